@@ -1,0 +1,373 @@
+"""The whole configuration of a run: frozen, typed, bounded, and written back resolved.
+
+A YAML file names only what differs from the defaults below. Every key, type and bound is
+checked before anything else happens; what is wrong is said in one line. Knows nothing of JAX.
+
+Pydantic does the checking (strict types, bounds, unknown keys, and a schema from which the
+reference can be generated); ruamel.yaml does the reading, because it speaks YAML 1.2, where
+`1e-3` is a number, and refuses a key that is given twice.
+"""
+
+import difflib
+import io
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    ValidationError,
+    model_validator,
+)
+from pydantic_core import ErrorDetails
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
+
+from jetbot_mjx.errors import UserError
+
+
+class ConfigError(UserError):
+    """A configuration that cannot run; the message names the key, the value and the remedy."""
+
+
+def _integral(value: object) -> object:
+    """Lets `3e7` stand for a count: YAML reads it as a float."""
+    if isinstance(value, float) and value.is_integer():
+        return int(value)
+    return value
+
+
+_Scalar = bool | int | float | str
+
+Count = Annotated[int, BeforeValidator(_integral), Field(ge=1)]
+Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+class _Section(BaseModel):
+    """What every section shares: frozen, strict, and without unknown keys."""
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
+    )
+
+
+class RobotConfig(_Section):
+    """Which robot drives."""
+
+    preset: Literal["isaac", "real"] = "isaac"
+    """`isaac`: the tutorial's heavy robot, reaches 1 m/s; `real`: 0.69 kg, 0.41 m/s."""
+
+
+class TaskConfig(_Section):
+    """What is to be done, and what the policy sees and commands."""
+
+    name: str = "jetbot_mjx.task:GoalTask"
+    """The task class, as `package.module:Class`; it is built as `Class(task_config)`."""
+    observation: Literal["world", "egocentric"] = "world"
+    """`world`: the tutorial's 16 numbers; `egocentric`: the goal as the robot sees it."""
+    episode_length: Count = 256
+    """Control steps after which an episode is cut off."""
+    max_speed: Positive = 1.0
+    """[m/s] forward speed commanded by a₀ = 1."""
+    max_yaw_rate: Positive = math.pi
+    """[rad/s] yaw rate commanded by a₁ = 1."""
+    goal_distance_min: Positive = 0.2
+    """[m] nearest goal."""
+    goal_distance_span: NonNegative = 1.0
+    """[m] farthest goal minus nearest."""
+    success_radius: Positive = 0.1
+    """[m] 3-D distance of the axle midpoint to the goal below which it is reached."""
+    options: dict[str, _Scalar] = Field(default_factory=dict)
+    """Free settings for a task of your own."""
+
+
+class PhysicsConfig(_Section):
+    """Time steps and solver effort. Integrator: Euler, without implicit joint damping."""
+
+    ctrl_dt: Positive = 1 / 60
+    """[s] one environment step: how long an action is held."""
+    sim_dt: Positive = 1 / 120
+    """[s] one physics step; `ctrl_dt` is a whole multiple of it."""
+    iterations: Count = 2
+    """Newton iterations per physics step."""
+    ls_iterations: Count = 1
+    """Line-search steps per Newton iteration."""
+
+    @property
+    def n_substeps(self) -> int:
+        """Physics steps per environment step."""
+        return round(self.ctrl_dt / self.sim_dt)
+
+    @model_validator(mode="after")
+    def _whole_substeps(self) -> Self:
+        ratio = self.ctrl_dt / self.sim_dt
+        # A decimal in YAML cannot hold 1/120: accept what rounds to a whole ratio.
+        if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-3 * ratio:
+            nearest = self.ctrl_dt / max(1, round(ratio))
+            raise ValueError(
+                f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
+                f" make the sub-steps whole, for example sim_dt = {nearest:.9g}"
+            )
+        return self
+
+
+class NetworkConfig(_Section):
+    """Policy and value networks, in the names of `brax.training.agents.ppo.networks`."""
+
+    policy_hidden_layer_sizes: Layers = (128, 128, 128)
+    """Units of the policy's hidden layers."""
+    value_hidden_layer_sizes: Layers = (128, 128, 128)
+    """Units of the value function's hidden layers."""
+    activation: Literal["tanh", "relu", "elu", "swish"] = "tanh"
+    """Activation between the layers."""
+    distribution_type: Literal["normal", "tanh_normal"] = "tanh_normal"
+    """Action distribution; `normal` leaves clipping to the environment, as SB3 does."""
+
+
+class PPOConfig(_Section):
+    """Hyperparameters under the names of `brax.training.agents.ppo.train.train`."""
+
+    num_timesteps: Count = 1_000_000
+    """Environment steps to train for; rounded up to whole training steps."""
+    num_envs: Count = 512
+    """Parallel environments, over all devices."""
+    unroll_length: Count = 16
+    """Environment steps per environment and unroll."""
+    batch_size: Count = 128
+    """Unrolls per minibatch."""
+    num_minibatches: Count = 4
+    """Minibatches per pass over the collected data."""
+    num_updates_per_batch: Count = 4
+    """Passes over the collected data before new data is collected."""
+    learning_rate: Positive = 1e-3
+    """Adam's step size; where the schedule starts."""
+    learning_rate_schedule: Literal["NONE", "ADAPTIVE_KL"] = "NONE"
+    """`ADAPTIVE_KL` steers the step size so that an update moves the policy by `desired_kl`."""
+    desired_kl: Positive = 0.01
+    """Target of `ADAPTIVE_KL`."""
+    learning_rate_schedule_min_lr: Positive = 1e-5
+    """Lower end of `ADAPTIVE_KL`."""
+    learning_rate_schedule_max_lr: Positive = 1e-2
+    """Upper end of `ADAPTIVE_KL`."""
+    discounting: Fraction = 0.95
+    """γ, per environment step."""
+    gae_lambda: Fraction = 0.95
+    """λ of generalised advantage estimation."""
+    entropy_cost: NonNegative = 1e-3
+    """Weight of the entropy bonus."""
+    clipping_epsilon: Positive = 0.2
+    """PPO's clip range of the probability ratio."""
+    vf_loss_coefficient: Positive = 1.0
+    """Weight of the value loss; Brax halves it once more."""
+    max_grad_norm: Positive | None = 1.0
+    """Global norm that gradients are clipped to; null: no clipping."""
+    reward_scaling: Positive = 10.0
+    """Factor on the reward inside the loss."""
+    normalize_observations: bool = True
+    """Normalise observations by running mean and deviation."""
+    normalize_advantage: bool = True
+    """Normalise advantages within a minibatch."""
+    network: NetworkConfig = NetworkConfig()
+    """Network sizes."""
+
+    @property
+    def steps_per_training_step(self) -> int:
+        """Environment steps that one training step collects."""
+        return self.batch_size * self.num_minibatches * self.unroll_length
+
+    @model_validator(mode="after")
+    def _whole_batches(self) -> Self:
+        unrolls = self.batch_size * self.num_minibatches
+        if unrolls % self.num_envs:
+            # The smallest minibatch size whose total the environments divide.
+            step = self.num_envs // math.gcd(self.num_envs, self.num_minibatches)
+            fit = step * max(1, round(self.batch_size / step))
+            raise ValueError(
+                f"batch_size * num_minibatches = {unrolls} is not a multiple of"
+                f" num_envs = {self.num_envs}: for example batch_size = {fit}"
+            )
+        low, high = self.learning_rate_schedule_min_lr, self.learning_rate_schedule_max_lr
+        if self.learning_rate_schedule == "ADAPTIVE_KL" and not low <= self.learning_rate <= high:
+            raise ValueError(
+                f"learning_rate = {self.learning_rate:g} lies outside the schedule's"
+                f" [{low:g}, {high:g}]: choose it inside, or widen the bounds"
+            )
+        return self
+
+
+class EvaluationConfig(_Section):
+    """The evaluations during training; `python -m jetbot_mjx.evaluate` has its own arguments."""
+
+    episodes: Count = 256
+    """Deterministic episodes per evaluation, on goals set apart from the final test's."""
+
+
+class Config(_Section):
+    """Everything that decides a run."""
+
+    seed: Annotated[int, BeforeValidator(_integral), Field(ge=0, lt=2**32)] = 0
+    """Seed of networks, environments and exploration."""
+    trainer: Literal["brax"] = "brax"
+    """`brax`: the stock `brax.training.agents.ppo.train.train`."""
+    checkpoint_interval: Count = 100_000
+    """Environment steps between two checkpoints, each with an evaluation and a log line."""
+    robot: RobotConfig = RobotConfig()
+    task: TaskConfig = TaskConfig()
+    physics: PhysicsConfig = PhysicsConfig()
+    ppo: PPOConfig = PPOConfig()
+    evaluation: EvaluationConfig = EvaluationConfig()
+
+    @model_validator(mode="after")
+    def _checkpoints_fit(self) -> Self:
+        step = self.ppo.steps_per_training_step
+        if self.checkpoint_interval < step:
+            raise ValueError(
+                f"checkpoint_interval = {self.checkpoint_interval} is shorter than one training"
+                f" step of {step} environment steps (ppo.batch_size * ppo.num_minibatches *"
+                f" ppo.unroll_length): make it at least {step}"
+            )
+        return self
+
+    def check_devices(self, device_count: int) -> None:
+        """Refuses a number of environments that the devices cannot share evenly.
+
+        Args:
+          device_count: devices that training will use, over all hosts.
+
+        Raises:
+          ConfigError: `num_envs` or `batch_size` is no multiple of `device_count`.
+        """
+        for key in ("num_envs", "batch_size"):
+            value = getattr(self.ppo, key)
+            if value % device_count:
+                fit = device_count * max(1, round(value / device_count))
+                raise ConfigError(
+                    f"ppo.{key} = {value} cannot be shared evenly by {device_count} devices:"
+                    f" for example ppo.{key} = {fit}"
+                )
+
+    def to_yaml(self) -> str:
+        """The resolved configuration, every key written out, as YAML."""
+        stream = io.StringIO()
+        yaml = YAML(typ="safe", pure=True)
+        yaml.default_flow_style = False
+        yaml.sort_base_mapping_type_on_output = False
+        yaml.dump(self.model_dump(mode="json"), stream)
+        return stream.getvalue()
+
+
+def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+    """Reads a YAML file, applies overrides, and checks the whole.
+
+    Args:
+      path: the YAML file; it names only what differs from the defaults.
+      overrides: `section.key=value`, the value read as YAML; the last one wins.
+
+    Returns:
+      The resolved configuration.
+
+    Raises:
+      ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
+        type, out of bounds or at odds with another.
+    """
+    values = _read_yaml(Path(path))
+    for override in overrides:
+        _apply_override(values, override)
+    return parse_config(values, source=str(path))
+
+
+def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
+    """Checks a nested mapping of settings.
+
+    Args:
+      values: the settings, nested as in YAML.
+      source: where they come from, for the message.
+
+    Returns:
+      The resolved configuration.
+
+    Raises:
+      ConfigError: as for `load_config`.
+    """
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        raise ConfigError(f"{source}: {_explain(error.errors()[0])}") from None
+
+
+def _read_yaml(path: Path) -> dict[str, Any]:
+    try:
+        text = path.read_text(encoding="utf-8")
+    except FileNotFoundError:
+        raise ConfigError(f"config {path} does not exist: give the path of a YAML file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
+        raise ConfigError(f"config {path} cannot be read: {reason}") from None
+    values = _parse_yaml(text, f"config {path}")
+    if values is None:
+        return {}
+    if not isinstance(values, dict):
+        raise ConfigError(f"config {path} holds {values!r}: write `key: value` lines")
+    return values
+
+
+def _parse_yaml(text: str, source: str) -> object:
+    try:
+        return YAML(typ="safe", pure=True).load(text)
+    except YAMLError as error:
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        mark = getattr(error, "problem_mark", None)
+        place = f", line {mark.line + 1}" if mark else ""
+        raise ConfigError(f"{source}{place} is not valid YAML: {problem}") from None
+
+
+def _apply_override(values: dict[str, Any], override: str) -> None:
+    key, separator, text = override.partition("=")
+    parts = key.strip().split(".")
+    if not separator or not all(parts):
+        raise ConfigError(f"--set {override}: write section.key=value, as in ppo.num_envs=256")
+    section = values
+    for part in parts[:-1]:
+        section = section.setdefault(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"--set {override}: {part} is a value, not a section")
+    section[parts[-1]] = _parse_yaml(text, f"--set {override}")
+
+
+def _explain(error: ErrorDetails) -> str:
+    """One line from pydantic's first finding: the key, the value, and what would be right."""
+    # Pydantic adds the name of the union's branch or of a tuple's place; keep keys only.
+    location = [str(part) for part in error["loc"]]
+    key = ".".join(location)
+    value = error["input"]
+    match error["type"]:
+        case "extra_forbidden":
+            known = _known_keys(location[:-1])
+            close = difflib.get_close_matches(location[-1], known, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+            return f"{key} = {value!r} is unknown: {hint}"
+        case "value_error":
+            prefix = f"{key}: " if key else ""
+            return prefix + str(error["ctx"]["error"]) if "ctx" in error else error["msg"]
+        case "model_type" | "model_attributes_type":
+            return f"{key} = {value!r} is not a section: write its keys below it"
+        case _:
+            wanted = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+            return f"{key} = {value!r} is wrong: it should be {wanted}"
+
+
+def _known_keys(location: Sequence[str]) -> list[str]:
+    model: type[BaseModel] = Config
+    for part in location:
+        annotation = model.model_fields[part].annotation
+        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
+            return []
+        model = annotation
+    return list(model.model_fields)

@@ -1,0 +1,249 @@
+"""The environment: one model and one task, wired into a `brax.envs.Env`.
+
+Pure, unbatched and stateless: batch with `jax.vmap`, compile with `jax.jit`. The state holds
+only what physics integrates and what the task drew; `mjx.Data` is rebuilt inside `step`.
+"""
+
+import copy
+from typing import Self
+
+import brax.envs
+import jax
+import jax.numpy as jnp
+import mujoco
+from flax import struct
+from jaxtyping import Array, Float, UInt32
+from mujoco import mjx
+
+from jetbot_mjx import kinematics
+from jetbot_mjx.config import Config
+from jetbot_mjx.model import (
+    CONTROLLER_WHEEL_RADIUS,
+    CONTROLLER_WHEEL_SEPARATION,
+    QPOS_QUAT,
+    QPOS_XYZ,
+    QVEL_ANGULAR_B,
+    QVEL_LINEAR_W,
+    ROBOTS,
+    make_mj_model,
+)
+from jetbot_mjx.task import Goal, RobotState, Task, layout_size, make_task
+
+
+@struct.dataclass
+class PhysicsState:
+    """What physics integrates, and nothing that can be computed from it."""
+
+    qpos: Float[Array, " nq"]
+    """Position (x, y, z) [m], quaternion (w, x, y, z), wheel angles (left, right) [rad]."""
+    qvel: Float[Array, " nv"]
+    """Velocity, world frame [m/s]; angular velocity, body frame; wheel speeds [rad/s]."""
+    qacc_warmstart: Float[Array, " nv"]
+    """Last acceleration, where the solver starts from."""
+    time: Float[Array, ""]
+    """Since the episode began [s]."""
+
+
+@struct.dataclass
+class State(brax.envs.State):
+    """Brax's environment state, with the task's own parts beside it."""
+
+    goal: Goal = None
+    """What the task drew for this episode."""
+    key: UInt32[Array, "2"] | None = None
+    """Random key from which the next episode is drawn."""
+
+
+class JetBotEnv(brax.envs.Env):
+    """A JetBot and its task.
+
+    Action: two numbers in [-1, 1], clipped; v = (a₀ + 1)/2 · `max_speed` [m/s] and
+    ω = a₁ · `max_yaw_rate` [rad/s], turned into wheel speeds by the tutorial's differential
+    controller and held for one environment step. Observation: as the task's `layout` says.
+    `metrics` holds `reward/<term>` of every step and `success`; `info` holds `terminated`.
+    `done` is termination; the time limit belongs to the wrappers.
+    """
+
+    def __init__(self, config: Config) -> None:
+        """Builds the models.
+
+        Args:
+          config: robot, task and physics.
+
+        Raises:
+          UserError: the task cannot be built.
+        """
+        self.config = config
+        self.task: Task = make_task(config.task)
+        self.robot = ROBOTS[config.robot.preset]
+        self.mj_model: mujoco.MjModel = make_mj_model(
+            self.robot, config.physics, build_scene=self.task.build_scene
+        )
+        physics_model = make_mj_model(
+            self.robot, config.physics, build_scene=self.task.build_scene, visual=False
+        )
+        self.mjx_model: mjx.Model = mjx.put_model(physics_model)
+        self._data: mjx.Data = mjx.make_data(physics_model)
+
+    def with_model(self, mjx_model: mjx.Model) -> Self:
+        """This environment on another physics model, as a new object.
+
+        Args:
+          mjx_model: a model of the same structure, such as one with other friction.
+
+        Returns:
+          A copy; `self` stays as it is.
+        """
+        env = copy.copy(self)
+        env.mjx_model = mjx_model
+        return env
+
+    def reset(self, rng: UInt32[Array, "2"]) -> State:
+        """Begins an episode: the robot at rest at the origin, a new goal.
+
+        Args:
+          rng: a legacy key, `jax.random.PRNGKey`; Brax's wrappers rely on its shape.
+
+        Returns:
+          The first state.
+        """
+        key, goal_key = jax.random.split(rng)
+        goal = self.task.sample(goal_key)
+        physics = PhysicsState(
+            qpos=jnp.asarray(self.mj_model.qpos0, jnp.float32),
+            qvel=jnp.zeros(self.mj_model.nv),
+            qacc_warmstart=jnp.zeros(self.mj_model.nv),
+            time=jnp.zeros(()),
+        )
+        robot = robot_state(physics)
+        # The names of the terms, without computing them: a first state has none.
+        _, terms = jax.eval_shape(
+            self.task.reward, robot, robot, goal, jnp.zeros(self.action_size)
+        )
+        zero = jnp.zeros(())
+        return State(
+            pipeline_state=physics,
+            obs=self.task.observe(robot, goal),
+            reward=zero,
+            done=zero,
+            metrics={"success": zero, **{f"reward/{name}": zero for name in terms}},
+            info={"terminated": zero},
+            goal=goal,
+            key=key,
+        )
+
+    def step(self, state: State, action: Float[Array, "2"]) -> State:
+        """Holds an action for one environment step.
+
+        Args:
+          state: of the same environment.
+          action: in [-1, 1]².
+
+        Returns:
+          The next state, with the same tree, shapes and dtypes.
+        """
+        physics = self.step_physics(state.pipeline_state, self.wheel_targets(action))
+        before, after = robot_state(state.pipeline_state), robot_state(physics)
+        reward, terms = self.task.reward(before, after, state.goal, action)
+        terminated = self.task.terminated(after, state.goal).astype(jnp.float32)
+        success = self.task.success(after, state.goal).astype(jnp.float32)
+        rewards = {f"reward/{name}": term for name, term in terms.items()}
+        return state.replace(
+            pipeline_state=physics,
+            obs=self.task.observe(after, state.goal),
+            reward=reward,
+            done=terminated,
+            metrics={**state.metrics, "success": success, **rewards},
+            info={**state.info, "terminated": terminated},
+        )
+
+    def wheel_targets(self, action: Float[Array, "2"]) -> Float[Array, "2"]:
+        """Wheel speeds (left, right) [rad/s] that an action commands, before motor limits."""
+        twist_b = kinematics.twist_from_action(
+            action,
+            max_speed=self.config.task.max_speed,
+            max_yaw_rate=self.config.task.max_yaw_rate,
+        )
+        return kinematics.wheel_speeds(
+            twist_b,
+            wheel_radius=CONTROLLER_WHEEL_RADIUS,
+            wheel_separation=CONTROLLER_WHEEL_SEPARATION,
+        )
+
+    def step_physics(self, physics: PhysicsState, ctrl: Float[Array, "2"]) -> PhysicsState:
+        """Integrates one environment step, `n_substeps` physics steps.
+
+        Args:
+          physics: where to start.
+          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
+
+        Returns:
+          The physics state one `ctrl_dt` later.
+        """
+
+        def substep(physics: PhysicsState, _: None) -> tuple[PhysicsState, None]:
+            data = self._data.replace(
+                qpos=physics.qpos,
+                qvel=physics.qvel,
+                qacc_warmstart=physics.qacc_warmstart,
+                time=physics.time,
+                ctrl=ctrl,
+            )
+            data = mjx.step(self.mjx_model, data)
+            return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time), None
+
+        # GPUs multiply float32 matrices in TF32 unless told otherwise, and the contact solver
+        # then diverges. Only physics asks for full precision; networks choose their own.
+        with jax.default_matmul_precision("highest"):
+            physics, _ = jax.lax.scan(substep, physics, length=self.config.physics.n_substeps)
+        return physics
+
+    @property
+    def observation_size(self) -> int:
+        """Length of the observation, from the task's layout."""
+        return layout_size(self.task.layout)
+
+    @property
+    def action_size(self) -> int:
+        """Two: drive and turn."""
+        return 2
+
+    @property
+    def backend(self) -> str:
+        """Physics back end, in Brax's words."""
+        return "mjx"
+
+    @property
+    def dt(self) -> float:
+        """Duration of one environment step [s]."""
+        return self.config.physics.ctrl_dt
+
+
+def robot_state(physics: PhysicsState) -> RobotState:
+    """The robot as a task sees it, from the generalised coordinates.
+
+    MuJoCo's free joint holds the velocity of the body's origin in the world frame, but the
+    angular velocity in the body frame: it is rotated here.
+    """
+    quat = physics.qpos[QPOS_QUAT]
+    return RobotState(
+        position_w=physics.qpos[QPOS_XYZ],
+        quat=quat,
+        linear_velocity_w=physics.qvel[QVEL_LINEAR_W],
+        angular_velocity_w=kinematics.rotate(quat, physics.qvel[QVEL_ANGULAR_B]),
+    )
+
+
+def make_env(config: Config) -> JetBotEnv:
+    """Builds the environment that a configuration describes.
+
+    Args:
+      config: robot, task and physics.
+
+    Returns:
+      The environment, unbatched and unwrapped.
+
+    Raises:
+      UserError: the task cannot be built.
+    """
+    return JetBotEnv(config)

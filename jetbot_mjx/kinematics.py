@@ -1,0 +1,152 @@
+"""Planar differential-drive kinematics and frames: pure functions of one robot.
+
+No batch axis: batch with `jax.vmap`. SI units. Frames: `_w` world, `_b` body
+(x forward, y left, z up). Angles are counter-clockwise positive. Quaternions are
+MuJoCo's (w, x, y, z).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+
+def twist_from_action(
+    action: Float[Array, "2"], *, max_speed: float, max_yaw_rate: float
+) -> Float[Array, "2"]:
+    """Body twist that the tutorial's action asks for.
+
+        v = (a₀ + 1)/2 · v_max        ω = a₁ · ω_max
+
+    The map has no reverse gear: a₀ = -1 stands still, a₀ = 0 is already half speed.
+
+    Args:
+      action: (a₀, a₁), each in [-1, 1]; values outside are clipped.
+      max_speed: v_max [m/s].
+      max_yaw_rate: ω_max [rad/s].
+
+    Returns:
+      (v, ω), forward speed [m/s] and yaw rate [rad/s].
+
+    Source: Isaac Sim 2022.x documentation, section 9.9, `JetBotEnv.step`.
+    """
+    drive, turn = jnp.clip(action, -1.0, 1.0)
+    return jnp.stack([0.5 * (drive + 1.0) * max_speed, turn * max_yaw_rate])
+
+
+def action_from_twist(
+    twist_b: Float[Array, "2"], *, max_speed: float, max_yaw_rate: float
+) -> Float[Array, "2"]:
+    """Action that asks for a body twist; the inverse of `twist_from_action`, clipped.
+
+    Args:
+      twist_b: (v, ω), forward speed [m/s] and yaw rate [rad/s].
+      max_speed: v_max [m/s].
+      max_yaw_rate: ω_max [rad/s].
+
+    Returns:
+      The action in [-1, 1]².
+    """
+    v, yaw_rate = twist_b
+    action = jnp.stack([2.0 * v / max_speed - 1.0, yaw_rate / max_yaw_rate])
+    return jnp.clip(action, -1.0, 1.0)
+
+
+def wheel_speeds(
+    twist_b: Float[Array, "2"], *, wheel_radius: float, wheel_separation: float
+) -> Float[Array, "2"]:
+    """Wheel speeds that make a differential drive follow a body twist.
+
+        ω_L = (v - ω b/2) / r        ω_R = (v + ω b/2) / r
+
+    Assumes rolling without slip; no actuator limits are applied here.
+
+    Args:
+      twist_b: (v, ω), forward speed [m/s] and yaw rate [rad/s].
+      wheel_radius: r [m].
+      wheel_separation: b, distance between the two wheels' contact points [m].
+
+    Returns:
+      (ω_L, ω_R), left and right wheel speeds [rad/s].
+
+    Source: Isaac Sim `DifferentialController` (it calls b `wheel_base`).
+    """
+    v, yaw_rate = twist_b
+    turn = 0.5 * yaw_rate * wheel_separation
+    return jnp.stack([v - turn, v + turn]) / wheel_radius
+
+
+def body_twist(
+    wheel_speeds: Float[Array, "2"], *, wheel_radius: float, wheel_separation: float
+) -> Float[Array, "2"]:
+    """Body twist of a differential drive that rolls without slip.
+
+        v = r (ω_L + ω_R) / 2        ω = r (ω_R - ω_L) / b
+
+    Args:
+      wheel_speeds: (ω_L, ω_R) [rad/s].
+      wheel_radius: r [m].
+      wheel_separation: b, distance between the two wheels' contact points [m].
+
+    Returns:
+      (v, ω), forward speed [m/s] and yaw rate [rad/s].
+    """
+    left, right = wheel_speeds
+    return wheel_radius * jnp.stack(
+        [0.5 * (left + right), (right - left) / wheel_separation]
+    )
+
+
+def rotate(quat: Float[Array, "4"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
+    """Rotates a vector by a unit quaternion: body frame to world frame.
+
+    Args:
+      quat: (w, x, y, z) of the body in the world.
+      vector: in the body frame.
+
+    Returns:
+      The same vector in the world frame.
+    """
+    w, axis = quat[0], quat[1:]
+    # Two cross products in place of a matrix: element-wise, hence never in TF32.
+    t = 2.0 * jnp.cross(axis, vector)
+    return vector + w * t + jnp.cross(axis, t)
+
+
+def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
+    """Heading of a body, the angle of its x axis about the world's z axis.
+
+    Args:
+      quat: (w, x, y, z) of the body in the world.
+
+    Returns:
+      Yaw in (-π, π] [rad].
+    """
+    w, x, y, z = quat
+    return jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
+    """Angle between a body's z axis and the world's.
+
+    Args:
+      quat: (w, x, y, z) of the body in the world.
+
+    Returns:
+      Tilt in [0, π] [rad]; π is upside down.
+    """
+    _, x, y, _ = quat
+    return 2.0 * jnp.arcsin(jnp.clip(jnp.hypot(x, y), 0.0, 1.0))
+
+
+def to_body(heading: Float[Array, ""], vector_w: Float[Array, "2"]) -> Float[Array, "2"]:
+    """Turns a horizontal world vector into the frame of a body that heads `heading`.
+
+    Args:
+      heading: yaw of the body [rad].
+      vector_w: (x, y) in the world frame.
+
+    Returns:
+      (forward, left) in the body frame.
+    """
+    cos, sin = jnp.cos(heading), jnp.sin(heading)
+    x, y = vector_w
+    return jnp.stack([cos * x + sin * y, cos * y - sin * x])
