@@ -13,9 +13,8 @@ import jax.numpy as jnp
 import mujoco
 from flax import struct
 from jaxtyping import Array, Float, UInt32
-from mujoco import mjx
 
-from jetbot_mjx import kinematics
+from jetbot_mjx import kinematics, mjx
 from jetbot_mjx.config import Config
 from jetbot_mjx.model import (
     CONTROLLER_WHEEL_RADIUS,

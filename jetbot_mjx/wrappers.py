@@ -20,8 +20,8 @@ import jax.numpy as jnp
 from brax.envs import Env, Wrapper
 from brax.envs.wrappers.training import VmapWrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
-from mujoco import mjx
 
+from jetbot_mjx import mjx
 from jetbot_mjx.env import JetBotEnv, State
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]

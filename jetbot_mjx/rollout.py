@@ -1,0 +1,130 @@
+"""Whole episodes under a controller: one compiled program, shared by all who judge or draw.
+
+A controller sees the whole state, so that a scripted one can be judged beside a policy:
+`controller(params, state, key) -> action`. Here the batch axis is made, by `jax.vmap`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree, UInt32
+
+from jetbot_mjx.env import JetBotEnv, State
+from jetbot_mjx.model import QPOS_XYZ
+from jetbot_mjx.task import Goal
+from jetbot_mjx.wrappers import EpisodeWrapper
+
+Controller = Callable[[Any, State, UInt32[Array, "2"]], Float[Array, "2"]]
+
+
+class Episodes(NamedTuple):
+    """One finished episode of each of n environments."""
+
+    success: Float[Array, " n"]
+    """1 where the task's success was reached."""
+    steps: Float[Array, " n"]
+    """Environment steps until the end."""
+    episode_return: Float[Array, " n"]
+    """Sum of rewards."""
+    nonfinite: Float[Array, " n"]
+    """1 where the episode was cut off because its world was no longer finite."""
+    path_length: Float[Array, " n"]
+    """Way travelled by the axle midpoint [m], on the floor."""
+    start_w: Float[Array, "n 2"]
+    """Where the robot started [m]."""
+    end_w: Float[Array, "n 2"]
+    """Where it ended [m]."""
+    goal_w: Float[Array, "n 3"]
+    """Where it had to go [m], world frame."""
+    goal: Goal
+    """The whole of what the task drew."""
+    qpos: Float[Array, "n time nq"] | None
+    """Trajectory, first state included; after the end it stands still. None: not recorded."""
+
+
+class _Tally(NamedTuple):
+    alive: Float[Array, ""]
+    success: Float[Array, ""]
+    steps: Float[Array, ""]
+    episode_return: Float[Array, ""]
+    nonfinite: Float[Array, ""]
+    path_length: Float[Array, ""]
+
+
+def make_rollout(
+    env: JetBotEnv,
+    controllers: Sequence[Controller],
+    episode_length: int,
+    *,
+    record: bool = False,
+) -> Callable[[int, Any, UInt32[Array, "n 2"]], Episodes]:
+    """Compiles episodes under any one of several controllers into one program.
+
+    Args:
+      env: one environment, unwrapped.
+      controllers: what can drive.
+      episode_length: environment steps after which an episode is truncated.
+      record: whether to keep the trajectories.
+
+    Returns:
+      A function of (index of the controller, its parameters, one reset key for each
+      environment). The reset key also seeds the controller's own randomness.
+    """
+    episode_env = EpisodeWrapper(env, episode_length)
+
+    def one_step(
+        carry: tuple[State, _Tally], action: Float[Array, "2"]
+    ) -> tuple[tuple[State, _Tally], Float[Array, " nq"]]:
+        state, tally = carry
+        nstate = episode_env.step(state, action)
+        moved = jnp.linalg.norm(
+            nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
+        )
+        now = _Tally(
+            alive=-nstate.done,
+            success=nstate.metrics["success"],
+            steps=jnp.ones(()),
+            episode_return=nstate.reward,
+            nonfinite=nstate.metrics["nonfinite_worlds"],
+            path_length=moved,
+        )
+        added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
+        # A finished robot stands where it finished.
+        nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
+        return (nstate, added), nstate.pipeline_state.qpos
+
+    def run(index: int, params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
+        first = jax.vmap(episode_env.reset)(keys)
+        zero = jnp.zeros(keys.shape[0])
+        tally = _Tally(jnp.ones_like(zero), zero, zero, zero, zero, zero)
+
+        def act(state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
+            branches = [lambda s, k, c=c: c(params, s, k) for c in controllers]
+            return jax.lax.switch(index, branches, state, key)
+
+        def body(carry: tuple[State, _Tally], time: Array) -> tuple[tuple[State, _Tally], PyTree]:
+            # Reset keys with the step folded in: apart from those of later episodes.
+            step_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, time)
+            actions = jax.vmap(act)(carry[0], step_keys)
+            carry, qpos = jax.vmap(one_step)(carry, actions)
+            return carry, qpos if record else None
+
+        (last, tally), trail = jax.lax.scan(body, (first, tally), jnp.arange(episode_length))
+        start = first.pipeline_state.qpos
+        qpos = jnp.concatenate([start[None], trail]).swapaxes(0, 1) if record else None
+        return Episodes(
+            success=tally.success,
+            steps=tally.steps,
+            episode_return=tally.episode_return,
+            nonfinite=tally.nonfinite,
+            path_length=tally.path_length,
+            start_w=start[:, QPOS_XYZ][:, :2],
+            end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],
+            goal_w=jax.vmap(env.task.goal_position)(first.goal),
+            goal=first.goal,
+            qpos=qpos,
+        )
+
+    return jax.jit(run)
