@@ -1,7 +1,7 @@
 """A JetBot that learns to drive to goals, thousands at a time: MuJoCo MJX and Brax's PPO.
 
 The modules in reading order, each knowing only those before it:
-`errors`, `config`, `mjx`, `kinematics`, `model`, `task`, `env`, `wrappers`, `policy`,
+`errors`, `config`, `mjx`, `kinematics`, `model`, `task`, `state`, `env`, `wrappers`, `policy`,
 `rollout`, `evaluation`, `checkpoint`, `run_folder`, `metrics`, `brax_ppo`, `cli`, and the
 commands `train`, `evaluate`, `render`. Commands meet only in the run folder.
 """
@@ -12,8 +12,8 @@ from jetbot_mjx import mjx as _mjx  # isort: skip
 from jetbot_mjx.checkpoint import load_policy as load_policy
 from jetbot_mjx.config import load_config as load_config
 from jetbot_mjx.env import JetBotEnv as JetBotEnv
-from jetbot_mjx.env import State as State
 from jetbot_mjx.env import make_env as make_env
+from jetbot_mjx.state import State as State
 from jetbot_mjx.task import Task as Task
 from jetbot_mjx.wrappers import wrap_for_training as wrap_for_training
 

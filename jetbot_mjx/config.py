@@ -95,9 +95,9 @@ class PhysicsConfig(_Section):
     """[s] one environment step: how long an action is held."""
     sim_dt: Positive = 1 / 120
     """[s] one physics step; `ctrl_dt` is a whole multiple of it."""
-    iterations: Count = 2
-    """Newton iterations per physics step."""
-    ls_iterations: Count = 1
+    iterations: Count | None = None
+    """Newton iterations per physics step; null: as many as the robot needs, 2 or 3."""
+    ls_iterations: Count = 2
     """Line-search steps per Newton iteration."""
 
     @property

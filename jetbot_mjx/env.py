@@ -5,13 +5,11 @@ only what physics integrates and what the task drew; `mjx.Data` is rebuilt insid
 """
 
 import copy
-from typing import Self
 
 import brax.envs
 import jax
 import jax.numpy as jnp
 import mujoco
-from flax import struct
 from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx import kinematics, mjx
@@ -19,38 +17,11 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
-    QPOS_QUAT,
-    QPOS_XYZ,
-    QVEL_ANGULAR_B,
-    QVEL_LINEAR_W,
     ROBOTS,
     make_mj_model,
 )
-from jetbot_mjx.task import Goal, RobotState, Task, layout_size, make_task
-
-
-@struct.dataclass
-class PhysicsState:
-    """What physics integrates, and nothing that can be computed from it."""
-
-    qpos: Float[Array, " nq"]
-    """Position (x, y, z) [m], quaternion (w, x, y, z), wheel angles (left, right) [rad]."""
-    qvel: Float[Array, " nv"]
-    """Velocity, world frame [m/s]; angular velocity, body frame; wheel speeds [rad/s]."""
-    qacc_warmstart: Float[Array, " nv"]
-    """Last acceleration, where the solver starts from."""
-    time: Float[Array, ""]
-    """Since the episode began [s]."""
-
-
-@struct.dataclass
-class State(brax.envs.State):
-    """Brax's environment state, with the task's own parts beside it."""
-
-    goal: Goal = None
-    """What the task drew for this episode."""
-    key: UInt32[Array, "2"] | None = None
-    """Random key from which the next episode is drawn."""
+from jetbot_mjx.state import PhysicsState, State, robot_state
+from jetbot_mjx.task import Task, layout_size, make_task
 
 
 class JetBotEnv(brax.envs.Env):
@@ -84,7 +55,7 @@ class JetBotEnv(brax.envs.Env):
         self.mjx_model: mjx.Model = mjx.put_model(physics_model)
         self._data: mjx.Data = mjx.make_data(physics_model)
 
-    def with_model(self, mjx_model: mjx.Model) -> Self:
+    def with_model(self, mjx_model: mjx.Model) -> "JetBotEnv":
         """This environment on another physics model, as a new object.
 
         Args:
@@ -216,21 +187,6 @@ class JetBotEnv(brax.envs.Env):
     def dt(self) -> float:
         """Duration of one environment step [s]."""
         return self.config.physics.ctrl_dt
-
-
-def robot_state(physics: PhysicsState) -> RobotState:
-    """The robot as a task sees it, from the generalised coordinates.
-
-    MuJoCo's free joint holds the velocity of the body's origin in the world frame, but the
-    angular velocity in the body frame: it is rotated here.
-    """
-    quat = physics.qpos[QPOS_QUAT]
-    return RobotState(
-        position_w=physics.qpos[QPOS_XYZ],
-        quat=quat,
-        linear_velocity_w=physics.qvel[QVEL_LINEAR_W],
-        angular_velocity_w=kinematics.rotate(quat, physics.qvel[QVEL_ANGULAR_B]),
-    )
 
 
 def make_env(config: Config) -> JetBotEnv:

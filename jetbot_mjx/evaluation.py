@@ -15,9 +15,10 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx import kinematics
-from jetbot_mjx.env import JetBotEnv, State, robot_state
+from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.policy import PolicyParams, make_policy
 from jetbot_mjx.rollout import Controller, Episodes, make_rollout
+from jetbot_mjx.state import State, robot_state
 
 GOAL_SET_VERSION = 1
 """Raised whenever the goals or the rules of the report change."""

@@ -1,7 +1,7 @@
 """The policy: Brax's networks, their parameters by name, and inference."""
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
 import jax
@@ -31,6 +31,7 @@ class PolicyParams(NamedTuple):
     """Weights of the value network."""
 
 
+@runtime_checkable
 class Policy(Protocol):
     """A policy as users call it."""
 

@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.env import JetBotEnv, State
+from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import QPOS_XYZ
+from jetbot_mjx.state import State
 from jetbot_mjx.task import Goal
 from jetbot_mjx.wrappers import EpisodeWrapper
 

@@ -22,7 +22,8 @@ from brax.envs.wrappers.training import VmapWrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx import mjx
-from jetbot_mjx.env import JetBotEnv, State
+from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.state import State
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 """From one model to (a batch of models, the batch's axes as `jax.vmap` wants them)."""

@@ -1,0 +1,47 @@
+# The two commands are `make train` and `make test`; both set up what they need, once.
+PYTHON ?= python3
+VENV ?= .venv
+CONFIG ?= configs/jetbot.yaml
+RUN ?= runs/$(notdir $(basename $(CONFIG)))-$(shell date +%Y%m%d-%H%M%S)
+
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+
+.PHONY: setup train test test-slow check format benchmark clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: Python %d.%d is too old: jetbot_mjx needs 3.11 or newer; say make PYTHON=python3.11" % sys.version_info[:2])'
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+# Trains the tutorial's task on whatever JAX finds, then judges it and shows it.
+train: RUN := $(RUN)
+train: setup
+	$(BIN)/python -m jetbot_mjx.train --config $(CONFIG) --run-dir $(RUN)
+	$(BIN)/python -m jetbot_mjx.evaluate $(RUN)
+	$(BIN)/python -m jetbot_mjx.render $(RUN)
+	@echo "everything lies in $(RUN)"
+
+test: setup
+	$(BIN)/python -m pytest -m 'not slow'
+
+test-slow: setup
+	$(BIN)/python -m pytest -m slow
+
+check: setup
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/pyright
+
+format: setup
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+benchmark: setup
+	$(BIN)/python benchmarks/steps_per_second.py
+
+clean:
+	rm -rf $(VENV) .cache

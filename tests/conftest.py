@@ -1,0 +1,37 @@
+"""Shared fixtures: the CPU, a compilation cache in the work tree, environments built once."""
+
+import os
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+
+# Before JAX is imported. Subprocesses of the tests inherit all of it.
+os.environ.setdefault("JAX_PLATFORMS", "cpu")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax"))
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("MPLBACKEND", "agg")
+
+import pytest
+
+from jetbot_mjx.config import Config, parse_config
+from jetbot_mjx.env import JetBotEnv, make_env
+
+
+@pytest.fixture(scope="session")
+def root() -> Path:
+    return ROOT
+
+
+@pytest.fixture(scope="session")
+def world_config() -> Config:
+    return parse_config({})
+
+
+@pytest.fixture(scope="session")
+def world_env(world_config: Config) -> JetBotEnv:
+    return make_env(world_config)
+
+
+@pytest.fixture(scope="session", params=["isaac", "real"])
+def preset_env(request) -> JetBotEnv:
+    return make_env(parse_config({"robot": {"preset": request.param}}))

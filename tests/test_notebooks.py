@@ -1,0 +1,96 @@
+"""The notebooks run from top to bottom, as a reader would, on the smallest configuration."""
+
+import os
+
+import nbformat
+import pytest
+from ipykernel.kernelspec import write_kernel_spec
+from nbclient import NotebookClient
+
+NAMES = ("01_environment", "02_train", "03_evaluate_and_render")
+
+IMAGES = {"image/png", "image/jpeg", "image/gif"}
+
+
+@pytest.fixture(scope="module")
+def execute(root, tmp_path_factory):
+    """Runs a notebook with this interpreter; the runs share one folder, hence the module."""
+    folder = tmp_path_factory.mktemp("notebooks")
+    write_kernel_spec(folder / "jupyter" / "kernels" / "this")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
+        patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
+        patch.setenv("JETBOT_EPISODES", "3")
+        patch.setenv("PYTHONPATH", str(root), prepend=os.pathsep)
+        # Nothing of the user's own Jupyter, and nothing left in it.
+        patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
+        patch.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))
+        patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+        patch.setenv("IPYTHONDIR", str(folder / "ipython"))
+        # The kernel sets its own back end, which puts figures into the notebook.
+        patch.delenv("MPLBACKEND", raising=False)
+
+        def run(name):
+            notebook = nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4)
+            client = NotebookClient(
+                notebook,
+                kernel_name="this",
+                timeout=300,
+                resources={"metadata": {"path": str(root / "notebooks")}},
+            )
+            return client.execute()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def trained(execute):
+    return execute("02_train")
+
+
+@pytest.fixture(scope="module")
+def read(root):
+    return {
+        name: nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4) for name in NAMES
+    }
+
+
+def images(notebook):
+    """MIME types of the images in the outputs."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert not [output for output in outputs if output.output_type == "error"]
+    return [mime for output in outputs for mime in output.get("data", {}) if mime in IMAGES]
+
+
+def text(notebook):
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "".join(output.get("text", "") for output in outputs)
+
+
+def test_environment_notebook_runs(execute):
+    notebook = execute("01_environment")
+    assert images(notebook) == ["image/png"] * 2
+    assert "20 different goals in 20 episodes" in text(notebook)
+
+
+def test_training_notebook_runs(trained):
+    assert images(trained) == ["image/png"]
+    assert "best policy" in text(trained)
+
+
+def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, trained):
+    notebook = execute("03_evaluate_and_render")
+    assert images(notebook) == ["image/png", "image/png", "image/gif"]
+    assert "scripted" in text(notebook)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_committed_notebooks_hold_no_outputs(read, name):
+    nbformat.validate(read[name])
+    code = [cell for cell in read[name].cells if cell.cell_type == "code"]
+    assert code
+    assert all(cell.outputs == [] and cell.execution_count is None for cell in code)
+
+
+def test_every_notebook_is_tested(root):
+    assert sorted(path.stem for path in (root / "notebooks").glob("*.ipynb")) == list(NAMES)
