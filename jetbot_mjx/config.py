@@ -135,7 +135,8 @@ class PPOConfig(_Section):
     """Hyperparameters under the names of `brax.training.agents.ppo.train.train`."""
 
     num_timesteps: Count = 1_000_000
-    """Environment steps to train for; rounded up to whole training steps."""
+    """Environment steps to train for; each checkpoint interval is rounded up to whole training
+    steps of `batch_size * num_minibatches * unroll_length`."""
     num_envs: Count = 512
     """Parallel environments, over all devices."""
     unroll_length: Count = 16

@@ -71,7 +71,7 @@ def versions() -> dict[str, Any]:
     devices = jax.devices()
     return {
         "python": platform.python_version(),
-        "platform": platform.platform(),
+        "platform": f"{platform.system()} {platform.machine()}",
         "packages": {name: _version(name) for name in _PACKAGES},
         "device": devices[0].device_kind,
         "device_platform": devices[0].platform,
