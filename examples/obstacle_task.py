@@ -43,9 +43,9 @@ class Options(BaseModel):
     """[m] largest distance of the pillar's axis from the straight line to the goal."""
     robot_radius: Positive = 0.11
     """[m] circle about the axle midpoint that holds the whole robot, its rear corners too."""
-    margin: Positive = 0.1
+    margin: Positive = 0.2
     """[m] free room between pillar and robot at the start, and were it to stand on the goal."""
-    collision_penalty: NonNegative = 0.5
+    collision_penalty: NonNegative = 1.0
     """[m] what hitting the pillar costs, in the unit of progress."""
 
 

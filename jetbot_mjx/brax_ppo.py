@@ -71,7 +71,7 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
         nonlocal clock
         clock = time.perf_counter()
 
-    with _device_put_replicated():
+    with device_put_replicated():
         _, params, _ = brax_train.train(
             environment=env,
             episode_length=config.task.episode_length,
@@ -91,7 +91,7 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
 
 
 @contextlib.contextmanager
-def _device_put_replicated() -> Iterator[None]:
+def device_put_replicated() -> Iterator[None]:
     """Lends JAX ≥ 0.10 the function that it dropped and that Brax 0.14.2 still calls.
 
     The mesh axis is named `i`, as in Brax's `pmap`: under any other name the shardings of

@@ -5,8 +5,10 @@ resolved configuration, observation layout, versions, and the figures they were 
 Orbax writes in the background and renames at the end: a folder is whole or absent.
 """
 
+import functools
 import json
 import logging
+import sys
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
@@ -125,6 +127,7 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
             tree = reader.restore(folder / _PARAMS, _to_tree(template))
     # Orbax and TensorStore report a damaged folder by many kinds of exception.
     except Exception as error:
+        _hush_stragglers()
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise CheckpointError(f"checkpoint {folder} cannot be read: {reason[:200]}") from error
     return Checkpoint(
@@ -238,6 +241,23 @@ def _manager(folder: Path, *, create: bool) -> ocp.CheckpointManager:
         cleanup_tmp_directories=True,
     )
     return ocp.CheckpointManager(folder.absolute(), options=options)
+
+
+@functools.cache
+def _hush_stragglers() -> None:
+    """Keeps Python from printing a traceback for every read that outlives a failed restore.
+
+    Orbax reads all arrays at once and closes its event loop at the first that fails. Each
+    other read then ends in a callback to a closed loop, or is thrown away half done.
+    """
+    report = sys.unraisablehook
+    expected = ("Event loop is closed", "Encountered error while reading array")
+
+    def report_others(unraisable: Any) -> None:
+        if not str(unraisable.exc_value).startswith(expected):
+            report(unraisable)
+
+    sys.unraisablehook = report_others
 
 
 def _template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:

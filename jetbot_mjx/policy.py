@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
 import jax
+import numpy as np
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import identity_observation_preprocessor
@@ -36,7 +37,7 @@ class Policy(Protocol):
     """A policy as users call it."""
 
     def __call__(
-        self, obs: Float[Array, "*batch obs"], key: UInt32[Array, "2"] | None = None
+        self, obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
         """Acts: the distribution's mode without a key, a sample with one."""
         ...
@@ -106,7 +107,7 @@ def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Pol
     greedy, exploring = inference(params, deterministic=True), inference(params)
 
     def policy(
-        obs: Float[Array, "*batch obs"], key: UInt32[Array, "2"] | None = None
+        obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
         if key is None:
             # Brax asks for a key that the mode does not use.

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import imageio.v3 as iio
 import jax
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
 from jaxtyping import UInt8
@@ -127,7 +128,7 @@ def _title(checkpoint: Checkpoint, episodes: Episodes) -> str:
 def _film(renderer: Renderer, env: JetBotEnv, episodes: Episodes, index: int) -> list[Frame]:
     """One episode in real time: the chase camera beside the view from above."""
     assert episodes.qpos is not None
-    goal = jax.tree.map(lambda leaf: leaf[index], episodes.goal)
+    goal = jax.tree.map(lambda leaf: jnp.asarray(leaf[index]), episodes.goal)
     markers = env.task.markers(goal)
     steps = int(episodes.steps[index])
     stride = 1.0 / (_VIDEO_FPS * env.dt)

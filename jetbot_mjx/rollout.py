@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PyTree, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt32
 
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import QPOS_XYZ
@@ -96,7 +96,7 @@ def make_rollout(
         nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
         return (nstate, added), nstate.pipeline_state.qpos
 
-    def run(index: int, params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
+    def run(index: Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = jax.vmap(episode_env.reset)(keys)
         zero = jnp.zeros(keys.shape[0])
         tally = _Tally(jnp.ones_like(zero), zero, zero, zero, zero, zero)

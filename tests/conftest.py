@@ -35,3 +35,14 @@ def world_env(world_config: Config) -> JetBotEnv:
 @pytest.fixture(scope="session", params=["isaac", "real"])
 def preset_env(request) -> JetBotEnv:
     return make_env(parse_config({"robot": {"preset": request.param}}))
+
+
+@pytest.fixture(scope="session")
+def smoke_run(tmp_path_factory) -> Path:
+    """A run folder, trained once with `configs/smoke.yaml` and never written to by a test."""
+    from jetbot_mjx import train
+    from jetbot_mjx.config import load_config
+
+    run_dir = tmp_path_factory.mktemp("runs") / "smoke"
+    train.run(load_config(ROOT / "configs" / "smoke.yaml"), run_dir)
+    return run_dir

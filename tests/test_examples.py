@@ -181,7 +181,7 @@ def test_pillar_takes_no_part_in_physics(env, world_env):
     [
         ("task.options.pilar_radius=0.1", "pilar_radius"),
         ("task.options.pillar_radius=-0.1", "pillar_radius = -0.1"),
-        ("task.goal_distance_min=0.3", "make it at least 0.58"),
+        ("task.goal_distance_min=0.3", "make it at least 0.78"),
     ],
 )
 def test_wrong_settings_are_refused(load, override, message):

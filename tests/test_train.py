@@ -1,0 +1,134 @@
+"""Training end to end on the smoke configuration: what lies in the run folder, and what it says."""
+
+import hashlib
+import json
+import shutil
+
+import brax.training.agents.ppo.train as brax_ppo_train
+import jax
+import numpy as np
+import pytest
+
+from jetbot_mjx import brax_ppo, evaluate, load_config, make_env, train, wrap_for_training
+from jetbot_mjx.checkpoint import load_checkpoint
+from jetbot_mjx.evaluation import BASELINES
+
+
+@pytest.fixture(scope="module")
+def lines(smoke_run):
+    return [json.loads(line) for line in (smoke_run / "metrics.jsonl").read_text().splitlines()]
+
+
+def test_the_run_folder_holds_what_is_promised(smoke_run, root):
+    assert (smoke_run / "tensorboard").is_dir()
+    assert load_config(smoke_run / "config.yaml") == load_config(root / "configs" / "smoke.yaml")
+    found = json.loads((smoke_run / "versions.json").read_text())
+    assert found["packages"]["mujoco"] == found["packages"]["mujoco-mjx"]
+    assert found["device_count"] == jax.device_count()
+
+
+def test_the_metrics_hold_what_is_promised(lines):
+    assert [line["env_steps"] for line in lines] == [0, 16_384, 32_768, 49_152, 65_536]
+    wanted = {
+        "eval/success_rate",
+        "eval/time_to_goal_median",
+        "eval/episode_return",
+        "eval/nonfinite_worlds",
+        "loss/total",
+        "loss/policy",
+        "loss/value",
+        "policy/entropy",
+        "policy/kl",
+        "policy/learning_rate",
+        "time/env_steps_per_second",
+        "time/compile_seconds",
+        "time/wall_seconds",
+    }
+    assert wanted <= set(lines[-1])
+    last = lines[-1]
+    assert all(np.isfinite(last[name]) for name in wanted)
+    walls = [line["time/wall_seconds"] for line in lines]
+    assert walls == sorted(walls)
+    assert last["eval/nonfinite_worlds"] == 0
+
+
+def test_training_learns(lines):
+    success = [line["eval/success_rate"] for line in lines]
+    assert success[0] < 0.2
+    assert max(success) > 0.6
+    assert lines[-1]["eval/episode_return"] > lines[0]["eval/episode_return"] + 0.2
+
+
+def test_evaluating_twice_gives_identical_numbers(smoke_run, tmp_path, capsys):
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    texts = []
+    for _ in range(2):
+        assert evaluate.main([str(run_dir), "--episodes", "48"]) == 0
+        texts.append(next(run_dir.glob("evaluations/*/report.json")).read_text())
+    assert texts[0] == texts[1]
+    report = json.loads(texts[0])
+    assert set(report["baselines"]) == set(BASELINES)
+    assert report["policy"]["episodes"] == 48
+    assert report["goal_set_version"] == 1
+    policy = report["policy"]
+    assert policy["success_low"] <= policy["success_rate"] <= policy["success_high"]
+    shown = capsys.readouterr().out
+    for name in ("policy", *BASELINES):
+        assert name in shown
+    assert f"{policy['success_rate']:.2%}" in shown
+    # Below the target it says so, and the exit code does.
+    assert evaluate.main([str(run_dir), "--episodes", "48", "--min-success", "1"]) == (
+        0 if policy["success_rate"] == 1 else 1
+    )
+    assert evaluate.main([str(run_dir), "--episodes", "48", "--min-success", "0"]) == 0
+
+
+def test_an_early_policy_is_below_the_target(smoke_run, tmp_path):
+    run_dir = shutil.copytree(smoke_run, tmp_path / "run")
+    arguments = [str(run_dir), "--checkpoint", "0", "--episodes", "48", "--min-success", "0.5"]
+    assert evaluate.main(arguments) == 1
+
+
+def fingerprint(run_dir):
+    params = load_checkpoint(run_dir, "last").params
+    leaves = b"".join(np.asarray(leaf).tobytes() for leaf in jax.tree.leaves(params))
+    return hashlib.sha256(leaves).hexdigest()
+
+
+def test_the_same_seed_trains_the_same_policy(smoke_run, tmp_path, root, capsys):
+    arguments = ["--config", str(root / "configs" / "smoke.yaml"), "--run-dir"]
+    assert train.main([*arguments, str(tmp_path / "again")]) == 0
+    assert fingerprint(tmp_path / "again") == fingerprint(smoke_run)
+    assert str(tmp_path / "again") in capsys.readouterr().out
+    short = ["--set", "ppo.num_timesteps=16384", "--seed", "1"]
+    assert train.main([*arguments, str(tmp_path / "other"), *short]) == 0
+    assert fingerprint(tmp_path / "other") != fingerprint(smoke_run)
+    assert load_config(tmp_path / "other" / "config.yaml").seed == 1
+
+
+def test_stock_brax_takes_wrap_for_training_as_its_wrap_env_fn(root):
+    config = load_config(root / "configs" / "smoke.yaml")
+    with brax_ppo.device_put_replicated():
+        _, params, _ = brax_ppo_train.train(
+            environment=make_env(config),
+            num_timesteps=1,
+            num_envs=8,
+            batch_size=8,
+            num_minibatches=1,
+            num_updates_per_batch=1,
+            unroll_length=2,
+            episode_length=8,
+            num_evals=2,
+            num_eval_envs=8,
+            wrap_env_fn=wrap_for_training,
+        )
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "least"), [("jetbot_egocentric.yaml", 0.99), ("jetbot.yaml", 0.98)]
+)
+def test_the_shipped_configurations_reach_their_success(name, least, root, tmp_path):
+    train.run(load_config(root / "configs" / name), tmp_path / "run")
+    assert evaluate.run(tmp_path / "run").policy.success_rate >= least
