@@ -6,7 +6,7 @@ wrappers, and reports each epoch through one callback. `trainer: brax` selects i
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -51,6 +51,8 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
     ppo = config.ppo.model_dump(exclude={"network"})
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
     latest: dict[str, Any] = {}
+    # Brax annotates it as a function of the environment alone, and calls it with all four.
+    wrap_env_fn: Any = wrap_for_training
     clock = time.perf_counter()
 
     # Brax calls back twice an epoch: first with the parameters, then with the metrics.
@@ -75,7 +77,7 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
         _, params, _ = brax_train.train(
             environment=env,
             episode_length=config.task.episode_length,
-            wrap_env_fn=wrap_for_training,
+            wrap_env_fn=wrap_env_fn,
             network_factory=network_factory(config.ppo.network),
             seed=config.seed,
             # One initial report and one after every interval; the evaluations are ours.
@@ -101,7 +103,7 @@ def device_put_replicated() -> Iterator[None]:
         yield
         return
 
-    def device_put_replicated(tree: Any, devices: list[jax.Device]) -> Any:
+    def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
         sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
         return jax.tree.map(
             lambda x: jax.device_put(jnp.stack([jnp.asarray(x)] * len(devices)), sharding), tree

@@ -278,9 +278,7 @@ def _template(networks: ppo_networks.PPONetworks, observation_size: int) -> Poli
 
 def _to_tree(params: PolicyParams) -> dict[str, Any]:
     """Plain nested dictionaries: what is on disk depends on no Python class."""
-    return {
-        name: flax.serialization.to_state_dict(part) for name, part in params._asdict().items()
-    }
+    return {name: flax.serialization.to_state_dict(part) for name, part in params._asdict().items()}
 
 
 def _from_tree(template: PolicyParams, tree: Mapping[str, Any]) -> PolicyParams:

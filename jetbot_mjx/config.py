@@ -259,7 +259,7 @@ class Config(_Section):
         stream = io.StringIO()
         yaml = YAML(typ="safe", pure=True)
         yaml.default_flow_style = False
-        yaml.sort_base_mapping_type_on_output = False
+        yaml.sort_base_mapping_type_on_output = False  # pyright: ignore[reportAttributeAccessIssue]
         yaml.dump(self.model_dump(mode="json"), stream)
         return stream.getvalue()
 

@@ -87,9 +87,7 @@ class JetBotEnv(brax.envs.Env):
         )
         robot = robot_state(physics)
         # The names of the terms, without computing them: a first state has none.
-        _, terms = jax.eval_shape(
-            self.task.reward, robot, robot, goal, jnp.zeros(self.action_size)
-        )
+        _, terms = jax.eval_shape(self.task.reward, robot, robot, goal, jnp.zeros(self.action_size))
         zero = jnp.zeros(())
         return State(
             pipeline_state=physics,

@@ -90,9 +90,7 @@ def body_twist(
       (v, ω), forward speed [m/s] and yaw rate [rad/s].
     """
     left, right = wheel_speeds
-    return wheel_radius * jnp.stack(
-        [0.5 * (left + right), (right - left) / wheel_separation]
-    )
+    return wheel_radius * jnp.stack([0.5 * (left + right), (right - left) / wheel_separation])
 
 
 def rotate(quat: Float[Array, "4"], vector: Float[Array, "3"]) -> Float[Array, "3"]:

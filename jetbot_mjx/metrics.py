@@ -22,7 +22,7 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Protocol, Self, TextIO
+from typing import Protocol, Self, TextIO
 
 import jax
 import tensorboardX
@@ -180,12 +180,12 @@ class CompileClock:
         self._spans: list[tuple[float, float]] = []
         jax.monitoring.register_event_duration_secs_listener(self._listen)
 
-    def _listen(self, event: str, seconds: float, **details: Any) -> None:
-        del details
+    def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del kwargs
         if event not in self._EVENTS:
             return
         end = time.perf_counter()
-        start = end - seconds
+        start = end - duration_secs
         # Tracing nests: a span that covers earlier ones stands for them all.
         while self._spans and self._spans[-1][0] >= start:
             self._spans.pop()

@@ -134,6 +134,7 @@ ROBOTS = {"isaac": ISAAC, "real": REAL}
 _SOLREF = (0.04, 1.0)  # time constant [s], damping ratio; SIM
 _SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)  # SIM
 
+
 def make_mj_model(
     robot: Robot,
     physics: PhysicsConfig,
@@ -168,7 +169,8 @@ def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig, robot: Robot) -> N
     option = spec.option
     option.timestep = physics.ctrl_dt / physics.n_substeps
     # Explicit Euler: as accurate here as `implicitfast`, and stable at two or three Newton
-    # iterations, where `implicitfast` needs six. Its condition: timestep * motor_gain / wheel inertia < 2.
+    # iterations, where `implicitfast` needs six. Its condition:
+    # timestep * motor_gain / wheel inertia < 2.
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import networks as ppo_networks
@@ -85,9 +86,7 @@ def make_networks(
     Returns:
       Brax's networks.
     """
-    preprocess = (
-        running_statistics.normalize if normalize else identity_observation_preprocessor
-    )
+    preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
     return network_factory(config)(
         observation_size, action_size, preprocess_observations_fn=preprocess
     )
@@ -111,7 +110,7 @@ def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Pol
     ) -> Float[Array, "*batch action"]:
         if key is None:
             # Brax asks for a key that the mode does not use.
-            return greedy(obs, jax.random.PRNGKey(0))[0]
-        return exploring(obs, key)[0]
+            return greedy(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
+        return exploring(jnp.asarray(obs), key)[0]
 
     return policy

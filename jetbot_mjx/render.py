@@ -8,10 +8,10 @@ from typing import NamedTuple
 import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
 from jaxtyping import UInt8
 from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx import cli
@@ -73,7 +73,9 @@ def run(run_or_checkpoint: str | Path, *, episodes: int = 20, which: Which = "be
     with Renderer(env.mj_model, width=_VIEW, height=_VIEW) as renderer:
         films = [_film(renderer, env, driven, index) for index in range(episodes)]
     iio.imwrite(pictures.mp4, np.stack(list(chain(*films))), fps=_VIDEO_FPS, **_H264)
-    _write_gif(pictures.gif, [_half(frame) for film in films[:_GIF_EPISODES] for frame in film[::2]])
+    _write_gif(
+        pictures.gif, [_half(frame) for film in films[:_GIF_EPISODES] for frame in film[::2]]
+    )
     return pictures
 
 
@@ -102,7 +104,7 @@ def plot_trajectories(episodes: Episodes, title: str = "") -> Figure:
         way = qpos[: steps + 1, :2]
         axes.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.2, alpha=0.8)
         axes.add_patch(
-            matplotlib.patches.Rectangle(
+            Rectangle(
                 (goal_w[0] - 0.05, goal_w[1] - 0.05), 0.1, 0.1, color=colour, alpha=0.35, lw=0
             )
         )
@@ -136,7 +138,7 @@ def _film(renderer: Renderer, env: JetBotEnv, episodes: Episodes, index: int) ->
     film = []
     for time in [*times, steps]:
         views = [
-            renderer.frame(episodes.qpos[index, time], markers, camera)
+            renderer.frame(np.asarray(episodes.qpos[index, time]), markers, camera)
             for camera in ("chase", "top")
         ]
         outcome = "" if time < steps else ("reached" if episodes.success[index] else "missed")

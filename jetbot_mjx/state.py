@@ -1,6 +1,7 @@
 """What an episode carries from step to step: Brax's state, kept as small as physics allows."""
 
-import brax.envs
+from typing import Any
+
 from flax import struct
 from jaxtyping import Array, Float, UInt32
 
@@ -9,8 +10,7 @@ from jetbot_mjx.model import QPOS_QUAT, QPOS_XYZ, QVEL_ANGULAR_B, QVEL_LINEAR_W
 from jetbot_mjx.task import Goal, RobotState
 
 
-@struct.dataclass
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode):
     """What physics integrates, and nothing that can be computed from it."""
 
     qpos: Float[Array, " nq"]
@@ -23,13 +23,24 @@ class PhysicsState:
     """Since the episode began [s]."""
 
 
-@struct.dataclass
-class State(brax.envs.State):
-    """Brax's environment state, with the task's own parts beside it."""
+class State(struct.PyTreeNode):
+    """An environment's state: Brax's fields, which its trainers use, and the task's own."""
 
-    goal: Goal = None
+    pipeline_state: PhysicsState
+    """What physics integrates, under Brax's name for it."""
+    obs: Float[Array, " obs"]
+    """What the policy sees."""
+    reward: Float[Array, ""]
+    """Of the step that led here."""
+    done: Float[Array, ""]
+    """1 where that step ended the episode."""
+    metrics: dict[str, Float[Array, ""]]
+    """Figures of that step; the same names at every step."""
+    info: dict[str, Any]
+    """What wrappers and trainers keep beside; the same names at every step."""
+    goal: Goal
     """What the task drew for this episode."""
-    key: UInt32[Array, "2"] | None = None
+    key: UInt32[Array, "2"]
     """Random key from which the next episode is drawn."""
 
 

@@ -157,7 +157,7 @@ class GoalTask:
     def sample(self, key: UInt32[Array, "2"]) -> Float[Array, "3"]:
         """Draws a goal position [m], world frame.
 
-            α = 2π u₁,  r = span √u₂ + minimum,  goal = (r sin α, r cos α, 0.05)
+        α = 2π u₁,  r = span √u₂ + minimum,  goal = (r sin α, r cos α, 0.05)
         """
         u1, u2 = jax.random.uniform(key, (2,))
         angle = 2.0 * math.pi * u1

@@ -13,7 +13,14 @@ from jetbot_mjx.checkpoint import CheckpointWriter
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
-from jetbot_mjx.metrics import CompileClock, Figures, JsonlSink, ProgressSink, Sinks, TensorBoardSink
+from jetbot_mjx.metrics import (
+    CompileClock,
+    Figures,
+    JsonlSink,
+    ProgressSink,
+    Sinks,
+    TensorBoardSink,
+)
 from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.run_folder import check_free, create_run_folder, default_run_dir, versions
 
@@ -117,9 +124,7 @@ class _Monitor:
 
     def _losses(self, progress: Progress) -> Figures:
         """Brax's figures under this project's names."""
-        brax = {
-            name.removeprefix("training/"): value for name, value in progress.metrics.items()
-        }
+        brax = {name.removeprefix("training/"): value for name, value in progress.metrics.items()}
         figures = {ours: brax[theirs] for theirs, ours in _BRAX_NAMES.items() if theirs in brax}
         entropy_cost = self._config.ppo.entropy_cost
         if "entropy_loss" in brax and entropy_cost > 0:

@@ -14,6 +14,7 @@ What `info` holds from `reset` on, all float32 (Brax's trainer reads the first f
 """
 
 from collections.abc import Callable
+from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,14 @@ from jetbot_mjx.state import State
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 """From one model to (a batch of models, the batch's axes as `jax.vmap` wants them)."""
+
+
+class _Env(Protocol):
+    """What a wrapper asks of what it wraps."""
+
+    def reset(self, rng: UInt32[Array, "2"]) -> State: ...
+
+    def step(self, state: State, action: Float[Array, "2"]) -> State: ...
 
 
 def wrap_for_training(
@@ -50,7 +59,7 @@ def wrap_for_training(
       The batched environment: `reset` takes keys of shape (n, 2), `step` actions (n, 2).
     """
 
-    def chain(env: JetBotEnv) -> Env:
+    def chain(env: JetBotEnv) -> NewEpisodeWrapper:
         return NewEpisodeWrapper(EpisodeWrapper(env, episode_length, action_repeat))
 
     if randomization_fn is None:
@@ -65,6 +74,8 @@ class EpisodeWrapper(Wrapper):
     nothing (reward 0, truncated, so the loss masks it), the learner sees the last finite
     observation instead, and `nonfinite_worlds` counts it.
     """
+
+    env: _Env
 
     def __init__(self, env: Env, episode_length: int, action_repeat: int = 1) -> None:
         """Wraps one environment.
@@ -91,7 +102,7 @@ class EpisodeWrapper(Wrapper):
             "episode_metrics": {
                 "sum_reward": zero,
                 "length": zero,
-                **{name: zero for name in metrics},
+                **dict.fromkeys(metrics, zero),
             },
             "final_obs": state.obs,
         }
@@ -156,6 +167,8 @@ class NewEpisodeWrapper(Wrapper):
     physics, goal and `obs` are already the new one's.
     """
 
+    env: _Env
+
     def step(self, state: State, action: Float[Array, "2"]) -> State:
         """One step, and a reset where it ended the episode."""
         state = self.env.step(state, action)
@@ -168,10 +181,12 @@ class NewEpisodeWrapper(Wrapper):
 class RandomizedVmapWrapper(Wrapper):
     """A batch of environments, each with a physics model of its own."""
 
+    env: JetBotEnv
+
     def __init__(
         self,
         env: JetBotEnv,
-        chain: Callable[[JetBotEnv], Env],
+        chain: Callable[[JetBotEnv], Any],
         randomization_fn: RandomizationFn,
     ) -> None:
         """Draws the models.

@@ -132,9 +132,7 @@ def test_the_angular_velocity_is_in_the_world_frame(world_env, keys):
         qpos=state.pipeline_state.qpos.at[3:7].set(roll),
         qvel=state.pipeline_state.qvel.at[3:6].set(jnp.array([0.0, 0.0, 2.0])),
     )
-    np.testing.assert_allclose(
-        robot_state(physics).angular_velocity_w, (0.0, -2.0, 0.0), atol=1e-6
-    )
+    np.testing.assert_allclose(robot_state(physics).angular_velocity_w, (0.0, -2.0, 0.0), atol=1e-6)
 
 
 def test_actions_beyond_the_limits_are_clipped(env, single_step, keys):

@@ -63,9 +63,7 @@ def test_rotations_match_scipy():
     np.testing.assert_allclose(
         jax.vmap(kinematics.yaw)(quats), np.arctan2(x_axis[:, 1], x_axis[:, 0]), atol=1e-5
     )
-    np.testing.assert_allclose(
-        jax.vmap(kinematics.tilt)(quats), np.arccos(z_axis[:, 2]), atol=2e-3
-    )
+    np.testing.assert_allclose(jax.vmap(kinematics.tilt)(quats), np.arccos(z_axis[:, 2]), atol=2e-3)
 
 
 def test_yaw_ignores_the_sign_of_the_quaternion():

@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import jax
@@ -103,7 +104,7 @@ def test_reward_is_progress_and_telescopes():
     task = GoalTask(TaskConfig())
     goal = goal_at(1.0, 0.0)
     way = [robot_at(x) for x in (0.0, 0.1, 0.05, 0.4)]
-    rewards = [task.reward(a, b, goal, jnp.zeros(2))[0] for a, b in zip(way, way[1:], strict=False)]
+    rewards = [task.reward(a, b, goal, jnp.zeros(2))[0] for a, b in itertools.pairwise(way)]
     np.testing.assert_allclose(rewards[1], -0.05, atol=1e-4)
     covered = task.distance(way[0], goal) - task.distance(way[-1], goal)
     np.testing.assert_allclose(sum(rewards), covered, rtol=1e-5)

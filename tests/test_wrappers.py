@@ -26,9 +26,7 @@ class Stub(brax.envs.Env):
         goal = jax.random.uniform(goal_key, (3,))
         zero = jnp.zeros(())
         physics = PhysicsState(jnp.zeros(9), jnp.zeros(8), jnp.zeros(8), zero)
-        return State(
-            physics, goal, zero, zero, {"success": zero}, {"terminated": zero}, goal, key
-        )
+        return State(physics, goal, zero, zero, {"success": zero}, {"terminated": zero}, goal, key)
 
     def step(self, state, action):
         terminated = (action[1] > 0.5).astype(jnp.float32)
@@ -164,7 +162,7 @@ def driven():
 
 
 def test_64_environments_see_20_different_goals_in_20_episodes(driven):
-    goal, _, _, done, goal_before = driven
+    _, _, _, done, goal_before = driven
     np.testing.assert_array_equal(done.sum(axis=0), EPISODES)
     ends = goal_before[EPISODE_LENGTH - 1 :: EPISODE_LENGTH]
     assert ends.shape == (EPISODES, ENVS, 3)

@@ -1,0 +1,267 @@
+"""How the package hangs together: who may know whom, what is public, what no file may name."""
+
+import ast
+import importlib
+import os
+import re
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+import jetbot_mjx
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "jetbot_mjx"
+
+NOUNS = (
+    "errors",
+    "config",
+    "mjx",
+    "kinematics",
+    "model",
+    "task",
+    "state",
+    "env",
+    "wrappers",
+    "policy",
+    "rollout",
+    "evaluation",
+    "checkpoint",
+    "run_folder",
+    "metrics",
+    "brax_ppo",
+    "cli",
+    "offscreen",
+)
+VERBS = ("train", "evaluate", "render")
+ORDER = (*NOUNS, *VERBS)
+"""A module knows only those before it, and a verb no other verb."""
+
+MAY_PRINT_AND_PARSE = ("cli", *VERBS)
+
+OUTSIDERS = {
+    "errors": set(),
+    "config": {"pydantic", "pydantic_core", "ruamel"},
+    "kinematics": {"jax", "jaxtyping"},
+    "cli": set(),
+}
+"""All that these import from outside the standard library and the package."""
+
+PUBLIC = {
+    "load_config": "config",
+    "make_env": "env",
+    "wrap_for_training": "wrappers",
+    "load_policy": "checkpoint",
+    "JetBotEnv": "env",
+    "Task": "task",
+    "State": "state",
+}
+
+
+def imports(source):
+    """Full names of all that a module imports, wherever it does."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            home = ".".join(
+                [PACKAGE] * (node.level > 0) + [node.module] * (node.module is not None)
+            )
+            yield from (f"{home}.{alias.name}" for alias in node.names)
+
+
+def complaints(name, source):
+    """What a module of the package does that its place forbids."""
+    known = ORDER[: ORDER.index(name)]
+    for imported in imports(source):
+        top, _, rest = imported.partition(".")
+        own = rest.partition(".")[0]
+        if top == PACKAGE and own not in known:
+            yield f"{name} imports {imported}, which does not stand before it"
+        elif top == PACKAGE and name in VERBS and own in VERBS:
+            yield f"{name} imports {imported}: verbs meet only in the run folder"
+        elif top == "argparse" and name not in MAY_PRINT_AND_PARSE:
+            yield f"{name} parses arguments"
+    for node in ast.walk(ast.parse(source)):
+        # A stream that was handed in may be written to.
+        match node:
+            case ast.Call(func=ast.Name("print"), keywords=keywords):
+                streams = [keyword for keyword in keywords if keyword.arg == "file"]
+                if not streams and name not in MAY_PRINT_AND_PARSE:
+                    yield f"{name} prints in line {node.lineno}"
+
+
+def test_every_module_has_a_place():
+    modules = {path.stem for path in (ROOT / PACKAGE).glob("*.py")} - {"__init__"}
+    assert modules == set(ORDER)
+    assert not [path for path in (ROOT / PACKAGE).iterdir() if (path / "__init__.py").exists()]
+
+
+@pytest.mark.parametrize("name", ORDER)
+def test_a_module_keeps_to_its_place(name):
+    assert list(complaints(name, (ROOT / PACKAGE / f"{name}.py").read_text("utf-8"))) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("kinematics", "from jetbot_mjx import env"),
+        ("kinematics", "from jetbot_mjx import config, env as e"),
+        ("kinematics", "import jetbot_mjx.env"),
+        ("kinematics", "import jetbot_mjx.env as env"),
+        ("kinematics", "from jetbot_mjx.env import JetBotEnv"),
+        ("kinematics", "from . import env"),
+        ("kinematics", "from .env import JetBotEnv"),
+        ("kinematics", "def late():\n    from jetbot_mjx.env import JetBotEnv"),
+        ("kinematics", "if TYPE_CHECKING:\n    from jetbot_mjx.env import JetBotEnv"),
+        ("kinematics", "from jetbot_mjx.kinematics import yaw"),
+        ("env", "import jetbot_mjx"),
+        ("env", "from jetbot_mjx import load_config"),
+        ("cli", "from jetbot_mjx.train import run"),
+        ("evaluate", "from jetbot_mjx import train"),
+        ("render", "from jetbot_mjx.evaluate import table"),
+        ("env", "import argparse"),
+        ("env", "from argparse import ArgumentParser"),
+        ("env", "def step():\n    print('stepping')"),
+        ("metrics", "print('line', flush=True)"),
+    ],
+)
+def test_a_breach_of_the_order_is_seen(name, source):
+    assert len(list(complaints(name, source))) == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "source"),
+    [
+        ("env", "import jax\nfrom jetbot_mjx import kinematics\nfrom jetbot_mjx.task import Task"),
+        ("evaluate", "from jetbot_mjx import cli\nprint('done')"),
+        ("cli", "import argparse"),
+        ("metrics", "print('line', file=stream)"),
+    ],
+)
+def test_what_is_allowed_is_not_taken_for_a_breach(name, source):
+    assert list(complaints(name, source)) == []
+
+
+def test_the_package_tells_the_order_that_holds():
+    told = re.findall(r"`(\w+)`", jetbot_mjx.__doc__)
+    assert told == [name for name in ORDER if name in told]
+    assert set(VERBS) < set(told)
+
+
+@pytest.mark.parametrize("name", OUTSIDERS)
+def test_a_module_imports_no_more_than_it_needs(name):
+    tops = {
+        imported.partition(".")[0]
+        for imported in imports((ROOT / PACKAGE / f"{name}.py").read_text("utf-8"))
+    }
+    assert tops - sys.stdlib_module_names - {PACKAGE} == OUTSIDERS[name]
+
+
+@pytest.mark.parametrize(("name", "home"), PUBLIC.items())
+def test_a_public_name_is_that_of_its_module(name, home):
+    module = importlib.import_module(f"{PACKAGE}.{home}")
+    assert getattr(jetbot_mjx, name) is getattr(module, name)
+
+
+def test_nothing_else_is_public():
+    public = {
+        name
+        for name, value in vars(jetbot_mjx).items()
+        if not name.startswith("_") and not isinstance(value, types.ModuleType)
+    }
+    assert public == set(PUBLIC)
+
+
+def test_importing_prints_nothing_and_starts_no_device(tmp_path):
+    # A platform that does not exist: the first use of a device would raise.
+    process = subprocess.run(
+        [sys.executable, "-c", "import jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "nowhere"},
+        capture_output=True,
+        text=True,
+    )
+    assert (process.returncode, process.stdout, process.stderr) == (0, "", "")
+
+
+# What no committed file may name. Put together here, so that this file does not name it either.
+
+MACHINE_PATH = re.compile(
+    r"(?<![\w.])/(?:" + "|".join(["work", "tmp", "root", "home", "Users"]) + ")/"
+)
+REGISTRIES = re.compile(
+    "|".join(
+        name + r"\." + top
+        for name, top in [
+            ("pypi", "org"),
+            ("pythonhosted", "org"),
+            ("anaconda", "org"),
+            ("npmjs", "(?:com|org)"),
+        ]
+    ),
+    re.IGNORECASE,
+)
+
+
+def committed_texts():
+    """Path and text of every text file in git's index."""
+    listed = subprocess.run(
+        ["git", "-C", str(ROOT), "ls-files", "-z"], capture_output=True, text=True, check=True
+    )
+    for name in listed.stdout.split("\0"):
+        path = ROOT / name
+        if not path.is_file():
+            continue
+        content = path.read_bytes()
+        if b"\0" not in content:
+            yield Path(name), content.decode("utf-8")
+
+
+@pytest.fixture(scope="module")
+def texts():
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout: nothing says which files are committed")
+    return dict(committed_texts())
+
+
+def findings(texts, pattern):
+    return [
+        f"{path}:{number}: {line.strip()}"
+        for path, text in texts.items()
+        for number, line in enumerate(text.splitlines(), start=1)
+        if pattern.search(line)
+    ]
+
+
+def test_no_committed_file_names_a_path_of_one_machine(texts):
+    shipped = {path: text for path, text in texts.items() if path.parts[0] != "tests"}
+    assert Path("pyproject.toml") in shipped
+    assert findings(shipped, MACHINE_PATH) == []
+
+
+def test_no_committed_file_names_a_package_registry(texts):
+    assert Path("constraints.txt") in texts
+    assert findings(texts, REGISTRIES) == []
+
+
+@pytest.mark.parametrize(
+    ("pattern", "line", "found"),
+    [
+        (MACHINE_PATH, "cd {0}work{0}main", True),
+        (MACHINE_PATH, '"{0}tmp{0}run"', True),
+        (MACHINE_PATH, "={0}root{0}.cache", True),
+        (MACHINE_PATH, "see docs{0}work{0}plan.md", False),
+        (MACHINE_PATH, "..{0}tmp{0}run", False),
+        (MACHINE_PATH, "x{0}workers{0}y", False),
+        (REGISTRIES, "--index-url https:{0}{0}pypi{1}org{0}simple", True),
+        (REGISTRIES, "files{1}PythonHosted{1}org", True),
+        (REGISTRIES, "the PyPI organisation", False),
+    ],
+)
+def test_what_no_file_may_name_is_seen(pattern, line, found):
+    texts = {Path("a.txt"): "first\n" + line.format("/", ".")}
+    assert bool(findings(texts, pattern)) is found
