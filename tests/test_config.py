@@ -62,8 +62,10 @@ def test_loading_mutates_neither_its_arguments_nor_the_defaults(root):
     assert values == kept
     values["task"]["options"]["a"] = 2
     assert config.task.options == {"a": 1}
-    config.task.options["a"] = 3  # the one thing in a configuration that can be changed
-    assert Config().task.options == parse_config({}).task.options == {}
+    # The one thing in a configuration that can be changed belongs to that one alone.
+    for make in (Config, lambda: parse_config({}), lambda: parse_config({"task": {"name": "x:Y"}})):
+        make().task.options["a"] = 3
+        assert make().task.options == {}
 
 
 @pytest.mark.parametrize("text", ["", "# nothing but a comment\n", "---\n", "{}", "\ufeff"])
@@ -420,7 +422,7 @@ def test_environments_that_devices_cannot_share_are_refused(num_envs, batch_size
         ("no_such_package.task:Task", "no module named 'no_such_package' can be imported"),
         ("jetbot_mjx.no_such:Task", "no module named 'jetbot_mjx.no_such' can be imported"),
         ("jetbot_mjx.task:GaolTask", "jetbot_mjx.task has no 'GaolTask'"),
-        ("builtins:str", "is no task: it lacks layout, sample, observe, reward"),
+        ("builtins:str", "is no task: it lacks "),
     ],
 )
 def test_a_task_that_is_none_is_refused(name, said):

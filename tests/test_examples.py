@@ -10,8 +10,9 @@ import pytest
 import jetbot_mjx
 from jetbot_mjx import train
 from jetbot_mjx.config import load_config
-from jetbot_mjx.env import make_env, robot_state
+from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.state import robot_state
 from jetbot_mjx.task import layout_size
 from jetbot_mjx.wrappers import wrap_for_training
 

@@ -46,7 +46,6 @@ OUTSIDERS = {
     "errors": set(),
     "config": {"pydantic", "pydantic_core", "ruamel"},
     "kinematics": {"jax", "jaxtyping"},
-    "cli": set(),
 }
 """All that these import from outside the standard library and the package."""
 

@@ -1,0 +1,146 @@
+"""Measures how long success takes: `python benchmarks/time_to_success.py --config FILE`.
+
+For each seed a new process trains from a cold start (an empty compilation cache), and another
+judges its best policy on the report's fixed goals. The clock is that of whole processes, imports
+and compilation included; what the trainer says of itself stands beside it.
+"""
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from jetbot_mjx import cli
+from jetbot_mjx.config import load_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.run_folder import write_json
+
+_FOLDER = Path(__file__).resolve().parent
+
+
+def measure(config: Path, overrides: Sequence[str], seed: int, target: float) -> dict[str, Any]:
+    """Trains and judges one seed.
+
+    Args:
+      config: YAML file.
+      overrides: as for `--set`.
+      seed: of the run.
+      target: success rate that the evaluations during training are watched for.
+
+    Returns:
+      Times, success and the two processes' own output, as JSON.
+
+    Raises:
+      UserError: one of the processes failed.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        run_dir = Path(folder) / "run"
+        environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"}
+        settings = [argument for override in overrides for argument in ("--set", override)]
+        train = ["train", "--config", str(config), "--seed", str(seed), *settings]
+        began = time.perf_counter()
+        printed = _run([*train, "--run-dir", str(run_dir)], environment)
+        seconds = time.perf_counter() - began
+        printed += _run(["evaluate", str(run_dir)], environment)
+        report = json.loads(next(run_dir.glob("evaluations/*/report.json")).read_text())
+        lines = (run_dir / "metrics.jsonl").read_text().splitlines()
+        history = [json.loads(line) for line in lines]
+        # From the run: asking JAX here would take the GPU's memory away from the trainings.
+        versions = json.loads((run_dir / "versions.json").read_text())
+    reached = [line for line in history if line["eval/success_rate"] >= target]
+    # What passes before the trainer's own clock starts is mostly imports.
+    before = seconds - history[-1]["time/wall_seconds"]
+    return {
+        "seed": seed,
+        "process_seconds": seconds,
+        "compile_seconds": sum(line["time/compile_seconds"] for line in history),
+        "target_reached_seconds": before + reached[0]["time/wall_seconds"] if reached else None,
+        "target_reached_steps": reached[0]["env_steps"] if reached else None,
+        "policy": report["policy"],
+        "versions": versions,
+        "output": printed.replace(folder, "").splitlines(),
+    }
+
+
+def _run(command: Sequence[str], environment: dict[str, str]) -> str:
+    module, *arguments = command
+    done = subprocess.run(
+        [sys.executable, "-m", f"jetbot_mjx.{module}", *arguments],
+        env=environment,
+        capture_output=True,
+        text=True,
+    )
+    if done.returncode:
+        raise UserError(f"{module} failed: {(done.stderr.strip() or 'no word').splitlines()[-1]}")
+    return done.stdout
+
+
+def _row(run: dict[str, Any]) -> str:
+    policy = run["policy"]
+    reached = run["target_reached_seconds"]
+    return (
+        f"| {run['seed']:>4} | {run['process_seconds']:9.1f} s | {run['compile_seconds']:7.1f} s |"
+        f" {'never' if reached is None else f'{reached:.1f} s':>8} |"
+        f" {policy['success_rate']:8.2%} | {policy['success_low']:.2%} .."
+        f" {policy['success_high']:.2%} |"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line, measures, prints the table and writes the JSON file.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      0, or 1 where a seed's success rate on the fixed goals is below the target.
+    """
+    parser = cli.Parser(description=__doc__)
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--seeds", type=cli.positive_int, default=1, help="seeds 0 to N-1")
+    parser.add_argument("--target", type=cli.fraction, default=0.99, help="default: 0.99")
+    parser.add_argument("--output", type=Path, required=True, help="JSON file")
+    options = parser.parse_args(arguments)
+    config = load_config(options.config, options.overrides)
+    print(
+        " ".join([options.config.name, *options.overrides]) + ", cold start\n"
+        f"| seed |     process |   compile | ≥ {options.target:.0%} at |  success |"
+        "    95 % interval   |\n"
+        "|-----:|------------:|----------:|---------:|---------:|:------------------:|",
+        flush=True,
+    )
+    runs = []
+    for seed in range(options.seeds):
+        runs.append(measure(options.config, options.overrides, seed, options.target))
+        print(_row(runs[-1]), flush=True)
+    seconds = [run["process_seconds"] for run in runs]
+    machine = runs[0]["versions"]
+    print(
+        f"median of the process's time: {statistics.median(seconds):.1f} s on"
+        f" {machine['device_count']} x {machine['device']}, {os.cpu_count()} CPU cores"
+    )
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    write_json(
+        options.output,
+        {
+            "command": f"train --config configs/{options.config.name}",
+            "overrides": options.overrides,
+            "target": options.target,
+            "cpu_cores": os.cpu_count(),
+            "config": config.model_dump(mode="json"),
+            "runs": runs,
+        },
+    )
+    print(f"results: {options.output}")
+    return 1 if any(run["policy"]["success_rate"] < options.target for run in runs) else 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
