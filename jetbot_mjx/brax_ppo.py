@@ -37,17 +37,13 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
     """Trains a policy.
 
     Args:
-      config: the run.
+      config: the run; `check_devices` has passed it.
       env: the environment, unwrapped.
       report: called before the first step and after every interval.
 
     Returns:
       The last parameters.
-
-    Raises:
-      ConfigError: the devices cannot share the environments evenly.
     """
-    config.check_devices(jax.device_count())
     ppo = config.ppo.model_dump(exclude={"network"})
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
     latest: dict[str, Any] = {}
