@@ -9,7 +9,7 @@ import imageio.v3 as iio
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw, ImageFont
@@ -69,7 +69,10 @@ def run(run_or_checkpoint: str | Path, *, episodes: int = 20, which: Which = "be
         successes=int(driven.success.sum()),
         episodes=episodes,
     )
-    plot_trajectories(driven, _title(checkpoint, driven)).savefig(pictures.trajectories, dpi=120)
+    markers = jax.vmap(env.task.markers)(driven.goal)
+    others = [np.asarray(place) for name, place in markers.items() if name != "goal"]
+    figure = plot_trajectories(driven, _title(checkpoint, driven), others)
+    figure.savefig(pictures.trajectories, dpi=120)
     with Renderer(env.mj_model, width=_VIEW, height=_VIEW) as renderer:
         films = [_film(renderer, env, driven, index) for index in range(episodes)]
     iio.imwrite(pictures.mp4, np.stack(list(chain(*films))), fps=_VIDEO_FPS, **_H264)
@@ -79,12 +82,15 @@ def run(run_or_checkpoint: str | Path, *, episodes: int = 20, which: Which = "be
     return pictures
 
 
-def plot_trajectories(episodes: Episodes, title: str = "") -> Figure:
+def plot_trajectories(
+    episodes: Episodes, title: str = "", others_w: Sequence[Float[np.ndarray, "n 3"]] = ()
+) -> Figure:
     """Plan view of recorded episodes: where the robot went and where it should have gone.
 
     Args:
       episodes: recorded.
       title: of the figure.
+      others_w: what else stood in each episode's world [m], drawn as grey dots.
 
     Returns:
       The figure.
@@ -109,11 +115,14 @@ def plot_trajectories(episodes: Episodes, title: str = "") -> Figure:
             )
         )
         axes.plot(*way[-1], marker="o", color=colour, markersize=4)
+    for places in others_w:
+        axes.scatter(places[:, 0], places[:, 1], color="grey", alpha=0.5, zorder=0)
     axes.plot(0, 0, marker=(3, 0, -90), color="black", markersize=11, label="start, heading +x")
     axes.plot([], [], color="tab:green", label="reached")
     axes.plot([], [], color="tab:red", label="not reached")
     axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
-    axes.set(xlim=(-1.4, 1.4), ylim=(-1.4, 1.4))
+    reach = 1.1 * max(1.25, float(np.abs(np.asarray(episodes.goal_w)[:, :2]).max()))
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
     axes.grid(alpha=0.3)
     axes.legend(loc="upper left", fontsize="small")
     return figure
@@ -162,7 +171,8 @@ def _half(frame: Frame) -> Frame:
 def _write_gif(path: Path, frames: Sequence[Frame]) -> None:
     # One palette for all frames: a palette each flickers.
     images = [Image.fromarray(frame) for frame in frames]
-    palette = images[len(images) // 2].quantize(128)
+    sample = Image.fromarray(np.vstack(frames[:: max(1, len(frames) // 8)]))
+    palette = sample.quantize(128)
     reduced = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     reduced[0].save(
         path,

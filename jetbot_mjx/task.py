@@ -129,7 +129,11 @@ class Task(Protocol):
         ...
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
-        """Adds the task's own bodies to the scene before it is compiled."""
+        """Adds the task's own bodies to the scene before it is compiled.
+
+        What only shows wants `contype=0, conaffinity=0`: geoms that can collide stay in the
+        physics model.
+        """
         ...
 
 
@@ -237,7 +241,7 @@ def make_task(config: TaskConfig) -> Task:
     except ModuleNotFoundError as error:
         raise UserError(
             f"task.name = {config.name!r}: no module named {error.name!r} can be imported;"
-            " install it or run from the folder that holds it"
+            " install it, or name its folder in PYTHONPATH"
         ) from None
     task_class: Any = getattr(module, class_name, None)
     if task_class is None:

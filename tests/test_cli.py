@@ -310,12 +310,6 @@ DAMAGES = {
         damage_about(lambda about: about["config"]["ppo"].update(momentum=0.9)),
         "does not explain itself: .*ppo.momentum = 0.9 is unknown",
     ),
-    "other layers": (
-        damage_about(
-            lambda about: about["config"]["ppo"]["network"].update(policy_hidden_layer_sizes=[5])
-        ),
-        "cannot be read: .*shape",
-    ),
     "no list of parameters": (
         lambda checkpoint: (checkpoint / "policy" / "_METADATA").unlink(),
         "cannot be read: ",
