@@ -145,13 +145,13 @@ def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times the trainer by its own reports, the first intervals left out."""
     config = training_config(config, num_envs, sizes)
     env = make_env(config)
-    clock = CompileClock()
     reports: list[tuple[int, float, float]] = []
+    with CompileClock() as clock:
 
-    def report(progress: Progress) -> None:
-        reports.append((progress.env_steps, progress.seconds, clock.lap()))
+        def report(progress: Progress) -> None:
+            reports.append((progress.env_steps, progress.seconds, clock.lap()))
 
-    params = brax_ppo.train(config, env, report)
+        params = brax_ppo.train(config, env, report)
     if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params)):
         raise UserError(f"training at {num_envs} environments: the parameters are not finite")
     steps = np.diff([env_steps for env_steps, _, _ in reports])

@@ -2,8 +2,8 @@
 
 The modules in reading order, each knowing only those before it:
 `errors`, `config`, `mjx`, `kinematics`, `model`, `task`, `state`, `env`, `wrappers`, `policy`,
-`rollout`, `evaluation`, `checkpoint`, `run_folder`, `metrics`, `brax_ppo`, `cli`, and the
-commands `train`, `evaluate`, `render`. Commands meet only in the run folder.
+`rollout`, `evaluation`, `checkpoint`, `run_folder`, `metrics`, `brax_ppo`, `cli`, `offscreen`,
+and the commands `train`, `evaluate`, `render`. Commands meet only in the run folder.
 """
 
 # First, before Brax imports MJX and lets it print.

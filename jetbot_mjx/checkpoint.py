@@ -5,11 +5,9 @@ resolved configuration, observation layout, versions, and the figures they were 
 Orbax writes in the background and renames at the end: a folder is whole or absent.
 """
 
-import functools
 import json
 import logging
-import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, Self
 
@@ -17,10 +15,12 @@ import flax.serialization
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+import tensorstore as ts
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
 from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.policy import Policy, PolicyParams, make_networks, make_policy
 
@@ -31,6 +31,7 @@ _FOLDER = "checkpoints"
 _PARAMS, _ABOUT = "policy", "about"
 _STEP_DIGITS = 12
 _FORMAT = "jetbot_mjx.policy/1"
+_KEYS = ("config", "layout", "observation_size", "action_size", "env_steps", "figures")
 
 # Orbax tells of every step of its work at INFO, and of what it would prefer at WARNING.
 logging.getLogger("absl").setLevel(logging.ERROR)
@@ -51,6 +52,27 @@ class Checkpoint(NamedTuple):
     params: PolicyParams
     networks: ppo_networks.PPONetworks
     about: Mapping[str, Any]
+
+    def make_env(self) -> JetBotEnv:
+        """Builds the environment that the policy was trained in.
+
+        Raises:
+          UserError: the task cannot be built.
+          CheckpointError: its observation is not the one that the policy knows.
+        """
+        env = make_env(self.config)
+        layout = [field._asdict() for field in env.task.layout]
+        if layout != self.about["layout"]:
+            raise CheckpointError(
+                f"checkpoint {self.path} was trained on another observation than"
+                f" {self.config.task.name} gives: {_names(self.about['layout'])} then,"
+                f" {_names(layout)} here"
+            )
+        return env
+
+
+def _names(layout: Sequence[Mapping[str, Any]]) -> str:
+    return " ".join(f"{field['name']}[{field['size']}]" for field in layout)
 
 
 class CheckpointWriter:
@@ -123,11 +145,13 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
     except (KeyError, TypeError, ConfigError) as error:
         raise CheckpointError(f"checkpoint {folder} does not explain itself: {error}") from None
     try:
+        _read_all(folder / _PARAMS)
         with ocp.StandardCheckpointer() as reader:
+            stored = reader.metadata(folder / _PARAMS).item_metadata.tree
+            _check_shapes(_to_tree(template), stored)
             tree = reader.restore(folder / _PARAMS, _to_tree(template))
     # Orbax and TensorStore report a damaged folder by many kinds of exception.
     except Exception as error:
-        _hush_stragglers()
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise CheckpointError(f"checkpoint {folder} cannot be read: {reason[:200]}") from error
     return Checkpoint(
@@ -158,6 +182,33 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
     return make_policy(checkpoint.networks, checkpoint.params)
 
 
+# Orbax reads in threads of its own. Where one fails, the others go on and print tracebacks that
+# nobody can catch: whatever could fail is tried here first.
+
+
+def _read_all(folder: Path) -> None:
+    """Reads every stored chunk once, and raises where one is missing or damaged."""
+    store = ts.KvStore.open({"driver": "ocdbt", "base": f"file://{folder}/"}).result()
+    for key in store.list().result():
+        store.read(key).result()
+
+
+def _check_shapes(wanted: Any, stored: Any) -> None:
+    """Raises where the stored parameters are not those of the networks."""
+    wanted, stored = (
+        {
+            jax.tree_util.keystr(path, simple=True, separator="."): tuple(np.shape(leaf))
+            for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
+        }
+        for tree in (wanted, stored)
+    )
+    for name in sorted(wanted.keys() | stored.keys()):
+        if wanted.get(name) != stored.get(name):
+            raise ValueError(
+                f"{name} has shape {stored.get(name)}, and the networks want {wanted.get(name)}"
+            )
+
+
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     """Finds a checkpoint folder.
 
@@ -172,6 +223,13 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
       CheckpointError: there is none.
     """
     path = Path(path).absolute()
+    try:
+        return _find(path, which)
+    except OSError as error:
+        raise CheckpointError(f"no checkpoint at {path}: {error.strerror}") from None
+
+
+def _find(path: Path, which: Which) -> Path:
     if not path.is_dir():
         raise CheckpointError(
             f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
@@ -205,7 +263,7 @@ def checkpoint_steps(run_dir: Path) -> list[int]:
     return sorted(
         int(folder.name)
         for folder in folders
-        if folder.name.isdigit() and (folder / _PARAMS).is_dir()
+        if folder.name.isdecimal() and (folder / _PARAMS).is_dir()
     )
 
 
@@ -228,6 +286,9 @@ def _read_about(folder: Path) -> dict[str, Any]:
         ) from None
     if not isinstance(about, dict) or about.get("format") != _FORMAT:
         raise CheckpointError(f"checkpoint {folder} is not in the format {_FORMAT}")
+    missing = [name for name in _KEYS if name not in about]
+    if missing:
+        raise CheckpointError(f"checkpoint {folder} does not explain itself: no {missing[0]}")
     return about
 
 
@@ -241,23 +302,6 @@ def _manager(folder: Path, *, create: bool) -> ocp.CheckpointManager:
         cleanup_tmp_directories=True,
     )
     return ocp.CheckpointManager(folder.absolute(), options=options)
-
-
-@functools.cache
-def _hush_stragglers() -> None:
-    """Keeps Python from printing a traceback for every read that outlives a failed restore.
-
-    Orbax reads all arrays at once and closes its event loop at the first that fails. Each
-    other read then ends in a callback to a closed loop, or is thrown away half done.
-    """
-    report = sys.unraisablehook
-    expected = ("Event loop is closed", "Encountered error while reading array")
-
-    def report_others(unraisable: Any) -> None:
-        if not str(unraisable.exc_value).startswith(expected):
-            report(unraisable)
-
-    sys.unraisablehook = report_others
 
 
 def _template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:

@@ -5,9 +5,12 @@
 """
 
 import argparse
+import os
 import sys
 from collections.abc import Callable, Sequence
 from typing import NoReturn
+
+import jax
 
 from jetbot_mjx.checkpoint import Which
 from jetbot_mjx.errors import UserError
@@ -21,6 +24,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Prints the line and exits with 2."""
+        message = " ".join(message.splitlines())
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
@@ -35,6 +39,15 @@ def run_command(command: Callable[[Sequence[str] | None], int]) -> NoReturn:
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         code = USER_ERROR
+    except jax.errors.JaxRuntimeError as error:
+        if "RESOURCE_EXHAUSTED" not in str(error):
+            raise
+        print(
+            "error: the device's memory does not suffice: choose a smaller ppo.num_envs,"
+            " evaluation.episodes or --episodes",
+            file=sys.stderr,
+        )
+        code = USER_ERROR
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED
@@ -45,6 +58,25 @@ def run_command(command: Callable[[Sequence[str] | None], int]) -> NoReturn:
     sys.exit(code)
 
 
+def require_device() -> None:
+    """Refuses to go on where JAX has no device to run on.
+
+    Raises:
+      UserError: `JAX_PLATFORMS` names what is not there.
+    """
+    try:
+        jax.devices()
+    # JAX fails by an assertion where the plugin for a platform is not installed.
+    except (RuntimeError, AssertionError):
+        wanted = os.environ.get("JAX_PLATFORMS")
+        raise UserError(
+            f"JAX_PLATFORMS = {wanted!r} cannot be used here: unset it, or install what it needs"
+        ) from None
+
+
+_LARGEST = 2**31 - 1
+
+
 def positive_int(text: str) -> int:
     """An argument that counts something."""
     try:
@@ -53,6 +85,8 @@ def positive_int(text: str) -> int:
         raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is too small: give at least 1")
+    if value > _LARGEST:
+        raise argparse.ArgumentTypeError(f"{value} is too large: give at most {_LARGEST}")
     return value
 
 
@@ -73,7 +107,7 @@ def which_checkpoint(text: str) -> Which:
         return "best"
     if text == "last":
         return "last"
-    if text.isdigit():
+    if text.isdecimal():
         return int(text)
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 

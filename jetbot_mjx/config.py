@@ -43,11 +43,15 @@ def _integral(value: object) -> object:
 
 _Scalar = bool | int | float | str
 
-Count = Annotated[int, BeforeValidator(_integral), Field(ge=1)]
+Count = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**31)]
+Steps = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**53)]
 Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+_MOST_SUBSTEPS = 10_000
 
 
 class _Section(BaseModel):
@@ -82,8 +86,9 @@ class TaskConfig(_Section):
     """[m] nearest goal."""
     goal_distance_span: NonNegative = 1.0
     """[m] farthest goal minus nearest."""
-    success_radius: Positive = 0.1
-    """[m] 3-D distance of the axle midpoint to the goal below which it is reached."""
+    success_radius: Annotated[float, Field(ge=0.02, allow_inf_nan=False)] = 0.1
+    """[m] 3-D distance of the axle midpoint to the goal below which it is reached. The cube's
+    centre lies 18 mm above the axle: no smaller radius can be reached."""
     options: dict[str, _Scalar] = Field(default_factory=dict)
     """Free settings for a task of your own."""
 
@@ -93,7 +98,7 @@ class PhysicsConfig(_Section):
 
     ctrl_dt: Positive = 1 / 60
     """[s] one environment step: how long an action is held."""
-    sim_dt: Positive = 1 / 120
+    sim_dt: Annotated[float, Field(ge=1e-5, allow_inf_nan=False)] = 1 / 120
     """[s] one physics step; `ctrl_dt` is a whole multiple of it."""
     iterations: Count | None = None
     """Newton iterations per physics step; null: as many as the robot needs, 2 or 3."""
@@ -108,6 +113,11 @@ class PhysicsConfig(_Section):
     @model_validator(mode="after")
     def _whole_substeps(self) -> Self:
         ratio = self.ctrl_dt / self.sim_dt
+        if ratio > _MOST_SUBSTEPS:
+            raise ValueError(
+                f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
+                f" make it at most {_MOST_SUBSTEPS} times"
+            )
         # A decimal in YAML cannot hold 1/120: accept what rounds to a whole ratio.
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-3 * ratio:
             nearest = self.ctrl_dt / max(1, round(ratio))
@@ -134,7 +144,7 @@ class NetworkConfig(_Section):
 class PPOConfig(_Section):
     """Hyperparameters under the names of `brax.training.agents.ppo.train.train`."""
 
-    num_timesteps: Count = 1_000_000
+    num_timesteps: Steps = 1_000_000
     """Environment steps to train for; each checkpoint interval is rounded up to whole training
     steps of `batch_size * num_minibatches * unroll_length`."""
     num_envs: Count = 512
@@ -217,7 +227,7 @@ class Config(_Section):
     """Seed of networks, environments and exploration."""
     trainer: Literal["brax"] = "brax"
     """`brax`: the stock `brax.training.agents.ppo.train.train`."""
-    checkpoint_interval: Count = 100_000
+    checkpoint_interval: Steps = 100_000
     """Environment steps between two checkpoints, each with an evaluation and a log line."""
     robot: RobotConfig = RobotConfig()
     task: TaskConfig = TaskConfig()
@@ -281,7 +291,7 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
     values = _read_yaml(Path(path))
     for override in overrides:
         _apply_override(values, override)
-    return parse_config(values, source=str(path))
+    return parse_config(values, source=" ".join([str(path), *(f"--set {o}" for o in overrides)]))
 
 
 def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
@@ -327,6 +337,9 @@ def _parse_yaml(text: str, source: str) -> object:
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}" if mark else ""
         raise ConfigError(f"{source}{place} is not valid YAML: {problem}") from None
+    # What ruamel.yaml lets through: `!!int x`, `!!bool x`, integers and nestings without end.
+    except (ValueError, LookupError, RecursionError) as error:
+        raise ConfigError(f"{source} is not valid YAML: {error}") from None
 
 
 def _apply_override(values: dict[str, Any], override: str) -> None:
@@ -348,7 +361,16 @@ def _explain(error: ErrorDetails) -> str:
     location = [str(part) for part in error["loc"]]
     key = ".".join(location)
     value = error["input"]
+    if location[:2] == ["task", "options"] and len(location) > 2:
+        key = ".".join(location[:3])
+        return f"{key} = {value!r} is wrong: it should be true, false, a number or text"
     match error["type"]:
+        case "invalid_key":
+            return f"{key} = {value!r} is no key: keys should be strings"
+        case "tuple_type":
+            return f"{key} = {value!r} is wrong: it should be a list"
+        case "too_short":
+            return f"{key} = {value!r} is wrong: it should have at least 1 item"
         case "extra_forbidden":
             known = _known_keys(location[:-1])
             close = difflib.get_close_matches(location[-1], known, n=1)

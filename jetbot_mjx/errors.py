@@ -3,3 +3,7 @@
 
 class UserError(Exception):
     """A mistake that the user can mend; its message is one line, shown without a traceback."""
+
+    def __init__(self, message: str) -> None:
+        """Keeps to one line what quotes a key, a path or another library's message."""
+        super().__init__(" ".join(message.splitlines()))

@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 from jetbot_mjx import cli
 from jetbot_mjx.checkpoint import Which, load_checkpoint
-from jetbot_mjx.env import make_env
 from jetbot_mjx.evaluation import (
     GOAL_SET_VERSION,
     Evaluator,
@@ -14,7 +13,7 @@ from jetbot_mjx.evaluation import (
     report_keys,
     summarize,
 )
-from jetbot_mjx.run_folder import versions, write_json
+from jetbot_mjx.run_folder import make_folder, versions, write_json
 
 BELOW_TARGET = 1
 
@@ -45,7 +44,9 @@ def run(run_or_checkpoint: str | Path, *, episodes: int = 1024, which: Which = "
       UserError: there is no usable checkpoint.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    env = make_env(checkpoint.config)
+    env = checkpoint.make_env()
+    folder = checkpoint.run_dir / "evaluations" / checkpoint.path.name
+    make_folder(folder)
     evaluator = Evaluator(env, checkpoint.networks, baselines=True)
     keys = report_keys(episodes)
     policy = summarize(evaluator.run(checkpoint.params, keys), env.dt)
@@ -53,11 +54,9 @@ def run(run_or_checkpoint: str | Path, *, episodes: int = 1024, which: Which = "
         name: summarize(episodes, env.dt)
         for name, episodes in evaluator.run_baselines(checkpoint.params, keys).items()
     }
-    folder = checkpoint.run_dir / "evaluations" / checkpoint.path.name
     report = Report(
         checkpoint.path, folder / "report.json", checkpoint.env_steps, policy, baselines
     )
-    folder.mkdir(parents=True, exist_ok=True)
     write_json(report.path, _as_json(report))
     return report
 
@@ -112,6 +111,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--min-success", type=cli.fraction, help="exit with 1 below this success rate"
     )
     options = parser.parse_args(arguments)
+    cli.require_device()
     report = run(options.run, episodes=options.episodes, which=options.checkpoint)
     print(
         f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"

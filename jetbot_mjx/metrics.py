@@ -106,14 +106,14 @@ class TensorBoardSink:
         Args:
           folder: for `tensorboard --logdir`.
         """
-        self._writer = tensorboardX.SummaryWriter(str(folder))
+        # A queue lies before the file, and `flush` does not wait for it: let its own thread write.
+        self._writer = tensorboardX.SummaryWriter(str(folder), flush_secs=1)
 
     def write(self, env_steps: int, figures: Figures) -> None:
         """Adds one scalar for each figure there is."""
         for name, value in figures.items():
             if value is not None:
                 self._writer.add_scalar(name, value, env_steps)
-        self._writer.flush()
 
     def close(self) -> None:
         """Closes the event file."""
@@ -167,7 +167,10 @@ def _shown(figures: Figures, name: str, form: str) -> str:
 
 
 class CompileClock:
-    """Seconds that JAX has spent tracing, lowering and compiling, by its own account."""
+    """Seconds that JAX has spent tracing, lowering and compiling, by its own account.
+
+    A context manager that stops listening.
+    """
 
     _EVENTS = (
         "/jax/core/compile/jaxpr_trace_duration",
@@ -195,3 +198,11 @@ class CompileClock:
         """Seconds since the last call."""
         spans, self._spans = self._spans, []
         return sum(end - start for start, end in spans)
+
+    def __enter__(self) -> Self:
+        """Enters."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Stops listening."""
+        jax.monitoring.unregister_event_duration_listener(self._listen)

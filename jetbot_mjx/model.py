@@ -20,6 +20,7 @@ import mujoco
 import numpy as np
 
 from jetbot_mjx.config import PhysicsConfig
+from jetbot_mjx.errors import UserError
 
 # The tutorial's controller. Kept apart from the robot's own geometry: the mismatch of 1.3 %
 # between its wheel base and the true separation is part of the task.
@@ -156,6 +157,7 @@ def make_mj_model(
     """
     text = resources.files("jetbot_mjx").joinpath("assets/jetbot.xml").read_text()
     spec = mujoco.MjSpec.from_string(text)
+    _check_stable(robot, physics)
     _set_options(spec, physics, robot)
     _set_robot(spec, robot)
     build_scene(spec)
@@ -163,6 +165,16 @@ def make_mj_model(
         _strip(spec)
     _settle(spec)
     return spec.compile()
+
+
+def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
+    """Explicit Euler's condition: timestep * motor_gain / wheel inertia < 2."""
+    limit = 2.0 * (robot.wheel_inertia[1] + robot.armature) / robot.motor_gain
+    if physics.sim_dt >= limit:
+        raise UserError(
+            f"physics.sim_dt = {physics.sim_dt:g} is too long: this robot's motors are stable"
+            f" below {limit:.4f} s"
+        )
 
 
 def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig, robot: Robot) -> None:

@@ -16,10 +16,11 @@ from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx import cli
 from jetbot_mjx.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.evaluation import Evaluator, report_keys
 from jetbot_mjx.offscreen import Renderer
 from jetbot_mjx.rollout import Episodes
+from jetbot_mjx.run_folder import make_folder
 
 _VIEW = 400  # [pixels] side of one view
 _VIDEO_FPS = 30
@@ -57,11 +58,11 @@ def run(run_or_checkpoint: str | Path, *, episodes: int = 20, which: Which = "be
       UserError: there is no usable checkpoint, or no OpenGL.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    env = make_env(checkpoint.config)
+    env = checkpoint.make_env()
     evaluator = Evaluator(env, checkpoint.networks, record=True)
     driven = jax.device_get(evaluator.run(checkpoint.params, report_keys(episodes)))
     folder = checkpoint.run_dir / "videos" / checkpoint.path.name
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     pictures = Pictures(
         mp4=folder / "episodes.mp4",
         gif=folder / "episodes.gif",
@@ -197,6 +198,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.add_checkpoint_arguments(parser)
     parser.add_argument("--episodes", type=cli.positive_int, default=20)
     options = parser.parse_args(arguments)
+    cli.require_device()
     pictures = run(options.run, episodes=options.episodes, which=options.checkpoint)
     print(
         f"{pictures.successes} of {pictures.episodes} goals reached\n"

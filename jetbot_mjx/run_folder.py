@@ -43,7 +43,11 @@ def check_free(run_dir: Path) -> None:
     Raises:
       UserError: it exists and is not an empty folder.
     """
-    if run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir())):
+    try:
+        in_use = run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir()))
+    except OSError as error:
+        raise UserError(f"--run-dir {run_dir} cannot be used: {error.strerror}") from None
+    if in_use:
         raise UserError(f"--run-dir {run_dir} is already in use: name a new folder")
 
 
@@ -64,6 +68,18 @@ def create_run_folder(run_dir: Path, config: Config) -> None:
         write_json(run_dir / "versions.json", versions())
     except OSError as error:
         raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
+
+
+def make_folder(path: Path) -> None:
+    """Makes a folder for results inside a run folder, unless it is there.
+
+    Raises:
+      UserError: it cannot be made.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def versions() -> dict[str, Any]:

@@ -7,7 +7,7 @@ Frames: `_w` world, `_b` body (x forward, y left, z up). No batch axis: `jax.vma
 
 import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -234,7 +234,7 @@ def make_task(config: TaskConfig) -> Task:
       UserError: the name is malformed, cannot be imported, or is no task.
     """
     module_name, separator, class_name = config.name.partition(":")
-    if not separator or not module_name or not class_name:
+    if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
         raise UserError(f"task.name = {config.name!r} is wrong: write package.module:Class")
     try:
         module = importlib.import_module(module_name)
@@ -246,15 +246,21 @@ def make_task(config: TaskConfig) -> Task:
     task_class: Any = getattr(module, class_name, None)
     if task_class is None:
         raise UserError(f"task.name = {config.name!r}: {module_name} has no {class_name!r}")
+    _check_members(config.name, task_class, _TASK_METHODS)
+    if task_class is Task:
+        raise UserError(f"task.name = {config.name!r} is the contract, not a task: derive from it")
     task = task_class(config)
-    if not isinstance(task, Task):
-        missing = [name for name in _TASK_MEMBERS if not hasattr(task, name)]
-        raise UserError(f"task.name = {config.name!r} is no task: it lacks {', '.join(missing)}")
+    _check_members(config.name, task, ("layout",))
     return task
 
 
-_TASK_MEMBERS = (
-    "layout",
+def _check_members(name: str, thing: object, members: Sequence[str]) -> None:
+    missing = [member for member in members if not hasattr(thing, member)]
+    if missing:
+        raise UserError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
+
+
+_TASK_METHODS = (
     "sample",
     "observe",
     "reward",

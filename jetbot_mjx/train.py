@@ -59,7 +59,6 @@ def run(config: Config, run_dir: Path) -> Result:
     config.check_devices(jax.device_count())
     env = make_env(config)
     create_run_folder(run_dir, config)
-    monitor = _Monitor(config, env)
     print(_headline(config, run_dir), flush=True)
     sinks = Sinks(
         [
@@ -68,7 +67,9 @@ def run(config: Config, run_dir: Path) -> Result:
             ProgressSink(config.ppo.num_timesteps),
         ]
     )
-    with sinks, CheckpointWriter(run_dir, _about(config, env)) as checkpoints:
+    writer = CheckpointWriter(run_dir, _about(config, env))
+    with CompileClock() as clock, sinks, writer as checkpoints:
+        monitor = _Monitor(config, env, clock)
 
         def report(progress: Progress) -> None:
             summary, figures = monitor.judge(progress)
@@ -82,7 +83,7 @@ def run(config: Config, run_dir: Path) -> Result:
 class _Monitor:
     """Judges what a trainer reports, and keeps the clocks and the best."""
 
-    def __init__(self, config: Config, env: JetBotEnv) -> None:
+    def __init__(self, config: Config, env: JetBotEnv, clock: CompileClock) -> None:
         networks = make_networks(
             config.ppo.network,
             env.observation_size,
@@ -92,7 +93,7 @@ class _Monitor:
         self._evaluator = Evaluator(env, networks)
         self._keys = training_keys(config.evaluation.episodes)
         self._config = config
-        self._compile_clock = CompileClock()
+        self._compile_clock = clock
         self._began = time.perf_counter()
         self._env_steps = 0
         self.best_steps = 0
@@ -187,6 +188,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, help="the same as --set seed=N")
     parser.add_argument("--run-dir", type=Path, help="default: runs/<config>-<date>-<time>")
     options = parser.parse_args(arguments)
+    cli.require_device()
     overrides = list(options.overrides)
     if options.seed is not None:
         overrides.append(f"seed={options.seed}")
