@@ -173,7 +173,7 @@ def _write_gif(path: Path, frames: Sequence[Frame]) -> None:
     # One palette for all frames: a palette each flickers.
     images = [Image.fromarray(frame) for frame in frames]
     sample = Image.fromarray(np.vstack(frames[:: max(1, len(frames) // 8)]))
-    palette = sample.quantize(128)
+    palette = sample.quantize(256)
     reduced = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     reduced[0].save(
         path,
