@@ -103,7 +103,7 @@ ISAAC = Robot(
         Caster("caster_front", 0.00476, (0.038, 0.0, -WHEEL_RADIUS + 0.0005 + 0.00476)),
         Caster("caster_rear", 0.00476, (-0.082, 0.0, -WHEEL_RADIUS + 0.0005 + 0.00476)),
     ),
-    motor_torque=0.1,  # SIM: the most that keeps the worst tilt under 4°
+    motor_torque=0.1,  # SIM: keeps the worst tilt under 1.5°
     motor_gain=0.05,  # SIM: Isaac's 1e4 is unstable at any useful time step
     armature=3e-4,  # EST: rotor 1.4e-7 kg m² through the 1:48 gear
     max_wheel_speed=None,  # the tutorial's 1 m/s needs 31 rad/s; USD would stop at 12.56
@@ -131,7 +131,7 @@ ROBOTS = {"isaac": ISAAC, "real": REAL}
 
 # Contact of every pair, softer than MuJoCo's default. In a pyramidal cone the friction of a
 # wheel that slides also pushes it off the floor, the harder the contact the more: at μ = 0.4
-# and (0.02, 1), (0.95, 0.99) the robot hops and tilts by 5° even at the converged solution.
+# and (0.02, 1), (0.95, 0.99) the robot hops and tilts by 5° even with six Newton iterations.
 _SOLREF = (0.04, 1.0)  # time constant [s], damping ratio; SIM
 _SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)  # SIM
 
@@ -180,9 +180,8 @@ def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
 def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig, robot: Robot) -> None:
     option = spec.option
     option.timestep = physics.ctrl_dt / physics.n_substeps
-    # Explicit Euler: as accurate here as `implicitfast`, and stable at two or three Newton
-    # iterations, where `implicitfast` needs six. Its condition:
-    # timestep * motor_gain / wheel inertia < 2.
+    # Explicit Euler is the cheapest, and stable with two or three Newton iterations as long as
+    # `_check_stable` holds.
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON

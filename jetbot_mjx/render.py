@@ -27,7 +27,7 @@ _VIDEO_FPS = 30
 _GIF_FPS = _VIDEO_FPS // 2
 # What every browser and notebook plays.
 _H264 = {"plugin": "pyav", "codec": "libx264"}
-_GIF_EPISODES = 8  # about 2 MB: what a README or a chat still shows
+_GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _HOLD_SECONDS = 0.4  # after the end, so that the eye sees it
 
 Frame = UInt8[np.ndarray, "height width 3"]
