@@ -9,7 +9,7 @@ import jetbot_mjx  # noqa: F401  isort: skip
 import math
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -20,15 +20,17 @@ from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx import brax_ppo
-from jetbot_mjx.brax_ppo import Progress
+from jetbot_mjx import brax_ppo, resumable_ppo
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.metrics import CompileClock
 from jetbot_mjx.model import WHEEL_RADIUS
 from jetbot_mjx.policy import make_networks
+from jetbot_mjx.ppo import Fault
+from jetbot_mjx.preemption import Preemption
 from jetbot_mjx.state import PhysicsState
+from jetbot_mjx.trainer import Progress
 from jetbot_mjx.wrappers import wrap_for_training
 
 WARM_UP_CALLS = 3  # GPUs record their command graphs in the second call
@@ -141,28 +143,53 @@ def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:
     return _time("rollout", env, unroll, first, calls=calls, length=length, repeats=sizes.repeats)
 
 
+class _Reports:
+    """Listens to a trainer, and keeps neither logs nor checkpoints."""
+
+    def __init__(self, clock: CompileClock) -> None:
+        self._clock = clock
+        self.rows: list[tuple[int, float, float]] = []
+        """Environment steps, seconds since the last report, compilation among them."""
+        self.finite = True
+
+    def report(self, progress: Sequence[Progress]) -> bool:
+        one = progress[0]
+        compiling = self._clock.lap()
+        # The resumable trainer's seconds are those of its compiled step alone.
+        inside = compiling if one.state is None else 0.0
+        self.rows.append((one.env_steps, one.seconds - inside, compiling))
+        self.finite &= all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(one.params))
+        return True
+
+    def pause(self, progress: Sequence[Progress]) -> None: ...
+
+    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None: ...
+
+    def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None: ...
+
+    def compiled(self) -> None: ...
+
+
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times the trainer by its own reports, the first intervals left out."""
+    """Times the configured trainer by its own reports, the first intervals left out."""
     config = training_config(config, num_envs, sizes)
     env = make_env(config)
-    reports: list[tuple[int, float, float]] = []
     with CompileClock() as clock:
-
-        def report(progress: Progress) -> None:
-            reports.append((progress.env_steps, progress.seconds, clock.lap()))
-
-        params = brax_ppo.train(config, env, report)
-    if not all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(params)):
+        reports = _Reports(clock)
+        if config.trainer == "brax":
+            brax_ppo.train(config, env, reports)
+        else:
+            program = resumable_ppo.Program(config, env)
+            resumable_ppo.train(config, program, reports, Preemption(config.preemption_notice))
+    if not reports.finite:
         raise UserError(f"training at {num_envs} environments: the parameters are not finite")
-    steps = np.diff([env_steps for env_steps, _, _ in reports])
-    seconds = [wall - compiling for _, wall, compiling in reports[1:]]
-    rates = (steps / seconds).tolist()
-    compile_seconds = sum(compiling for _, _, compiling in reports)
+    steps = np.diff([env_steps for env_steps, _, _ in reports.rows])
+    rates = (steps / [seconds for _, seconds, _ in reports.rows[1:]]).tolist()
     return _row(
         "training",
         env,
         num_envs,
-        compile_seconds,
+        sum(compiling for _, _, compiling in reports.rows),
         rates[WARM_UP_INTERVALS:],
         int(steps[-1]) // num_envs,
     )

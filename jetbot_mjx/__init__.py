@@ -2,8 +2,9 @@
 
 The modules in reading order, each knowing only those before it:
 `errors`, `config`, `mjx`, `kinematics`, `model`, `task`, `state`, `env`, `wrappers`, `policy`,
-`rollout`, `evaluation`, `checkpoint`, `run_folder`, `metrics`, `brax_ppo`, `cli`, `offscreen`,
-and the commands `train`, `evaluate`, `render`. Commands meet only in the run folder.
+`ppo`, `trainer`, `rollout`, `evaluation`, `store`, `checkpoint`, `resume`, `faults`, `run_folder`,
+`metrics`, `recording`, `preemption`, `resumable_ppo`, `brax_ppo`, `cli`, `offscreen`, and the
+commands `train`, `evaluate`, `render`, `replay`. Commands meet only in the run folder.
 """
 
 # First, before Brax imports MJX and lets it print.

@@ -1,13 +1,13 @@
 """The stock trainer: `brax.training.agents.ppo.train.train` on our environment.
 
 Nothing of PPO is written here. This module translates the configuration, hands Brax our
-wrappers, and reports each epoch through one callback. `trainer: brax` selects it.
+wrappers, and reports each epoch to a `Recorder`. `trainer: brax` selects it.
 """
 
 import contextlib
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -18,31 +18,22 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jetbot_mjx.config import Config
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.policy import PolicyParams, network_factory
+from jetbot_mjx.ppo import LOSSES
+from jetbot_mjx.trainer import Progress, Recorder
 from jetbot_mjx.wrappers import wrap_for_training
 
 
-class Progress(NamedTuple):
-    """What a trainer reports at each checkpoint interval."""
-
-    env_steps: int
-    """Environment steps so far."""
-    params: PolicyParams
-    metrics: Mapping[str, float]
-    """Losses and the like, by Brax's names under `training/`."""
-    seconds: float
-    """Wall time that the steps since the last report took, compilation included."""
+class _Enough(Exception):
+    """Brax's loop has no other way out."""
 
 
-def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) -> PolicyParams:
-    """Trains a policy.
+def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
+    """Trains until the end, or until the recorder has enough.
 
     Args:
       config: the run; `check_devices` has passed it.
       env: the environment, unwrapped.
-      report: called before the first step and after every interval.
-
-    Returns:
-      The last parameters.
+      recorder: hears before the first step and after every interval.
     """
     ppo = config.ppo.model_dump(exclude={"network"})
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
@@ -56,21 +47,21 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
         del make_policy
         latest["params"] = PolicyParams(*params)
         if env_steps == 0:
-            report(Progress(0, latest["params"], {}, 0.0))
-            restart_clock()
+            report(0, {}, 0.0)
 
     def on_metrics(env_steps: int, metrics: Mapping[str, Any]) -> None:
-        seconds = time.perf_counter() - clock
-        values = {name: float(value) for name, value in metrics.items()}
-        report(Progress(env_steps, latest["params"], values, seconds))
-        restart_clock()
+        report(env_steps, metrics, time.perf_counter() - clock)
 
-    def restart_clock() -> None:
+    def report(env_steps: int, metrics: Mapping[str, Any], seconds: float) -> None:
         nonlocal clock
+        figures = _figures(metrics, config.ppo.entropy_cost)
+        params = jax.device_get(latest["params"])
+        if not recorder.report([Progress(env_steps, params, figures, seconds)]):
+            raise _Enough
         clock = time.perf_counter()
 
-    with device_put_replicated():
-        _, params, _ = brax_train.train(
+    with device_put_replicated(), contextlib.suppress(_Enough):
+        brax_train.train(
             environment=env,
             episode_length=config.task.episode_length,
             wrap_env_fn=wrap_env_fn,
@@ -85,7 +76,15 @@ def train(config: Config, env: JetBotEnv, report: Callable[[Progress], None]) ->
             policy_params_fn=on_params,
             **ppo,
         )
-    return PolicyParams(*params)
+
+
+def _figures(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+    """Brax's figures under this project's names."""
+    brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
+    figures = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
+    if "entropy_loss" in brax and entropy_cost > 0:
+        figures["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
+    return figures
 
 
 @contextlib.contextmanager

@@ -1,44 +1,36 @@
-"""Checkpoints on disk, by Orbax, each one explaining itself.
+"""A policy read back from a run, with all that is needed to use it."""
 
-`checkpoints/<env_steps>/` holds the parameters and, as JSON, all that is needed to use them:
-resolved configuration, observation layout, versions, and the figures they were judged by.
-Orbax writes in the background and renames at the end: a folder is whole or absent.
-"""
-
-import json
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, Self
+from typing import Any, Literal, NamedTuple
 
-import flax.serialization
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
-import tensorstore as ts
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 
 from jetbot_mjx.config import Config, ConfigError, parse_config
 from jetbot_mjx.env import JetBotEnv, make_env
-from jetbot_mjx.errors import UserError
 from jetbot_mjx.policy import Policy, PolicyParams, make_networks, make_policy
+from jetbot_mjx.store import (
+    FOLDER,
+    CheckpointError,
+    checkpoint_path,
+    checkpoint_steps,
+    read_about,
+    read_tree,
+)
 
 Which = Literal["best", "last"] | int
 """A checkpoint of a run: the best, the last, or the one at that many environment steps."""
 
-_FOLDER = "checkpoints"
-_PARAMS, _ABOUT = "policy", "about"
-_STEP_DIGITS = 12
-_FORMAT = "jetbot_mjx.policy/1"
-_KEYS = ("config", "layout", "observation_size", "action_size", "env_steps", "figures")
+POLICY = "policy"
+"""The tree that holds a policy's parameters."""
 
-# Orbax tells of every step of its work at INFO, and of what it would prefer at WARNING.
-logging.getLogger("absl").setLevel(logging.ERROR)
+FORMAT = "jetbot_mjx/2"
+"""Of what lies in a checkpoint; another number means that it cannot be read here."""
 
-
-class CheckpointError(UserError):
-    """A checkpoint that is not there, or that cannot be used."""
+_KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "figures")
 
 
 class Checkpoint(NamedTuple):
@@ -75,47 +67,16 @@ def _names(layout: Sequence[Mapping[str, Any]]) -> str:
     return " ".join(f"{field['name']}[{field['size']}]" for field in layout)
 
 
-class CheckpointWriter:
-    """Writes the policies of one run; a context manager that waits for the last write."""
-
-    def __init__(self, run_dir: Path, about: Mapping[str, Any]) -> None:
-        """Opens a run's checkpoint folder.
-
-        Args:
-          run_dir: the run folder, which exists.
-          about: what is the same for all checkpoints of the run, as JSON.
-        """
-        self._about = {"format": _FORMAT, **about}
-        self._manager = _manager(run_dir / _FOLDER, create=True)
-
-    def save(self, env_steps: int, params: PolicyParams, figures: Mapping[str, Any]) -> None:
-        """Begins to write one checkpoint.
-
-        Args:
-          env_steps: environment steps so far; names the folder.
-          params: the policy.
-          figures: what it was judged by, as JSON; `success_rate` decides which is best, and
-            of equals the later one.
-        """
-        about = {**self._about, "env_steps": env_steps, "figures": dict(figures)}
-        self._manager.save(
-            env_steps,
-            args=ocp.args.Composite(
-                **{
-                    _PARAMS: ocp.args.StandardSave(_to_tree(params)),
-                    _ABOUT: ocp.args.JsonSave(about),
-                }
-            ),
-            metrics={"success_rate": figures["success_rate"]},
-        )
-
-    def __enter__(self) -> Self:
-        """Enters."""
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Waits until all is on disk."""
-        self._manager.close()
+def about_policy(config: Config, env: JetBotEnv) -> dict[str, Any]:
+    """What explains every checkpoint of a run, as JSON."""
+    return {
+        "format": FORMAT,
+        "config": config.model_dump(mode="json"),
+        "layout": [field._asdict() for field in env.task.layout],
+        "observation_size": env.observation_size,
+        "action_size": env.action_size,
+        "ctrl_dt": env.dt,
+    }
 
 
 def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
@@ -129,40 +90,51 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
       The checkpoint.
 
     Raises:
-      CheckpointError: there is none, it is not one of ours, or it cannot be read whole.
+      CheckpointError: there is none, it is not one of ours, or it is not as it was written.
     """
     folder = find_checkpoint(path, which)
-    about = _read_about(folder)
+    about = explanation(folder)
     try:
-        config = parse_config(about["config"], source=f"{folder}: stored config")
+        config = parse_config(about["config"], source="stored config")
         networks = make_networks(
             config.ppo.network,
             about["observation_size"],
             about["action_size"],
             normalize=config.ppo.normalize_observations,
         )
-        template = _template(networks, about["observation_size"])
+        template = policy_template(networks, about["observation_size"])
     except (KeyError, TypeError, ConfigError) as error:
         raise CheckpointError(f"checkpoint {folder} does not explain itself: {error}") from None
-    try:
-        _read_all(folder / _PARAMS)
-        with ocp.StandardCheckpointer() as reader:
-            stored = reader.metadata(folder / _PARAMS).item_metadata.tree
-            _check_shapes(_to_tree(template), stored)
-            tree = reader.restore(folder / _PARAMS, _to_tree(template))
-    # Orbax and TensorStore report a damaged folder by many kinds of exception.
-    except Exception as error:
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
-        raise CheckpointError(f"checkpoint {folder} cannot be read: {reason[:200]}") from error
     return Checkpoint(
         path=folder,
         run_dir=folder.parent.parent,
         env_steps=about["env_steps"],
         config=config,
-        params=_from_tree(template, tree),
+        params=read_tree(folder, POLICY, template),
         networks=networks,
         about=about,
     )
+
+
+def explanation(folder: Path) -> dict[str, Any]:
+    """Reads what explains a checkpoint of this project.
+
+    Args:
+      folder: the checkpoint folder.
+
+    Returns:
+      The JSON object, every key of `about_policy` and more in it.
+
+    Raises:
+      CheckpointError: it is not one of ours, not whole, or of another format.
+    """
+    about = read_about(folder, _KEYS)
+    if about["format"] != FORMAT:
+        raise CheckpointError(
+            f"checkpoint {folder} is in the format {about['format']!r}, and only {FORMAT!r} can be"
+            " read here"
+        )
+    return about
 
 
 def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
@@ -180,33 +152,6 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     return make_policy(checkpoint.networks, checkpoint.params)
-
-
-# Orbax reads in threads of its own. Where one fails, the others go on and print tracebacks that
-# nobody can catch: whatever could fail is tried here first.
-
-
-def _read_all(folder: Path) -> None:
-    """Reads every stored chunk once, and raises where one is missing or damaged."""
-    store = ts.KvStore.open({"driver": "ocdbt", "base": f"file://{folder}/"}).result()
-    for key in store.list().result():
-        store.read(key).result()
-
-
-def _check_shapes(wanted: Any, stored: Any) -> None:
-    """Raises where the stored parameters are not those of the networks."""
-    wanted, stored = (
-        {
-            jax.tree_util.keystr(path, simple=True, separator="."): tuple(np.shape(leaf))
-            for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
-        }
-        for tree in (wanted, stored)
-    )
-    for name in sorted(wanted.keys() | stored.keys()):
-        if wanted.get(name) != stored.get(name):
-            raise ValueError(
-                f"{name} has shape {stored.get(name)}, and the networks want {wanted.get(name)}"
-            )
 
 
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
@@ -234,77 +179,35 @@ def _find(path: Path, which: Which) -> Path:
         raise CheckpointError(
             f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
         )
-    if (path / _PARAMS).is_dir():
+    if (path / POLICY).is_dir():
         return path
-    if not (path / _FOLDER).is_dir():
+    if not (path / FOLDER).is_dir():
         raise CheckpointError(
-            f"no checkpoint at {path}: it holds neither {_FOLDER}/ nor {_PARAMS}/;"
+            f"no checkpoint at {path}: it holds neither {FOLDER}/ nor {POLICY}/;"
             " give a run folder or a checkpoint in it"
         )
     steps = checkpoint_steps(path)
     if not steps:
-        raise CheckpointError(f"no checkpoint in {path / _FOLDER}: the run saved none")
+        raise CheckpointError(f"no checkpoint in {path / FOLDER}: the run saved none")
     if which == "last":
         step = steps[-1]
     elif which == "best":
         # Of equals, the later: it has learnt for longer.
-        step = max(steps, key=lambda step: (_success_rate(path / _FOLDER / _name(step)), step))
+        step = max(steps, key=lambda step: (_success_rate(checkpoint_path(path, step)), step))
     elif which in steps:
         step = which
     else:
         known = ", ".join(str(step) for step in steps)
         raise CheckpointError(f"no checkpoint at {which} steps in {path}: there are {known}")
-    return path / _FOLDER / _name(step)
-
-
-def checkpoint_steps(run_dir: Path) -> list[int]:
-    """Environment steps of a run's checkpoints, ascending; unfinished ones are left out."""
-    folders = (run_dir / _FOLDER).iterdir()
-    return sorted(
-        int(folder.name)
-        for folder in folders
-        if folder.name.isdecimal() and (folder / _PARAMS).is_dir()
-    )
-
-
-def _name(step: int) -> str:
-    return f"{step:0{_STEP_DIGITS}d}"
+    return checkpoint_path(path, step)
 
 
 def _success_rate(folder: Path) -> float:
-    return float(_read_about(folder).get("figures", {}).get("success_rate", -1.0))
+    # One that was saved between two evaluations was not judged.
+    return float(explanation(folder)["figures"].get("success_rate", -1.0))
 
 
-def _read_about(folder: Path) -> dict[str, Any]:
-    path = folder / _ABOUT / "metadata"
-    try:
-        about = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        raise CheckpointError(
-            f"checkpoint {folder} is not one of jetbot_mjx: {path.relative_to(folder)} is missing"
-            " or damaged"
-        ) from None
-    if not isinstance(about, dict) or about.get("format") != _FORMAT:
-        raise CheckpointError(f"checkpoint {folder} is not in the format {_FORMAT}")
-    missing = [name for name in _KEYS if name not in about]
-    if missing:
-        raise CheckpointError(f"checkpoint {folder} does not explain itself: no {missing[0]}")
-    return about
-
-
-def _manager(folder: Path, *, create: bool) -> ocp.CheckpointManager:
-    names = ocp.path.step.standard_name_format(step_format_fixed_length=_STEP_DIGITS)
-    options = ocp.CheckpointManagerOptions(
-        create=create,
-        step_name_format=names,
-        best_fn=lambda metrics: metrics["success_rate"],
-        best_mode="max",
-        cleanup_tmp_directories=True,
-    )
-    return ocp.CheckpointManager(folder.absolute(), options=options)
-
-
-def _template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:
+def policy_template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:
     """Shapes and dtypes of a policy's parameters; no numbers that could pass for a policy."""
 
     def init() -> PolicyParams:
@@ -318,17 +221,3 @@ def _template(networks: ppo_networks.PPONetworks, observation_size: int) -> Poli
         )
 
     return jax.eval_shape(init)
-
-
-def _to_tree(params: PolicyParams) -> dict[str, Any]:
-    """Plain nested dictionaries: what is on disk depends on no Python class."""
-    return {name: flax.serialization.to_state_dict(part) for name, part in params._asdict().items()}
-
-
-def _from_tree(template: PolicyParams, tree: Mapping[str, Any]) -> PolicyParams:
-    return PolicyParams(
-        **{
-            name: flax.serialization.from_state_dict(part, tree[name])
-            for name, part in template._asdict().items()
-        }
-    )

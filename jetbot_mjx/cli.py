@@ -1,14 +1,17 @@
 """What the commands share: one line for a user's mistake, and exit codes that mean something.
 
 0 done · 1 done, and below what was asked for (`--min-success`) · 2 the user can mend it ·
-130 interrupted.
+75 a training was asked to stop, is saved, and goes on by the same command · 130 interrupted.
 """
 
 import argparse
+import hashlib
 import os
+import platform
 import sys
 from collections.abc import Callable, Sequence
-from typing import NoReturn
+from pathlib import Path
+from typing import Any, NoReturn
 
 import jax
 
@@ -72,6 +75,37 @@ def require_device() -> None:
         raise UserError(
             f"JAX_PLATFORMS = {wanted!r} cannot be used here: unset it, or install what it needs"
         ) from None
+
+
+def use_compilation_cache() -> None:
+    """Lets JAX keep what it compiles in the user's cache folder, for the next process.
+
+    `JAX_COMPILATION_CACHE_DIR` names another folder, and `JAX_ENABLE_COMPILATION_CACHE=false`
+    turns it off. What is compiled for one kind of processor does not run on every other: each
+    has a folder of its own.
+    """
+    settings: Any = jax.config
+    if settings.jax_compilation_cache_dir or not settings.jax_enable_compilation_cache:
+        return
+    root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    folder = root / "jetbot_mjx" / f"jax-{jax.__version__}-{_processor()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        print(f"no compilation cache: {folder}: {error.strerror}", file=sys.stderr)
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _processor() -> str:
+    """A short name for this processor's instruction set."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = [platform.machine(), platform.processor()]
+    kind = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    return hashlib.sha256("\n".join(kind or lines).encode()).hexdigest()[:8]
 
 
 _LARGEST = 2**31 - 1

@@ -159,8 +159,9 @@ class PPOConfig(_Section):
     """Passes over the collected data before new data is collected."""
     learning_rate: Positive = 1e-3
     """Adam's step size; where the schedule starts."""
-    learning_rate_schedule: Literal["NONE", "ADAPTIVE_KL"] = "NONE"
-    """`ADAPTIVE_KL` steers the step size so that an update moves the policy by `desired_kl`."""
+    learning_rate_schedule: Literal["NONE", "LINEAR", "ADAPTIVE_KL"] = "NONE"
+    """`LINEAR` falls to zero at `num_timesteps`; `ADAPTIVE_KL` steers the step size so that an
+    update moves the policy by `desired_kl`."""
     desired_kl: Positive = 0.01
     """Target of `ADAPTIVE_KL`."""
     learning_rate_schedule_min_lr: Positive = 1e-5
@@ -192,6 +193,11 @@ class PPOConfig(_Section):
     def steps_per_training_step(self) -> int:
         """Environment steps that one training step collects."""
         return self.batch_size * self.num_minibatches * self.unroll_length
+
+    @property
+    def training_steps(self) -> int:
+        """Training steps in which `num_timesteps` are reached."""
+        return -(-self.num_timesteps // self.steps_per_training_step)
 
     @model_validator(mode="after")
     def _whole_batches(self) -> Self:
@@ -225,15 +231,46 @@ class Config(_Section):
 
     seed: Annotated[int, BeforeValidator(_integral), Field(ge=0, lt=2**32)] = 0
     """Seed of networks, environments and exploration."""
-    trainer: Literal["brax"] = "brax"
-    """`brax`: the stock `brax.training.agents.ppo.train.train`."""
+    seeds: Annotated[int, BeforeValidator(_integral), Field(ge=1, le=1024)] = 1
+    """How many policies to train at once in one program, from `seed` on."""
+    trainer: Literal["resumable", "brax"] = "resumable"
+    """`resumable`: this project's loop of Brax's parts; `brax`: the stock
+    `brax.training.agents.ppo.train.train`, which cannot resume."""
+    deterministic: bool = False
+    """On a GPU: the same seed gives the same bits, more slowly. A CPU always does."""
     checkpoint_interval: Steps = 100_000
     """Environment steps between two checkpoints, each with an evaluation and a log line."""
+    checkpoints_to_keep: Count = 50
+    """How many of the latest checkpoints stay, besides the first and the best."""
+    preemption_notice: Annotated[float, Field(ge=2, allow_inf_nan=False)] = 30.0
+    """[s] how soon after SIGTERM or SIGINT the process must have saved and gone."""
+    stop_at_success: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
+    """Training ends at the first evaluation with this success rate; null: never before the end."""
+    tensorboard: bool = True
+    """Whether to write TensorBoard's event files beside `metrics.jsonl`."""
     robot: RobotConfig = RobotConfig()
     task: TaskConfig = TaskConfig()
     physics: PhysicsConfig = PhysicsConfig()
     ppo: PPOConfig = PPOConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+
+    @model_validator(mode="after")
+    def _trainer_can(self) -> Self:
+        if self.trainer == "brax":
+            if self.ppo.learning_rate_schedule == "LINEAR":
+                raise ValueError(
+                    "ppo.learning_rate_schedule = 'LINEAR' is not known to trainer = 'brax':"
+                    " take trainer = 'resumable', or NONE or ADAPTIVE_KL"
+                )
+            if self.deterministic:
+                raise ValueError(
+                    "deterministic = true is not known to trainer = 'brax': take 'resumable'"
+                )
+            if self.seeds > 1:
+                raise ValueError(
+                    f"seeds = {self.seeds} is not known to trainer = 'brax': take 'resumable'"
+                )
+        return self
 
     @model_validator(mode="after")
     def _checkpoints_fit(self) -> Self:
@@ -245,6 +282,30 @@ class Config(_Section):
                 f" ppo.unroll_length): make it at least {step}"
             )
         return self
+
+    def of_each_seed(self) -> list["Config"]:
+        """The configurations of single runs that this one stands for."""
+        return [
+            self.model_copy(update={"seed": self.seed + index, "seeds": 1})
+            for index in range(self.seeds)
+        ]
+
+    def check_resume(self, changed: "Config") -> None:
+        """Refuses a change that a run cannot take on half-way.
+
+        Args:
+          changed: what the run is to go on with.
+
+        Raises:
+          ConfigError: it differs in more than `CHANGEABLE_ON_RESUME`.
+        """
+        now, then = _flat(changed.model_dump(mode="json")), _flat(self.model_dump(mode="json"))
+        for key in then.keys() | now.keys():
+            if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME:
+                raise ConfigError(
+                    f"{key} = {now.get(key)!r} is not what the run began with,"
+                    f" {then.get(key)!r}: only {', '.join(CHANGEABLE_ON_RESUME)} may change"
+                )
 
     def check_devices(self, device_count: int) -> None:
         """Refuses a number of environments that the devices cannot share evenly.
@@ -272,6 +333,27 @@ class Config(_Section):
         yaml.sort_base_mapping_type_on_output = False  # pyright: ignore[reportAttributeAccessIssue]
         yaml.dump(self.model_dump(mode="json"), stream)
         return stream.getvalue()
+
+
+CHANGEABLE_ON_RESUME = (
+    "ppo.num_timesteps",
+    "stop_at_success",
+    "checkpoint_interval",
+    "checkpoints_to_keep",
+    "preemption_notice",
+    "tensorboard",
+)
+"""What a resumed run may do differently: how far it goes, and what it writes on the way."""
+
+
+def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= _flat(value, f"{prefix}{key}.")
+        else:
+            flat[prefix + key] = value
+    return flat
 
 
 def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:

@@ -6,11 +6,13 @@ during training, by which the best checkpoint is chosen, and one for the report.
 """
 
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy.stats
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt32
 
@@ -118,6 +120,24 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     spread = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+
+
+def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
+    """Mean of proportions over independent trainings, with Student's 95 % interval.
+
+    Args:
+      values: one proportion for each seed, at least two.
+
+    Returns:
+      Mean, lower and upper end, within [0, 1].
+
+    Source: Student, Biometrika 6 (1908), 1-25, doi:10.1093/biomet/6.1.1.
+    """
+    count = len(values)
+    mean = float(np.mean(values))
+    error = float(np.std(values, ddof=1)) / math.sqrt(count)
+    spread = float(scipy.stats.t.ppf(0.975, count - 1)) * error
+    return mean, max(0.0, mean - spread), min(1.0, mean + spread)
 
 
 class Evaluator:

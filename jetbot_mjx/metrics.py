@@ -11,21 +11,31 @@ Names, the same everywhere:
   policy/kl                 between the policy before and after an update, mean
   policy/std                of the action distribution, before squashing
   policy/learning_rate      Adam's step size
+  rollout/episodes          that ended while collecting, driven by the exploring policy
+  rollout/success_rate      of those; likewise rollout/episode_return, rollout/episode_length
+  train/nonfinite_worlds    while collecting: each was reset, and its first one kept for replay
+  train/nonfinite_updates   gradients that were not finite, and not applied
   time/env_steps_per_second environment steps over training seconds, compilation apart
   time/compile_seconds      spent tracing and compiling in this interval, evaluation included
   time/wall_seconds         since the process began to train
 """
 
+import contextlib
 import json
 import math
+import os
 import sys
+import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Protocol, Self, TextIO
+from typing import Any, NamedTuple, Protocol, Self, TextIO
 
 import jax
-import tensorboardX
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2, summary_pb2
+
+from jetbot_mjx.run_folder import write_text
 
 Figures = Mapping[str, float | None]
 
@@ -72,52 +82,116 @@ class Sinks:
         self.close()
 
 
+class History(NamedTuple):
+    """One line of `metrics.jsonl`."""
+
+    env_steps: int
+    timestamp: float
+    """When it was written [s since 1970]."""
+    figures: Figures
+
+
+def read_history(path: Path, last: int) -> list[History]:
+    """Reads the lines of an earlier training.
+
+    Args:
+      path: of `metrics.jsonl`; it need not be there.
+      last: environment steps after which nothing is wanted.
+
+    Returns:
+      What was written up to then; a line cut short is left out.
+    """
+    if not path.is_file():
+        return []
+    found = []
+    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+        with contextlib.suppress(ValueError, LookupError, TypeError, AttributeError):
+            values = json.loads(line)
+            env_steps, timestamp = values.pop("env_steps"), values.pop("timestamp")
+            if env_steps <= last:
+                found.append(History(env_steps, timestamp, values))
+    return found
+
+
 class JsonlSink:
     """One JSON object a line, readable while training runs."""
 
-    def __init__(self, path: Path) -> None:
-        """Opens the file for appending.
+    def __init__(self, path: Path, history: Sequence[History] = ()) -> None:
+        """Opens the file.
 
         Args:
           path: of the file.
+          history: what it begins with; anything else in it goes.
         """
+        text = "".join(_line(*entry) for entry in history)
+        if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
+            write_text(path, text)
         self._file = path.open("a", encoding="utf-8")
 
     def write(self, env_steps: int, figures: Figures) -> None:
-        """Appends a line; what is not finite is written as null, since JSON has no NaN."""
-        values = {
-            name: value if value is not None and math.isfinite(value) else None
-            for name, value in figures.items()
-        }
-        self._file.write(json.dumps({"env_steps": env_steps, **values}) + "\n")
+        """Appends a line and sees it onto the disk, so that no checkpoint is ahead of it."""
+        self._file.write(_line(env_steps, time.time(), figures))
         self._file.flush()
+        os.fsync(self._file.fileno())
 
     def close(self) -> None:
         """Closes the file."""
         self._file.close()
 
 
+def _line(env_steps: int, timestamp: float, figures: Figures) -> str:
+    """What is not finite is written as null, since JSON has no NaN."""
+    values = {
+        name: value if value is not None and math.isfinite(value) else None
+        for name, value in figures.items()
+    }
+    return json.dumps({"env_steps": env_steps, "timestamp": timestamp, **values}) + "\n"
+
+
+# Protocol buffers make their classes while they are imported, unseen by pyright.
+_SUMMARY: Any = vars(summary_pb2)["Summary"]
+_EVENT: Any = vars(event_pb2)["Event"]
+
+
 class TensorBoardSink:
     """TensorBoard event files, written without TensorFlow."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, history: Sequence[History] = ()) -> None:
         """Opens an event file.
 
         Args:
-          folder: for `tensorboard --logdir`.
+          folder: for `tensorboard --logdir`; events of an earlier training go.
+          history: is written first, in their place.
         """
-        # A queue lies before the file, and `flush` does not wait for it: let its own thread write.
-        self._writer = tensorboardX.SummaryWriter(str(folder), flush_secs=1)
+        folder.mkdir(exist_ok=True)
+        for events in folder.glob("events.out.tfevents.*"):
+            events.unlink()
+        # Its SummaryWriter writes from a thread, whose errors nobody hears.
+        self._writer = EventsWriter(str(folder / "events"))
+        for entry in history:
+            self._add(*entry)
+        self._writer.flush()
 
     def write(self, env_steps: int, figures: Figures) -> None:
         """Adds one scalar for each figure there is."""
-        for name, value in figures.items():
-            if value is not None:
-                self._writer.add_scalar(name, value, env_steps)
+        self._add(env_steps, time.time(), figures)
+        self._writer.flush()
+
+    def _add(self, env_steps: int, timestamp: float, figures: Figures) -> None:
+        values = [
+            _SUMMARY.Value(tag=name, simple_value=value)
+            for name, value in figures.items()
+            if value is not None
+        ]
+        event = _EVENT(wall_time=timestamp, step=env_steps, summary=_SUMMARY(value=values))
+        self._writer.write_event(event)
 
     def close(self) -> None:
         """Closes the event file."""
         self._writer.close()
+
+
+_SECONDS_BETWEEN_LINES = 10.0
 
 
 class ProgressSink:
@@ -132,7 +206,7 @@ class ProgressSink:
         """
         self._total = total_steps
         self._stream = stream or sys.stdout
-        self._previous: tuple[int, float] | None = None
+        self._last_line = -math.inf
 
     def write(self, env_steps: int, figures: Figures) -> None:
         """Prints one line."""
@@ -143,19 +217,37 @@ class ProgressSink:
         parts.append(_shown(figures, "time/env_steps_per_second", "{:>10,.0f} steps/s"))
         parts.append(f"{wall:6.1f} s")
         compiled = figures.get("time/compile_seconds") or 0.0
-        parts.append(self._eta(env_steps, wall - compiled))
+        if rate := figures.get("time/env_steps_per_second"):
+            parts.append(self._eta(env_steps, rate))
         if compiled > 0.5:
             parts.append(f"(compiling {compiled:.1f} s)")
-        print("  ".join(part for part in parts if part), file=self._stream, flush=True)
-        self._previous = env_steps, wall
+        self._print(parts)
 
-    def _eta(self, env_steps: int, wall: float) -> str:
-        """Time left at the pace since the last line, compilation apart."""
-        if self._previous is None or env_steps <= self._previous[0]:
-            return ""
-        steps, before = self._previous
-        left = max(0, self._total - env_steps) * (wall - before) / (env_steps - steps)
+    def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
+        """Prints a line between two reports, unless the last one is still new."""
+        if time.monotonic() - self._last_line < _SECONDS_BETWEEN_LINES:
+            return
+        self._print(
+            [
+                f"{env_steps:>12,} steps",
+                _shown(figures, "rollout/success_rate", "exploring {:6.1%}"),
+                f"{env_steps_per_second:>10,.0f} steps/s",
+                self._eta(env_steps, env_steps_per_second),
+            ]
+        )
+
+    def _eta(self, env_steps: int, env_steps_per_second: float) -> str:
+        """Training time that is left at this pace."""
+        left = max(0, self._total - env_steps) / env_steps_per_second
         return f"ETA {left:5.0f} s"
+
+    def say(self, text: str) -> None:
+        """Prints a line of its own."""
+        self._print([text])
+
+    def _print(self, parts: Sequence[str]) -> None:
+        print("  ".join(part for part in parts if part), file=self._stream, flush=True)
+        self._last_line = time.monotonic()
 
     def close(self) -> None:
         """Nothing is left."""
@@ -167,9 +259,9 @@ def _shown(figures: Figures, name: str, form: str) -> str:
 
 
 class CompileClock:
-    """Seconds that JAX has spent tracing, lowering and compiling, by its own account.
+    """What JAX spends on tracing, lowering and compiling, by its own account.
 
-    A context manager that stops listening.
+    A context manager that stops listening. Threads may compile side by side: a second counts once.
     """
 
     _EVENTS = (
@@ -177,27 +269,46 @@ class CompileClock:
         "/jax/core/compile/jaxpr_to_mlir_module_duration",
         "/jax/core/compile/backend_compile_duration",
     )
+    _CACHE_HIT = "/jax/compilation_cache/cache_hits"
+    _SAVED = "/jax/compilation_cache/compile_time_saved_sec"
 
     def __init__(self) -> None:
         """Starts to listen."""
+        self._lock = threading.Lock()
         self._spans: list[tuple[float, float]] = []
+        self.programs = 0
+        """Compiled, or found in the persistent cache."""
+        self.cached = 0
+        """Found in the persistent cache."""
+        self.saved_seconds = 0.0
+        """What compiling those would have taken."""
         jax.monitoring.register_event_duration_secs_listener(self._listen)
+        jax.monitoring.register_event_listener(self._count)
 
     def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
         del kwargs
-        if event not in self._EVENTS:
-            return
         end = time.perf_counter()
-        start = end - duration_secs
-        # Tracing nests: a span that covers earlier ones stands for them all.
-        while self._spans and self._spans[-1][0] >= start:
-            self._spans.pop()
-        self._spans.append((start, end))
+        with self._lock:
+            if event in self._EVENTS:
+                self._spans.append((end - duration_secs, end))
+                self.programs += event == self._EVENTS[-1]
+            elif event == self._SAVED:
+                self.saved_seconds += duration_secs
+
+    def _count(self, event: str, **kwargs: str | int) -> None:
+        del kwargs
+        with self._lock:
+            self.cached += event == self._CACHE_HIT
 
     def lap(self) -> float:
         """Seconds since the last call."""
-        spans, self._spans = self._spans, []
-        return sum(end - start for start, end in spans)
+        with self._lock:
+            spans, self._spans = sorted(self._spans), []
+        seconds, until = 0.0, -math.inf
+        for start, end in spans:
+            seconds += max(0.0, end - max(start, until))
+            until = max(until, end)
+        return seconds
 
     def __enter__(self) -> Self:
         """Enters."""
@@ -206,3 +317,17 @@ class CompileClock:
     def __exit__(self, *exception: object) -> None:
         """Stops listening."""
         jax.monitoring.unregister_event_duration_listener(self._listen)
+        jax.monitoring.unregister_event_listener(self._count)
+
+
+_IMPORTED = time.perf_counter()
+
+
+def process_seconds() -> float:
+    """Since this process began [s]; where the system does not tell, since this module's import."""
+    try:
+        after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+        began = int(after_name[19]) / os.sysconf("SC_CLK_TCK")
+        return time.clock_gettime(time.CLOCK_BOOTTIME) - began
+    except (OSError, AttributeError, ValueError, IndexError):
+        return time.perf_counter() - _IMPORTED

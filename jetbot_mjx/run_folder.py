@@ -1,20 +1,25 @@
 """A run is one folder, and everything after training needs only that folder.
 
 config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/, checkpoints/<env_steps>/,
-evaluations/<env_steps>/, videos/.
+evaluations/<env_steps>/, videos/, faults/; of several seeds trained at once, seed-<n>/ with all of
+that in each.
 """
 
+import contextlib
 import datetime
+import fcntl
 import importlib.metadata
 import json
+import os
 import platform
 import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
 
 _PACKAGES = (
@@ -31,43 +36,129 @@ _PACKAGES = (
 )
 
 
+CONFIG = "config.yaml"
+"""The resolved configuration, in a run folder."""
+
+_VERSIONS = "versions.json"
+
+
 def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
     """`runs/<config>-<date>-<time>`, in local time."""
     now = datetime.datetime.now().astimezone()
     return root / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
 
 
-def check_free(run_dir: Path) -> None:
-    """Refuses a run folder that something already lies in.
+def seed_dirs(run_dir: Path, config: Config) -> list[Path]:
+    """Where the run of each seed lies: in the folder itself where there is one seed."""
+    if config.seeds == 1:
+        return [run_dir]
+    return [run_dir / f"seed-{one.seed}" for one in config.of_each_seed()]
+
+
+def stored_config(run_dir: Path) -> Config | None:
+    """The configuration of the run that lies in a folder.
+
+    Args:
+      run_dir: a run folder, or one that is to become one.
+
+    Returns:
+      Its resolved configuration; None where there is no folder yet, or nothing in it.
 
     Raises:
-      UserError: it exists and is not an empty folder.
+      UserError: something else lies there, or it cannot be read.
     """
     try:
-        in_use = run_dir.exists() and (not run_dir.is_dir() or any(run_dir.iterdir()))
+        if run_dir.is_dir() and (run_dir / CONFIG).is_file():
+            return load_config(run_dir / CONFIG)
+        if run_dir.is_dir() and all(path.name.startswith(".") for path in run_dir.iterdir()):
+            return None
+        in_use = run_dir.exists()
     except OSError as error:
         raise UserError(f"--run-dir {run_dir} cannot be used: {error.strerror}") from None
     if in_use:
-        raise UserError(f"--run-dir {run_dir} is already in use: name a new folder")
+        raise UserError(
+            f"--run-dir {run_dir} is in use, and holds no run (no {CONFIG}): name a new folder"
+        )
+    return None
 
 
-def create_run_folder(run_dir: Path, config: Config) -> None:
-    """Makes the folder and writes what is known before training.
+@contextlib.contextmanager
+def occupied(run_dir: Path) -> Iterator[None]:
+    """Makes a run folder unless it is there, and keeps every other training out of it.
+
+    The lock belongs to the process: however that ends, the folder is free again.
+
+    Raises:
+      UserError: the folder cannot be written, or another training holds it.
+    """
+    path = run_dir / ".lock"
+    try:
+        run_dir.mkdir(parents=True, exist_ok=True)
+        file = path.open("a+")
+    except OSError as error:
+        raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
+    with file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            raise UserError(
+                f"--run-dir {run_dir} is held by another training (process"
+                f" {file.read().strip() or 'unknown'}): wait for it, or name another folder"
+            ) from None
+        except OSError:
+            # A file system without locks: nothing can be promised, and nothing is refused.
+            pass
+        file.truncate(0)
+        print(os.getpid(), file=file, flush=True)
+        yield
+
+
+def write_run(run_dir: Path, config: Config) -> None:
+    """Writes what is known before training: the configuration and the versions.
 
     Args:
-      run_dir: a folder that does not exist yet, or is empty.
+      run_dir: the run folder, which exists.
       config: the resolved configuration.
 
     Raises:
-      UserError: the folder is in use or cannot be written.
+      UserError: the folder cannot be written.
     """
-    check_free(run_dir)
+    with writing_to(run_dir):
+        write_text(run_dir / CONFIG, config.to_yaml())
+        write_json(run_dir / _VERSIONS, versions())
+
+
+def changed_versions(run_dir: Path) -> list[str]:
+    """What is not as it was when the run was last trained, such as `jax 0.10.2, now 0.11.2`."""
     try:
-        run_dir.mkdir(parents=True, exist_ok=True)
-        (run_dir / "config.yaml").write_text(config.to_yaml(), encoding="utf-8")
-        write_json(run_dir / "versions.json", versions())
+        then = json.loads((run_dir / _VERSIONS).read_text(encoding="utf-8"))
+        packages = then["packages"]
+    except (OSError, ValueError, LookupError, TypeError):
+        return []
+    now = versions()
+    found = [
+        f"{name} {packages.get(name)}, now {version}"
+        for name, version in now["packages"].items()
+        if packages.get(name) != version
+    ]
+    for key in ("device", "device_count"):
+        if then.get(key) != now[key]:
+            found.append(f"{key} {then.get(key)}, now {now[key]}")
+    return found
+
+
+@contextlib.contextmanager
+def writing_to(path: Path) -> Iterator[None]:
+    """Turns what the file system refuses into one line.
+
+    Raises:
+      UserError: in place of an `OSError`.
+    """
+    try:
+        yield
     except OSError as error:
-        raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
+        raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
 def make_folder(path: Path) -> None:
@@ -76,10 +167,8 @@ def make_folder(path: Path) -> None:
     Raises:
       UserError: it cannot be made.
     """
-    try:
+    with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror}") from None
 
 
 def versions() -> dict[str, Any]:
@@ -98,7 +187,14 @@ def versions() -> dict[str, Any]:
 
 def write_json(path: Path, values: Any) -> None:
     """Writes JSON for people: indented, with a final newline."""
-    path.write_text(json.dumps(values, indent=2, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
+
+
+def write_text(path: Path, text: str) -> None:
+    """Writes a file that is whole or as it was, whenever the process ends."""
+    unfinished = path.with_name(f".{path.name}.unfinished")
+    unfinished.write_text(text, encoding="utf-8")
+    unfinished.replace(path)
 
 
 def _version(name: str) -> str | None:

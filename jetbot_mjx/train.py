@@ -1,169 +1,171 @@
-"""Trains a policy into a run folder: `python -m jetbot_mjx.train --config configs/jetbot.yaml`."""
+"""Trains a policy into a run folder: `python -m jetbot_mjx.train --config configs/jetbot.yaml`.
 
-import time
-from collections.abc import Callable, Sequence
+The same command with the same `--run-dir`, or `--resume RUN`, goes on where a run was stopped.
+SIGTERM and Ctrl-C stop it: all is saved, and the exit code is 75.
+"""
+
+import contextlib
+import threading
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 
-from jetbot_mjx import brax_ppo, cli
-from jetbot_mjx.brax_ppo import Progress
-from jetbot_mjx.checkpoint import CheckpointWriter
+from jetbot_mjx import brax_ppo, cli, resumable_ppo
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.env import JetBotEnv, make_env
-from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
-from jetbot_mjx.metrics import (
-    CompileClock,
-    Figures,
-    JsonlSink,
-    ProgressSink,
-    Sinks,
-    TensorBoardSink,
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import Summary, mean_interval
+from jetbot_mjx.metrics import CompileClock
+from jetbot_mjx.preemption import STOPPED, Preemption, leave_now
+from jetbot_mjx.recording import RunRecorder, Standing
+from jetbot_mjx.resume import Resumption, resume
+from jetbot_mjx.run_folder import (
+    CONFIG,
+    changed_versions,
+    default_run_dir,
+    occupied,
+    seed_dirs,
+    stored_config,
+    write_run,
 )
-from jetbot_mjx.policy import PolicyParams, make_networks
-from jetbot_mjx.run_folder import check_free, create_run_folder, default_run_dir, versions
-
-Trainer = Callable[[Config, JetBotEnv, Callable[[Progress], None]], PolicyParams]
-
-TRAINERS: dict[str, Trainer] = {"brax": brax_ppo.train}
-"""By the configuration's `trainer`: each trains and reports, and knows nothing of files."""
 
 
 class Result(NamedTuple):
     """What a training leaves."""
 
     run_dir: Path
-    best_steps: int
-    """Environment steps of the best checkpoint."""
-    best: Summary
-    """Its figures on the training's own evaluation goals."""
+    standings: list[Standing]
+    """How far each seed has come."""
+    fingerprints: list[str]
+    """SHA-256 of each seed's last parameters; the same seed gives the same."""
+    finished: bool
+    """Whether it came to its end; otherwise the same command goes on."""
     wall_seconds: float
+    """In all processes together."""
+
+    @property
+    def best(self) -> Summary:
+        """Figures of the best checkpoint, of the first seed."""
+        assert self.standings[0].best is not None
+        return self.standings[0].best
+
+    @property
+    def best_steps(self) -> int:
+        """Environment steps of the best checkpoint, of the first seed."""
+        return self.standings[0].best_steps
 
 
 def run(config: Config, run_dir: Path) -> Result:
-    """Trains a policy.
+    """Trains a policy, from the beginning or from where the folder's run was stopped.
 
     Args:
       config: the run.
-      run_dir: the run folder to make; it must not be in use.
+      run_dir: the run folder: a new one, or that of a run with this configuration.
 
     Returns:
       Where it lies and how good it became.
 
     Raises:
-      UserError: the folder is in use, the task cannot be built, or the devices cannot share
-        the environments; nothing has been written then.
+      UserError: the folder holds something else, belongs to another training or cannot be
+        written; the task cannot be built; the devices cannot share the environments.
     """
-    check_free(run_dir)
     config.check_devices(jax.device_count())
     env = make_env(config)
-    create_run_folder(run_dir, config)
+    stored = stored_config(run_dir)
+    if stored is not None:
+        if "brax" in (stored.trainer, config.trainer):
+            raise UserError(
+                f"--run-dir {run_dir} is in use by a run of trainer = {stored.trainer!r}, which"
+                " cannot be continued: name a new folder"
+            )
+        stored.check_resume(config)
+    with occupied(run_dir), CompileClock() as clock:
+        if config.trainer == "brax":
+            return _run_brax(config, env, run_dir, clock)
+        return _run_resumable(config, env, run_dir, clock)
+
+
+def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock) -> Result:
+    write_run(run_dir, config)
     print(_headline(config, run_dir), flush=True)
-    sinks = Sinks(
-        [
-            JsonlSink(run_dir / "metrics.jsonl"),
-            TensorBoardSink(run_dir / "tensorboard"),
-            ProgressSink(config.ppo.num_timesteps),
-        ]
+    with RunRecorder(config, env, [run_dir], clock) as recorder:
+        brax_ppo.train(config, env, recorder)
+    return _result(run_dir, recorder, finished=True)
+
+
+def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock) -> Result:
+    run_dirs = seed_dirs(run_dir, config)
+    with contextlib.ExitStack() as stack:
+        preemption = stack.enter_context(Preemption(config.preemption_notice))
+        if config.seeds > 1:
+            for seed_dir in run_dirs:
+                stack.enter_context(occupied(seed_dir))
+        program = resumable_ppo.Program(config, env)
+        resumption = resume(run_dirs, config.of_each_seed(), program.template())
+        if resumption is not None:
+            print(_welcome_back(run_dir, resumption), flush=True)
+        write_run(run_dir, config)
+        if config.seeds > 1:
+            for seed_dir, seed_config in zip(run_dirs, config.of_each_seed(), strict=True):
+                write_run(seed_dir, seed_config)
+        recorder = stack.enter_context(RunRecorder(config, env, run_dirs, clock, resumption))
+        if not recorder.complete:
+            print(_headline(config, run_dir), flush=True)
+            states = resumption.states if resumption else None
+            resumable_ppo.train(config, program, recorder, preemption, states)
+    return _result(run_dir, recorder, finished=recorder.complete)
+
+
+def _result(run_dir: Path, recorder: RunRecorder, *, finished: bool) -> Result:
+    return Result(
+        run_dir, recorder.standings, recorder.fingerprints, finished, recorder.wall_seconds
     )
-    writer = CheckpointWriter(run_dir, _about(config, env))
-    with CompileClock() as clock, sinks, writer as checkpoints:
-        monitor = _Monitor(config, env, clock)
-
-        def report(progress: Progress) -> None:
-            summary, figures = monitor.judge(progress)
-            checkpoints.save(progress.env_steps, progress.params, summary._asdict())
-            sinks.write(progress.env_steps, figures)
-
-        TRAINERS[config.trainer](config, env, report)
-    return Result(run_dir, monitor.best_steps, monitor.best, monitor.wall_seconds)
 
 
-class _Monitor:
-    """Judges what a trainer reports, and keeps the clocks and the best."""
-
-    def __init__(self, config: Config, env: JetBotEnv, clock: CompileClock) -> None:
-        networks = make_networks(
-            config.ppo.network,
-            env.observation_size,
-            env.action_size,
-            normalize=config.ppo.normalize_observations,
-        )
-        self._evaluator = Evaluator(env, networks)
-        self._keys = training_keys(config.evaluation.episodes)
-        self._config = config
-        self._compile_clock = clock
-        self._began = time.perf_counter()
-        self._env_steps = 0
-        self.best_steps = 0
-        self.best: Summary
-
-    def judge(self, progress: Progress) -> tuple[Summary, Figures]:
-        """Figures of one report."""
-        trainer_compiling = self._compile_clock.lap()
-        episodes = self._evaluator.run(progress.params, self._keys)
-        summary = summarize(episodes, self._config.physics.ctrl_dt)
-        if progress.env_steps == 0 or summary.success_rate >= self.best.success_rate:
-            self.best_steps, self.best = progress.env_steps, summary
-        training_seconds = progress.seconds - trainer_compiling
-        steps = progress.env_steps - self._env_steps
-        self._env_steps = progress.env_steps
-        figures = {
-            **{f"eval/{name}": value for name, value in summary._asdict().items()},
-            **self._losses(progress),
-            "time/env_steps_per_second": steps / training_seconds if steps else None,
-            "time/compile_seconds": trainer_compiling + self._compile_clock.lap(),
-            "time/wall_seconds": self.wall_seconds,
-        }
-        return summary, figures
-
-    @property
-    def wall_seconds(self) -> float:
-        """Since this training began [s]."""
-        return time.perf_counter() - self._began
-
-    def _losses(self, progress: Progress) -> Figures:
-        """Brax's figures under this project's names."""
-        brax = {name.removeprefix("training/"): value for name, value in progress.metrics.items()}
-        figures = {ours: brax[theirs] for theirs, ours in _BRAX_NAMES.items() if theirs in brax}
-        entropy_cost = self._config.ppo.entropy_cost
-        if "entropy_loss" in brax and entropy_cost > 0:
-            figures["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
-        return figures
-
-
-_BRAX_NAMES = {
-    "total_loss": "loss/total",
-    "policy_loss": "loss/policy",
-    "v_loss": "loss/value",
-    "entropy_loss": "loss/entropy",
-    "kl_mean": "policy/kl",
-    "policy_dist_mean_std": "policy/std",
-    "learning_rate": "policy/learning_rate",
-}
-
-
-def _about(config: Config, env: JetBotEnv) -> dict[str, object]:
-    """What explains every checkpoint of a run."""
-    return {
-        "config": config.model_dump(mode="json"),
-        "layout": [field._asdict() for field in env.task.layout],
-        "observation_size": env.observation_size,
-        "action_size": env.action_size,
-        "ctrl_dt": env.dt,
-        "versions": versions(),
-    }
+def _welcome_back(run_dir: Path, resumption: Resumption) -> str:
+    lines = [f"passed over: {reason}" for reason in resumption.passed_over]
+    if changes := changed_versions(run_dir):
+        lines.append(f"not as it was, so the bits may differ: {'; '.join(changes)}")
+    lines.append(f"going on after {resumption.env_steps:,} steps")
+    return "\n".join(lines)
 
 
 def _headline(config: Config, run_dir: Path) -> str:
     device = jax.devices()[0]
+    seeds = f", {config.seeds} seeds at once" if config.seeds > 1 else ""
     return (
         f"training {config.task.name} ({config.robot.preset} robot,"
         f" {config.task.observation} observation) with the {config.trainer} trainer:"
-        f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments on"
+        f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
         f" {jax.device_count()} x {device.device_kind}\nrun folder: {run_dir}"
     )
+
+
+def summary(result: Result) -> str:
+    """What the terminal says at the end of a training."""
+    lines = []
+    for standing, fingerprint in zip(result.standings, result.fingerprints, strict=True):
+        assert standing.best is not None
+        lines.append(
+            f"best policy: {standing.best.success_rate:.1%} success at {standing.best_steps:,}"
+            f" steps; last parameters: sha256 {fingerprint}"
+        )
+    if len(lines) > 1:
+        rates = [standing.best.success_rate for standing in result.standings if standing.best]
+        mean, low, high = mean_interval(rates)
+        lines.append(
+            f"{len(lines)} seeds: {mean:.2%} success in the mean"
+            f" (95 % interval {low:.2%} .. {high:.2%})"
+        )
+    lines += [
+        f"{result.wall_seconds:.1f} s in all",
+        f"next: python -m jetbot_mjx.evaluate {result.run_dir}",
+        f"      python -m jetbot_mjx.render {result.run_dir}",
+        f"      tensorboard --logdir {result.run_dir}",
+    ]
+    return "\n".join(lines)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -173,10 +175,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
       arguments: without the program's name; None: those of the process.
 
     Returns:
-      The exit code.
+      0, or 75 where the training was asked to stop and can go on.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.train", description=__doc__)
-    parser.add_argument("--config", type=Path, required=True, help="YAML file, see configs/")
+    source = parser.add_mutually_exclusive_group(required=True)
+    source.add_argument("--config", type=Path, help="YAML file, see configs/")
+    source.add_argument(
+        "--resume", type=Path, metavar="RUN", help="go on with the run in this folder"
+    )
     parser.add_argument(
         "--set",
         dest="overrides",
@@ -186,22 +192,33 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="override one setting; may be given again",
     )
     parser.add_argument("--seed", type=int, help="the same as --set seed=N")
+    parser.add_argument("--seeds", type=int, help="the same as --set seeds=N: N policies at once")
     parser.add_argument("--run-dir", type=Path, help="default: runs/<config>-<date>-<time>")
     options = parser.parse_args(arguments)
+    if options.resume and options.run_dir:
+        parser.error("--run-dir: --resume names the folder already")
     cli.require_device()
+    cli.use_compilation_cache()
     overrides = list(options.overrides)
-    if options.seed is not None:
-        overrides.append(f"seed={options.seed}")
-    config = load_config(options.config, overrides)
-    result = run(config, options.run_dir or default_run_dir(options.config))
-    print(
-        f"best policy: {result.best.success_rate:.1%} success at {result.best_steps:,} steps;"
-        f" {result.wall_seconds:.1f} s in all\n"
-        f"next: python -m jetbot_mjx.evaluate {result.run_dir}\n"
-        f"      python -m jetbot_mjx.render {result.run_dir}\n"
-        f"      tensorboard --logdir {result.run_dir}"
-    )
-    return 0
+    overrides += [f"seed={options.seed}"] if options.seed is not None else []
+    overrides += [f"seeds={options.seeds}"] if options.seeds is not None else []
+    if options.resume:
+        if stored_config(options.resume) is None:
+            raise UserError(f"--resume {options.resume}: there is no run in this folder")
+        config, run_dir = load_config(options.resume / CONFIG, overrides), options.resume
+    else:
+        config = load_config(options.config, overrides)
+        run_dir = options.run_dir or default_run_dir(options.config)
+    result = run(config, run_dir)
+    if result.finished:
+        print(summary(result))
+        return 0
+    message = f"stopped; to go on: python -m jetbot_mjx.train --resume {run_dir}"
+    if threading.active_count() > 1:
+        # The compiler cannot be interrupted, and Python would wait for it.
+        leave_now(message)
+    print(message)
+    return STOPPED
 
 
 if __name__ == "__main__":

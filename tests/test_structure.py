@@ -27,16 +27,24 @@ NOUNS = (
     "env",
     "wrappers",
     "policy",
+    "ppo",
+    "trainer",
     "rollout",
     "evaluation",
+    "store",
     "checkpoint",
+    "resume",
+    "faults",
     "run_folder",
     "metrics",
+    "recording",
+    "preemption",
+    "resumable_ppo",
     "brax_ppo",
     "cli",
     "offscreen",
 )
-VERBS = ("train", "evaluate", "render")
+VERBS = ("train", "evaluate", "render", "replay")
 ORDER = (*NOUNS, *VERBS)
 """A module knows only those before it, and a verb no other verb."""
 
@@ -178,7 +186,11 @@ def test_nothing_else_is_public():
 def test_importing_prints_nothing_and_starts_no_device(tmp_path):
     # A platform that does not exist: the first use of a device would raise.
     process = subprocess.run(
-        [sys.executable, "-c", "import jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render"],
+        [
+            sys.executable,
+            "-c",
+            "import jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render, jetbot_mjx.replay",
+        ],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "nowhere"},
         capture_output=True,

@@ -1,0 +1,280 @@
+"""What a training leaves behind: judged, logged and saved at every report, seed by seed."""
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Self
+
+from jetbot_mjx.checkpoint import POLICY, about_policy
+from jetbot_mjx.config import Config
+from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
+from jetbot_mjx.faults import save_fault
+from jetbot_mjx.metrics import (
+    CompileClock,
+    Figures,
+    History,
+    JsonlSink,
+    ProgressSink,
+    Sink,
+    Sinks,
+    TensorBoardSink,
+    process_seconds,
+    read_history,
+)
+from jetbot_mjx.policy import make_networks
+from jetbot_mjx.ppo import Fault
+from jetbot_mjx.resume import Resumption, to_trees
+from jetbot_mjx.run_folder import versions, writing_to
+from jetbot_mjx.store import Store, digest
+from jetbot_mjx.trainer import Progress
+
+_METRICS = "metrics.jsonl"
+
+
+@dataclasses.dataclass
+class Standing:
+    """How far one seed has come; it travels in its checkpoints."""
+
+    env_steps: int = 0
+    best_steps: int = 0
+    best: Summary | None = None
+    """The best evaluation, of equals the later."""
+    last: Summary | None = None
+    """The last one."""
+    wall_seconds: float = 0.0
+    """Spent on training in all processes so far."""
+
+    def to_json(self) -> dict[str, Any]:
+        """As it is stored."""
+        return {
+            **vars(self),
+            "best": self.best._asdict() if self.best else None,
+            "last": self.last._asdict() if self.last else None,
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> "Standing":
+        """As it was stored."""
+        summaries = {
+            name: Summary(**values[name]) if values.get(name) else None for name in ("best", "last")
+        }
+        return cls(**{**values, **summaries})
+
+
+class RunRecorder:
+    """Records the training of one run, of one seed or several; a context manager."""
+
+    def __init__(
+        self,
+        config: Config,
+        env: JetBotEnv,
+        run_dirs: Sequence[Path],
+        clock: CompileClock,
+        resumption: Resumption | None = None,
+    ) -> None:
+        """Opens the logs and the checkpoint folders.
+
+        Args:
+          config: the run.
+          env: to judge policies in, unwrapped.
+          run_dirs: the folder of each seed.
+          clock: of the compiler.
+          resumption: where the seeds stand; None: at the beginning.
+
+        Raises:
+          UserError: a folder cannot be written.
+        """
+        networks = make_networks(
+            config.ppo.network,
+            env.observation_size,
+            env.action_size,
+            normalize=config.ppo.normalize_observations,
+        )
+        self._config = config
+        self._evaluator = Evaluator(env, networks)
+        self._keys = training_keys(config.evaluation.episodes)
+        self._clock = clock
+        self._terminal = ProgressSink(config.ppo.num_timesteps)
+        resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
+        self._seeds = [
+            _SeedRecorder(
+                seed_config,
+                env,
+                run_dir,
+                Standing.from_json(standing),
+                read_history(run_dir / _METRICS, resumed.env_steps) if resumption else [],
+            )
+            for seed_config, run_dir, standing in zip(
+                config.of_each_seed(), run_dirs, resumed.progress, strict=True
+            )
+        ]
+        self._earlier = self._seeds[0].standing.wall_seconds
+        self._began = time.perf_counter()
+        self._compile_seconds = 0.0
+        self._awaiting_first_step = False
+        self.fingerprints = [digest(state.policy_params) for state in resumed.states]
+        """SHA-256 of each seed's last parameters."""
+
+    @property
+    def standings(self) -> list[Standing]:
+        """Of each seed."""
+        return [seed.standing for seed in self._seeds]
+
+    @property
+    def complete(self) -> bool:
+        """Whether every seed has made all its steps, or reached `stop_at_success`."""
+        ppo, target = self._config.ppo, self._config.stop_at_success
+        total = ppo.training_steps * ppo.steps_per_training_step
+        return all(
+            one.env_steps >= total
+            or (target is not None and one.last is not None and one.last.success_rate >= target)
+            for one in self.standings
+        )
+
+    @property
+    def wall_seconds(self) -> float:
+        """Since the training began, in all processes [s]."""
+        return self._earlier + time.perf_counter() - self._began
+
+    def report(self, progress: Sequence[Progress]) -> bool:
+        """Judges, logs and saves every seed; tells whether it is worth going on."""
+        # What a trainer compiles while it trains belongs to the time it reports.
+        compiling = self._lap()
+        summaries = [
+            summarize(self._evaluator.run(one.params, self._keys), self._config.physics.ctrl_dt)
+            for one in progress
+        ]
+        compiled = compiling + self._lap()
+        lines = []
+        for seed, one, summary in zip(self._seeds, progress, summaries, strict=True):
+            steps = one.env_steps - seed.standing.env_steps
+            training = one.seconds - (compiling if one.state is None else 0.0)
+            figures = {
+                **{f"eval/{name}": value for name, value in summary._asdict().items()},
+                **one.figures,
+                "time/env_steps_per_second": steps / training if steps and training > 0 else None,
+                "time/compile_seconds": compiled,
+                "time/wall_seconds": self.wall_seconds,
+            }
+            seed.report(one, summary, figures, self.wall_seconds)
+            lines.append(figures)
+        self._tell_first_step()
+        self._terminal.write(progress[0].env_steps, _mean(lines))
+        self.fingerprints = [digest(one.params) for one in progress]
+        return not self.complete
+
+    def pause(self, progress: Sequence[Progress]) -> None:
+        """Saves every seed as it is."""
+        for seed, one in zip(self._seeds, progress, strict=True):
+            seed.save(one, {}, self.wall_seconds)
+
+    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
+        """Shows on the terminal that something happens."""
+        self._tell_first_step()
+        steps = env_steps - self._seeds[0].standing.env_steps
+        self._terminal.tell(env_steps, figures, steps / max(seconds, 1e-9))
+
+    def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None:
+        """Keeps it for replay, and says where."""
+        path = self._seeds[seed_index].keep_fault(env_steps, fault)
+        if path is not None:
+            self._terminal.say(
+                f"a world stopped being finite before step {env_steps:,} and was reset:"
+                f" python -m jetbot_mjx.replay {path}"
+            )
+
+    def compiled(self) -> None:
+        """Waits for the first step to tell what came before it."""
+        self._awaiting_first_step = True
+
+    def _tell_first_step(self) -> None:
+        if not self._awaiting_first_step:
+            return
+        self._awaiting_first_step = False
+        self._lap()
+        cache = f"{self._clock.cached} of {self._clock.programs} programs from the cache"
+        if self._clock.cached:
+            cache += f", which saved {self._clock.saved_seconds:.1f} s"
+        self._terminal.say(
+            f"first training step done {process_seconds():.1f} s after the start;"
+            f" {self._compile_seconds:.1f} s of it compiling ({cache})"
+        )
+
+    def _lap(self) -> float:
+        seconds = self._clock.lap()
+        self._compile_seconds += seconds
+        return seconds
+
+    def __enter__(self) -> Self:
+        """Enters."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Waits until all is on disk."""
+        with contextlib.ExitStack() as stack:
+            for seed in self._seeds:
+                stack.callback(seed.close)
+
+
+class _SeedRecorder:
+    """The logs and checkpoints of one seed."""
+
+    def __init__(
+        self,
+        config: Config,
+        env: JetBotEnv,
+        run_dir: Path,
+        standing: Standing,
+        history: Sequence[History],
+    ) -> None:
+        self.standing = standing
+        self._config = config
+        self._run_dir = run_dir
+        self._about = {**about_policy(config, env), "versions": versions()}
+        with writing_to(run_dir):
+            sinks: list[Sink] = [JsonlSink(run_dir / _METRICS, history)]
+            if config.tensorboard:
+                sinks.append(TensorBoardSink(run_dir / "tensorboard", history))
+        self._sinks = Sinks(sinks)
+        self._store = Store(run_dir, config.checkpoints_to_keep)
+
+    def report(
+        self, progress: Progress, summary: Summary, figures: Figures, wall_seconds: float
+    ) -> None:
+        """Logs, then saves: a checkpoint is never ahead of the log."""
+        standing = self.standing
+        standing.env_steps, standing.last = progress.env_steps, summary
+        if standing.best is None or summary.success_rate >= standing.best.success_rate:
+            standing.best_steps, standing.best = progress.env_steps, summary
+        with writing_to(self._run_dir):
+            self._sinks.write(progress.env_steps, figures)
+        self.save(progress, summary._asdict(), wall_seconds)
+
+    def save(self, progress: Progress, judged: Mapping[str, Any], wall_seconds: float) -> None:
+        """Begins to write a checkpoint."""
+        self.standing.wall_seconds = wall_seconds
+        trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}
+        about = {**self._about, "figures": dict(judged), "progress": self.standing.to_json()}
+        self._store.save(progress.env_steps, trees, about, judged.get("success_rate"))
+
+    def keep_fault(self, env_steps: int, fault: Fault) -> Path | None:
+        with writing_to(self._run_dir):
+            return save_fault(self._run_dir, self._config, env_steps, fault)
+
+    def close(self) -> None:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(self._store)
+            stack.enter_context(writing_to(self._run_dir))
+            stack.callback(self._sinks.close)
+
+
+def _mean(figures: Sequence[Figures]) -> Figures:
+    """Of several seeds, figure by figure; a seed that has none is left out."""
+    means: dict[str, float | None] = {}
+    for name in figures[0]:
+        values = [value for one in figures if (value := one.get(name)) is not None]
+        means[name] = sum(values) / len(values) if values else None
+    return means

@@ -1,0 +1,97 @@
+"""Replays a world that stopped being finite: `python -m jetbot_mjx.replay RUN/faults/FILE`."""
+
+import math
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jetbot_mjx import cli
+from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.faults import StoredFault, load_fault
+from jetbot_mjx.kinematics import yaw
+from jetbot_mjx.state import State, robot_state
+from jetbot_mjx.store import flatten
+from jetbot_mjx.wrappers import wrap_for_training
+
+NOT_REPRODUCED = 1
+
+
+class Moment(NamedTuple):
+    """One step of the replay."""
+
+    action: np.ndarray
+    state: State
+    """After the step, as physics left it: not yet reset."""
+    odd: list[str]
+    """Names of the arrays that are not finite."""
+
+
+def run(stored: StoredFault, env: JetBotEnv) -> Iterator[Moment]:
+    """Steps from where the unroll began, with the actions that were taken.
+
+    Args:
+      stored: the fault.
+      env: its environment.
+
+    Yields:
+      Every step up to the one that blew up.
+    """
+    wrapped = wrap_for_training(env, stored.config.task.episode_length)
+    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(env.step))
+    state: Any = jax.tree.map(lambda x: jnp.asarray(x)[None], stored.fault.env_state)
+    for action in stored.fault.actions[: int(stored.fault.step) + 1]:
+        after = jax.device_get(jax.tree.map(lambda x: x[0], raw_step(state, action[None])))
+        seen = {"pipeline_state": after.pipeline_state, "obs": after.obs, "reward": after.reward}
+        odd = [name for name, leaf in flatten(seen).items() if not np.all(np.isfinite(leaf))]
+        yield Moment(action, after, odd)
+        state = step(state, action[None])
+
+
+def line(index: int, moment: Moment) -> str:
+    """One step as a line of the table."""
+    robot = robot_state(moment.state.pipeline_state)
+    x, y, z = np.asarray(robot.position_w)
+    fastest = np.abs(moment.state.pipeline_state.qvel).max()
+    return (
+        f"{index:4d}  {moment.action[0]:+7.3f} {moment.action[1]:+7.3f}  {x:+8.3f} {y:+8.3f}"
+        f" {z:+8.4f}  {math.degrees(float(yaw(robot.quat))):+7.1f}°  {fastest:10.3g}"
+        f"  {', '.join(moment.odd)}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and replays.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      0, or 1 where the world stayed finite this time.
+    """
+    parser = cli.Parser(prog="python -m jetbot_mjx.replay", description=__doc__)
+    parser.add_argument("file", type=Path, help="a file in a run's faults/")
+    options = parser.parse_args(arguments)
+    cli.require_device()
+    stored = load_fault(options.file)
+    print(
+        f"a world that blew up before step {stored.env_steps:,} of its training, from where its"
+        " unroll began\n"
+        f"{'step':>4}  {'action':>15}  {'x [m]':>8} {'y [m]':>8} {'z [m]':>8}  {'yaw':>8}"
+        f"  {'max |qvel|':>10}  not finite"
+    )
+    odd: list[str] = []
+    for index, moment in enumerate(run(stored, make_env(stored.config))):
+        print(line(index, moment))
+        odd = moment.odd
+    if not odd:
+        print("it stayed finite here: other devices and other versions round differently")
+        return NOT_REPRODUCED
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)

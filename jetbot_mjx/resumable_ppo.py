@@ -1,0 +1,260 @@
+"""The resumable trainer: `ppo.PPO` compiled once, over all devices and all seeds.
+
+Each device holds its share of every seed's environments and a copy of the rest. How many
+training steps one call makes is an argument of the compiled program: short calls answer
+signals and tell of progress, and since figures are summed inside the state, what is logged and
+what is computed do not depend on how the steps were cut into calls.
+"""
+
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.ppo import LOSSES, PPO, Fault, TrainState
+from jetbot_mjx.preemption import Preemption
+from jetbot_mjx.trainer import Progress, Recorder
+from jetbot_mjx.wrappers import wrap_for_training
+
+_AXIS = "devices"
+_CALL_SECONDS = 1.0
+_CALLS_PER_NOTICE = 10
+
+DETERMINISTIC = {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_level": 0}
+"""What XLA needs to be told for the same bits in every run: no atomics, no timing of kernels."""
+
+
+class Program:
+    """One configuration's training, over all devices and all its seeds."""
+
+    def __init__(self, config: Config, env: JetBotEnv) -> None:
+        """Prepares the program; nothing is compiled yet.
+
+        Args:
+          config: the run; `check_devices` has passed it.
+          env: the environment, unwrapped.
+        """
+        devices = jax.devices()
+        self._mesh = Mesh(np.array(devices), (_AXIS,))
+        self._options = DETERMINISTIC if config.deterministic else {}
+        self._seeds = list(range(config.seed, config.seed + config.seeds))
+        self._ppo = PPO(
+            config.ppo,
+            wrap_for_training(env, config.task.episode_length),
+            axis_name=_AXIS,
+            device_count=len(devices),
+        )
+        self._shapes = jax.eval_shape(jax.vmap(self._ppo.init), self._keys())
+        # Seeds come first, and environments second.
+        replicated = jax.tree.map(lambda _: PartitionSpec(), self._shapes)
+        shared = jax.tree.map(lambda _: PartitionSpec(None, _AXIS), self._shapes.env_state)
+        self._specs = replicated.replace(env_state=shared)
+        self._shardings = jax.tree.map(lambda spec: NamedSharding(self._mesh, spec), self._specs)
+
+    def template(self) -> TrainState:
+        """Shapes and dtypes of one seed's state."""
+        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._shapes)
+
+    def init(self) -> TrainState:
+        """The state before the first step, on the devices."""
+        init = jax.jit(
+            jax.vmap(self._ppo.init),
+            out_shardings=self._shardings,
+            compiler_options=self._options,
+        )
+        return init(self._keys())
+
+    def put(self, states: Sequence[TrainState]) -> TrainState:
+        """States of all seeds from the host, onto the devices."""
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+        return jax.tree.map(jax.device_put, stacked, self._shardings)
+
+    def get(self, state: TrainState) -> list[TrainState]:
+        """States of all seeds, on the host."""
+        host = jax.device_get(state)
+        return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
+
+    def compile(self) -> Callable[[TrainState, int, bool], tuple[TrainState, Fault]]:
+        """Compiles the training step, for once and for all: another shape is an error, not a wait.
+
+        Returns:
+          A function of (state, training steps, whether the tally starts anew), which takes the
+          state's memory for its result. Faults have the axes (devices, seeds).
+        """
+
+        def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
+            state, fault = jax.vmap(self._ppo.advance, in_axes=(0, None, None))(
+                state, steps, restart
+            )
+            return state, jax.tree.map(lambda x: x[None], fault)
+
+        sharded = jax.shard_map(
+            advance,
+            mesh=self._mesh,
+            in_specs=(self._specs, PartitionSpec(), PartitionSpec()),
+            out_specs=(self._specs, PartitionSpec(_AXIS)),
+            # Brax's utilities average gradients themselves, as under `pmap`.
+            check_vma=False,
+        )
+        replicated = NamedSharding(self._mesh, PartitionSpec())
+        jitted = jax.jit(
+            sharded,
+            donate_argnums=0,
+            in_shardings=(self._shardings, replicated, replicated),
+            out_shardings=(self._shardings, NamedSharding(self._mesh, PartitionSpec(_AXIS))),
+        )
+        scalars = (jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        program = jitted.lower(self._shapes, *scalars).compile(compiler_options=self._options)
+
+        def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, Fault]:
+            return program(state, np.int32(steps), np.bool_(restart))
+
+        return call
+
+    def _keys(self) -> jax.Array:
+        return jnp.stack([jax.random.PRNGKey(seed) for seed in self._seeds])
+
+
+def train(
+    config: Config,
+    program: Program,
+    recorder: Recorder,
+    preemption: Preemption,
+    states: Sequence[TrainState] | None = None,
+) -> None:
+    """Trains until the end, until the recorder has enough, or until a signal comes.
+
+    Args:
+      config: the run.
+      program: of that run.
+      recorder: hears of everything.
+      preemption: asked before every call and while compiling.
+      states: where each seed stands, on the host; None: at the beginning.
+    """
+    compiling = _Background(program.compile)
+    if states is None:
+        state = program.init()
+        if not recorder.report(_reports(config, program.get(state), 0.0)):
+            return
+        done = 0
+    else:
+        state = program.put(states)
+        done = env_steps(states[0]) // config.ppo.steps_per_training_step
+    while compiling.running:
+        if preemption.wait(0.02):
+            return
+    advance = compiling.result()
+    recorder.compiled()
+
+    size = config.ppo.steps_per_training_step
+    interval = -(-config.checkpoint_interval // size)
+    pace = _Pace(min(_CALL_SECONDS, config.preemption_notice / _CALLS_PER_NOTICE))
+    seconds, restart = 0.0, False
+    while done < config.ppo.training_steps and not preemption.requested:
+        goal = min(config.ppo.training_steps, (done // interval + 1) * interval)
+        count = min(pace.steps, goal - done)
+        began = time.perf_counter()
+        state, faults = advance(state, count, restart)
+        found = np.asarray(faults.found)
+        lasted = time.perf_counter() - began
+        pace.learn(count, lasted)
+        done, seconds, restart = done + count, seconds + lasted, False
+        for device, seed in np.argwhere(found):
+            fault = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], faults)
+            recorder.keep_fault(int(seed), done * size, fault)
+        if done < goal:
+            tallies = jax.device_get(state.tally)
+            figures = _figures(config, jax.tree.map(np.mean, tallies))
+            recorder.tell(done * size, figures, seconds)
+            continue
+        if not recorder.report(_reports(config, program.get(state), seconds)):
+            return
+        seconds, restart = 0.0, True
+    # After a report there is nothing new to save.
+    if seconds > 0:
+        recorder.pause([_progress(config, one, seconds) for one in program.get(state)])
+
+
+class _Pace:
+    """How many training steps a call may make."""
+
+    def __init__(self, seconds: float) -> None:
+        self._seconds = seconds
+        self.steps = 1
+
+    def learn(self, steps: int, seconds: float) -> None:
+        """Draws the consequence from the last call."""
+        self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
+
+
+class _Background:
+    """A function's result, computed in a thread of its own."""
+
+    def __init__(self, function: Callable[[], Any]) -> None:
+        self._outcome: list[Any] = []
+        self._error: BaseException | None = None
+        self._thread = threading.Thread(target=self._run, args=[function], daemon=True)
+        self._thread.start()
+
+    @property
+    def running(self) -> bool:
+        return self._thread.is_alive()
+
+    def result(self) -> Any:
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+        return self._outcome[0]
+
+    def _run(self, function: Callable[[], Any]) -> None:
+        try:
+            self._outcome.append(function())
+        except BaseException as error:  # handed on to who asks for the result
+            self._error = error
+
+
+def env_steps(state: TrainState) -> int:
+    """Environment steps of a state on the host."""
+    return int(state.env_steps.to_numpy())
+
+
+def _reports(config: Config, states: Sequence[TrainState], seconds: float) -> list[Progress]:
+    """At the end of an interval: whoever goes on from here begins a new tally."""
+    return [
+        _progress(config, state, seconds)._replace(
+            state=state.replace(tally=jax.tree.map(np.zeros_like, state.tally))
+        )
+        for state in states
+    ]
+
+
+def _progress(config: Config, state: TrainState, seconds: float) -> Progress:
+    return Progress(
+        env_steps(state), state.policy_params, _figures(config, state.tally), seconds, state
+    )
+
+
+def _figures(config: Config, tally: Mapping[str, Any]) -> dict[str, float]:
+    """Means and counts from sums; empty before the first step."""
+    sums = {name: float(value) for name, value in tally.items()}
+    steps, episodes = sums["training_steps"], sums["rollout/episodes"]
+    if steps == 0:
+        return {}
+    figures = {name: sums[name] / steps for name in LOSSES.values()}
+    if config.ppo.entropy_cost > 0:
+        figures["policy/entropy"] = -figures["loss/entropy"] / config.ppo.entropy_cost
+    figures["rollout/episodes"] = episodes
+    if episodes > 0:
+        figures["rollout/success_rate"] = sums["rollout/successes"] / episodes
+        figures["rollout/episode_return"] = sums["rollout/return"] / episodes
+        figures["rollout/episode_length"] = sums["rollout/length"] / episodes
+    figures["train/nonfinite_worlds"] = sums["nonfinite_worlds"]
+    figures["train/nonfinite_updates"] = sums["nonfinite_updates"]
+    return figures
