@@ -9,7 +9,7 @@ import jetbot_mjx  # noqa: F401  isort: skip
 import math
 import statistics
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -27,10 +27,9 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.metrics import CompileClock
 from jetbot_mjx.model import WHEEL_RADIUS
 from jetbot_mjx.policy import make_networks
-from jetbot_mjx.ppo import Fault
 from jetbot_mjx.preemption import Preemption
 from jetbot_mjx.state import PhysicsState
-from jetbot_mjx.trainer import Progress
+from jetbot_mjx.trainer import Progress, Recorder
 from jetbot_mjx.wrappers import wrap_for_training
 
 WARM_UP_CALLS = 3  # GPUs record their command graphs in the second call
@@ -143,16 +142,22 @@ def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:
     return _time("rollout", env, unroll, first, calls=calls, length=length, repeats=sizes.repeats)
 
 
-class _Reports:
-    """Listens to a trainer, and keeps neither logs nor checkpoints."""
+class Listener(Recorder):
+    """Keeps neither logs nor checkpoints, only times."""
 
     def __init__(self, clock: CompileClock) -> None:
+        """Prepares an empty list.
+
+        Args:
+          clock: of the compiler.
+        """
         self._clock = clock
         self.rows: list[tuple[int, float, float]] = []
         """Environment steps, seconds since the last report, compilation among them."""
         self.finite = True
 
     def report(self, progress: Sequence[Progress]) -> bool:
+        """Notes the times."""
         one = progress[0]
         compiling = self._clock.lap()
         # The resumable trainer's seconds are those of its compiled step alone.
@@ -161,32 +166,37 @@ class _Reports:
         self.finite &= all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(one.params))
         return True
 
-    def pause(self, progress: Sequence[Progress]) -> None: ...
-
-    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None: ...
-
-    def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None: ...
-
-    def compiled(self) -> None: ...
-
 
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times the configured trainer by its own reports, the first intervals left out."""
-    config = training_config(config, num_envs, sizes)
+    """Times the resumable trainer by its own reports, the first intervals left out."""
+    config = training_config(config, num_envs, sizes, trainer="resumable")
+    program = resumable_ppo.Program(config, env := make_env(config))
+    preemption = Preemption(config.preemption_notice)
+    return _time_trainer(
+        "training", config, env, lambda to: resumable_ppo.train(config, program, to, preemption)
+    )
+
+
+def measure_stock(config: Config, num_envs: int, sizes: Sizes) -> Row:
+    """Times Brax's own `ppo.train` under the same hyperparameters in the same way."""
+    config = training_config(config, num_envs, sizes, trainer="brax")
     env = make_env(config)
+    return _time_trainer("stock", config, env, lambda to: brax_ppo.train(config, env, to))
+
+
+def _time_trainer(
+    rate: str, config: Config, env: JetBotEnv, train: Callable[[Listener], None]
+) -> Row:
+    num_envs = config.ppo.num_envs
     with CompileClock() as clock:
-        reports = _Reports(clock)
-        if config.trainer == "brax":
-            brax_ppo.train(config, env, reports)
-        else:
-            program = resumable_ppo.Program(config, env)
-            resumable_ppo.train(config, program, reports, Preemption(config.preemption_notice))
+        reports = Listener(clock)
+        train(reports)
     if not reports.finite:
         raise UserError(f"training at {num_envs} environments: the parameters are not finite")
     steps = np.diff([env_steps for env_steps, _, _ in reports.rows])
     rates = (steps / [seconds for _, seconds, _ in reports.rows[1:]]).tolist()
     return _row(
-        "training",
+        rate,
         env,
         num_envs,
         sum(compiling for _, _, compiling in reports.rows),
@@ -200,12 +210,13 @@ MEASUREMENTS: dict[str, Callable[[Config, int, Sizes], Row]] = {
     "env": measure_env,
     "rollout": measure_rollout,
     "training": measure_training,
+    "stock": measure_stock,
 }
 """By the name of the rate: each takes a configuration and a number of environments."""
 
 
-def training_config(config: Config, num_envs: int, sizes: Sizes) -> Config:
-    """The configuration with which `training` is measured.
+def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -> Config:
+    """The configuration with which `training` and `stock` are measured.
 
     One training step learns from one unroll of every environment. The number of minibatches
     stays; their size follows the number of environments.
@@ -214,6 +225,7 @@ def training_config(config: Config, num_envs: int, sizes: Sizes) -> Config:
       config: the run's.
       num_envs: environments, over all devices.
       sizes: repeats, and training steps in each.
+      trainer: as in the configuration.
 
     Returns:
       The adapted configuration.
@@ -230,7 +242,7 @@ def training_config(config: Config, num_envs: int, sizes: Sizes) -> Config:
         )
     interval = num_envs * config.ppo.unroll_length * sizes.training_steps
     values = config.model_dump(mode="json")
-    values["checkpoint_interval"] = interval
+    values |= {"trainer": trainer, "checkpoint_interval": interval, "stop_at_success": None}
     values["ppo"] |= {
         "num_envs": num_envs,
         "batch_size": num_envs // minibatches,

@@ -1,10 +1,11 @@
 """Measures how fast robots step: `python benchmarks/steps_per_second.py --num-envs 256,1024`.
 
-Four rates, each of a program of its own, for each number of environments:
+Five rates, each of a program of its own, for each number of environments:
   physics   `JetBotEnv.step_physics` alone, under random actions
   env       the whole training environment: observation, reward, books, resets to new goals
   rollout   the same under the exploring policy, with the transitions that PPO stores
   training  PPO by the trainer of `python -m jetbot_mjx.train`: rollouts and updates
+  stock     the same hyperparameters by Brax's own `ppo.train`, for comparison
 README.md beside this file says how each is measured and how to read the table.
 """
 
@@ -176,7 +177,7 @@ def _parser() -> argparse.ArgumentParser:
 _SIZES_HELP = {
     "repeats": "timings of each rate",
     "unroll": "environment steps in one compiled call, rounded up to whole unrolls in rollout",
-    "training_steps": "training steps in one timing of training",
+    "training_steps": "training steps in one timing of training and of stock",
 }
 
 
@@ -202,7 +203,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if "training" in rates:
         # Said before minutes of measuring, not after them.
         for count in num_envs:
-            training_config(config, count, sizes)
+            training_config(config, count, sizes, config.trainer)
     output = options.output or _default_output()
     _check_output(output)
     conditions = _conditions(config, sizes)

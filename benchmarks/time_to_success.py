@@ -1,12 +1,15 @@
 """Measures how long success takes: `python benchmarks/time_to_success.py --config FILE`.
 
 For each seed a new process trains from a cold start (an empty compilation cache), and another
-judges its best policy on the report's fixed goals. The clock is that of whole processes, imports
-and compilation included; what the trainer says of itself stands beside it.
+judges its best policy on the report's fixed goals; with `--warm` the same follows once more with
+the cache as the first left it. The clock is that of whole processes, imports and compilation
+included; what the trainer says of itself stands beside it. `--set trainer=brax` measures the
+stock trainer.
 """
 
 import json
 import os
+import re
 import statistics
 import subprocess
 import sys
@@ -24,7 +27,9 @@ from jetbot_mjx.run_folder import write_json
 _FOLDER = Path(__file__).resolve().parent
 
 
-def measure(config: Path, overrides: Sequence[str], seed: int, target: float) -> dict[str, Any]:
+def measure(
+    config: Path, overrides: Sequence[str], seed: int, target: float, cache: Path
+) -> dict[str, Any]:
     """Trains and judges one seed.
 
     Args:
@@ -32,6 +37,7 @@ def measure(config: Path, overrides: Sequence[str], seed: int, target: float) ->
       overrides: as for `--set`.
       seed: of the run.
       target: success rate that the evaluations during training are watched for.
+      cache: folder of compiled programs; cold where it is empty.
 
     Returns:
       Times, success and the two processes' own output, as JSON.
@@ -39,9 +45,10 @@ def measure(config: Path, overrides: Sequence[str], seed: int, target: float) ->
     Raises:
       UserError: one of the processes failed.
     """
+    start = "warm" if cache.is_dir() and any(cache.iterdir()) else "cold"
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
-        environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": f"{folder}/cache"}
+        environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
         settings = [argument for override in overrides for argument in ("--set", override)]
         train = ["train", "--config", str(config), "--seed", str(seed), *settings]
         began = time.perf_counter()
@@ -56,8 +63,11 @@ def measure(config: Path, overrides: Sequence[str], seed: int, target: float) ->
     reached = [line for line in history if line["eval/success_rate"] >= target]
     # What passes before the trainer's own clock starts is mostly imports.
     before = seconds - history[-1]["time/wall_seconds"]
+    first_step = re.search(r"first training step done ([\d.]+) s", printed)
     return {
         "seed": seed,
+        "start": start,
+        "first_step_seconds": float(first_step[1]) if first_step else None,
         "process_seconds": seconds,
         "compile_seconds": sum(line["time/compile_seconds"] for line in history),
         "target_reached_seconds": before + reached[0]["time/wall_seconds"] if reached else None,
@@ -84,8 +94,11 @@ def _run(command: Sequence[str], environment: dict[str, str]) -> str:
 def _row(run: dict[str, Any]) -> str:
     policy = run["policy"]
     reached = run["target_reached_seconds"]
+    first_step = run["first_step_seconds"]
     return (
-        f"| {run['seed']:>4} | {run['process_seconds']:9.1f} s | {run['compile_seconds']:7.1f} s |"
+        f"| {run['seed']:>4} | {run['start']} | {run['process_seconds']:9.1f} s |"
+        f" {run['compile_seconds']:7.1f} s |"
+        f" {'-' if first_step is None else f'{first_step:.1f} s':>10} |"
         f" {'never' if reached is None else f'{reached:.1f} s':>8} |"
         f" {policy['success_rate']:8.2%} | {policy['success_low']:.2%} .."
         f" {policy['success_high']:.2%} |"
@@ -106,26 +119,32 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--seeds", type=cli.positive_int, default=1, help="seeds 0 to N-1")
     parser.add_argument("--target", type=cli.fraction, default=0.99, help="default: 0.99")
+    parser.add_argument("--warm", action="store_true", help="once more with a warm cache")
     parser.add_argument("--output", type=Path, required=True, help="JSON file")
     options = parser.parse_args(arguments)
     config = load_config(options.config, options.overrides)
     print(
-        " ".join([options.config.name, *options.overrides]) + ", cold start\n"
-        f"| seed |     process |   compile | ≥ {options.target:.0%} at |  success |"
-        "    95 % interval   |\n"
-        "|-----:|------------:|----------:|---------:|---------:|:------------------:|",
+        " ".join([options.config.name, *options.overrides]) + "\n"
+        f"| seed |start |     process |   compile | first step | ≥ {options.target:.0%} at |"
+        "  success |    95 % interval   |\n"
+        "|-----:|:-----|------------:|----------:|-----------:|---------:|---------:"
+        "|:------------------:|",
         flush=True,
     )
     runs = []
     for seed in range(options.seeds):
-        runs.append(measure(options.config, options.overrides, seed, options.target))
-        print(_row(runs[-1]), flush=True)
-    seconds = [run["process_seconds"] for run in runs]
+        with tempfile.TemporaryDirectory() as cache:
+            for _ in range(2 if options.warm else 1):
+                run = measure(options.config, options.overrides, seed, options.target, Path(cache))
+                runs.append(run)
+                print(_row(run), flush=True)
     machine = runs[0]["versions"]
-    print(
-        f"median of the process's time: {statistics.median(seconds):.1f} s on"
-        f" {machine['device_count']} x {machine['device']}, {os.cpu_count()} CPU cores"
-    )
+    for start in dict.fromkeys(run["start"] for run in runs):
+        seconds = [run["process_seconds"] for run in runs if run["start"] == start]
+        print(
+            f"{start}: median of the process's time {statistics.median(seconds):.1f} s on"
+            f" {machine['device_count']} x {machine['device']}, {os.cpu_count()} CPU cores"
+        )
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_json(
         options.output,

@@ -181,6 +181,10 @@ def _find(path: Path, which: Which) -> Path:
         )
     if (path / POLICY).is_dir():
         return path
+    if seeds := sorted(path.glob("seed-*")):
+        raise CheckpointError(
+            f"no checkpoint at {path}: it holds several seeds; name one, such as {seeds[0]}"
+        )
     if not (path / FOLDER).is_dir():
         raise CheckpointError(
             f"no checkpoint at {path}: it holds neither {FOLDER}/ nor {POLICY}/;"

@@ -16,8 +16,11 @@ Names, the same everywhere:
   train/nonfinite_worlds    while collecting: each was reset, and its first one kept for replay
   train/nonfinite_updates   gradients that were not finite, and not applied
   time/env_steps_per_second environment steps over training seconds, compilation apart
+  time/training_seconds     spent on training since the last report
+  time/evaluation_seconds   spent on this evaluation, its compilation included
+  time/recording_seconds    spent on logging and saving after the last evaluation
   time/compile_seconds      spent tracing and compiling in this interval, evaluation included
-  time/wall_seconds         since the process began to train
+  time/wall_seconds         since training began, in all processes that worked on the run
 """
 
 import contextlib

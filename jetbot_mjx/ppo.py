@@ -300,9 +300,10 @@ class PPO:
             params, optimizer_state, key = carry
             key, shuffle_key, minibatch_key = jax.random.split(key, 3)
 
+            order = jax.random.permutation(shuffle_key, data.reward.shape[0])
+
             def minibatches(x: Array) -> Array:
-                x = jax.random.permutation(shuffle_key, x)
-                return x.reshape((self.config.num_minibatches, -1, *x.shape[1:]))
+                return x[order].reshape((self.config.num_minibatches, -1, *x.shape[1:]))
 
             (params, optimizer_state, _), figures = jax.lax.scan(
                 lambda carry, batch: self._minibatch_step(carry, batch, normalizer),

@@ -24,12 +24,12 @@ from jetbot_mjx.metrics import (
     process_seconds,
     read_history,
 )
-from jetbot_mjx.policy import make_networks
+from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.ppo import Fault
 from jetbot_mjx.resume import Resumption, to_trees
 from jetbot_mjx.run_folder import versions, writing_to
 from jetbot_mjx.store import Store, digest
-from jetbot_mjx.trainer import Progress
+from jetbot_mjx.trainer import Progress, Recorder
 
 _METRICS = "metrics.jsonl"
 
@@ -64,7 +64,7 @@ class Standing:
         return cls(**{**values, **summaries})
 
 
-class RunRecorder:
+class RunRecorder(Recorder):
     """Records the training of one run, of one seed or several; a context manager."""
 
     def __init__(
@@ -114,6 +114,7 @@ class RunRecorder:
         self._earlier = self._seeds[0].standing.wall_seconds
         self._began = time.perf_counter()
         self._compile_seconds = 0.0
+        self._recording_seconds = 0.0
         self._awaiting_first_step = False
         self.fingerprints = [digest(state.policy_params) for state in resumed.states]
         """SHA-256 of each seed's last parameters."""
@@ -143,10 +144,9 @@ class RunRecorder:
         """Judges, logs and saves every seed; tells whether it is worth going on."""
         # What a trainer compiles while it trains belongs to the time it reports.
         compiling = self._lap()
-        summaries = [
-            summarize(self._evaluator.run(one.params, self._keys), self._config.physics.ctrl_dt)
-            for one in progress
-        ]
+        began = time.perf_counter()
+        summaries = [self.judge(one.params) for one in progress]
+        judging = time.perf_counter() - began
         compiled = compiling + self._lap()
         lines = []
         for seed, one, summary in zip(self._seeds, progress, summaries, strict=True):
@@ -156,6 +156,9 @@ class RunRecorder:
                 **{f"eval/{name}": value for name, value in summary._asdict().items()},
                 **one.figures,
                 "time/env_steps_per_second": steps / training if steps and training > 0 else None,
+                "time/training_seconds": training,
+                "time/evaluation_seconds": judging,
+                "time/recording_seconds": self._recording_seconds,
                 "time/compile_seconds": compiled,
                 "time/wall_seconds": self.wall_seconds,
             }
@@ -164,7 +167,13 @@ class RunRecorder:
         self._tell_first_step()
         self._terminal.write(progress[0].env_steps, _mean(lines))
         self.fingerprints = [digest(one.params) for one in progress]
+        self._recording_seconds = time.perf_counter() - began - judging
         return not self.complete
+
+    def judge(self, params: PolicyParams) -> Summary:
+        """Figures of a policy on the goals that every report uses."""
+        episodes = self._evaluator.run(params, self._keys)
+        return summarize(episodes, self._config.physics.ctrl_dt)
 
     def pause(self, progress: Sequence[Progress]) -> None:
         """Saves every seed as it is."""

@@ -199,6 +199,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--episodes", type=cli.positive_int, default=20)
     options = parser.parse_args(arguments)
     cli.require_device()
+    cli.use_compilation_cache()
     pictures = run(options.run, episodes=options.episodes, which=options.checkpoint)
     print(
         f"{pictures.successes} of {pictures.episodes} goals reached\n"

@@ -76,6 +76,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", type=Path, help="a file in a run's faults/")
     options = parser.parse_args(arguments)
     cli.require_device()
+    cli.use_compilation_cache()
     stored = load_fault(options.file)
     print(
         f"a world that blew up before step {stored.env_steps:,} of its training, from where its"

@@ -27,9 +27,6 @@ _AXIS = "devices"
 _CALL_SECONDS = 1.0
 _CALLS_PER_NOTICE = 10
 
-DETERMINISTIC = {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_level": 0}
-"""What XLA needs to be told for the same bits in every run: no atomics, no timing of kernels."""
-
 
 class Program:
     """One configuration's training, over all devices and all its seeds."""
@@ -43,7 +40,7 @@ class Program:
         """
         devices = jax.devices()
         self._mesh = Mesh(np.array(devices), (_AXIS,))
-        self._options = DETERMINISTIC if config.deterministic else {}
+        self._options = config.compiler_options
         self._seeds = list(range(config.seed, config.seed + config.seeds))
         self._ppo = PPO(
             config.ppo,

@@ -128,4 +128,4 @@ def make_rollout(
             qpos=qpos,
         )
 
-    return jax.jit(run)
+    return jax.jit(run, compiler_options=env.config.compiler_options)

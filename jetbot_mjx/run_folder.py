@@ -55,6 +55,12 @@ def seed_dirs(run_dir: Path, config: Config) -> list[Path]:
     return [run_dir / f"seed-{one.seed}" for one in config.of_each_seed()]
 
 
+def seed_folders(run_dir: Path) -> list[Path]:
+    """The folders of the seeds that were trained at once; none where it was one seed."""
+    found = [path for path in run_dir.glob("seed-*") if (path / CONFIG).is_file()]
+    return sorted(found, key=lambda path: (len(path.name), path.name))
+
+
 def stored_config(run_dir: Path) -> Config | None:
     """The configuration of the run that lies in a folder.
 
@@ -133,7 +139,7 @@ def changed_versions(run_dir: Path) -> list[str]:
     """What is not as it was when the run was last trained, such as `jax 0.10.2, now 0.11.2`."""
     try:
         then = json.loads((run_dir / _VERSIONS).read_text(encoding="utf-8"))
-        packages = then["packages"]
+        packages = dict(then["packages"])
     except (OSError, ValueError, LookupError, TypeError):
         return []
     now = versions()

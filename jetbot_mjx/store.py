@@ -8,8 +8,10 @@ from the host: what is on disk depends on no Python class and on no number of de
 
 import contextlib
 import hashlib
+import itertools
 import json
 import logging
+import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -28,11 +30,13 @@ FOLDER = "checkpoints"
 
 _ABOUT = "about"
 _DIGESTS = "sha256"
+_SUCCESS = "success_rate"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
 
-# Orbax tells of every step of its work at INFO, and of what it would prefer at WARNING.
-logging.getLogger("absl").setLevel(logging.ERROR)
+# Orbax tells of every step of its work at INFO, of what it would prefer at WARNING, and at ERROR,
+# by tracebacks from each of its threads, of what it raises as well.
+logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 class CheckpointError(UserError):
@@ -53,10 +57,11 @@ class Store:
           run_dir: the run folder, which exists.
           keep: how many of the latest stay, besides the first and the best.
         """
+        self._success = {step: _success_rate(run_dir, step) for step in checkpoint_steps(run_dir)}
         options = ocp.CheckpointManagerOptions(
             create=True,
             step_name_format=_step_names(),
-            preservation_policy=_KeepSome(keep),
+            preservation_policy=_KeepSome(keep, self._success),
             cleanup_tmp_directories=True,
         )
         self._folder = (run_dir / FOLDER).absolute()
@@ -83,14 +88,14 @@ class Store:
             sum(np.asarray(x).nbytes for tree in flat.values() for x in tree.values())
         )
         digests = {name: digest(tree) for name, tree in flat.items()}
-        about = {**about, "env_steps": env_steps, _DIGESTS: digests}
+        about = {**about, "env_steps": env_steps, _SUCCESS: success_rate, _DIGESTS: digests}
         about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
         items = {name: ocp.args.StandardSave(tree) for name, tree in flat.items()}
+        self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
             self._manager.save(
                 env_steps,
                 args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)}),
-                metrics=None if success_rate is None else {"success_rate": success_rate},
             )
 
     def wait(self) -> None:
@@ -113,10 +118,10 @@ class Store:
 
     def _check_space(self, size: int) -> None:
         """Refuses before anything is begun that could not be finished."""
-        free = shutil.disk_usage(self._folder).free
-        if free < size + _SPARE_BYTES:
+        needed, free = size + _SPARE_BYTES, shutil.disk_usage(self._folder).free
+        if free < needed:
             raise CheckpointError(
-                f"{self._folder}: the disk is full: a checkpoint needs {size / 1e6:.1f} MB, and"
+                f"{self._folder}: the disk is full: a checkpoint needs {needed / 1e6:.1f} MB, and"
                 f" {free / 1e6:.1f} MB are free; the checkpoints there are as they were"
             )
 
@@ -135,14 +140,15 @@ class Store:
 class _KeepSome(checkpoint_managers.PreservationPolicy):
     """The latest, the first, and the best; of equally good ones the later."""
 
-    def __init__(self, latest: int) -> None:
+    def __init__(self, latest: int, success: Mapping[int, float]) -> None:
         self._latest = latest
+        self._success = success
 
     def should_preserve(
         self, checkpoints: Sequence[Any], *, context: checkpoint_managers.PreservationContext
     ) -> Sequence[bool]:
         del context
-        success = [(one.metrics or {}).get("success_rate", -1.0) for one in checkpoints]
+        success = [self._success.get(one.step, -1.0) for one in checkpoints]
         best = max(range(len(success)), key=lambda index: (success[index], index), default=0)
         first_of_latest = len(checkpoints) - self._latest
         return [index in (0, best) or index >= first_of_latest for index in range(len(checkpoints))]
@@ -153,7 +159,9 @@ def checkpoint_steps(run_dir: Path) -> list[int]:
     folder = run_dir / FOLDER
     if not folder.is_dir():
         return []
-    return sorted(int(path.name) for path in folder.iterdir() if path.name.isdecimal())
+    found = (int(path.name) for path in folder.iterdir() if path.name.isdecimal())
+    # Other spellings of a number are not ours.
+    return sorted(step for step in set(found) if os.path.lexists(checkpoint_path(run_dir, step)))
 
 
 def checkpoint_path(run_dir: Path, env_steps: int) -> Path:
@@ -169,11 +177,19 @@ def set_aside(path: Path) -> Path:
 
     Returns:
       Where it lies now: in the run's `set_aside/`.
+
+    Raises:
+      CheckpointError: it cannot be moved.
     """
     folder = path.parent.parent / "set_aside"
-    folder.mkdir(exist_ok=True)
-    number = sum(1 for other in folder.iterdir() if other.name.startswith(path.name))
-    return Path(shutil.move(path, folder / f"{path.name}.{number}"))
+    try:
+        folder.mkdir(exist_ok=True)
+        numbers = (folder / f"{path.name}.{number}" for number in itertools.count())
+        return path.rename(next(free for free in numbers if not os.path.lexists(free)))
+    except OSError as error:
+        raise CheckpointError(
+            f"checkpoint {path} cannot be moved into {folder}: {error.strerror}"
+        ) from None
 
 
 def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
@@ -233,18 +249,13 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
         raise CheckpointError(f"checkpoint {path} holds no {name}")
     wanted = flatten(template)
     try:
-        _read_all(path / name)
-        with ocp.StandardCheckpointer() as reader:
-            stored = reader.metadata(path / name).item_metadata.tree
-            _check_arrays(wanted, stored)
-            flat = reader.restore(path / name, wanted)
-    # Orbax and TensorStore report a damaged folder by many kinds of exception.
+        flat = _read_arrays(path / name, wanted)
+    # TensorStore reports a damaged folder by many kinds of exception.
     except Exception as error:
         raise CheckpointError(f"checkpoint {path} cannot be read: {_reason(error)}") from None
     if digest(flat) != about[_DIGESTS][name]:
         raise CheckpointError(f"checkpoint {path} is damaged: {name} is not as it was written")
-    leaves = [np.asarray(flat[key]) for key in wanted]
-    return jax.tree.unflatten(jax.tree.structure(template), leaves)
+    return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
 
 
 def flatten(tree: Any) -> dict[str, Any]:
@@ -265,22 +276,37 @@ def digest(tree: Any) -> str:
     return total.hexdigest()
 
 
+def _success_rate(run_dir: Path, env_steps: int) -> float:
+    """By which a checkpoint is kept; below all others where it was not judged, or is damaged."""
+    try:
+        rate = read_about(checkpoint_path(run_dir, env_steps)).get(_SUCCESS)
+    except CheckpointError:
+        return -1.0
+    return -1.0 if rate is None else rate
+
+
 def _digest_json(values: Mapping[str, Any]) -> str:
     text = json.dumps(values, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-# Orbax reads in threads of its own. Where one fails, the others go on and print tracebacks that
-# nobody can catch: whatever could fail is tried here first.
+def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Reads what Orbax wrote, one array after the other, and raises at the first that is wrong.
 
-
-def _read_all(folder: Path) -> None:
-    """Reads every stored chunk once, and raises where one is missing or damaged."""
+    Orbax itself reads in threads: where one fails, the others print tracebacks that nobody can
+    catch.
+    """
     if not folder.is_dir():
         raise ValueError(f"{folder.name} is missing")
-    store = ts.KvStore.open({"driver": "ocdbt", "base": f"file://{folder}/"}).result()
-    for key in store.list().result():
-        store.read(key).result()
+    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
+    keys = [key.decode() for key in ts.KvStore.open(files).result().list().result()]
+    names = [key.removesuffix("/.zarray") for key in keys if key.endswith("/.zarray")]
+    stored = {}
+    for name in names:
+        place = {**files, "path": f"{name}/"}
+        stored[name] = ts.open({"driver": "zarr", "kvstore": place}, read=True).result()
+    _check_arrays(wanted, stored)
+    return {name: array.read().result() for name, array in stored.items()}
 
 
 def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
@@ -292,14 +318,16 @@ def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
 
 
 def _reason(error: Exception) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0][:200] if lines else type(error).__name__
+    lines = str(error).strip().splitlines() or [type(error).__name__]
+    # What TensorStore says begins with what it did, and ends with why it failed.
+    return lines[0] if len(lines[0]) <= 300 else f"{lines[0][:150]} ... {lines[0][-150:]}"
 
 
 def _describe(array: Any) -> str:
     if array is None:
         return "missing"
-    return f"{np.dtype(array.dtype)}{list(np.shape(array))}"
+    dtype = getattr(array.dtype, "numpy_dtype", array.dtype)
+    return f"{np.dtype(dtype)}{list(array.shape)}"
 
 
 def _step_names() -> ocp.path.step.NameFormat[Any]:

@@ -36,6 +36,8 @@ class Result(NamedTuple):
     """What a training leaves."""
 
     run_dir: Path
+    run_dirs: list[Path]
+    """The folder of each seed; of a single one, the run folder."""
     standings: list[Standing]
     """How far each seed has come."""
     fingerprints: list[str]
@@ -92,7 +94,7 @@ def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock
     print(_headline(config, run_dir), flush=True)
     with RunRecorder(config, env, [run_dir], clock) as recorder:
         brax_ppo.train(config, env, recorder)
-    return _result(run_dir, recorder, finished=True)
+    return _result(run_dir, [run_dir], recorder, finished=True)
 
 
 def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock) -> Result:
@@ -115,12 +117,19 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, clock: Compile
             print(_headline(config, run_dir), flush=True)
             states = resumption.states if resumption else None
             resumable_ppo.train(config, program, recorder, preemption, states)
-    return _result(run_dir, recorder, finished=recorder.complete)
+    return _result(run_dir, run_dirs, recorder, finished=recorder.complete)
 
 
-def _result(run_dir: Path, recorder: RunRecorder, *, finished: bool) -> Result:
+def _result(
+    run_dir: Path, run_dirs: list[Path], recorder: RunRecorder, *, finished: bool
+) -> Result:
     return Result(
-        run_dir, recorder.standings, recorder.fingerprints, finished, recorder.wall_seconds
+        run_dir=run_dir,
+        run_dirs=run_dirs,
+        standings=recorder.standings,
+        fingerprints=recorder.fingerprints,
+        finished=finished,
+        wall_seconds=recorder.wall_seconds,
     )
 
 
@@ -146,11 +155,14 @@ def _headline(config: Config, run_dir: Path) -> str:
 def summary(result: Result) -> str:
     """What the terminal says at the end of a training."""
     lines = []
-    for standing, fingerprint in zip(result.standings, result.fingerprints, strict=True):
+    for standing, folder, fingerprint in zip(
+        result.standings, result.run_dirs, result.fingerprints, strict=True
+    ):
         assert standing.best is not None
+        seed = f"{folder.name}, " if folder != result.run_dir else ""
         lines.append(
-            f"best policy: {standing.best.success_rate:.1%} success at {standing.best_steps:,}"
-            f" steps; last parameters: sha256 {fingerprint}"
+            f"{seed}best policy: {standing.best.success_rate:.1%} success at"
+            f" {standing.best_steps:,} steps; last parameters: sha256 {fingerprint}"
         )
     if len(lines) > 1:
         rates = [standing.best.success_rate for standing in result.standings if standing.best]
@@ -162,7 +174,7 @@ def summary(result: Result) -> str:
     lines += [
         f"{result.wall_seconds:.1f} s in all",
         f"next: python -m jetbot_mjx.evaluate {result.run_dir}",
-        f"      python -m jetbot_mjx.render {result.run_dir}",
+        f"      python -m jetbot_mjx.render {result.run_dirs[0]}",
         f"      tensorboard --logdir {result.run_dir}",
     ]
     return "\n".join(lines)

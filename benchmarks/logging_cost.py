@@ -1,0 +1,130 @@
+"""Measures what logging and saving cost: `python benchmarks/logging_cost.py --config FILE`.
+
+The same compiled training runs again and again, in turn with nobody listening and with all that
+`python -m jetbot_mjx.train` does at a report: metrics.jsonl, TensorBoard, the terminal, and the
+whole state to disk in the background. Evaluations are left out of both: they are no logging.
+"""
+
+import statistics
+import tempfile
+import time
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from measurements import Listener
+
+from jetbot_mjx import cli, resumable_ppo
+from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.env import make_env
+from jetbot_mjx.evaluation import Summary
+from jetbot_mjx.metrics import CompileClock
+from jetbot_mjx.policy import PolicyParams
+from jetbot_mjx.preemption import Preemption
+from jetbot_mjx.recording import RunRecorder
+from jetbot_mjx.run_folder import write_json
+from jetbot_mjx.trainer import Progress, Recorder
+
+_UNJUDGED = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
+
+
+class _Timed(Recorder):
+    """Passes reports on, and notes when they have been dealt with."""
+
+    def __init__(self, recorder: Recorder) -> None:
+        self._recorder = recorder
+        self.began = self.ended = 0.0
+
+    def report(self, progress: Sequence[Progress]) -> bool:
+        going_on = self._recorder.report(progress)
+        # From the end of the first report: what compiles comes before it.
+        self.ended = time.perf_counter()
+        self.began = self.began or self.ended
+        return going_on
+
+    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
+        self._recorder.tell(env_steps, figures, seconds)
+
+
+class _Unjudged(RunRecorder):
+    def judge(self, params: PolicyParams) -> Summary:
+        del params
+        return _UNJUDGED
+
+
+def measure(config: Config, repeats: int) -> dict[str, list[float]]:
+    """Times both ways.
+
+    Args:
+      config: the run.
+      repeats: trainings of each.
+
+    Returns:
+      Seconds of every training from its first report to its last, all of that on disk.
+    """
+    env = make_env(config)
+    program = resumable_ppo.Program(config, env)
+    compiled = program.compile()
+    program.compile = lambda: compiled
+    seconds: dict[str, list[float]] = {"off": [], "on": []}
+    for repeat in range(repeats + 1):
+        for name in seconds:
+            lasted = _once(config, env, program, recorded=name == "on")
+            if repeat > 0:
+                seconds[name].append(lasted)
+    return seconds
+
+
+def _once(config: Config, env: Any, program: resumable_ppo.Program, *, recorded: bool) -> float:
+    with tempfile.TemporaryDirectory() as folder, CompileClock() as clock:
+
+        def train(recorder: Recorder) -> _Timed:
+            timed = _Timed(recorder)
+            resumable_ppo.train(config, program, timed, Preemption(config.preemption_notice))
+            return timed
+
+        if not recorded:
+            timed = train(Listener(clock))
+        else:
+            with _Unjudged(config, env, [Path(folder)], clock) as recorder:
+                timed = train(recorder)
+            timed.ended = time.perf_counter()
+    return timed.ended - timed.began
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line, measures and prints.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      0, or 1 where the cost is above `--most`.
+    """
+    parser = cli.Parser(description=__doc__)
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--repeats", type=cli.positive_int, default=5)
+    parser.add_argument("--most", type=cli.fraction, default=0.02, help="default: 0.02")
+    parser.add_argument("--output", type=Path, help="JSON file")
+    options = parser.parse_args(arguments)
+    config = load_config(options.config, options.overrides)
+    seconds = measure(config, options.repeats)
+    medians = {name: statistics.median(values) for name, values in seconds.items()}
+    cost = medians["on"] / medians["off"] - 1
+    steps = config.ppo.training_steps * config.ppo.steps_per_training_step
+    for name, median in medians.items():
+        spread = f"{min(seconds[name]):.3f} .. {max(seconds[name]):.3f} s"
+        print(f"logs and checkpoints {name:3}  {steps / median:12,.0f} steps/s  ({spread})")
+    print(f"cost {cost:+.2%} with a report every {config.checkpoint_interval:,} steps")
+    if options.output:
+        device = jax.devices()[0].device_kind
+        write_json(
+            options.output, {"device": device, "config": options.config.name, "seconds": seconds}
+        )
+    return 1 if cost > options.most else 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
