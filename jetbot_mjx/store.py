@@ -82,6 +82,9 @@ class Store:
           trees: arrays on the host, by name.
           about: what explains them, as JSON.
           success_rate: by which the best is kept; None where it was not judged.
+
+        Raises:
+          CheckpointError: this one, or the one before, could not be written.
         """
         flat = {name: flatten(tree) for name, tree in trees.items()}
         self._check_space(
@@ -93,10 +96,12 @@ class Store:
         items = {name: ocp.args.StandardSave(tree) for name, tree in flat.items()}
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
-            self._manager.save(
+            begun = self._manager.save(
                 env_steps,
                 args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)}),
             )
+            if not begun:
+                raise ValueError(f"there is one after {env_steps} steps or more")
 
     def wait(self) -> None:
         """Waits until all is on disk.

@@ -1,4 +1,3 @@
-import json
 import shutil
 import subprocess
 import sys
@@ -11,12 +10,15 @@ import pytest
 
 from jetbot_mjx import load_policy
 from jetbot_mjx.checkpoint import (
+    FORMAT,
+    POLICY,
     CheckpointError,
-    CheckpointWriter,
-    checkpoint_steps,
+    explanation,
     find_checkpoint,
     load_checkpoint,
 )
+from jetbot_mjx.resume import TRAINING
+from jetbot_mjx.store import Store, checkpoint_steps, digest
 
 
 @pytest.fixture
@@ -39,26 +41,46 @@ def test_checkpoints_stand_at_the_stated_interval(smoke_run):
     assert checkpoint_steps(smoke_run) == [0, 16_384, 32_768, 49_152, 65_536]
 
 
-def test_the_best_is_the_one_with_the_highest_success_and_of_equals_the_latest(tmp_path, smoke_run):
-    params = load_checkpoint(smoke_run).params
-    about = load_checkpoint(smoke_run).about
-    (tmp_path / "run").mkdir()
-    with CheckpointWriter(tmp_path / "run", about) as writer:
-        for steps, success in ((0, 0.1), (10, 0.9), (20, 0.9), (30, 0.5)):
-            writer.save(steps, params, {"success_rate": success})
+@pytest.fixture
+def write(smoke_run, tmp_path):
+    """Writes checkpoints with the parameters of the smoke run, and what else a test changes."""
+    checkpoint = load_checkpoint(smoke_run)
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+
+    def write(*steps, trees=None, without=(), **changes):
+        about = {**checkpoint.about, **changes}
+        for key in without:
+            del about[key]
+        with Store(run_dir, keep=50) as store:
+            for env_steps, success_rate in steps:
+                judged = {} if success_rate is None else {"success_rate": success_rate}
+                explained = {**about, "figures": judged}
+                store.save(env_steps, trees or {POLICY: checkpoint.params}, explained, success_rate)
+        return run_dir
+
+    return write
+
+
+def test_the_best_is_the_one_with_the_highest_success_and_of_equals_the_latest(tmp_path, write):
+    write((0, 0.1), (10, 0.9), (20, 0.9), (30, 0.5))
     assert load_checkpoint(tmp_path / "run", "best").env_steps == 20
     assert load_checkpoint(tmp_path / "run", "last").env_steps == 30
     assert load_checkpoint(tmp_path / "run", 10).env_steps == 10
 
 
-def test_what_is_read_is_what_was_written(tmp_path, smoke_run):
+def test_one_that_was_not_judged_is_not_the_best(write):
+    run_dir = write((0, 0.0), (10, None))
+    assert load_checkpoint(run_dir, "best").env_steps == 0
+    assert load_checkpoint(run_dir, "last").env_steps == 10
+
+
+def test_what_is_read_is_what_was_written(smoke_run, write):
     checkpoint = load_checkpoint(smoke_run)
-    (tmp_path / "run").mkdir()
-    with CheckpointWriter(tmp_path / "run", checkpoint.about) as writer:
-        writer.save(1, checkpoint.params, {"success_rate": 1.0})
-    again = load_checkpoint(tmp_path / "run").params
+    again = load_checkpoint(write((1, 1.0))).params
     assert jax.tree.structure(again) == jax.tree.structure(checkpoint.params)
     jax.tree.map(np.testing.assert_array_equal, again, checkpoint.params)
+    assert digest(again) == digest(checkpoint.params) == checkpoint.about["sha256"][POLICY]
     assert np.any(np.asarray(again.normalizer.mean) != 0)
 
 
@@ -121,35 +143,78 @@ def test_a_foreign_checkpoint_is_refused(tmp_path):
     assert "not one of jetbot_mjx" in refused(tmp_path / "000000000001")
 
 
-def test_another_shape_is_refused(run_copy):
-    folder = find_checkpoint(run_copy, "best")
+def test_another_shape_is_refused(smoke_run, write):
+    config = load_checkpoint(smoke_run).about["config"]
+    config["ppo"]["network"]["policy_hidden_layer_sizes"] = [32, 48]
+    said = refused(write((1, 0.5), config=config))
+    assert "cannot be read: policy.params.hidden_1." in said
+    assert "is float32[32], and should be float32[48]" in said
+
+
+@pytest.mark.parametrize("key", ["config", "observation_size", "format", "layout"])
+def test_an_incomplete_explanation_is_refused(write, key):
+    assert f"does not explain itself: no {key}" in refused(write((1, 0.5), without=[key]), 1)
+
+
+@pytest.mark.parametrize("key", ["config", "layout", "env_steps"])
+def test_an_explanation_that_was_changed_is_refused(run_copy, key):
+    folder = find_checkpoint(run_copy, "last")
     path = folder / "about" / "metadata"
-    about = json.loads(path.read_text())
-    about["config"]["ppo"]["network"]["policy_hidden_layer_sizes"] = [32, 48]
-    path.write_text(json.dumps(about))
-    assert "cannot be read" in refused(folder)
+    path.write_text(path.read_text().replace(f'"{key}"', f'"{key}s"', 1))
+    for use in (lambda: refused(folder), lambda: refused(run_copy, "last")):
+        assert "about/metadata is not as it was written" in use()
 
 
-@pytest.mark.parametrize("key", ["config", "observation_size", "format"])
-def test_an_incomplete_explanation_is_refused(run_copy, key):
+@pytest.mark.parametrize("number", ["jetbot_mjx/1", "jetbot_mjx/3", None, 2])
+def test_another_format_is_refused_by_name(write, number):
+    said = refused(write((1, 0.5), format=number))
+    assert f"in the format {number!r}, and only {FORMAT!r} can be read" in said
+
+
+@pytest.mark.parametrize("config", [{}, {"seed": -1}, {"sede": 0}, 3, None])
+def test_a_configuration_that_cannot_run_is_refused(write, config):
+    assert "checkpoint" in refused(write((1, 0.5), config=config))
+
+
+def test_a_checkpoint_without_a_policy_is_refused(smoke_run, write):
+    trees = {TRAINING: {"key": np.zeros(2, np.uint32)}}
+    run_dir = write((1, 0.5), trees=trees)
+    assert "holds no policy" in refused(run_dir)
+    assert explanation(find_checkpoint(run_dir, 1))["env_steps"] == 1
+
+
+def test_a_policy_from_another_checkpoint_is_refused(run_copy):
+    folder = find_checkpoint(run_copy, 65_536)
+    shutil.rmtree(folder / POLICY)
+    shutil.copytree(find_checkpoint(run_copy, 49_152) / POLICY, folder / POLICY)
+    assert "policy is not as it was written" in refused(folder)
+
+
+def test_what_acting_does_not_need_may_be_damaged(run_copy):
     folder = find_checkpoint(run_copy, "best")
-    path = folder / "about" / "metadata"
-    about = json.loads(path.read_text())
-    del about[key]
-    path.write_text(json.dumps(about))
-    assert "checkpoint" in refused(folder)
+    before = load_checkpoint(folder)
+    shutil.rmtree(folder / TRAINING)
+    assert digest(load_checkpoint(run_copy).params) == digest(before.params)
 
 
-@pytest.mark.parametrize("harm", ["empty", "cut", "gone"])
-def test_a_damaged_checkpoint_is_refused(run_copy, harm):
+def stored_bytes(folder):
+    return [path for path in folder.rglob("*") if path.is_file() and path.parent.name == "d"]
+
+
+@pytest.mark.parametrize("harm", ["empty", "cut", "flip", "gone"])
+def test_a_damaged_checkpoint_is_refused(run_copy, harm, capfd):
     folder = find_checkpoint(run_copy, "best")
-    for path in (folder / "policy").rglob("*"):
-        if path.is_file() and path.parent.name == "d":
-            match harm:
-                case "empty":
-                    path.write_bytes(b"")
-                case "cut":
-                    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-                case "gone":
-                    path.unlink()
+    for path in stored_bytes(folder / POLICY):
+        match harm:
+            case "empty":
+                path.write_bytes(b"")
+            case "cut":
+                path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+            case "flip":
+                data = bytearray(path.read_bytes())
+                data[::50] = (byte ^ 4 for byte in data[::50])
+                path.write_bytes(data)
+            case "gone":
+                path.unlink()
     assert "cannot be read" in refused(folder)
+    assert capfd.readouterr() == ("", "")

@@ -9,13 +9,14 @@ import sys
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 from brax.training.acme import running_statistics, specs
 
-from jetbot_mjx import cli, evaluate, render, train
-from jetbot_mjx.checkpoint import CheckpointWriter
+from jetbot_mjx import cli, evaluate, render, replay, store, train
+from jetbot_mjx.checkpoint import FORMAT
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import Summary
@@ -23,7 +24,7 @@ from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.task import WORLD
 
 SMOKE = str(Path(__file__).parents[1] / "configs" / "smoke.yaml")
-COMMANDS = {"train": train, "evaluate": evaluate, "render": render}
+COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay}
 
 
 @pytest.fixture
@@ -57,8 +58,11 @@ def refused(here, capfd):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "the following arguments are required: --config"),
-        ([SMOKE], "the following arguments are required: --config"),
+        ([], "one of the arguments --config --resume is required"),
+        ([SMOKE], "one of the arguments --config --resume is required"),
+        (["--config", SMOKE, "--resume", "run"], "--resume: not allowed with argument --config"),
+        (["--resume", "run", "--run-dir", "run"], "--run-dir: --resume names the folder already"),
+        (["--config", SMOKE, "--seeds", "x"], "argument --seeds: invalid int value: 'x'"),
         (["--config"], "argument --config: expected one argument"),
         (["--config", SMOKE, "more"], "unrecognized arguments: more"),
         (["--config", SMOKE, "--lr", "1"], "unrecognized arguments: --lr 1"),
@@ -119,6 +123,12 @@ def test_train_refuses_a_path_without_a_file(refused, path, said):
         ("ppo.network=3", "ppo.network = 3 is not a section: write its keys below it"),
         ("physics.sim_dt=0.01", "for example sim_dt = 0.00833333333"),
         ("checkpoint_interval=100", "make it at least 4096"),
+        ("checkpoints_to_keep=0", "checkpoints_to_keep = 0 is wrong"),
+        ("preemption_notice=1", "preemption_notice = 1 is wrong: it should be greater than or eq"),
+        ("stop_at_success=99", "stop_at_success = 99 is wrong: it should be less than or equal"),
+        ("seeds=0", "seeds = 0 is wrong: it should be greater than or equal to 1"),
+        ("trainer=stock", "trainer = 'stock' is wrong: it should be 'resumable' or 'brax'"),
+        ("ppo.learning_rate_schedule=COSINE", "it should be 'NONE', 'LINEAR' or 'ADAPTIVE_KL'"),
         ("task.name=GoalTask", "task.name = 'GoalTask' is wrong: write package.module:Class"),
         ("task.name=nowhere:Task", "no module named 'nowhere' can be imported"),
         ("task.name=jetbot_mjx.task:GaolTask", "jetbot_mjx.task has no 'GaolTask'"),
@@ -135,6 +145,25 @@ def test_train_refuses_a_bad_seed(refused):
     assert "seed = -1 is wrong" in refused(train, "--config", SMOKE, "--seed", "-1")
 
 
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("seeds=2", "seeds = 2 is not known to trainer = 'brax'"),
+        ("deterministic=true", "deterministic = true is not known to trainer = 'brax'"),
+        ("ppo.learning_rate_schedule=LINEAR", "'LINEAR' is not known to trainer = 'brax'"),
+    ],
+)
+def test_train_refuses_what_the_stock_trainer_cannot_do(refused, setting, said):
+    assert said in refused(train, "--config", SMOKE, "--set", "trainer=brax", "--set", setting)
+
+
+@pytest.mark.parametrize("run", ["nothing", "empty"])
+def test_train_refuses_to_resume_where_there_is_no_run(refused, here, run):
+    (here / "empty").mkdir()
+    line = refused(train, "--resume", run)
+    assert line == f"error: --resume {run}: there is no run in this folder\n"
+
+
 def test_train_refuses_environments_that_the_devices_cannot_share(refused, monkeypatch):
     monkeypatch.setattr(jax, "device_count", lambda: 3)
     assert "ppo.num_envs = 128 cannot be shared evenly by 3 devices" in refused(
@@ -146,14 +175,14 @@ def test_train_refuses_a_run_folder_in_use(refused, here):
     (here / "run").mkdir()
     (here / "run" / "metrics.jsonl").write_text("precious")
     line = refused(train, "--config", SMOKE, "--run-dir", "run")
-    assert line == "error: --run-dir run is already in use: name a new folder\n"
+    assert "run is in use, and holds no run (no config.yaml): name a new folder" in line
     assert (here / "run" / "metrics.jsonl").read_text() == "precious"
 
 
 @pytest.mark.parametrize(
     ("run_dir", "said"),
     [
-        ("file", "--run-dir file is already in use: name a new folder"),
+        ("file", "--run-dir file is in use, and holds no run (no config.yaml): name a new folder"),
         ("file/run", "--run-dir file/run cannot be written: Not a directory"),
     ],
 )
@@ -179,6 +208,7 @@ def trained(tmp_path_factory):
         networks.value_network.init(key),
     )
     about = {
+        "format": FORMAT,
         "config": config.model_dump(mode="json"),
         "layout": [field._asdict() for field in WORLD],
         "observation_size": 16,
@@ -186,9 +216,11 @@ def trained(tmp_path_factory):
     }
     folder = tmp_path_factory.mktemp("trained") / "run"
     folder.mkdir()
-    with CheckpointWriter(folder, about) as writer:
+    params = jax.tree.map(lambda leaf: np.asarray(jnp.asarray(leaf)), params)
+    about["figures"] = {"success_rate": 0.5}
+    with store.Store(folder, keep=5) as checkpoints:
         for env_steps in (0, 2048):
-            writer.save(env_steps, params, {"success_rate": 0.5})
+            checkpoints.save(env_steps, {"policy": params}, about, 0.5)
     return folder
 
 
@@ -246,13 +278,9 @@ def test_evaluate_refuses_a_success_rate_that_is_none(refused, value, said):
         (lambda path: path.mkdir(), "it holds neither checkpoints/ nor policy/; give a run folder"),
         (lambda path: (path / "src").mkdir(parents=True), "neither checkpoints/ nor policy/"),
         (lambda path: (path / "checkpoints").mkdir(parents=True), "the run saved none"),
-        # What an interrupted write leaves.
-        (
-            lambda path: (path / "checkpoints" / "000000002048").mkdir(parents=True),
-            "the run saved none",
-        ),
+        (lambda path: (path / "seed-1").mkdir(parents=True), "it holds several seeds; name one"),
     ],
-    ids=["missing", "file", "empty", "not a run", "without checkpoints", "unfinished"],
+    ids=["missing", "file", "empty", "not a run", "without checkpoints", "seeds"],
 )
 def test_a_path_without_a_policy_is_refused(refused, here, command, make, said):
     make(here / "run")
@@ -269,14 +297,15 @@ def test_a_checkpoint_that_is_not_there_is_refused(refused, trained, command):
 
 
 @both
-@pytest.mark.parametrize("item", ["policy", "default"])
-def test_a_foreign_orbax_checkpoint_is_refused(refused, here, command, item):
-    with ocp.CheckpointManager(here / "run" / "checkpoints") as manager:
-        save = ocp.args.StandardSave({"kernel": np.ones(3)})
-        manager.save(7, args=ocp.args.Composite(**{item: save}))
+@pytest.mark.parametrize("item", ["policy", "default", None])
+def test_a_foreign_checkpoint_is_refused(refused, here, command, item):
+    folder = here / "run" / "checkpoints" / "000000000007"
+    folder.mkdir(parents=True)
+    if item is not None:
+        with ocp.StandardCheckpointer() as writer:
+            writer.save(folder / item, {"kernel": np.ones(3)})
     line = refused(command, "run")
-    expected = {"policy": "is not one of jetbot_mjx: about/metadata is missing or damaged"}
-    assert expected.get(item, "the run saved none") in line
+    assert "is not one of jetbot_mjx: about/metadata is missing or damaged" in line
 
 
 def damage_about(change):
@@ -284,6 +313,8 @@ def damage_about(change):
         path = checkpoint / "about" / "metadata"
         about = json.loads(path.read_text())
         change(about)
+        del about["sha256"]["about"]
+        about["sha256"]["about"] = store._digest_json(about)
         path.write_text(json.dumps(about))
 
     return damage
@@ -299,8 +330,8 @@ DAMAGES = {
         "is not one of jetbot_mjx: about/metadata is missing or damaged",
     ),
     "another format": (
-        damage_about(lambda about: about.update(format="jetbot_mjx.policy/2")),
-        "is not in the format jetbot_mjx.policy/1",
+        damage_about(lambda about: about.update(format="jetbot_mjx/9")),
+        "is in the format 'jetbot_mjx/9', and only 'jetbot_mjx/2' can be read here",
     ),
     "no configuration": (
         damage_about(lambda about: about.pop("config")),
@@ -412,6 +443,23 @@ def test_train_takes_settings_in_order_and_the_seed_last(asked):
     assert config.ppo.learning_rate == 1e-4
     assert config.ppo.num_envs == 128  # the file's
     assert run_dir == Path("a/b")
+
+
+def test_train_takes_seeds(asked):
+    assert asked("--config", SMOKE, "--seeds", "4")[0].seeds == 4
+
+
+def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
+    assert "nothing.npz does not exist: give a file of a run's faults/" in refused(
+        replay, here / "nothing.npz"
+    )
+    for name, write in {
+        "text.npz": lambda path: path.write_text("no archive"),
+        "other.npz": lambda path: np.savez(path, a=np.ones(3)),
+        "empty.npz": lambda path: path.touch(),
+    }.items():
+        write(tmp_path / name)
+        assert "is not a fault kept by a training" in refused(replay, tmp_path / name)
 
 
 def test_train_names_its_run_folder_after_the_configuration(asked):

@@ -168,7 +168,7 @@ BAD_VALUES = {
         "robot.colour = 'red'",
         "is unknown: known are preset",
     ),
-    "unknown section": ("zzz: {a: 1}", "zzz = {'a': 1}", "known are seed, trainer,"),
+    "unknown section": ("zzz: {a: 1}", "zzz = {'a': 1}", "known are seed, seeds, trainer,"),
     "key in the wrong section": ("num_envs: 3", "num_envs = 3", "is unknown: known are seed"),
     "key that is a number": ("ppo: {1: 2}", "ppo.1 = 1", "should be strings"),
     # Types.
@@ -238,7 +238,7 @@ BAD_VALUES = {
     "infinite count": ("ppo: {num_timesteps: .inf}", "ppo.num_timesteps = inf", "integer"),
     # Choices.
     "unknown robot": ("robot: {preset: isac}", "robot.preset = 'isac'", "'isaac' or 'real'"),
-    "unknown trainer": ("trainer: sac", "trainer = 'sac'", "should be 'brax'"),
+    "unknown trainer": ("trainer: sac", "trainer = 'sac'", "should be 'resumable' or 'brax'"),
     "unknown observation": (
         "task: {observation: camera}",
         "task.observation = 'camera'",
@@ -252,7 +252,7 @@ BAD_VALUES = {
     "unknown schedule": (
         "ppo: {learning_rate_schedule: cosine}",
         "ppo.learning_rate_schedule = 'cosine'",
-        "'NONE' or 'ADAPTIVE_KL'",
+        "'NONE', 'LINEAR' or 'ADAPTIVE_KL'",
     ),
     # Combinations.
     "step size outside its schedule": (
@@ -332,7 +332,7 @@ def test_a_path_that_is_no_text_file_is_refused(tmp_path, name, remedy):
         ("ppo.num_envs=3=4", "ppo.num_envs = '3=4' is wrong: it should be integer"),
         ("ppo.num_envs=", "ppo.num_envs = None is wrong: it should be integer"),
         ("ppo=3", "ppo = 3 is not a section"),
-        ("trainer.x=1", "trainer = {'x': 1} is wrong: it should be 'brax'"),
+        ("trainer.x=1", "trainer = {'x': 1} is wrong: it should be 'resumable' or 'brax'"),
     ],
 )
 def test_a_bad_override_is_refused(refusal, override, said):

@@ -1,9 +1,14 @@
 """Where the figures go: each sink says what it was told, and the clock counts compiling once."""
 
+import errno
 import io
 import json
 import math
+import os
+import re
 import struct
+import threading
+import time
 import types
 
 import jax
@@ -12,17 +17,33 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 
 from jetbot_mjx import metrics
-from jetbot_mjx.metrics import CompileClock, JsonlSink, ProgressSink, Sinks, TensorBoardSink
+from jetbot_mjx.metrics import (
+    CompileClock,
+    History,
+    JsonlSink,
+    ProgressSink,
+    Sinks,
+    TensorBoardSink,
+    process_seconds,
+    read_history,
+)
+
+
+def lines_of(path):
+    """The objects of a file of lines, each checked to tell when it was written."""
+    lines = [json.loads(line) for line in path.read_text().splitlines()]
+    assert all(abs(line.pop("timestamp") - time.time()) < 60 for line in lines)
+    return lines
 
 
 def test_jsonl_holds_one_object_a_line_readable_at_once(tmp_path):
     path = tmp_path / "metrics.jsonl"
     sink = JsonlSink(path)
     sink.write(0, {"eval/success_rate": 0.25})
-    assert path.read_text() == '{"env_steps": 0, "eval/success_rate": 0.25}\n'
+    assert lines_of(path) == [{"env_steps": 0, "eval/success_rate": 0.25}]
     sink.write(512, {"loss/total": -1.5, "eval/episodes": 4})
-    lines = path.read_text().splitlines()
-    assert [json.loads(line) for line in lines] == [
+    assert path.read_text().endswith("}\n")
+    assert lines_of(path) == [
         {"env_steps": 0, "eval/success_rate": 0.25},
         {"env_steps": 512, "loss/total": -1.5, "eval/episodes": 4},
     ]
@@ -35,32 +56,133 @@ def test_what_is_no_number_is_null_in_json(tmp_path, value):
     sink.write(1, {"before": 1.0, "it": value, "after": 2.0})
     sink.close()
     text = (tmp_path / "metrics.jsonl").read_text()
-    assert text == '{"env_steps": 1, "before": 1.0, "it": null, "after": 2.0}\n'
+    assert re.fullmatch(
+        r'\{"env_steps": 1, "timestamp": [\d.]+, "before": 1.0, "it": null, "after": 2.0\}\n', text
+    )
 
 
-def test_jsonl_appends_to_what_is_there(tmp_path):
+def test_a_line_is_on_the_disk_when_it_is_written(tmp_path, monkeypatch):
+    synced = []
+    fake = types.SimpleNamespace(fsync=lambda file: synced.append(path.read_text()))
+    monkeypatch.setattr(metrics, "os", fake)
     path = tmp_path / "metrics.jsonl"
-    for env_steps in (1, 2):
-        sink = JsonlSink(path)
-        sink.write(env_steps, {})
-        sink.close()
-    assert path.read_text() == '{"env_steps": 1}\n{"env_steps": 2}\n'
+    sink = JsonlSink(path)
+    sink.write(1, {})
+    sink.write(2, {})
+    sink.close()
+    assert [text.count("\n") for text in synced] == [1, 2]
 
 
-def read_events(folder):
-    """(step, name, value) of every scalar in the one event file of a folder.
+def test_jsonl_without_a_history_begins_anew(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    path.write_text('{"env_steps": 5, "timestamp": 1.0}\n')
+    sink = JsonlSink(path)
+    assert path.read_text() == ""
+    sink.write(1, {})
+    sink.close()
+    assert lines_of(path) == [{"env_steps": 1}]
+
+
+HISTORY = [
+    History(0, 1.5, {"eval/success_rate": 0.25, "eval/time_to_goal_median": None}),
+    History(512, 2.5, {"eval/success_rate": 0.5, "eval/episodes": 4}),
+    History(1024, 3.5, {}),
+]
+
+
+@pytest.fixture
+def logged(tmp_path):
+    """The file of a training that made the reports of `HISTORY`."""
+    path = tmp_path / "metrics.jsonl"
+    JsonlSink(path, HISTORY).close()
+    return path
+
+
+def test_a_history_is_read_as_it_was_written(logged, tmp_path):
+    assert read_history(logged, 1024) == HISTORY
+    assert read_history(logged, 1023) == HISTORY[:2]
+    assert read_history(logged, 512) == HISTORY[:2]
+    assert read_history(tmp_path / "nothing", 512) == []
+
+
+@pytest.mark.parametrize(
+    "rest",
+    [
+        '{"env_steps": 1500, "timestamp": 4.5, "eval/succ',
+        '{"env_steps": 1024, "timestamp": 4.',
+        "{",
+        "\0\0\0\0",
+        "3\n",
+        "[]\n",
+        '{"timestamp": 4.5}\n',
+        '{"env_steps": "many", "timestamp": 4.5}\n',
+        '{"env_steps": null, "timestamp": 4.5}\n',
+        "\udcff\udcfe\n",
+    ],
+)
+def test_a_line_cut_short_is_left_out_of_the_history(logged, rest):
+    with logged.open("a", errors="surrogateescape") as file:
+        file.write(rest)
+    assert read_history(logged, 2000) == HISTORY
+
+
+@pytest.mark.parametrize("last", [1024, 512, 0, -1])
+def test_jsonl_goes_on_after_its_history_and_drops_the_rest(logged, last):
+    before = logged.read_text()
+    with logged.open("a") as file:
+        file.write('{"env_steps": 2000, "timestamp": 4.')
+    history = read_history(logged, last)
+    sink = JsonlSink(logged, history)
+    assert before.startswith(logged.read_text())
+    assert logged.read_text().count("\n") == len(history)
+    sink.write(3000, {"loss/total": 1.0})
+    sink.close()
+    again = read_history(logged, 3000)
+    assert again[:-1] == history
+    assert again[-1].figures == {"loss/total": 1.0}
+
+
+def test_a_file_that_is_its_history_is_not_written_anew(logged):
+    inode = logged.stat().st_ino
+    JsonlSink(logged, read_history(logged, 1024)).close()
+    assert logged.stat().st_ino == inode
+    JsonlSink(logged, read_history(logged, 512)).close()
+    assert logged.stat().st_ino != inode
+
+
+def test_a_full_disk_is_not_hidden(tmp_path, monkeypatch):
+    def fail(file):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    sink = JsonlSink(tmp_path / "metrics.jsonl")
+    monkeypatch.setattr(metrics, "os", types.SimpleNamespace(fsync=fail))
+    with pytest.raises(OSError, match="No space left"):
+        sink.write(1, {})
+    sink.close()
+
+
+def events(folder):
+    """The events of the one event file of a folder.
 
     A record is its length (8 bytes), a checksum (4), the event, and a checksum (4).
     """
     (path,) = folder.iterdir()
     data = path.read_bytes()
-    scalars = []
+    found = []
     while data:
         (length,) = struct.unpack("<Q", data[:8])
-        event = Event.FromString(data[12 : 12 + length])
+        found.append(Event.FromString(data[12 : 12 + length]))
         data = data[12 + length + 4 :]
-        scalars += [(event.step, value.tag, value.simple_value) for value in event.summary.value]
-    return scalars
+    return found
+
+
+def read_events(folder):
+    """(step, name, value) of every scalar in the one event file of a folder."""
+    return [
+        (event.step, value.tag, value.simple_value)
+        for event in events(folder)
+        for value in event.summary.value
+    ]
 
 
 def test_tensorboard_events_can_be_read_again(tmp_path):
@@ -73,6 +195,34 @@ def test_tensorboard_events_can_be_read_again(tmp_path):
         (3_000_000_000, "eval/success_rate", 0.5),
         (3_000_000_000, "loss/total", -1.5),
     ]
+
+
+def test_tensorboard_holds_the_history_once_and_goes_on(tmp_path):
+    folder = tmp_path / "tensorboard"
+    for last in (1024, 512, 0):
+        sink = TensorBoardSink(folder, [entry for entry in HISTORY if entry.env_steps <= last])
+        sink.write(last + 100, {"eval/success_rate": 0.75})
+        sink.close()
+        known = [(0, "eval/success_rate", 0.25)]
+        if last >= 512:
+            known += [(512, "eval/success_rate", 0.5), (512, "eval/episodes", 4.0)]
+        assert read_events(folder) == [*known, (last + 100, "eval/success_rate", 0.75)]
+        # Its name tells the second: that of the next one is another.
+        (file,) = folder.iterdir()
+        file.rename(folder / "events.out.tfevents.1.elsewhere")
+
+
+def test_tensorboard_keeps_the_time_at_which_something_was_reported(tmp_path):
+    TensorBoardSink(tmp_path / "tensorboard", HISTORY).close()
+    assert [event.wall_time for event in events(tmp_path / "tensorboard")][-3:] == [1.5, 2.5, 3.5]
+
+
+def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):
+    folder = tmp_path / "tensorboard"
+    folder.mkdir()
+    (folder / "notes.txt").write_text("mine")
+    TensorBoardSink(folder, HISTORY).close()
+    assert (folder / "notes.txt").read_text() == "mine"
 
 
 @pytest.fixture
@@ -115,26 +265,33 @@ def test_a_line_leaves_out_what_there_is_not_yet(lines):
         assert part not in line
 
 
-@pytest.mark.parametrize(
-    ("compiled", "eta"),
-    # From 0 to 2,000 steps in 20 s: 8,000 more take 80 s. Of the 20 s, compiling took some.
-    [(0.0, 80), (12.0, 32)],
-)
-def test_the_time_left_is_that_of_the_last_pace_without_compiling(lines, compiled, eta):
-    _, line = lines((0, clocks(30.0, 29.0)), (2_000, clocks(50.0, compiled)))
-    assert f"ETA {eta:5d} s" in line
-
-
-def test_the_time_left_follows_the_latest_interval(lines):
-    # 2,000 to 4,000 steps in 5 s: 6,000 more take 15 s, however slowly it began.
-    *_, line = lines((0, clocks(0.0, 0.0)), (2_000, clocks(50.0, 0.0)), (4_000, clocks(55.0, 0.0)))
-    assert "ETA    15 s" in line
+def test_the_time_left_follows_the_pace_of_this_interval(lines):
+    # 8,000 steps are left at 100 steps/s, then 6,000 at 400.
+    first, second = lines(
+        (2_000, {"time/env_steps_per_second": 100.0, **clocks(20.0, 0.0)}),
+        (4_000, {"time/env_steps_per_second": 400.0, **clocks(25.0, 0.0)}),
+    )
+    assert "ETA    80 s" in first
+    assert "ETA    15 s" in second
 
 
 def test_no_time_is_left_at_the_end_and_beyond(lines):
     # Training steps are whole: the last may go beyond what was asked for.
-    *_, line = lines((0, clocks(0.0, 0.0)), (10_240, clocks(5.0, 0.0)))
+    (line,) = lines((10_240, {"time/env_steps_per_second": 100.0, **clocks(5.0, 0.0)}))
     assert "ETA     0 s" in line
+
+
+def test_a_line_between_two_reports_is_printed_where_the_last_one_is_old(monkeypatch):
+    now = 0.0
+    monkeypatch.setattr(metrics, "time", types.SimpleNamespace(monotonic=lambda: now))
+    stream = io.StringIO()
+    sink = ProgressSink(10_000, stream)
+    for now in (0.0, 9.0, 11.0, 12.0, 20.0, 21.5):
+        sink.tell(int(now), {"rollout/success_rate": 0.5}, 100.0)
+    shown = stream.getvalue().splitlines()
+    assert [int(line.split()[0]) for line in shown] == [0, 11, 21]
+    assert all("exploring  50.0%" in line and "100 steps/s" in line for line in shown)
+    assert "ETA   100 s" in shown[0]
 
 
 def test_progress_goes_to_standard_output(capsys):
@@ -178,9 +335,8 @@ def test_joined_sinks_are_closed_where_training_fails():
 
 @pytest.fixture
 def clock():
-    clock = CompileClock()
-    yield clock
-    jax.monitoring.unregister_event_duration_listener(clock._listen)
+    with CompileClock() as clock:
+        yield clock
 
 
 def test_compiling_is_counted_and_running_is_not(clock):
@@ -249,3 +405,43 @@ def test_a_span_stands_for_those_within_it(clock, monkeypatch, events, expected)
         jax.monitoring.record_event_duration_secs(CompileClock._EVENTS[0], duration)
         jax.monitoring.record_event_duration_secs("/jax/some/other/event", 100.0)
     assert clock.lap() == pytest.approx(expected)
+
+
+def test_what_threads_compile_side_by_side_counts_once(clock):
+    barrier = threading.Barrier(2)
+
+    def compile():
+        barrier.wait()
+        jax.monitoring.record_event_duration_secs(CompileClock._EVENTS[2], 5.0)
+
+    threads = [threading.Thread(target=compile) for _ in range(2)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert 5.0 <= clock.lap() < 9.0
+    assert clock.programs == 2
+
+
+def test_the_clock_counts_programs_and_those_from_the_cache(clock):
+    jax.monitoring.record_event_duration_secs(CompileClock._EVENTS[0], 1.0)
+    for _ in range(3):
+        jax.monitoring.record_event_duration_secs(CompileClock._EVENTS[2], 1.0)
+    jax.monitoring.record_event(CompileClock._CACHE_HIT)
+    jax.monitoring.record_event_duration_secs(CompileClock._SAVED, 7.5)
+    assert (clock.programs, clock.cached, clock.saved_seconds) == (3, 1, 7.5)
+
+
+def test_a_clock_that_was_left_no_longer_listens():
+    with CompileClock() as clock:
+        pass
+    jax.monitoring.record_event_duration_secs(CompileClock._EVENTS[2], 5.0)
+    jax.monitoring.record_event(CompileClock._CACHE_HIT)
+    assert clock.lap() == 0
+    assert (clock.programs, clock.cached) == (0, 0)
+
+
+def test_a_process_knows_how_long_it_has_been_there():
+    before = process_seconds()
+    time.sleep(0.05)
+    assert 0.0 < before < process_seconds() < 24 * 3600
