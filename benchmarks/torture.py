@@ -267,7 +267,7 @@ def kill(run_dir: Path, settings: Sequence[str], aim: Aim, template: TrainState)
       Broken: the process ended by itself, or did not go on from where it should.
       CheckpointError: the newest checkpoint is not whole.
     """
-    known = checkpoint_steps(run_dir)
+    known, damaged = checkpoint_steps(run_dir), _damaged(run_dir, template)
     with Process(run_dir, settings) as process:
         process.until(_condition(process, known, aim))
         moment = time.monotonic() + aim.delay
@@ -277,16 +277,16 @@ def kill(run_dir: Path, settings: Sequence[str], aim: Aim, template: TrainState)
     left = checkpoint_steps(run_dir)
     if left:
         check_checkpoint(run_dir, left[-1], template)
-    partly_cleared = sum(not _loads(run_dir, steps, template) for steps in left[:-1])
+    partly_cleared = _damaged(run_dir, template)
     if process.unfinished:
         phase = SAVING
-    elif partly_cleared:
+    elif partly_cleared - damaged:
         phase = CLEARING
     elif not left:
         phase = BEFORE_FIRST
     else:
         phase = _phase(printed, silence)
-    return Kill(phase, len(left), partly_cleared)
+    return Kill(phase, len(left), len(partly_cleared))
 
 
 def _condition(process: Process, known: Sequence[int], aim: Aim) -> Callable[[], bool]:
@@ -335,12 +335,14 @@ def _unfinished(run_dir: Path) -> set[str]:
     return {path.name for path in folder.iterdir() if "orbax-checkpoint-tmp" in path.name}
 
 
-def _loads(run_dir: Path, env_steps: int, template: TrainState) -> bool:
-    try:
-        check_checkpoint(run_dir, env_steps, template)
-    except UserError:
-        return False
-    return True
+def _damaged(run_dir: Path, template: TrainState) -> set[int]:
+    found = set()
+    for steps in checkpoint_steps(run_dir):
+        try:
+            check_checkpoint(run_dir, steps, template)
+        except UserError:
+            found.add(steps)
+    return found
 
 
 def table(kills: Sequence[Kill]) -> str:
@@ -387,7 +389,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 kills.append(kill(folder / "killed", settings, aim, template))
                 print(
                     f"{len(kills):>4}  {aim.event} + {aim.delay:.3f} s: {kills[-1].phase},"
-                    f" {kills[-1].known} checkpoints, {time.monotonic() - began:.0f} s",
+                    f" {kills[-1].known} checkpoints, {kills[-1].partly_cleared} of them partly"
+                    f" cleared away, {time.monotonic() - began:.0f} s",
                     flush=True,
                 )
             found = differences(undisturbed, finish(folder / "killed", settings))

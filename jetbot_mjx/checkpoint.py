@@ -207,8 +207,11 @@ def _find(path: Path, which: Which) -> Path:
 
 
 def _success_rate(folder: Path) -> float:
-    # One that was saved between two evaluations was not judged.
-    return float(explanation(folder)["figures"].get("success_rate", -1.0))
+    """What a checkpoint was judged by; below 0 where it was not, or cannot be read."""
+    try:
+        return float(explanation(folder)["figures"].get("success_rate", -1.0))
+    except CheckpointError:
+        return -1.0
 
 
 def policy_template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:

@@ -18,6 +18,8 @@ STOPPED = 75
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 _SHARE_OF_NOTICE = 0.8
+_END = 0
+"""Through the pipe, where no signal has this number: nothing more will come."""
 
 
 class Preemption:
@@ -36,6 +38,7 @@ class Preemption:
         self._notice = notice
         self._requested = threading.Event()
         self._clock: threading.Timer | None = None
+        self._listener: threading.Thread | None = None
 
     @property
     def requested(self) -> bool:
@@ -55,26 +58,35 @@ class Preemption:
         os.set_blocking(self._writer, False)
         self._former_fd = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         for number in _SIGNALS:
-            self._former[number] = signal.signal(number, _do_nothing)
-        threading.Thread(target=self._listen, daemon=True).start()
+            # A shell lets its background jobs ignore Ctrl-C: so do they here.
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                self._former[number] = signal.signal(number, _do_nothing)
+        self._listener = threading.Thread(target=self._listen, daemon=True)
+        self._listener.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Stops listening and puts the former handlers back."""
-        if not self._former:
+        if self._listener is None:
             return
         for number, handler in self._former.items():
             signal.signal(number, handler)
         signal.set_wakeup_fd(self._former_fd)
+        os.write(self._writer, bytes([_END]))
+        self._listener.join()
+        os.close(self._reader)
         os.close(self._writer)
         if self._clock is not None:
             self._clock.cancel()
 
     def _listen(self) -> None:
-        """Reads the numbers of the signals that come, until the pipe is closed."""
+        """Reads the numbers of the signals that come, until the end is told."""
         began = 0.0
-        while number := os.read(self._reader, 1):
-            name = signal.Signals(number[0]).name
+        while (number := os.read(self._reader, 1)[0]) != _END:
+            # Python tells of every signal that has a handler, whoever set it.
+            if number not in _SIGNALS:
+                continue
+            name = signal.Signals(number).name
             if not self._requested.is_set():
                 began = time.monotonic()
                 self._requested.set()
@@ -90,7 +102,6 @@ class Preemption:
             # Schedulers and terminals may send the same signal to a whole group, twice over.
             elif time.monotonic() - began > 0.5:
                 _leave(f"second {name}")
-        os.close(self._reader)
 
 
 def leave_now(message: str) -> None:

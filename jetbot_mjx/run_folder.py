@@ -56,8 +56,15 @@ def seed_dirs(run_dir: Path, config: Config) -> list[Path]:
 
 
 def seed_folders(run_dir: Path) -> list[Path]:
-    """The folders of the seeds that were trained at once; none where it was one seed."""
-    found = [path for path in run_dir.glob("seed-*") if (path / CONFIG).is_file()]
+    """The folders of the seeds that were trained at once; none where it was one seed.
+
+    Raises:
+      UserError: the folder cannot be read.
+    """
+    try:
+        found = [path for path in run_dir.glob("seed-*") if (path / CONFIG).is_file()]
+    except OSError as error:
+        raise UserError(f"{run_dir} cannot be read: {error.strerror}") from None
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 

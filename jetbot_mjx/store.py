@@ -33,6 +33,7 @@ _DIGESTS = "sha256"
 _SUCCESS = "success_rate"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
+_DELETED = ".deleted"
 
 # Orbax tells of every step of its work at INFO, of what it would prefer at WARNING, and at ERROR,
 # by tracebacks from each of its threads, of what it raises as well.
@@ -63,8 +64,11 @@ class Store:
             step_name_format=_step_names(),
             preservation_policy=_KeepSome(keep, self._success),
             cleanup_tmp_directories=True,
+            # Renamed first: one that is half deleted must not stand under its name.
+            todelete_subdir=_DELETED,
         )
         self._folder = (run_dir / FOLDER).absolute()
+        self._clear_deleted()
         with self._writing():
             self._manager = ocp.CheckpointManager(self._folder, options=options)
 
@@ -86,6 +90,7 @@ class Store:
         Raises:
           CheckpointError: this one, or the one before, could not be written.
         """
+        self._clear_deleted()
         flat = {name: flatten(tree) for name, tree in trees.items()}
         self._check_space(
             sum(np.asarray(x).nbytes for tree in flat.values() for x in tree.values())
@@ -120,6 +125,11 @@ class Store:
         """Waits until all is on disk."""
         with self._writing():
             self._manager.close()
+        self._clear_deleted()
+
+    def _clear_deleted(self) -> None:
+        # Orbax may be moving the next one in; what is left goes the next time.
+        shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
 
     def _check_space(self, size: int) -> None:
         """Refuses before anything is begun that could not be finished."""

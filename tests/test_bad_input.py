@@ -21,6 +21,7 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.metrics import TensorBoardSink
+from jetbot_mjx.run_folder import stored_config
 
 
 @pytest.mark.parametrize(
@@ -164,8 +165,8 @@ def test_too_little_memory_costs_one_line(capfd):
 @pytest.mark.parametrize(
     ("method", "use"),
     [
-        ("exists", lambda: train.check_free(Path("run"))),
-        ("iterdir", lambda: train.check_free(Path(__file__).parent)),
+        ("exists", lambda: stored_config(Path("run"))),
+        ("iterdir", lambda: stored_config(Path(__file__).parent)),
         ("is_dir", lambda: evaluate.main(["run"])),
     ],
 )

@@ -218,3 +218,10 @@ def test_a_damaged_checkpoint_is_refused(run_copy, harm, capfd):
                 path.unlink()
     assert "cannot be read" in refused(folder)
     assert capfd.readouterr() == ("", "")
+
+
+def test_the_best_is_found_beside_one_that_cannot_be_read(run_copy):
+    best = find_checkpoint(run_copy, "best")
+    other = next(path for path in best.parent.iterdir() if path.name.isdecimal() and path != best)
+    shutil.rmtree(other / "about")
+    assert find_checkpoint(run_copy, "best") == best

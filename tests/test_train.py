@@ -11,6 +11,7 @@ import pytest
 
 from jetbot_mjx import brax_ppo, evaluate, load_config, make_env, train, wrap_for_training
 from jetbot_mjx.checkpoint import load_checkpoint
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import BASELINES
 
 
@@ -40,6 +41,10 @@ def test_the_metrics_hold_what_is_promised(lines):
         "policy/entropy",
         "policy/kl",
         "policy/learning_rate",
+        "rollout/success_rate",
+        "train/nonfinite_worlds",
+        "train/nonfinite_updates",
+        "time/training_seconds",
         "time/env_steps_per_second",
         "time/compile_seconds",
         "time/wall_seconds",
@@ -50,6 +55,19 @@ def test_the_metrics_hold_what_is_promised(lines):
     walls = [line["time/wall_seconds"] for line in lines]
     assert walls == sorted(walls)
     assert last["eval/nonfinite_worlds"] == 0
+
+
+def test_figures_of_rollouts_are_those_of_finished_episodes(lines):
+    for line in lines[1:]:
+        assert 0 < line["rollout/episodes"] < 16_384 / 2
+        assert 0 <= line["rollout/success_rate"] <= 1
+        assert 1 <= line["rollout/episode_length"] <= 256
+        assert line["train/nonfinite_worlds"] == line["train/nonfinite_updates"] == 0
+
+
+def test_nothing_compiles_after_the_first_interval(lines):
+    assert lines[0]["time/compile_seconds"] > 0
+    assert [line["time/compile_seconds"] for line in lines[2:]] == [0, 0, 0]
 
 
 def test_training_learns(lines):
@@ -104,6 +122,26 @@ def test_the_same_seed_trains_the_same_policy(smoke_run, tmp_path, root, capsys)
     assert train.main([*arguments, str(tmp_path / "other"), *short]) == 0
     assert fingerprint(tmp_path / "other") != fingerprint(smoke_run)
     assert load_config(tmp_path / "other" / "config.yaml").seed == 1
+
+
+def test_the_stock_trainer_leaves_the_same_kind_of_run(root, tmp_path, capsys):
+    arguments = ["--config", str(root / "configs" / "smoke.yaml"), "--set", "trainer=brax"]
+    arguments += ["--set", "ppo.num_timesteps=16384", "--run-dir", str(tmp_path / "run")]
+    assert train.main(arguments) == 0
+    lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["env_steps"] for line in lines] == [0, 16_384]
+    assert "loss/policy" in json.loads(lines[-1])
+    assert load_checkpoint(tmp_path / "run", "last").env_steps == 16_384
+    with pytest.raises(UserError, match="trainer = 'brax', which cannot be continued"):
+        train.main(arguments)
+
+
+def test_training_stops_at_the_success_asked_for(root, tmp_path, capsys):
+    config = load_config(root / "configs" / "smoke.yaml", ["stop_at_success=0.01"])
+    result = train.run(config, tmp_path / "run")
+    assert result.finished
+    assert result.standings[0].env_steps < 65_536
+    assert result.standings[0].last.success_rate >= 0.01
 
 
 def test_stock_brax_takes_wrap_for_training_as_its_wrap_env_fn(root):

@@ -1,0 +1,72 @@
+"""A training that is killed again and again ends as if it had never been."""
+
+import random
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import pytest
+
+sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
+
+import torture
+from torture import SETTINGS, Aim
+
+from jetbot_mjx.store import checkpoint_steps
+
+
+@pytest.fixture(scope="module")
+def template():
+    return torture.make_template(SETTINGS)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory):
+    # Another module may have finished it already: then it says the same once more.
+    return torture.finish(tmp_path_factory.getbasetemp() / "undisturbed", SETTINGS)
+
+
+def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undisturbed, tmp_path):
+    rng = random.Random(4)
+    aims = [
+        Aim("started", rng.uniform(0.2, 2.5)),
+        Aim("saving", rng.uniform(0.0, 0.03)),
+        Aim("saved", rng.uniform(0.0, 0.5)),
+        Aim("saving", rng.uniform(0.0, 0.03), 2),
+        Aim("trained", rng.uniform(0.0, 1.0)),
+        Aim("started", rng.uniform(0.2, 2.5)),
+    ]
+    phases = [torture.kill(tmp_path / "run", SETTINGS, aim, template).phase for aim in aims]
+    assert phases.count(torture.SAVING) >= 2, phases
+    assert torture.BEFORE_FIRST in phases
+    assert checkpoint_steps(tmp_path / "run")[-1] > 0, "the last start must be from the middle"
+    killed = torture.finish(tmp_path / "run", SETTINGS)
+    assert torture.differences(undisturbed, killed) == []
+    assert checkpoint_steps(tmp_path / "run") == [line["env_steps"] for line in killed.metrics]
+    for steps in checkpoint_steps(tmp_path / "run"):
+        torture.check_checkpoint(tmp_path / "run", steps, template)
+
+
+@pytest.mark.parametrize(
+    "said",
+    [
+        "run folder: run",
+        "going on after 4,096 steps\nrun folder: run",
+        "passed over: checkpoint 8192\ngoing on after 8,192 steps\nrun folder: run",
+        "Traceback (most recent call last):",
+    ],
+)
+def test_a_start_from_elsewhere_is_seen(said):
+    with pytest.raises(torture.Broken):
+        torture.check_start(SimpleNamespace(stdout=said, stderr=""), [0, 8_192])
+
+
+def test_what_differs_at_the_end_is_seen(undisturbed):
+    assert set(undisturbed.digests) == {"policy", "training"}
+    for name in torture.Outcome._fields:
+        assert torture.differences(undisturbed, undisturbed._replace(**{name: []})) == [name]
+
+
+@pytest.mark.slow
+def test_fifty_kills_in_all_phases_change_nothing():
+    assert torture.main(["--kills", "50"]) == 0
