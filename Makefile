@@ -6,8 +6,9 @@ RUN ?= runs/$(notdir $(basename $(CONFIG)))-$(shell date +%Y%m%d-%H%M%S)
 
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
+DOCS_STAMP := $(VENV)/.installed-docs
 
-.PHONY: setup train test test-slow check format benchmark clean
+.PHONY: setup train test test-slow check format benchmark docs clean
 
 setup: $(STAMP)
 
@@ -44,5 +45,13 @@ format: setup
 benchmark: setup
 	$(BIN)/python benchmarks/steps_per_second.py
 
+# Into site/index.html; a warning is an error. The variable silences an advertisement.
+docs: $(DOCS_STAMP)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
+
+$(DOCS_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	@touch $@
+
 clean:
-	rm -rf $(VENV) .cache
+	rm -rf $(VENV) .cache site

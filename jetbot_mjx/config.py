@@ -145,8 +145,8 @@ class PPOConfig(_Section):
     """Hyperparameters under the names of `brax.training.agents.ppo.train.train`."""
 
     num_timesteps: Steps = 1_000_000
-    """Environment steps to train for; each checkpoint interval is rounded up to whole training
-    steps of `batch_size * num_minibatches * unroll_length`."""
+    """Environment steps to train for, rounded up to whole training steps of
+    `batch_size * num_minibatches * unroll_length`; so is each checkpoint interval."""
     num_envs: Count = 512
     """Parallel environments, over all devices."""
     unroll_length: Count = 16
@@ -159,7 +159,7 @@ class PPOConfig(_Section):
     """Passes over the collected data before new data is collected."""
     learning_rate: Positive = 1e-3
     """Adam's step size; where the schedule starts."""
-    learning_rate_schedule: Literal["NONE", "LINEAR", "ADAPTIVE_KL"] = "NONE"
+    learning_rate_schedule: Literal["NONE", "LINEAR", "ADAPTIVE_KL"] = "LINEAR"
     """`LINEAR` falls to zero at `num_timesteps`; `ADAPTIVE_KL` steers the step size so that an
     update moves the policy by `desired_kl`."""
     desired_kl: Positive = 0.01

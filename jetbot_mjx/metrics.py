@@ -1,10 +1,12 @@
 """Where the figures of a training go: a file, TensorBoard, the terminal. One `Sink` each.
 
-Names, the same everywhere:
-  eval/success_rate         deterministic policy, fixed goals; with success_low, success_high
+Names, the same everywhere; a line of metrics.jsonl also holds env_steps and timestamp:
+  eval/episodes             of the deterministic policy, on fixed goals; likewise successes
+  eval/success_rate         of those; with success_low, success_high
   eval/time_to_goal_median  [s] of the successes; likewise time_to_goal_p95
   eval/path_efficiency      straight line over way travelled, mean over the successes
   eval/episode_return       mean sum of rewards [m]: about the distance covered
+  eval/final_distance_median    [m] to the goal at the end, on the floor
   eval/nonfinite_worlds     episodes cut off because their world was no longer finite
   loss/total, policy, value, entropy    means over the interval, as Brax computes them
   policy/entropy            of the action distribution, before squashing [nat]

@@ -1,0 +1,261 @@
+"""Writes `configuration.md` while the site is built, from the configuration itself: an MkDocs hook.
+
+Types, bounds, defaults and explanations come from the schema of `Config`, the refusals from its
+checks, the values of the shipped files from the files. Nothing of it is written by hand.
+"""
+
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from ruamel.yaml import YAML
+
+from jetbot_mjx.config import (
+    CHANGEABLE_ON_RESUME,
+    Config,
+    ConfigError,
+    load_config,
+    parse_config,
+)
+
+ROOT = Path(__file__).parents[1]
+PAGE = "configuration.md"
+
+_INTRODUCTION = """\
+# Configuration reference
+
+This page is written by the build of this site, out of `jetbot_mjx.config`: it is what the code
+checks.
+
+A YAML file names only what differs from the defaults below; `--set ppo.num_envs=256` changes
+one setting on the command line, the value read as YAML, the last one winning. Everything is
+checked before anything else happens. The run folder's `config.yaml` holds every key, written
+out.
+
+YAML here is version 1.2: `1e-3` and `2_621_440` are numbers, `3e7` may stand for a count, and a
+key that is given twice is an error.
+
+Settings marked ↻ may change when a run is [continued](stop-and-resume.md); all others belong to
+the run.
+"""
+
+_REFUSAL = """\
+Some settings do not fit, alone or together. Each is answered by one line that says what would
+be right, and exit code 2."""
+
+_REFUSED = (
+    ("ppo.num_env=256",),
+    ("ppo.num_envs=none",),
+    ("ppo.num_envs=0",),
+    ("ppo.discounting=1.5",),
+    ("ppo.batch_size=100",),
+    ("checkpoint_interval=1000",),
+    ("physics.sim_dt=0.005",),
+    ("ppo.learning_rate_schedule=ADAPTIVE_KL", "ppo.learning_rate=0.1"),
+    ("task.success_radius=0.01",),
+    ("task.options.pillar=[1, 2]",),
+    ("trainer=brax", "ppo.learning_rate_schedule=NONE", "seeds=5"),
+    ("trainer=brax", "ppo.learning_rate_schedule=NONE", "deterministic=true"),
+    ("trainer=brax", "ppo.learning_rate_schedule=LINEAR"),
+)
+"""Settings that do not fit; each is tried while the page is written."""
+
+
+class Setting(NamedTuple):
+    """One key of the configuration."""
+
+    key: str
+    """With its sections, such as `ppo.num_envs`."""
+    kind: str
+    default: Any
+    meaning: str
+
+
+class Section(NamedTuple):
+    """One section, nested ones apart."""
+
+    name: str
+    """With those around it, such as `ppo.network`; empty at the top."""
+    meaning: str
+    settings: list[Setting]
+
+
+def sections() -> list[Section]:
+    """The whole configuration, section by section."""
+    schema = Config.model_json_schema()
+    defaults = Config().model_dump(mode="json")
+    return list(_walk("", Config, schema, schema["$defs"], defaults))
+
+
+def _walk(
+    name: str,
+    model: type[BaseModel],
+    schema: Mapping[str, Any],
+    shared: Mapping[str, Any],
+    defaults: Mapping[str, Any],
+) -> Iterator[Section]:
+    settings, below = [], []
+    for key, value in schema["properties"].items():
+        path = f"{name}.{key}".lstrip(".")
+        field = model.model_fields[key]
+        if "$ref" in value:
+            inner = shared[value["$ref"].rpartition("/")[2]]
+            below.append((path, field.annotation, inner, shared, defaults[key]))
+        else:
+            meaning = " ".join(value["description"].split())
+            kind = _kind(value, list(dict.fromkeys(_bounds(field))))
+            settings.append(Setting(path, kind, defaults[key], meaning))
+    yield Section(name, " ".join(schema["description"].split()), settings)
+    for arguments in below:
+        yield from _walk(*arguments)
+
+
+def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
+    """A type and its bounds in words."""
+    if "anyOf" in schema:
+        return ", or ".join(_kind(one, bounds) for one in schema["anyOf"])
+    if "enum" in schema:
+        return " or ".join(f"`{value}`" for value in schema["enum"])
+    match schema["type"]:
+        case "array":
+            inner = _kind(schema["items"], bounds)
+            return f"list of at least {schema.get('minItems', 0)}; each a {inner}"
+        case "object":
+            return f"keys of your own; each {_kind(schema['additionalProperties'], bounds)}"
+        case "null":
+            return "`null`"
+        case "boolean":
+            return "`true` or `false`"
+        case "string":
+            return "text"
+        case "integer" | "number" as kind:
+            words = {"integer": "whole number", "number": "number"}[kind]
+            return ", ".join([words, *bounds])
+        case other:
+            raise ValueError(f"{other}: teach this page to say it")
+
+
+def _bounds(annotated: Any) -> Iterator[str]:
+    """The bounds of the numbers in a type; the schema lacks those behind a validator."""
+    words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+    for one in getattr(annotated, "metadata", getattr(annotated, "__metadata__", ())):
+        for name, word in words.items():
+            value = getattr(one, name, None)
+            if value is not None:
+                yield f"{word} {_bound(value)}"
+        if isinstance(one, FieldInfo):
+            yield from _bounds(one)
+    for part in get_args(getattr(annotated, "annotation", annotated)):
+        yield from _bounds(part)
+
+
+def _bound(value: float) -> str:
+    if value > 2**16 and math.log2(value).is_integer():
+        return f"2^{math.log2(value):.0f}^"
+    return f"{value:g}"
+
+
+def as_yaml(value: Any) -> str:
+    """A value as one would write it in YAML."""
+    match value:
+        case int() if not isinstance(value, bool):
+            return f"{value:_}" if value >= 10_000 else str(value)
+        case str():
+            return value
+        case _:
+            return json.dumps(value)
+
+
+def _default(value: Any) -> str:
+    """The value, and the round figure that it stands for."""
+    text = f"`{as_yaml(value)}`"
+    if value == math.pi:
+        return f"{text} (π)"
+    if isinstance(value, float) and len(repr(value)) > 10:
+        return f"{text} ({Fraction(value).limit_denominator(1000)})"
+    return text
+
+
+def _table(section: Section) -> Iterator[str]:
+    yield "| key | type and bounds | default | meaning |"
+    yield "|---|---|---|---|"
+    for one in section.settings:
+        mark = " ↻" if one.key in CHANGEABLE_ON_RESUME else ""
+        yield f"| `{one.key}`{mark} | {one.kind} | {_default(one.default)} | {one.meaning} |"
+
+
+def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from _leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+def _shipped() -> Iterator[str]:
+    """A table of what the files in `configs/` say, as they say it."""
+    files = sorted((ROOT / "configs").glob("*.yaml"))
+    said = []
+    for path in files:
+        load_config(path)
+        said.append(dict(_leaves(YAML(typ="safe", pure=True).load(path))))
+    yield "| key | " + " | ".join(f"`{path.stem}`" for path in files) + " |"
+    yield "|---|" + "---|" * len(files)
+    for section in sections():
+        for one in section.settings:
+            if any(one.key in values for values in said):
+                cells = (f"`{as_yaml(v[one.key])}`" if one.key in v else "" for v in said)
+                yield f"| `{one.key}` | " + " | ".join(cells) + " |"
+
+
+def _refusals() -> Iterator[str]:
+    """What settings that do not fit are answered with."""
+    yield "| settings | answer |"
+    yield "|---|---|"
+    for overrides in _REFUSED:
+        values: dict[str, Any] = {}
+        for override in overrides:
+            key, _, text = override.partition("=")
+            *above, last = key.split(".")
+            place = values
+            for name in above:
+                place = place.setdefault(name, {})
+            place[last] = YAML(typ="safe", pure=True).load(text)
+        try:
+            parse_config(values)
+        except ConfigError as error:
+            settings = "<br>".join(f"`{override}`" for override in overrides)
+            yield f"| {settings} | `{str(error).removeprefix('config: ')}` |"
+        else:
+            raise ValueError(f"{overrides} fits: take it from the list of what is refused")
+
+
+def page() -> str:
+    """The whole page, as Markdown."""
+    lines = [_INTRODUCTION]
+    for section in sections():
+        title = f"`{section.name}`" if section.name else "At the top"
+        anchor = section.name.replace(".", "-") or "top"
+        lines += [f"## {title} {{ #{anchor} }}", "", section.meaning, "", *_table(section), ""]
+    lines += ["## What the shipped files say { #shipped }", ""]
+    lines += ["A blank means the default.", "", *_shipped(), ""]
+    lines += ["## What is refused, and how { #refused }", ""]
+    lines += [_REFUSAL, "", *_refusals(), ""]
+    return "\n".join(lines)
+
+
+def on_files(files: Any, *, config: Any) -> Any:
+    """MkDocs asks which files there are: one more."""
+    from mkdocs.structure.files import File
+
+    files.append(File.generated(config, PAGE, content=page()))
+    return files
+
+
+if __name__ == "__main__":
+    print(page())
