@@ -56,7 +56,10 @@ _EPISODE_SUMS = {
 
 
 class TrainState(struct.PyTreeNode):
-    """All that a training is: with it, training goes on as if it had never stopped."""
+    """All that a training is: with it, training goes on as if it had never stopped.
+
+    Its leaves are `Any`: they also travel stacked, on the host, and as bare shapes.
+    """
 
     params: Any
     """Weights of the policy and value networks, `policy` and `value`."""
@@ -66,11 +69,11 @@ class TrainState(struct.PyTreeNode):
     """Running mean and deviation of the observation."""
     env_state: Any
     """Every environment's state, batched."""
-    key: UInt32[Array, "2"]
+    key: Any
     """Random key of the next training step."""
     env_steps: UInt64
     """Environment steps so far, over all devices."""
-    tally: dict[str, Float[Array, ""]]
+    tally: dict[str, Any]
     """Sums of the figures of the training steps since `tally["training_steps"]` was 0."""
 
     @property
@@ -82,13 +85,13 @@ class TrainState(struct.PyTreeNode):
 class Fault(struct.PyTreeNode):
     """A world that stopped being finite, and how it got there."""
 
-    found: Bool[Array, ""]
+    found: Any
     """Whether there is one; otherwise the rest means nothing."""
     env_state: Any
     """The environment's state where the unroll began."""
-    actions: Float[Array, "time action"]
-    """What it did from there on."""
-    step: Int[Array, ""]
+    actions: Any
+    """What it did from there on, (time, action)."""
+    step: Any
     """Index of the action under which it blew up."""
 
 
@@ -335,7 +338,7 @@ class PPO:
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
         (_, figures), gradient = self._loss_and_gradient(params, normalizer, batch, loss_key)
-        finite = jnp.isfinite(optax.global_norm(gradient))
+        finite = jnp.isfinite(optax.tree.norm(gradient))
         before = params, optimizer_state
         if self.config.learning_rate_schedule == "ADAPTIVE_KL":
             kl = figures["kl_mean"]

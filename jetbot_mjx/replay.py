@@ -53,7 +53,7 @@ def run(stored: StoredFault, env: JetBotEnv) -> Iterator[Moment]:
 
 def line(index: int, moment: Moment) -> str:
     """One step as a line of the table."""
-    robot = robot_state(moment.state.pipeline_state)
+    robot = robot_state(jax.tree.map(jnp.asarray, moment.state.pipeline_state))
     x, y, z = np.asarray(robot.position_w)
     fastest = np.abs(moment.state.pipeline_state.qvel).max()
     return (

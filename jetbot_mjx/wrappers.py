@@ -122,7 +122,7 @@ class EpisodeWrapper(Wrapper):
         truncation = jnp.where(out_of_time | ~finite, 1.0 - terminated, 0.0)
         done = jnp.maximum(terminated, truncation)
 
-        metrics = {**nstate.metrics, "nonfinite_worlds": 1.0 - finite}
+        metrics = {**nstate.metrics, "nonfinite_worlds": 1.0 - finite.astype(jnp.float32)}
         step_values = {"sum_reward": nstate.reward, "length": length, **metrics}
         sums = {
             name: jnp.where(begins, 0.0, total) + step_values[name]

@@ -342,7 +342,7 @@ DAMAGES = {
         "does not explain itself: .*ppo.momentum = 0.9 is unknown",
     ),
     "no list of parameters": (
-        lambda checkpoint: (checkpoint / "policy" / "_METADATA").unlink(),
+        lambda checkpoint: (checkpoint / "policy" / "manifest.ocdbt").unlink(),
         "cannot be read: ",
     ),
     "a task that is gone": (
