@@ -281,6 +281,7 @@ class CompileClock:
         """Starts to listen."""
         self._lock = threading.Lock()
         self._spans: list[tuple[float, float]] = []
+        self._counted_until = -math.inf
         self.programs = 0
         """Compiled, or found in the persistent cache."""
         self.cached = 0
@@ -309,10 +310,12 @@ class CompileClock:
         """Seconds since the last call."""
         with self._lock:
             spans, self._spans = sorted(self._spans), []
-        seconds, until = 0.0, -math.inf
+        # What was still compiling at the last call counts from there on.
+        seconds, until = 0.0, self._counted_until
         for start, end in spans:
             seconds += max(0.0, end - max(start, until))
             until = max(until, end)
+        self._counted_until = until
         return seconds
 
     def __enter__(self) -> Self:

@@ -114,6 +114,7 @@ class RunRecorder(Recorder):
         self._earlier = self._seeds[0].standing.wall_seconds
         self._began = time.perf_counter()
         self._compile_seconds = 0.0
+        self._unlogged_compile_seconds = 0.0
         self._recording_seconds = 0.0
         self._awaiting_first_step = False
         self.fingerprints = [digest(state.policy_params) for state in resumed.states]
@@ -147,7 +148,8 @@ class RunRecorder(Recorder):
         began = time.perf_counter()
         summaries = [self.judge(one.params) for one in progress]
         judging = time.perf_counter() - began
-        compiled = compiling + self._lap()
+        self._lap()
+        compiled, self._unlogged_compile_seconds = self._unlogged_compile_seconds, 0.0
         lines = []
         for seed, one, summary in zip(self._seeds, progress, summaries, strict=True):
             steps = one.env_steps - seed.standing.env_steps
@@ -215,6 +217,7 @@ class RunRecorder(Recorder):
     def _lap(self) -> float:
         seconds = self._clock.lap()
         self._compile_seconds += seconds
+        self._unlogged_compile_seconds += seconds
         return seconds
 
     def __enter__(self) -> Self:

@@ -445,3 +445,17 @@ def test_a_process_knows_how_long_it_has_been_there():
     before = process_seconds()
     time.sleep(0.05)
     assert 0.0 < before < process_seconds() < 24 * 3600
+
+
+def test_what_spans_two_laps_counts_once():
+    event = "/jax/core/compile/backend_compile_duration"
+    with CompileClock() as clock:
+        began = time.perf_counter()
+        jax.monitoring.record_event_duration_secs(event, 0.2)
+        first = clock.lap()
+        # Another thread's, that was under way all the time.
+        jax.monitoring.record_event_duration_secs(event, 0.2 + time.perf_counter() - began)
+        second = clock.lap()
+        elapsed = 0.2 + time.perf_counter() - began
+    assert first == pytest.approx(0.2, abs=0.01)
+    assert second < elapsed - 0.19
