@@ -31,6 +31,9 @@ NOUNS = (
     "trainer",
     "rollout",
     "evaluation",
+    "plots",
+    "offscreen",
+    "film",
     "store",
     "checkpoint",
     "resume",
@@ -42,7 +45,6 @@ NOUNS = (
     "resumable_ppo",
     "brax_ppo",
     "cli",
-    "offscreen",
 )
 VERBS = ("train", "evaluate", "render", "replay")
 ORDER = (*NOUNS, *VERBS)
