@@ -283,13 +283,6 @@ class Config(_Section):
             )
         return self
 
-    @property
-    def compiler_options(self) -> dict[str, Any]:
-        """What XLA is told when it compiles: no atomics and no timing of kernels, or nothing."""
-        if not self.deterministic:
-            return {}
-        return {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_level": 0}
-
     def of_each_seed(self) -> list["Config"]:
         """The configurations of single runs that this one stands for."""
         return [

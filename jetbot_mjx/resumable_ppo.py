@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.ppo import LOSSES, PPO, Fault, TrainState
@@ -40,7 +41,7 @@ class Program:
         """
         devices = jax.devices()
         self._mesh = Mesh(np.array(devices), (_AXIS,))
-        self._options = config.compiler_options
+        self._options = compiler_options(config)
         self._seeds = list(range(config.seed, config.seed + config.seeds))
         self._ppo = PPO(
             config.ppo,

@@ -9,8 +9,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, PyTree, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import QPOS_XYZ
 from jetbot_mjx.state import State
@@ -54,6 +55,13 @@ class _Tally(NamedTuple):
     path_length: Float[Array, ""]
 
 
+class _Carry(NamedTuple):
+    time: Int[Array, ""]
+    state: State
+    tally: _Tally
+    qpos: Float[Array, "n time nq"] | None
+
+
 def make_rollout(
     env: JetBotEnv,
     controllers: Sequence[Controller],
@@ -75,10 +83,7 @@ def make_rollout(
     """
     episode_env = EpisodeWrapper(env, episode_length)
 
-    def one_step(
-        carry: tuple[State, _Tally], action: Float[Array, "2"]
-    ) -> tuple[tuple[State, _Tally], Float[Array, " nq"]]:
-        state, tally = carry
+    def one_step(state: State, tally: _Tally, action: Float[Array, "2"]) -> tuple[State, _Tally]:
         nstate = episode_env.step(state, action)
         moved = jnp.linalg.norm(
             nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
@@ -94,7 +99,7 @@ def make_rollout(
         added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
         # A finished robot stands where it finished.
         nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
-        return (nstate, added), nstate.pipeline_state.qpos
+        return nstate, added
 
     def run(index: Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = jax.vmap(episode_env.reset)(keys)
@@ -105,16 +110,28 @@ def make_rollout(
             branches = [lambda s, k, c=c: c(params, s, k) for c in controllers]
             return jax.lax.switch(index, branches, state, key)
 
-        def body(carry: tuple[State, _Tally], time: Array) -> tuple[tuple[State, _Tally], PyTree]:
-            # Reset keys with the step folded in: apart from those of later episodes.
-            step_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, time)
-            actions = jax.vmap(act)(carry[0], step_keys)
-            carry, qpos = jax.vmap(one_step)(carry, actions)
-            return carry, qpos if record else None
+        def goes_on(carry: _Carry) -> Bool[Array, ""]:
+            # Most policies are done long before the time is out.
+            return (carry.time < episode_length) & (carry.tally.alive > 0).any()
 
-        (last, tally), trail = jax.lax.scan(body, (first, tally), jnp.arange(episode_length))
+        def body(carry: _Carry) -> _Carry:
+            # Reset keys with the step folded in: apart from those of later episodes.
+            step_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, carry.time)
+            actions = jax.vmap(act)(carry.state, step_keys)
+            state, tally = jax.vmap(one_step)(carry.state, carry.tally, actions)
+            qpos = carry.qpos
+            if qpos is not None:
+                qpos = qpos.at[:, carry.time + 1].set(state.pipeline_state.qpos)
+            return _Carry(carry.time + 1, state, tally, qpos)
+
         start = first.pipeline_state.qpos
-        qpos = jnp.concatenate([start[None], trail]).swapaxes(0, 1) if record else None
+        trail = jnp.repeat(start[:, None], episode_length + 1, axis=1) if record else None
+        time, last, tally, qpos = jax.lax.while_loop(
+            goes_on, body, _Carry(jnp.zeros((), jnp.int32), first, tally, trail)
+        )
+        if qpos is not None:
+            ended = jnp.arange(episode_length + 1) > time
+            qpos = jnp.where(ended[:, None], last.pipeline_state.qpos[:, None], qpos)
         return Episodes(
             success=tally.success,
             steps=tally.steps,
@@ -128,4 +145,4 @@ def make_rollout(
             qpos=qpos,
         )
 
-    return jax.jit(run, compiler_options=env.config.compiler_options)
+    return jax.jit(run, compiler_options=compiler_options(env.config))

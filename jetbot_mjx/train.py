@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import jax
 
-from jetbot_mjx import brax_ppo, cli, resumable_ppo
+from jetbot_mjx import cli, resumable_ppo
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
@@ -90,6 +90,9 @@ def run(config: Config, run_dir: Path) -> Result:
 
 
 def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock) -> Result:
+    # Brax's own trainer takes half a second to import.
+    from jetbot_mjx import brax_ppo
+
     write_run(run_dir, config)
     print(_headline(config, run_dir), flush=True)
     with RunRecorder(config, env, [run_dir], clock) as recorder:

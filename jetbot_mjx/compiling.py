@@ -1,0 +1,50 @@
+"""What XLA is told when it compiles, and only what the installed one knows.
+
+Before the first step of a training a CPU does little else than compile, and much of that goes into
+the last few percent of speed: without fusion emitters and at level 2 the training step
+compiles in two thirds of the time and runs 3 % slower, which pays for all but long trainings.
+"""
+
+import functools
+from typing import Any
+
+import jax
+
+from jetbot_mjx.config import Config
+
+Options = dict[str, Any]
+
+_QUICK: Options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 2}
+
+# No atomics, and no choice of kernels by timing them.
+_DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_level": 0}
+
+
+def compiler_options(config: Config) -> Options:
+    """What the programs of a run are compiled with.
+
+    Args:
+      config: the run.
+
+    Returns:
+      As `jax.jit` takes it; what the installed XLA does not know is left out.
+
+    Raises:
+      JaxRuntimeError: `deterministic` asks for what it does not know.
+    """
+    wanted = dict(_DETERMINISTIC) if config.deterministic else {}
+    if jax.default_backend() == "cpu":
+        wanted |= {name: value for name, value in _QUICK.items() if _is_known(name, value)}
+    return wanted
+
+
+@functools.cache
+def _is_known(name: str, value: Any) -> bool:
+    """Asks XLA, which refuses to compile with an option that it does not know."""
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+    except jax.errors.JaxRuntimeError as error:
+        if "No such compile option" not in str(error):
+            raise
+        return False
+    return True
