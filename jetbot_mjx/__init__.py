@@ -1,9 +1,9 @@
 """A JetBot that learns to drive to goals, thousands at a time: MuJoCo MJX and Brax's PPO.
 
 The modules in reading order, each knowing only those before it:
-`errors`, `config`, `compiling`, `mjx`, `kinematics`, `model`, `task`, `state`, `env`, `wrappers`,
-`policy`, `ppo`, `trainer`, `rollout`, `evaluation`, `plots`, `offscreen`, `film`, `store`,
-`checkpoint`, `resume`, `faults`, `run_folder`, `metrics`, `recording`, `preemption`,
+`errors`, `config`, `compiling`, `mjx`, `cholesky`, `kinematics`, `model`, `task`, `state`, `env`,
+`wrappers`, `policy`, `ppo`, `trainer`, `rollout`, `evaluation`, `plots`, `offscreen`, `film`,
+`store`, `checkpoint`, `resume`, `faults`, `run_folder`, `metrics`, `recording`, `preemption`,
 `resumable_ppo`, `brax_ppo`, `cli`, and the commands `train`, `evaluate`, `render`, `replay`.
 Commands meet only in the run folder.
 """

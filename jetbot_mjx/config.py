@@ -104,6 +104,9 @@ class PhysicsConfig(_Section):
     """Newton iterations per physics step; null: as many as the robot needs, 2 or 3."""
     ls_iterations: Count = 2
     """Line-search steps per Newton iteration."""
+    cholesky: Literal["unrolled", "library"] = "unrolled"
+    """How MJX factorises its matrices: `unrolled` into scalar arithmetic, or by a call of LAPACK or
+    cuSOLVER, which keeps a GPU from running a step as one CUDA graph."""
 
     @property
     def n_substeps(self) -> int:

@@ -4,6 +4,7 @@ Pure, unbatched and stateless: batch with `jax.vmap`, compile with `jax.jit`. Th
 only what physics integrates and what the task drew; `mjx.Data` is rebuilt inside `step`.
 """
 
+import contextlib
 import copy
 
 import brax.envs
@@ -12,7 +13,7 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx import kinematics, mjx
+from jetbot_mjx import cholesky, kinematics, mjx
 from jetbot_mjx.config import Config
 from jetbot_mjx.model import (
     CONTROLLER_WHEEL_RADIUS,
@@ -162,7 +163,12 @@ class JetBotEnv(brax.envs.Env):
 
         # GPUs multiply float32 matrices in TF32 unless told otherwise, and the contact solver
         # then diverges. Only physics asks for full precision; networks choose their own.
-        with jax.default_matmul_precision("highest"):
+        factorise = (
+            contextlib.nullcontext
+            if self.config.physics.cholesky == "library"
+            else cholesky.unrolled
+        )
+        with jax.default_matmul_precision("highest"), factorise():
             physics, _ = jax.lax.scan(substep, physics, length=self.config.physics.n_substeps)
         return physics
 

@@ -21,6 +21,7 @@ NOUNS = (
     "config",
     "compiling",
     "mjx",
+    "cholesky",
     "kinematics",
     "model",
     "task",
