@@ -34,14 +34,15 @@ def test_the_factor_is_the_librarys(size):
 
 @pytest.mark.parametrize("columns", [(), (3,)])
 def test_solutions_are_as_good_as_the_librarys(columns):
-    a = matrices(64, 8)
-    x = np.random.default_rng(1).normal(size=(64, 8, *columns))
+    a = matrices(256, 8)
+    x = np.random.default_rng(1).normal(size=(256, 8, *columns))
     b = jnp.asarray(np.einsum("bij,bj...->bi...", np.asarray(a, np.float64), x), jnp.float32)
 
     def error(factor, solve):
-        return np.abs(jax.vmap(lambda a, b: solve(factor(a), b))(a, b) - x).max()
+        missed = np.abs(jax.vmap(lambda a, b: solve(factor(a), b))(a, b) - x)
+        return np.median(missed.reshape(256, -1).max(axis=1))
 
-    assert error(cholesky.cho_factor, cholesky.cho_solve) < 2 * error(*library)
+    assert error(cholesky.cho_factor, cholesky.cho_solve) < 1.5 * error(*library)
 
 
 def test_either_solves_from_the_others_factor():
