@@ -27,6 +27,9 @@ from jetbot_mjx.state import State, robot_state
 GOAL_SET_VERSION = 1
 """Raised whenever the goals or the rules of the report change."""
 
+REPORT_GOALS = 1024
+"""How many of its fixed goals a report takes, unless told otherwise."""
+
 _REPORT_SEED = 20_251
 _TRAINING_SEED = 20_252
 

@@ -1,27 +1,39 @@
-"""Shows a policy drive: `python -m jetbot_mjx.render RUN` writes an mp4, a gif and a plot."""
+"""Shows policies drive: `python -m jetbot_mjx.render RUN` writes an mp4, a gif and a plot.
 
-from collections.abc import Sequence
-from itertools import chain
+By default the best checkpoint and the first of the report's fixed goals; `--goals 3,17` films
+those of them; `--gallery` has the first, the middle and the last checkpoint drive to the same
+goals side by side.
+"""
+
+import argparse
+import io
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 import numpy as np
+from PIL import Image
 
 from jetbot_mjx import cli
-from jetbot_mjx.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.evaluation import Evaluator, report_keys
-from jetbot_mjx.film import VIEW, film_episode, write_gif, write_mp4
-from jetbot_mjx.offscreen import Renderer
+from jetbot_mjx.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
+from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import REPORT_GOALS, Evaluator, report_keys
+from jetbot_mjx.film import GIF_STRIDE, Frame, Studio, drives, shrunk, write_gif, write_mp4
 from jetbot_mjx.plots import plot_trajectories
 from jetbot_mjx.rollout import Episodes
-from jetbot_mjx.run_folder import make_folder
+from jetbot_mjx.run_folder import make_folder, writing_to
+from jetbot_mjx.store import checkpoint_steps
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
+_GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # of the film's
 
 
 class Pictures(NamedTuple):
-    """The files made."""
+    """The files made of one policy."""
 
     mp4: Path
     gif: Path
@@ -30,50 +42,218 @@ class Pictures(NamedTuple):
     episodes: int
 
 
-def run(run_or_checkpoint: str | Path, *, episodes: int = 20, which: Which = "best") -> Pictures:
-    """Draws deterministic episodes on the first of the fixed goals.
+class Gallery(NamedTuple):
+    """The files made of several policies of one run."""
+
+    mp4: Path
+    gif: Path
+    plans: Path
+    """Their trajectories from above, side by side."""
+    successes: dict[int, int]
+    """Goals reached, by the checkpoint's environment steps."""
+    episodes: int
+    """Goals that each policy drove to."""
+
+
+def run(
+    run_or_checkpoint: str | Path,
+    *,
+    episodes: int = 20,
+    goals: Sequence[int] | None = None,
+    which: Which = "best",
+) -> Pictures:
+    """Draws deterministic episodes of one policy on some of the report's fixed goals.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
-      episodes: how many.
+      episodes: how many of the goals, from the first on.
+      goals: their indices instead, in this order.
       which: the checkpoint of a run folder.
 
     Returns:
-      The files, in `videos/<env_steps>/` of the run folder.
+      The files, in `videos/<env_steps>/` of the run folder; those of `goals` are named by them.
 
     Raises:
-      UserError: there is no usable checkpoint, or no OpenGL.
+      UserError: there is no usable checkpoint, no such goal, no OpenGL, or no room.
     """
+    names = ("episodes", "trajectories")
+    if goals is None:
+        goals = range(episodes)
+    else:
+        check_goals(goals)
+        names = (f"goals-{_spans(goals)}",) * 2
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
-    evaluator = Evaluator(env, checkpoint.networks, record=True)
-    driven = jax.device_get(evaluator.run(checkpoint.params, report_keys(episodes)))
+    driven = _drive([checkpoint], env, goals)[0]
     folder = checkpoint.run_dir / "videos" / checkpoint.path.name
     make_folder(folder)
     pictures = Pictures(
-        mp4=folder / "episodes.mp4",
-        gif=folder / "episodes.gif",
-        trajectories=folder / "trajectories.png",
+        mp4=folder / f"{names[0]}.mp4",
+        gif=folder / f"{names[0]}.gif",
+        trajectories=folder / f"{names[1]}.png",
         successes=int(driven.success.sum()),
-        episodes=episodes,
+        episodes=len(goals),
     )
-    markers = jax.vmap(env.task.markers)(driven.goal)
-    others = [np.asarray(place) for name, place in markers.items() if name != "goal"]
-    figure = plot_trajectories(driven, _title(checkpoint, driven), others)
-    figure.savefig(pictures.trajectories, dpi=120)
-    with Renderer(env.mj_model, width=VIEW, height=VIEW) as renderer:
-        films = [film_episode(renderer, env, driven, index) for index in range(episodes)]
-    write_mp4(pictures.mp4, list(chain(*films)))
-    write_gif(pictures.gif, list(chain(*films[:_GIF_EPISODES])))
+    with writing_to(pictures.trajectories):
+        _plan(checkpoint, env, driven, goals).save(pictures.trajectories)
+    with Studio(env) as studio:
+        films = [studio.film_episode(drive) for drive in drives(env, driven, goals)]
+        _write(pictures.mp4, pictures.gif, films, _GIF_SIZE)
     return pictures
 
 
-def _title(checkpoint: Checkpoint, episodes: Episodes) -> str:
-    count = episodes.success.size
-    return (
-        f"{int(episodes.success.sum())} of {count} goals reached,"
+def run_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
+    """Draws the first, the middle and the last checkpoint of a run driving to the same goals.
+
+    Goals are the report's, from the first on, so that nothing is chosen by its outcome.
+
+    Args:
+      run_dir: a run folder.
+      episodes: how many goals.
+
+    Returns:
+      The files, in `videos/` of the run folder.
+
+    Raises:
+      UserError: there is no usable checkpoint, no OpenGL, or no room.
+    """
+    path = Path(run_dir).absolute()
+    if find_checkpoint(path, "last") == path:
+        raise UserError(f"--gallery {run_dir} is one checkpoint: give the run folder it lies in")
+    chosen = early_middle_final(checkpoint_steps(path))
+    checkpoints = [load_checkpoint(path, one) for one in chosen]
+    env = checkpoints[0].make_env()
+    goals = range(episodes)
+    driven = _drive(checkpoints, env, goals)
+    folder = path / "videos"
+    make_folder(folder)
+    gallery = Gallery(
+        mp4=folder / "gallery.mp4",
+        gif=folder / "gallery.gif",
+        plans=folder / "gallery.png",
+        successes={
+            step: int(each.success.sum()) for step, each in zip(chosen, driven, strict=True)
+        },
+        episodes=episodes,
+    )
+    plans = [
+        np.asarray(_plan(checkpoint, env, each, goals))
+        for checkpoint, each in zip(checkpoints, driven, strict=True)
+    ]
+    with writing_to(gallery.plans):
+        Image.fromarray(np.hstack(plans)).save(gallery.plans)
+    headings = [f"{step:,} steps" for step in chosen]
+    by_goal = zip(*(drives(env, each, goals) for each in driven), strict=True)
+    with Studio(env) as studio:
+        films = [
+            studio.film_together(list(zip(headings, same_goal, strict=True)))
+            for same_goal in by_goal
+        ]
+        _write(gallery.mp4, gallery.gif, films, _GALLERY_GIF_SIZE)
+    return gallery
+
+
+def early_middle_final(steps: Sequence[int]) -> list[int]:
+    """The first, the middle and the last, of two middle ones the earlier; of fewer than three all.
+
+    Args:
+      steps: of the checkpoints there are, in order, at least one.
+    """
+    return sorted({steps[0], steps[(len(steps) - 1) // 2], steps[-1]})
+
+
+def _drive(
+    checkpoints: Sequence[Checkpoint], env: JetBotEnv, goals: Sequence[int]
+) -> list[Episodes]:
+    """Recorded episodes of policies of one run, all by one compiled program."""
+    evaluator = Evaluator(env, checkpoints[0].networks, record=True)
+    keys = report_keys(max(goals) + 1)[np.asarray(goals)]
+    return [jax.device_get(evaluator.run(each.params, keys)) for each in checkpoints]
+
+
+def _plan(
+    checkpoint: Checkpoint, env: JetBotEnv, episodes: Episodes, goals: Sequence[int]
+) -> Image.Image:
+    """Trajectories from above, each goal with its number."""
+    markers = jax.vmap(env.task.markers)(episodes.goal)
+    others = [np.asarray(place) for name, place in markers.items() if name != "goal"]
+    title = (
+        f"{int(episodes.success.sum())} of {len(goals)} goals reached,"
         f" policy after {checkpoint.env_steps:,} steps"
     )
+    figure = plot_trajectories(episodes, title, others)
+    for number, goal_w in zip(goals, episodes.goal_w, strict=True):
+        figure.axes[0].annotate(str(number), goal_w[:2], ha="center", va="center", fontsize="small")
+    file = io.BytesIO()
+    figure.savefig(file, dpi=120)
+    return Image.open(file).convert("RGB")
+
+
+def _write(mp4: Path, gif: Path, films: Sequence[Iterable[Frame]], size: float) -> None:
+    """Writes all films as one, and the first ones as an animation."""
+    kept: list[Frame] = []
+
+    def frames() -> Iterator[Frame]:
+        for place, film in enumerate(films):
+            for index, frame in enumerate(film):
+                if place < _GIF_EPISODES and index % GIF_STRIDE == 0:
+                    kept.append(shrunk(frame, size))
+                yield frame
+
+    with writing_to(mp4):
+        write_mp4(mp4, frames())
+    with writing_to(gif):
+        write_gif(gif, kept)
+
+
+def check_goals(goals: Sequence[int]) -> None:
+    """Refuses indices that name no goal of the fixed set, or one twice.
+
+    Args:
+      goals: the indices.
+
+    Raises:
+      UserError: as said.
+    """
+    if not goals:
+        raise UserError("goals = [] names none: give at least one index")
+    for place, goal in enumerate(goals):
+        if not 0 <= goal < REPORT_GOALS:
+            raise UserError(
+                f"goal {goal} is none of the {REPORT_GOALS:,} fixed goals: they are 0 to"
+                f" {REPORT_GOALS - 1}"
+            )
+        if goal in goals[:place]:
+            raise UserError(f"goal {goal} is named twice: once will do")
+
+
+def _spans(goals: Sequence[int]) -> str:
+    """Indices as one would write them: `3,17`, or `0-7` for neighbours."""
+    runs = [
+        [goal for _, goal in run] for _, run in groupby(enumerate(goals), lambda p: p[1] - p[0])
+    ]
+    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+
+
+def _goals(text: str) -> list[int]:
+    """An argument that names goals: indices and ranges of them."""
+    goals: list[int] = []
+    for part in text.split(","):
+        found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", part.strip(), re.ASCII)
+        if found is None:
+            raise argparse.ArgumentTypeError(
+                f"{part!r} is no goal: write indices and ranges, as in 3,17 or 0-7"
+            )
+        first, last = int(found[1]), int(found[2] or found[1])
+        if last < first:
+            raise argparse.ArgumentTypeError(f"{part} runs backwards: write {last}-{first}")
+        # More than there are need not be listed to be refused.
+        goals += range(first, min(last, first + REPORT_GOALS) + 1)
+    try:
+        check_goals(goals)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
+    return goals
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -87,17 +267,50 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.render", description=__doc__)
     cli.add_checkpoint_arguments(parser)
-    parser.add_argument("--episodes", type=cli.positive_int, default=20)
+    which_goals = parser.add_mutually_exclusive_group()
+    which_goals.add_argument(
+        "--episodes",
+        type=cli.positive_int,
+        metavar="N",
+        help="the first N of the fixed goals (default: 20, of a gallery 4)",
+    )
+    which_goals.add_argument(
+        "--goals", type=_goals, metavar="I,J-K", help="these of the fixed goals, as in 3,17 or 0-7"
+    )
+    parser.add_argument(
+        "--gallery",
+        action="store_true",
+        help="the first, the middle and the last checkpoint of the run side by side",
+    )
     options = parser.parse_args(arguments)
+    if options.gallery and options.goals:
+        parser.error("--goals: a gallery shows the first goals, chosen before anyone saw them")
+    if options.gallery and options.checkpoint != "best":
+        parser.error("--checkpoint: a gallery shows the first, the middle and the last")
     cli.require_device()
     cli.use_compilation_cache()
-    pictures = run(options.run, episodes=options.episodes, which=options.checkpoint)
+    if options.gallery:
+        return _main_gallery(options)
+    pictures = run(
+        options.run,
+        episodes=options.episodes or 20,
+        goals=options.goals,
+        which=options.checkpoint,
+    )
     print(
         f"{pictures.successes} of {pictures.episodes} goals reached\n"
         f"video: {pictures.mp4}\n"
         f"gif:   {pictures.gif}\n"
         f"plot:  {pictures.trajectories}"
     )
+    return 0
+
+
+def _main_gallery(options: argparse.Namespace) -> int:
+    gallery = run_gallery(options.run, episodes=options.episodes or 4)
+    for step, successes in gallery.successes.items():
+        print(f"{step:>12,} steps  {successes} of {gallery.episodes} goals reached")
+    print(f"video: {gallery.mp4}\ngif:   {gallery.gif}\nplans: {gallery.plans}")
     return 0
 
 
