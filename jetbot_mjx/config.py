@@ -227,6 +227,9 @@ class EvaluationConfig(_Section):
 
     episodes: Count = 256
     """Deterministic episodes per evaluation, on goals set apart from the final test's."""
+    video: bool = False
+    """Whether every evaluation also films the first four goals of the report, into
+    `videos/<env_steps>/`; without OpenGL a line says so, and training goes on."""
 
 
 class Config(_Section):
@@ -345,6 +348,7 @@ CHANGEABLE_ON_RESUME = (
     "checkpoints_to_keep",
     "preemption_notice",
     "tensorboard",
+    "evaluation.video",
 )
 """What a resumed run may do differently: how far it goes, and what it writes on the way."""
 

@@ -20,7 +20,7 @@ Names, the same everywhere; a line of metrics.jsonl also holds env_steps and tim
   time/env_steps_per_second environment steps over training seconds, compilation apart
   time/training_seconds     spent on training since the last report
   time/evaluation_seconds   spent on this evaluation, its compilation included
-  time/recording_seconds    spent on logging and saving after the last evaluation
+  time/recording_seconds    spent on logging, saving and filming after the last evaluation
   time/compile_seconds      spent tracing and compiling in this interval, evaluation included
   time/wall_seconds         since training began, in all processes that worked on the run
 """

@@ -10,8 +10,10 @@ from typing import Any, Self
 from jetbot_mjx.checkpoint import POLICY, about_policy
 from jetbot_mjx.config import Config
 from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.faults import save_fault
+from jetbot_mjx.film import EvaluationFilm
 from jetbot_mjx.metrics import (
     CompileClock,
     Figures,
@@ -24,11 +26,12 @@ from jetbot_mjx.metrics import (
     process_seconds,
     read_history,
 )
+from jetbot_mjx.offscreen import find_backend
 from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.ppo import Fault
 from jetbot_mjx.resume import Resumption, to_trees
-from jetbot_mjx.run_folder import versions, writing_to
-from jetbot_mjx.store import Store, digest
+from jetbot_mjx.run_folder import make_folder, versions, writing_to
+from jetbot_mjx.store import Store, checkpoint_path, digest
 from jetbot_mjx.trainer import Progress, Recorder
 
 _METRICS = "metrics.jsonl"
@@ -96,6 +99,7 @@ class RunRecorder(Recorder):
         self._config = config
         self._evaluator = Evaluator(env, networks)
         self._keys = training_keys(config.evaluation.episodes)
+        self._film = EvaluationFilm(env, networks) if config.evaluation.video else None
         self._clock = clock
         self._terminal = ProgressSink(config.ppo.num_timesteps)
         resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
@@ -169,6 +173,7 @@ class RunRecorder(Recorder):
         self._tell_first_step()
         self._terminal.write(progress[0].env_steps, _mean(lines))
         self.fingerprints = [digest(one.params) for one in progress]
+        self._film_seeds(progress)
         self._recording_seconds = time.perf_counter() - began - judging
         return not self.complete
 
@@ -200,6 +205,21 @@ class RunRecorder(Recorder):
     def compiled(self) -> None:
         """Waits for the first step to tell what came before it."""
         self._awaiting_first_step = True
+
+    def _film_seeds(self, progress: Sequence[Progress]) -> None:
+        """Comes last: whatever happens to a film, the log and the checkpoints are begun."""
+        if self._film is None:
+            return
+        try:
+            find_backend()
+        except UserError as error:
+            self._terminal.say(f"evaluation.video: nothing is filmed: {error}")
+            self._film = None
+            return
+        for seed, one in zip(self._seeds, progress, strict=True):
+            seed.film(self._film, one)
+        # No trainer compiled this.
+        self._lap()
 
     def _tell_first_step(self) -> None:
         if not self._awaiting_first_step:
@@ -271,6 +291,13 @@ class _SeedRecorder:
         trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}
         about = {**self._about, "figures": dict(judged), "progress": self.standing.to_json()}
         self._store.save(progress.env_steps, trees, about, judged.get("success_rate"))
+
+    def film(self, film: EvaluationFilm, progress: Progress) -> None:
+        name = checkpoint_path(self._run_dir, progress.env_steps).name
+        path = self._run_dir / "videos" / name / "evaluation.mp4"
+        make_folder(path.parent)
+        with writing_to(path):
+            film.write(path, progress.params, progress.env_steps)
 
     def keep_fault(self, env_steps: int, fault: Fault) -> Path | None:
         with writing_to(self._run_dir):

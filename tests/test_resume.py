@@ -643,6 +643,7 @@ CHANGES = {
     "checkpoints_to_keep": 1,
     "preemption_notice": 60.0,
     "tensorboard": "false",
+    "evaluation.video": "true",
 }
 
 
