@@ -47,7 +47,7 @@ mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 150)
 """
 
 _REMEDY = (
-    "no OpenGL for pictures: install one of libegl1 with a GPU driver or libegl-mesa0, or"
+    "install one of libegl1 with a GPU driver or libegl-mesa0, or"
     " libosmesa6 (Debian and Ubuntu: apt-get install libegl1 libegl-mesa0)"
 )
 
@@ -205,4 +205,4 @@ def find_backend() -> str:
             return backend
     if wanted in _BACKENDS:
         raise UserError(f"MUJOCO_GL = {wanted!r} does not work here: unset it, or {_REMEDY}")
-    raise UserError(_REMEDY)
+    raise UserError(f"no OpenGL for pictures: {_REMEDY}")

@@ -243,7 +243,7 @@ def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
     monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit('{backend}' == 'osmesa')")
     offscreen.find_backend.cache_clear()
     try:
-        with pytest.raises(UserError, match="MUJOCO_GL = 'osmesa'"):
+        with pytest.raises(UserError, match="'osmesa' does not work here: unset it, or install"):
             offscreen.find_backend()
     finally:
         offscreen.find_backend.cache_clear()
