@@ -7,7 +7,16 @@ import pytest
 from ipykernel.kernelspec import write_kernel_spec
 from nbclient import NotebookClient
 
-NAMES = ("01_environment", "02_train", "03_evaluate_and_render")
+NAMES = ("01_environment", "02_train", "03_evaluate_and_render", "04_own_task")
+
+SHORT = (
+    "checkpoint_interval=16384",
+    "ppo.num_timesteps=32768",
+    "ppo.network.policy_hidden_layer_sizes=[32]",
+    "ppo.network.value_hidden_layer_sizes=[32]",
+    "evaluation.episodes=32",
+)
+"""For the task of one's own, whose configuration is part of the notebook."""
 
 IMAGES = {"image/png", "image/jpeg", "image/gif"}
 
@@ -21,6 +30,8 @@ def execute(root, tmp_path_factory):
         patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
         patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
         patch.setenv("JETBOT_EPISODES", "3")
+        patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
+        patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
         patch.setenv("PYTHONPATH", str(root), prepend=os.pathsep)
         # Nothing of the user's own Jupyter, and nothing left in it.
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
@@ -67,9 +78,15 @@ def text(notebook):
     return "".join(output.get("text", "") for output in outputs)
 
 
+def html(notebook):
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "".join(output.get("data", {}).get("text/html", "") for output in outputs)
+
+
 def test_environment_notebook_runs(execute):
     notebook = execute("01_environment")
     assert images(notebook) == ["image/png"] * 2
+    assert "<video" in html(notebook)
     assert "20 different goals in 20 episodes" in text(notebook)
 
 
@@ -82,6 +99,14 @@ def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, tra
     notebook = execute("03_evaluate_and_render")
     assert images(notebook) == ["image/png", "image/png", "image/gif"]
     assert "scripted" in text(notebook)
+
+
+def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, root):
+    notebook = execute("04_own_task")
+    assert images(notebook) == ["image/png", "image/gif"]
+    assert "blank_task:BlankTask sees" in text(notebook)
+    assert "training parking_task:ParkingTask" in text(notebook)
+    assert "reward/parked" in text(notebook)
 
 
 @pytest.mark.parametrize("name", NAMES)
