@@ -111,7 +111,22 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           The next state, with the same tree, shapes and dtypes.
         """
-        physics = self.step_physics(state.pipeline_state, self.wheel_targets(action))
+        return self.step_towards(state, action, self.wheel_targets(action))
+
+    def step_towards(
+        self, state: State, action: Float[Array, "2"], ctrl: Float[Array, "2"]
+    ) -> State:
+        """One environment step with wheel speeds other than those that the action commands.
+
+        Args:
+          state: of the same environment.
+          action: in [-1, 1]², for the task's reward alone.
+          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
+
+        Returns:
+          The next state.
+        """
+        physics = self.step_physics(state.pipeline_state, ctrl)
         before, after = robot_state(state.pipeline_state), robot_state(physics)
         reward, terms = self.task.reward(before, after, state.goal, action)
         terminated = self.task.terminated(after, state.goal).astype(jnp.float32)

@@ -145,6 +145,23 @@ def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
     return mean, max(0.0, mean - spread), min(1.0, mean + spread)
 
 
+def policy_controller(networks: ppo_networks.PPONetworks) -> Controller:
+    """The controller that acts as a policy does, without exploring.
+
+    Args:
+      networks: of the policy; its parameters are the controller's.
+
+    Returns:
+      The controller.
+    """
+
+    def act(params: PolicyParams, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
+        del key
+        return make_policy(networks, params)(state.obs)
+
+    return act
+
+
 class Evaluator:
     """Judges policies, and baselines beside them, in one compiled program."""
 
@@ -166,12 +183,7 @@ class Evaluator:
         """
         self._env = env
         self._names = ["policy", *(BASELINES if baselines else ())]
-
-        def act_greedily(params: PolicyParams, state: State, key: UInt32[Array, "2"]) -> Array:
-            del key
-            return make_policy(networks, params)(state.obs)
-
-        controllers: list[Controller] = [act_greedily]
+        controllers = [policy_controller(networks)]
         if baselines:
             controllers += [make(env) for make in BASELINES.values()]
         length = env.config.task.episode_length

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jetbot_mjx.compiling import compiler_options
@@ -46,6 +47,10 @@ class Episodes(NamedTuple):
     """Trajectory, first state included; after the end it stands still. None: not recorded."""
 
 
+Rollout = Callable[[int | Int[Array, ""], Any, UInt32[Array, "n 2"]], Episodes]
+"""Of (index of the controller, its parameters, reset keys)."""
+
+
 class _Tally(NamedTuple):
     alive: Float[Array, ""]
     success: Float[Array, ""]
@@ -68,7 +73,7 @@ def make_rollout(
     episode_length: int,
     *,
     record: bool = False,
-) -> Callable[[int, Any, UInt32[Array, "n 2"]], Episodes]:
+) -> Rollout:
     """Compiles episodes under any one of several controllers into one program.
 
     Args:
@@ -80,6 +85,28 @@ def make_rollout(
     Returns:
       A function of (index of the controller, its parameters, one reset key for each
       environment). The reset key also seeds the controller's own randomness.
+    """
+    run = rollout_fn(env, controllers, episode_length, record=record)
+    return jax.jit(run, compiler_options=compiler_options(env.config))
+
+
+def rollout_fn(
+    env: JetBotEnv | Wrapper,
+    controllers: Sequence[Controller],
+    episode_length: int,
+    *,
+    record: bool = False,
+) -> Rollout:
+    """What `make_rollout` compiles, for those who make it part of a larger program.
+
+    Args:
+      env: one environment, or one in a wrapper that leaves its state a `State`.
+      controllers: what can drive.
+      episode_length: environment steps after which an episode is truncated.
+      record: whether to keep the trajectories.
+
+    Returns:
+      The same function as `make_rollout`'s, not compiled.
     """
     episode_env = EpisodeWrapper(env, episode_length)
 
@@ -101,7 +128,7 @@ def make_rollout(
         nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
         return nstate, added
 
-    def run(index: Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
+    def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = jax.vmap(episode_env.reset)(keys)
         zero = jnp.zeros(keys.shape[0])
         tally = _Tally(jnp.ones_like(zero), zero, zero, zero, zero, zero)
@@ -145,4 +172,4 @@ def make_rollout(
             qpos=qpos,
         )
 
-    return jax.jit(run, compiler_options=compiler_options(env.config))
+    return run
