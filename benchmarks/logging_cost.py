@@ -1,8 +1,9 @@
 """Measures what logging and saving cost: `python benchmarks/logging_cost.py --config FILE`.
 
 The same compiled training runs again and again, in turn with nobody listening and with all that
-`python -m jetbot_mjx.train` does at a report: metrics.jsonl, TensorBoard, the terminal, and the
-whole state to disk in the background. Evaluations are left out of both: they are no logging.
+`python -m jetbot_mjx.train` does at a report: metrics.jsonl, TensorBoard, the terminal (on one, the
+dashboard too), and the whole state to disk in the background. Evaluations are left out of both:
+they are no logging.
 """
 
 import statistics
@@ -88,6 +89,7 @@ def _once(config: Config, env: Any, program: resumable_ppo.Program, *, recorded:
             timed = train(Listener(clock))
         else:
             with _Unjudged(config, env, [Path(folder)], clock) as recorder:
+                recorder.begin("with logs and checkpoints")
                 timed = train(recorder)
             timed.ended = time.perf_counter()
     return timed.ended - timed.began

@@ -1,6 +1,7 @@
-"""Where the figures of a training go: a file, TensorBoard, the terminal. One `Sink` each.
+"""Where the figures of a training go: a file and TensorBoard, one `Sink` each.
 
-Names, the same everywhere; a line of metrics.jsonl also holds env_steps and timestamp:
+Names, the same everywhere; a line of metrics.jsonl also holds env_steps and timestamp, and
+TensorBoard the names of Stable-Baselines3 (`aliases`):
   eval/episodes             of the deterministic policy, on fixed goals; likewise successes
   eval/success_rate         of those; with success_low, success_high
   eval/time_to_goal_median  [s] of the successes; likewise time_to_goal_p95
@@ -9,7 +10,7 @@ Names, the same everywhere; a line of metrics.jsonl also holds env_steps and tim
   eval/final_distance_median    [m] to the goal at the end, on the floor
   eval/nonfinite_worlds     episodes cut off because their world was no longer finite
   loss/total, policy, value, entropy    means over the interval, as Brax computes them
-  policy/entropy            of the action distribution, before squashing [nat]
+  policy/entropy            of the actions, after squashing where they are squashed [nat]
   policy/kl                 between the policy before and after an update, mean
   policy/std                of the action distribution, before squashing
   policy/learning_rate      Adam's step size
@@ -29,17 +30,17 @@ import contextlib
 import json
 import math
 import os
-import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self, TextIO
+from typing import Any, NamedTuple, Protocol, Self
 
 import jax
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
 
+from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.run_folder import write_text
 
 Figures = Mapping[str, float | None]
@@ -85,6 +86,82 @@ class Sinks:
     def __exit__(self, *exception: object) -> None:
         """Closes each."""
         self.close()
+
+
+def mean_of(figures: Sequence[Figures]) -> Figures:
+    """Of several seeds, figure by figure; a seed that has none is left out."""
+    means: dict[str, float | None] = {}
+    for name in figures[0]:
+        values = [value for one in figures if (value := one.get(name)) is not None]
+        means[name] = sum(values) / len(values) if values else None
+    return means
+
+
+class Alias(NamedTuple):
+    """One of our figures under another's name."""
+
+    figure: str
+    """Ours; or `env_steps`."""
+    times: float = 1.0
+    """What it is multiplied by,"""
+    over: float | str = 1.0
+    """and divided by: a number, or another of our figures."""
+
+
+def aliases(ppo: PPOConfig) -> dict[str, Alias]:
+    """Our figures by the names that Stable-Baselines3's PPO gives them, in its units.
+
+    Only what means the same is here. Figures that both call alike need no alias.
+
+    Args:
+      ppo: of the run; nothing of it that is used here may change when a run goes on.
+
+    Returns:
+      By Stable-Baselines3's tag.
+
+    Source: DLR-RM/stable-baselines3, stable_baselines3/ppo/ppo.py, common/on_policy_algorithm.py.
+    """
+    # Brax halves the squared error, and sees scaled rewards.
+    value_loss = ppo.vf_loss_coefficient * ppo.reward_scaling**2 / 2
+    return {
+        "rollout/ep_rew_mean": Alias("rollout/episode_return"),
+        "rollout/ep_len_mean": Alias("rollout/episode_length"),
+        "eval/mean_reward": Alias("eval/episode_return"),
+        "train/loss": Alias("loss/total"),
+        "train/policy_gradient_loss": Alias("loss/policy"),
+        "train/value_loss": Alias("loss/value", over=value_loss),
+        "train/entropy_loss": Alias("policy/entropy", times=-1.0),
+        "train/approx_kl": Alias("policy/kl"),
+        "train/std": Alias("policy/std"),
+        "train/learning_rate": Alias("policy/learning_rate"),
+        "train/n_updates": Alias(
+            "env_steps", ppo.num_updates_per_batch, over=ppo.steps_per_training_step
+        ),
+        "time/iterations": Alias("env_steps", over=ppo.steps_per_training_step),
+        "time/total_timesteps": Alias("env_steps"),
+        "time/time_elapsed": Alias("time/wall_seconds"),
+        "time/fps": Alias("env_steps", over="time/wall_seconds"),
+    }
+
+
+def with_aliases(env_steps: int, figures: Figures, names: Mapping[str, Alias]) -> dict[str, float]:
+    """Adds what is known under other names, and leaves out what there is not.
+
+    Args:
+      env_steps: at that moment.
+      figures: ours.
+      names: from `aliases`.
+
+    Returns:
+      All figures that have a value.
+    """
+    known: dict[str, float] = {name: value for name, value in figures.items() if value is not None}
+    ours = {**known, "env_steps": float(env_steps)}
+    for tag, (figure, times, over) in names.items():
+        divisor = ours.get(over) if isinstance(over, str) else over
+        if figure in ours and divisor:
+            known[tag] = ours[figure] * times / divisor
+    return known
 
 
 class History(NamedTuple):
@@ -161,13 +238,20 @@ _EVENT: Any = vars(event_pb2)["Event"]
 class TensorBoardSink:
     """TensorBoard event files, written without TensorFlow."""
 
-    def __init__(self, folder: Path, history: Sequence[History] = ()) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        history: Sequence[History] = (),
+        names: Mapping[str, Alias] | None = None,
+    ) -> None:
         """Opens an event file.
 
         Args:
           folder: for `tensorboard --logdir`; events of an earlier training go.
           history: is written first, in their place.
+          names: from `aliases`: what is written under further names.
         """
+        self._names = names or {}
         folder.mkdir(exist_ok=True)
         for events in folder.glob("events.out.tfevents.*"):
             events.unlink()
@@ -185,8 +269,7 @@ class TensorBoardSink:
     def _add(self, env_steps: int, timestamp: float, figures: Figures) -> None:
         values = [
             _SUMMARY.Value(tag=name, simple_value=value)
-            for name, value in figures.items()
-            if value is not None
+            for name, value in with_aliases(env_steps, figures, self._names).items()
         ]
         event = _EVENT(wall_time=timestamp, step=env_steps, summary=_SUMMARY(value=values))
         self._writer.write_event(event)
@@ -194,73 +277,6 @@ class TensorBoardSink:
     def close(self) -> None:
         """Closes the event file."""
         self._writer.close()
-
-
-_SECONDS_BETWEEN_LINES = 10.0
-
-
-class ProgressSink:
-    """A line on the terminal for every interval, with what is left to wait."""
-
-    def __init__(self, total_steps: int, stream: TextIO | None = None) -> None:
-        """Prepares the lines.
-
-        Args:
-          total_steps: environment steps of the whole training.
-          stream: where to print; standard output by default.
-        """
-        self._total = total_steps
-        self._stream = stream or sys.stdout
-        self._last_line = -math.inf
-
-    def write(self, env_steps: int, figures: Figures) -> None:
-        """Prints one line."""
-        wall = figures.get("time/wall_seconds") or 0.0
-        parts = [f"{env_steps:>12,} steps"]
-        parts.append(_shown(figures, "eval/success_rate", "success {:6.1%}"))
-        parts.append(_shown(figures, "eval/time_to_goal_median", "to goal {:4.2f} s"))
-        parts.append(_shown(figures, "time/env_steps_per_second", "{:>10,.0f} steps/s"))
-        parts.append(f"{wall:6.1f} s")
-        compiled = figures.get("time/compile_seconds") or 0.0
-        if rate := figures.get("time/env_steps_per_second"):
-            parts.append(self._eta(env_steps, rate))
-        if compiled > 0.5:
-            parts.append(f"(compiling {compiled:.1f} s)")
-        self._print(parts)
-
-    def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
-        """Prints a line between two reports, unless the last one is still new."""
-        if time.monotonic() - self._last_line < _SECONDS_BETWEEN_LINES:
-            return
-        self._print(
-            [
-                f"{env_steps:>12,} steps",
-                _shown(figures, "rollout/success_rate", "exploring {:6.1%}"),
-                f"{env_steps_per_second:>10,.0f} steps/s",
-                self._eta(env_steps, env_steps_per_second),
-            ]
-        )
-
-    def _eta(self, env_steps: int, env_steps_per_second: float) -> str:
-        """Training time that is left at this pace."""
-        left = max(0, self._total - env_steps) / env_steps_per_second
-        return f"ETA {left:5.0f} s"
-
-    def say(self, text: str) -> None:
-        """Prints a line of its own."""
-        self._print([text])
-
-    def _print(self, parts: Sequence[str]) -> None:
-        print("  ".join(part for part in parts if part), file=self._stream, flush=True)
-        self._last_line = time.monotonic()
-
-    def close(self) -> None:
-        """Nothing is left."""
-
-
-def _shown(figures: Figures, name: str, form: str) -> str:
-    value = figures.get(name)
-    return form.format(value) if value is not None else ""
 
 
 class CompileClock:

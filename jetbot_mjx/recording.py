@@ -9,6 +9,7 @@ from typing import Any, Self
 
 from jetbot_mjx.checkpoint import POLICY, about_policy
 from jetbot_mjx.config import Config
+from jetbot_mjx.dashboard import open_terminal
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import Evaluator, Summary, summarize, training_keys
@@ -19,10 +20,10 @@ from jetbot_mjx.metrics import (
     Figures,
     History,
     JsonlSink,
-    ProgressSink,
     Sink,
     Sinks,
     TensorBoardSink,
+    aliases,
     process_seconds,
     read_history,
 )
@@ -32,6 +33,7 @@ from jetbot_mjx.ppo import Fault
 from jetbot_mjx.resume import Resumption, to_trees
 from jetbot_mjx.run_folder import make_folder, versions, writing_to
 from jetbot_mjx.store import Store, checkpoint_path, digest
+from jetbot_mjx.terminal import COMPILING, EVALUATING, FILMING, SAVING, TRAINING
 from jetbot_mjx.trainer import Progress, Recorder
 
 _METRICS = "metrics.jsonl"
@@ -101,18 +103,25 @@ class RunRecorder(Recorder):
         self._keys = training_keys(config.evaluation.episodes)
         self._film = EvaluationFilm(env, networks) if config.evaluation.video else None
         self._clock = clock
-        self._terminal = ProgressSink(config.ppo.num_timesteps)
         resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
+        histories = [
+            read_history(run_dir / _METRICS, resumed.env_steps) if resumption else []
+            for run_dir in run_dirs
+        ]
+        ppo = config.ppo
+        self._total = ppo.training_steps * ppo.steps_per_training_step
+        self._terminal = open_terminal(run_dirs, self._total, histories)
+        self._compiled = False
         self._seeds = [
             _SeedRecorder(
                 seed_config,
                 env,
                 run_dir,
                 Standing.from_json(standing),
-                read_history(run_dir / _METRICS, resumed.env_steps) if resumption else [],
+                history,
             )
-            for seed_config, run_dir, standing in zip(
-                config.of_each_seed(), run_dirs, resumed.progress, strict=True
+            for seed_config, run_dir, standing, history in zip(
+                config.of_each_seed(), run_dirs, resumed.progress, histories, strict=True
             )
         ]
         self._earlier = self._seeds[0].standing.wall_seconds
@@ -132,10 +141,9 @@ class RunRecorder(Recorder):
     @property
     def complete(self) -> bool:
         """Whether every seed has made all its steps, or reached `stop_at_success`."""
-        ppo, target = self._config.ppo, self._config.stop_at_success
-        total = ppo.training_steps * ppo.steps_per_training_step
+        target = self._config.stop_at_success
         return all(
-            one.env_steps >= total
+            one.env_steps >= self._total
             or (target is not None and one.last is not None and one.last.success_rate >= target)
             for one in self.standings
         )
@@ -145,13 +153,20 @@ class RunRecorder(Recorder):
         """Since the training began, in all processes [s]."""
         return self._earlier + time.perf_counter() - self._began
 
+    def begin(self, headline: str) -> None:
+        """Says what is trained, and that compiling has begun."""
+        self._terminal.say(headline)
+        self._terminal.begin()
+
     def report(self, progress: Sequence[Progress]) -> bool:
         """Judges, logs and saves every seed; tells whether it is worth going on."""
+        self._at(EVALUATING)
         # What a trainer compiles while it trains belongs to the time it reports.
         compiling = self._lap()
         began = time.perf_counter()
         summaries = [self.judge(one.params) for one in progress]
         judging = time.perf_counter() - began
+        self._at(SAVING)
         self._lap()
         compiled, self._unlogged_compile_seconds = self._unlogged_compile_seconds, 0.0
         lines = []
@@ -171,10 +186,13 @@ class RunRecorder(Recorder):
             seed.report(one, summary, figures, self.wall_seconds)
             lines.append(figures)
         self._tell_first_step()
-        self._terminal.write(progress[0].env_steps, _mean(lines))
+        self._terminal.write(progress[0].env_steps, lines)
         self.fingerprints = [digest(one.params) for one in progress]
         self._film_seeds(progress)
         self._recording_seconds = time.perf_counter() - began - judging
+        if progress[0].env_steps > 0:
+            self._compiled = True
+        self._at(TRAINING)
         return not self.complete
 
     def judge(self, params: PolicyParams) -> Summary:
@@ -184,6 +202,7 @@ class RunRecorder(Recorder):
 
     def pause(self, progress: Sequence[Progress]) -> None:
         """Saves every seed as it is."""
+        self._terminal.phase(SAVING)
         for seed, one in zip(self._seeds, progress, strict=True):
             seed.save(one, {}, self.wall_seconds)
 
@@ -204,12 +223,15 @@ class RunRecorder(Recorder):
 
     def compiled(self) -> None:
         """Waits for the first step to tell what came before it."""
+        self._compiled = True
+        self._at(TRAINING)
         self._awaiting_first_step = True
 
     def _film_seeds(self, progress: Sequence[Progress]) -> None:
         """Comes last: whatever happens to a film, the log and the checkpoints are begun."""
         if self._film is None:
             return
+        self._at(FILMING)
         try:
             find_backend()
         except UserError as error:
@@ -220,6 +242,10 @@ class RunRecorder(Recorder):
             seed.film(self._film, one)
         # No trainer compiled this.
         self._lap()
+
+    def _at(self, phase: str) -> None:
+        """Tells the terminal; what is done before the first training step is mostly compiling."""
+        self._terminal.phase(phase if self._compiled else COMPILING)
 
     def _tell_first_step(self) -> None:
         if not self._awaiting_first_step:
@@ -246,7 +272,9 @@ class RunRecorder(Recorder):
 
     def __exit__(self, *exception: object) -> None:
         """Waits until all is on disk."""
+        self._terminal.phase(SAVING)
         with contextlib.ExitStack() as stack:
+            stack.callback(self._terminal.close)
             for seed in self._seeds:
                 stack.callback(seed.close)
 
@@ -269,7 +297,8 @@ class _SeedRecorder:
         with writing_to(run_dir):
             sinks: list[Sink] = [JsonlSink(run_dir / _METRICS, history)]
             if config.tensorboard:
-                sinks.append(TensorBoardSink(run_dir / "tensorboard", history))
+                names = aliases(config.ppo)
+                sinks.append(TensorBoardSink(run_dir / "tensorboard", history, names))
         self._sinks = Sinks(sinks)
         self._store = Store(run_dir, config.checkpoints_to_keep)
 
@@ -308,12 +337,3 @@ class _SeedRecorder:
             stack.enter_context(self._store)
             stack.enter_context(writing_to(self._run_dir))
             stack.callback(self._sinks.close)
-
-
-def _mean(figures: Sequence[Figures]) -> Figures:
-    """Of several seeds, figure by figure; a seed that has none is left out."""
-    means: dict[str, float | None] = {}
-    for name in figures[0]:
-        values = [value for one in figures if (value := one.get(name)) is not None]
-        means[name] = sum(values) / len(values) if values else None
-    return means

@@ -94,8 +94,8 @@ def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock
     from jetbot_mjx import brax_ppo
 
     write_run(run_dir, config)
-    print(_headline(config, run_dir), flush=True)
     with RunRecorder(config, env, [run_dir], clock) as recorder:
+        recorder.begin(_headline(config, run_dir))
         brax_ppo.train(config, env, recorder)
     return _result(run_dir, [run_dir], recorder, finished=True)
 
@@ -117,7 +117,7 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, clock: Compile
                 write_run(seed_dir, seed_config)
         recorder = stack.enter_context(RunRecorder(config, env, run_dirs, clock, resumption))
         if not recorder.complete:
-            print(_headline(config, run_dir), flush=True)
+            recorder.begin(_headline(config, run_dir))
             states = resumption.states if resumption else None
             resumable_ppo.train(config, program, recorder, preemption, states)
     return _result(run_dir, run_dirs, recorder, finished=recorder.complete)

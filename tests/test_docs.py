@@ -297,11 +297,8 @@ def documented_names():
     return names
 
 
-EXPLAINED = {
-    cells[0].strip("`"): cells[1:]
-    for cells in rows(PAGES["metrics.md"])
-    if cells[0].startswith("`")
-}
+OURS, THEIRS = PAGES["metrics.md"].split("\n## Stable-Baselines3's names\n")
+EXPLAINED = {cells[0].strip("`"): cells[1:] for cells in rows(OURS) if cells[0].startswith("`")}
 
 
 def test_every_metric_of_the_list_is_explained():
@@ -320,6 +317,20 @@ def test_every_metric_that_is_written_is_explained(smoke_run):
 def test_names_that_other_modules_give_are_explained():
     assert {f"eval/{name}" for name in Summary._fields} < set(EXPLAINED)
     assert set(LOSSES.values()) < set(EXPLAINED)
+
+
+def test_every_name_of_stable_baselines3_is_explained():
+    told = {
+        cells[0].strip("`"): re.findall("`([^`]+)`", cells[1])
+        for cells in rows(THEIRS)
+        if cells[0].startswith("`")
+    }
+    names = metrics.aliases(Config().ppo)
+    assert {tag for tag, ours in told.items() if ours != [tag]} == set(names)
+    for tag, (figure, _, over) in names.items():
+        assert figure in told[tag]
+        assert not isinstance(over, str) or over in told[tag]
+        assert figure in EXPLAINED
 
 
 # Commands.

@@ -1,7 +1,6 @@
 """Where the figures go: each sink says what it was told, and the clock counts compiling once."""
 
 import errno
-import io
 import json
 import math
 import os
@@ -17,15 +16,18 @@ import pytest
 from tensorboardX.proto.event_pb2 import Event
 
 from jetbot_mjx import metrics
+from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.metrics import (
     CompileClock,
     History,
     JsonlSink,
-    ProgressSink,
     Sinks,
     TensorBoardSink,
+    aliases,
+    mean_of,
     process_seconds,
     read_history,
+    with_aliases,
 )
 
 
@@ -225,80 +227,6 @@ def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-@pytest.fixture
-def lines():
-    """The lines that the progress of a training of 10,000 steps prints for some reports."""
-
-    def lines(*reports):
-        stream = io.StringIO()
-        sink = ProgressSink(10_000, stream)
-        for env_steps, figures in reports:
-            sink.write(env_steps, figures)
-        assert stream.getvalue().endswith("\n")
-        return stream.getvalue().splitlines()
-
-    return lines
-
-
-def clocks(wall, compiled):
-    return {"time/wall_seconds": wall, "time/compile_seconds": compiled}
-
-
-def test_a_line_of_progress_says_how_far_how_good_and_how_fast(lines):
-    figures = {
-        "eval/success_rate": 0.875,
-        "eval/time_to_goal_median": 1.25,
-        "time/env_steps_per_second": 123_456.7,
-        **clocks(wall=61.5, compiled=12.3),
-    }
-    (line,) = lines((4_096, figures))
-    for part in ("4,096 steps", "success  87.5%", "to goal 1.25 s", "123,457 steps/s", "61.5 s"):
-        assert part in line
-    assert "(compiling 12.3 s)" in line
-
-
-def test_a_line_leaves_out_what_there_is_not_yet(lines):
-    figures = {"eval/success_rate": 0.0, "eval/time_to_goal_median": None, **clocks(1.0, 0.1)}
-    (line,) = lines((0, figures))
-    assert "success   0.0%" in line
-    for part in ("to goal", "steps/s", "ETA", "compiling", "None"):
-        assert part not in line
-
-
-def test_the_time_left_follows_the_pace_of_this_interval(lines):
-    # 8,000 steps are left at 100 steps/s, then 6,000 at 400.
-    first, second = lines(
-        (2_000, {"time/env_steps_per_second": 100.0, **clocks(20.0, 0.0)}),
-        (4_000, {"time/env_steps_per_second": 400.0, **clocks(25.0, 0.0)}),
-    )
-    assert "ETA    80 s" in first
-    assert "ETA    15 s" in second
-
-
-def test_no_time_is_left_at_the_end_and_beyond(lines):
-    # Training steps are whole: the last may go beyond what was asked for.
-    (line,) = lines((10_240, {"time/env_steps_per_second": 100.0, **clocks(5.0, 0.0)}))
-    assert "ETA     0 s" in line
-
-
-def test_a_line_between_two_reports_is_printed_where_the_last_one_is_old(monkeypatch):
-    now = 0.0
-    monkeypatch.setattr(metrics, "time", types.SimpleNamespace(monotonic=lambda: now))
-    stream = io.StringIO()
-    sink = ProgressSink(10_000, stream)
-    for now in (0.0, 9.0, 11.0, 12.0, 20.0, 21.5):
-        sink.tell(int(now), {"rollout/success_rate": 0.5}, 100.0)
-    shown = stream.getvalue().splitlines()
-    assert [int(line.split()[0]) for line in shown] == [0, 11, 21]
-    assert all("exploring  50.0%" in line and "100 steps/s" in line for line in shown)
-    assert "ETA   100 s" in shown[0]
-
-
-def test_progress_goes_to_standard_output(capsys):
-    ProgressSink(10).write(5, {})
-    assert "5 steps" in capsys.readouterr().out
-
-
 class Recorder:
     """A sink that remembers."""
 
@@ -331,6 +259,91 @@ def test_joined_sinks_are_closed_where_training_fails():
     with pytest.raises(ZeroDivisionError), Sinks([sink]):
         raise ZeroDivisionError
     assert log == [(sink, "closed")]
+
+
+PPO = PPOConfig(
+    num_envs=8,
+    batch_size=5,
+    num_minibatches=8,
+    unroll_length=3,
+    num_updates_per_batch=7,
+    vf_loss_coefficient=0.5,
+    reward_scaling=10.0,
+)
+"""A training step of it is 120 environment steps."""
+
+
+def test_figures_have_the_names_and_units_of_stable_baselines3_as_well():
+    # What Brax computes of these: a policy loss of 0.1, squared errors of 4 m² in the mean (400 in
+    # scaled rewards) and an entropy of 1.5 nat.
+    figures = {
+        "rollout/episode_return": 0.75,
+        "rollout/episode_length": 64.0,
+        "eval/episode_return": 0.5,
+        "loss/total": 99.9,
+        "loss/policy": 0.1,
+        "loss/value": 0.5 * 0.5 * 400,
+        "policy/entropy": 1.5,
+        "policy/kl": 0.01,
+        "policy/std": 0.3,
+        "policy/learning_rate": 1e-3,
+        "time/wall_seconds": 80.0,
+    }
+    found = with_aliases(1_200, figures, aliases(PPO))
+    assert {name: found.pop(name) for name in figures} == figures
+    assert found == {
+        "rollout/ep_rew_mean": 0.75,
+        "rollout/ep_len_mean": 64.0,
+        "eval/mean_reward": 0.5,
+        "train/loss": 99.9,
+        "train/policy_gradient_loss": 0.1,
+        "train/value_loss": 4.0,
+        "train/entropy_loss": -1.5,
+        "train/approx_kl": 0.01,
+        "train/std": 0.3,
+        "train/learning_rate": 1e-3,
+        "train/n_updates": 70.0,
+        "time/iterations": 10.0,
+        "time/total_timesteps": 1_200.0,
+        "time/time_elapsed": 80.0,
+        "time/fps": 15.0,
+    }
+
+
+def test_what_does_not_exist_has_no_other_name_either():
+    figures = {"rollout/episode_return": None, "time/wall_seconds": 0.0}
+    found = with_aliases(0, figures, aliases(PPO))
+    assert found == {
+        "time/wall_seconds": 0.0,
+        "train/n_updates": 0.0,
+        "time/iterations": 0.0,
+        "time/total_timesteps": 0.0,
+        "time/time_elapsed": 0.0,
+    }
+
+
+def test_tensorboard_is_written_again_with_the_same_other_names(tmp_path):
+    figures = {"loss/value": 1 / 3, "policy/entropy": 0.1, "time/wall_seconds": 7.7}
+    for name in ("once", "again"):
+        history = read_history(tmp_path / "metrics.jsonl", 120)
+        folder = tmp_path / name
+        sinks = [JsonlSink(tmp_path / "metrics.jsonl", history)]
+        sinks.append(TensorBoardSink(folder, history, aliases(PPO)))
+        if not history:
+            for sink in sinks:
+                sink.write(120, figures)
+        for sink in sinks:
+            sink.close()
+    once, again = (read_events(tmp_path / name) for name in ("once", "again"))
+    assert once == again
+    assert "train/value_loss" in {name for _, name, _ in once}
+
+
+def test_the_mean_of_seeds_leaves_out_who_has_none():
+    assert mean_of([{"a": 1.0, "b": None}, {"a": None, "b": None}, {"a": 2.0, "b": None}]) == {
+        "a": 1.5,
+        "b": None,
+    }
 
 
 @pytest.fixture

@@ -8,11 +8,13 @@ import brax.training.agents.ppo.train as brax_ppo_train
 import jax
 import numpy as np
 import pytest
+from test_metrics import read_events
 
 from jetbot_mjx import brax_ppo, evaluate, load_config, make_env, train, wrap_for_training
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import BASELINES
+from jetbot_mjx.metrics import aliases
 
 
 @pytest.fixture(scope="module")
@@ -55,6 +57,18 @@ def test_the_metrics_hold_what_is_promised(lines):
     walls = [line["time/wall_seconds"] for line in lines]
     assert walls == sorted(walls)
     assert last["eval/nonfinite_worlds"] == 0
+
+
+def test_tensorboard_has_the_curves_of_stable_baselines3_too(smoke_run, lines):
+    shown = {(step, name): value for step, name, value in read_events(smoke_run / "tensorboard")}
+    names = aliases(load_config(smoke_run / "config.yaml").ppo)
+    assert {(65_536, name) for name in names} <= set(shown)
+    last = lines[-1]
+    assert shown[65_536, "train/entropy_loss"] == np.float32(-last["policy/entropy"])
+    # 16 training steps of 4 passes.
+    assert shown[65_536, "time/iterations"] == 16
+    assert shown[65_536, "train/n_updates"] == 64
+    assert not set(names) & set(last)
 
 
 def test_figures_of_rollouts_are_those_of_finished_episodes(lines):
