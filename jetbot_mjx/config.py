@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     BeforeValidator,
     ConfigDict,
@@ -39,6 +40,15 @@ def _integral(value: object) -> object:
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value
+
+
+def _wandb_project(name: str) -> str:
+    """Refuses what Weights & Biases would refuse after the training has begun."""
+    if not 0 < len(name) <= 128 or set(name) & set("/\\#?%:"):
+        raise ValueError(
+            f"{name!r} is no project's name: it should have 1 to 128 characters, none of /\\#?%:"
+        )
+    return name
 
 
 _Scalar = bool | int | float | str
@@ -254,6 +264,8 @@ class Config(_Section):
     """Training ends at the first evaluation with this success rate; null: never before the end."""
     tensorboard: bool = True
     """Whether to write TensorBoard's event files beside `metrics.jsonl`."""
+    wandb: Annotated[str, AfterValidator(_wandb_project)] | None = None
+    """Project of Weights & Biases that the run is logged to as well; null: to none."""
     robot: RobotConfig = RobotConfig()
     task: TaskConfig = TaskConfig()
     physics: PhysicsConfig = PhysicsConfig()
@@ -348,6 +360,7 @@ CHANGEABLE_ON_RESUME = (
     "checkpoints_to_keep",
     "preemption_notice",
     "tensorboard",
+    "wandb",
     "evaluation.video",
 )
 """What a resumed run may do differently: how far it goes, and what it writes on the way."""

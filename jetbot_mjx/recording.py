@@ -3,7 +3,7 @@
 import contextlib
 import dataclasses
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -34,6 +34,7 @@ from jetbot_mjx.resume import Resumption, to_trees
 from jetbot_mjx.run_folder import make_folder, versions, writing_to
 from jetbot_mjx.store import Store, checkpoint_path, digest
 from jetbot_mjx.terminal import COMPILING, EVALUATING, FILMING, SAVING, TRAINING
+from jetbot_mjx.tracking import WandbSink
 from jetbot_mjx.trainer import Progress, Recorder
 
 _METRICS = "metrics.jsonl"
@@ -119,6 +120,8 @@ class RunRecorder(Recorder):
                 run_dir,
                 Standing.from_json(standing),
                 history,
+                self._terminal.say,
+                len(run_dirs),
             )
             for seed_config, run_dir, standing, history in zip(
                 config.of_each_seed(), run_dirs, resumed.progress, histories, strict=True
@@ -289,6 +292,8 @@ class _SeedRecorder:
         run_dir: Path,
         standing: Standing,
         history: Sequence[History],
+        say: Callable[[str], None],
+        seeds: int,
     ) -> None:
         self.standing = standing
         self._config = config
@@ -299,6 +304,8 @@ class _SeedRecorder:
             if config.tensorboard:
                 names = aliases(config.ppo)
                 sinks.append(TensorBoardSink(run_dir / "tensorboard", history, names))
+            if config.wandb is not None:
+                sinks.append(WandbSink(config, run_dir, history, say, seeds))
         self._sinks = Sinks(sinks)
         self._store = Store(run_dir, config.checkpoints_to_keep)
 
@@ -334,6 +341,6 @@ class _SeedRecorder:
 
     def close(self) -> None:
         with contextlib.ExitStack() as stack:
-            stack.enter_context(self._store)
             stack.enter_context(writing_to(self._run_dir))
             stack.callback(self._sinks.close)
+            stack.enter_context(self._store)

@@ -30,6 +30,7 @@ from jetbot_mjx.run_folder import (
     stored_config,
     write_run,
 )
+from jetbot_mjx.tracking import check_tracking
 
 
 class Result(NamedTuple):
@@ -74,6 +75,7 @@ def run(config: Config, run_dir: Path) -> Result:
         written; the task cannot be built; the devices cannot share the environments.
     """
     config.check_devices(jax.device_count())
+    check_tracking(config)
     env = make_env(config)
     stored = stored_config(run_dir)
     if stored is not None:

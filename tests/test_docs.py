@@ -342,7 +342,7 @@ class Parsed(Exception):
 
 KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
 PLAIN = {"[", "break", "tensorboard", "apt-get"}
-VARIABLES = {"PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION"}
+VARIABLES = {"PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"}
 COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay}
 
 

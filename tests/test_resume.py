@@ -10,6 +10,7 @@ import functools
 import json
 import os
 import shutil
+import sys
 import time
 import types
 
@@ -18,6 +19,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 from test_metrics import read_events
+from test_tracking import FakeWandb
 
 from jetbot_mjx import load_config, make_env, metrics, recording, resumable_ppo, train
 from jetbot_mjx.checkpoint import POLICY
@@ -643,12 +645,14 @@ CHANGES = {
     "checkpoints_to_keep": 1,
     "preemption_notice": 60.0,
     "tensorboard": "false",
+    "wandb": "jetbots",
     "evaluation.video": "true",
 }
 
 
 @pytest.mark.parametrize("key", CHANGEABLE_ON_RESUME)
-def test_what_may_change_on_resume_is_taken_and_stored(run_copy, key):
+def test_what_may_change_on_resume_is_taken_and_stored(run_copy, key, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", FakeWandb())
     setting = f"{key}={CHANGES[key]}"
     assert train.main(["--resume", str(run_copy), "--set", setting]) == 0
     stored = load_config(run_copy / "config.yaml")

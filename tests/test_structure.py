@@ -44,6 +44,7 @@ NOUNS = (
     "faults",
     "run_folder",
     "metrics",
+    "tracking",
     "terminal",
     "board",
     "dashboard",
