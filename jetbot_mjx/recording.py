@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+from jetbot_mjx.aliases import aliases
 from jetbot_mjx.checkpoint import POLICY, about_policy
 from jetbot_mjx.config import Config
 from jetbot_mjx.dashboard import open_terminal
@@ -23,7 +24,6 @@ from jetbot_mjx.metrics import (
     Sink,
     Sinks,
     TensorBoardSink,
-    aliases,
     process_seconds,
     read_history,
 )

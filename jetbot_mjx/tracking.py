@@ -12,9 +12,10 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from jetbot_mjx.aliases import aliases, with_aliases
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.metrics import Figures, History, aliases, with_aliases
+from jetbot_mjx.metrics import Figures, History
 from jetbot_mjx.run_folder import write_json
 
 _FILE = "wandb.json"

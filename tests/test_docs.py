@@ -17,6 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 
 from jetbot_mjx import cli, evaluate, metrics, render, replay, train
+from jetbot_mjx.aliases import aliases
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.evaluation import Summary
@@ -325,7 +326,7 @@ def test_every_name_of_stable_baselines3_is_explained():
         for cells in rows(THEIRS)
         if cells[0].startswith("`")
     }
-    names = metrics.aliases(Config().ppo)
+    names = aliases(Config().ppo)
     assert {tag for tag, ours in told.items() if ours != [tag]} == set(names)
     for tag, (figure, _, over) in names.items():
         assert figure in told[tag]

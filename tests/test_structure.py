@@ -43,6 +43,7 @@ NOUNS = (
     "resume",
     "faults",
     "run_folder",
+    "aliases",
     "metrics",
     "tracking",
     "terminal",

@@ -11,10 +11,10 @@ import pytest
 from test_metrics import read_events
 
 from jetbot_mjx import brax_ppo, evaluate, load_config, make_env, train, wrap_for_training
+from jetbot_mjx.aliases import aliases
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import BASELINES
-from jetbot_mjx.metrics import aliases
 
 
 @pytest.fixture(scope="module")
