@@ -2,11 +2,11 @@
 
 The modules in reading order, each knowing only those before it:
 `errors`, `config`, `compiling`, `mjx`, `cholesky`, `kinematics`, `model`, `task`, `state`, `env`,
-`variation`, `wrappers`, `policy`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`, `plots`,
-`offscreen`, `film`, `store`, `checkpoint`, `resume`, `faults`, `run_folder`, `aliases`, `metrics`,
-`tracking`, `terminal`, `board`, `dashboard`, `recording`, `preemption`, `resumable_ppo`,
-`brax_ppo`, `cli`, and the commands `train`, `evaluate`, `render`, `replay`. Commands meet only in
-the run folder.
+`variation`, `wrappers`, `policy`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`,
+`report`, `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`,
+`checkpoint`, `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`,
+`terminal`, `board`, `dashboard`, `recording`, `preemption`, `resumable_ppo`, `brax_ppo`, `cli`, and
+the commands `train`, `evaluate`, `render`, `replay`. Commands meet only in the run folder.
 """
 
 # First, before Brax imports MJX and lets it print.

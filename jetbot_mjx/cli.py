@@ -146,9 +146,18 @@ def which_checkpoint(text: str) -> Which:
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 
 
-def add_checkpoint_arguments(parser: argparse.ArgumentParser) -> None:
-    """Adds `run` and `--checkpoint`, by which a command finds its policy."""
-    parser.add_argument("run", help="a run folder, or one checkpoint folder of it")
+def add_checkpoint_arguments(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+    """Adds `run` and `--checkpoint`, by which a command finds its policy.
+
+    Args:
+      parser: of the command.
+      several: whether it takes more than one run; `run` is then a list.
+    """
+    what = "a run folder, or one checkpoint folder of it"
+    if several:
+        parser.add_argument("run", nargs="+", help=f"{what}; several are compared")
+    else:
+        parser.add_argument("run", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,

@@ -308,6 +308,10 @@ class Config(_Section):
             for index in range(self.seeds)
         ]
 
+    def flat(self) -> dict[str, Any]:
+        """Every setting by its key, such as `ppo.num_envs`."""
+        return _flat(self.model_dump(mode="json"))
+
     def check_resume(self, changed: "Config") -> None:
         """Refuses a change that a run cannot take on half-way.
 
@@ -317,7 +321,7 @@ class Config(_Section):
         Raises:
           ConfigError: it differs in more than `CHANGEABLE_ON_RESUME`.
         """
-        now, then = _flat(changed.model_dump(mode="json")), _flat(self.model_dump(mode="json"))
+        now, then = changed.flat(), self.flat()
         for key in then.keys() | now.keys():
             if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME:
                 raise ConfigError(

@@ -1,154 +1,208 @@
-"""Judges a policy on fixed goals: `python -m jetbot_mjx.evaluate RUN [--min-success 0.95]`."""
+"""Judges policies on fixed goals: `python -m jetbot_mjx.evaluate RUN [RUN ...]`.
+
+One policy gets a report. Several seeds, or several runs, are compared as well.
+"""
 
 import argparse
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+
 from jetbot_mjx import cli
 from jetbot_mjx.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.evaluation import (
-    GOAL_SET_VERSION,
-    Evaluator,
-    Summary,
-    mean_interval,
-    report_keys,
-    summarize,
-)
-from jetbot_mjx.run_folder import make_folder, seed_folders, versions, write_json
+from jetbot_mjx.comparison import Comparison, check_comparable, compare
+from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import GOAL_SET_VERSION, Evaluator, report_keys, summarize
+from jetbot_mjx.metrics import read_history
+from jetbot_mjx.report import CurvePoint, Report, by_goal, find_failures, learning_curve
+from jetbot_mjx.report_files import write_comparison, write_report
+from jetbot_mjx.run_folder import seed_folders, versions
+from jetbot_mjx.tables import pairs_table, policies_table, runs_table
 
 BELOW_TARGET = 1
 
 
-class Report(NamedTuple):
-    """A policy's figures and the baselines' on the same goals."""
-
-    checkpoint: Path
-    path: Path
-    """The JSON file."""
-    env_steps: int
-    policy: Summary
-    baselines: Mapping[str, Summary]
-
-
-class SeedsReport(NamedTuple):
-    """The policies of several seeds on the same goals."""
-
-    path: Path
-    """The JSON file; each seed has its own as well."""
-    seeds: Mapping[str, Report]
-    """By the name of the seed's folder."""
-    mean: float
-    """Of the success rates."""
-    low: float
-    """Lower end of the 95 % interval of that mean, over seeds."""
-    high: float
-    """Upper end of it."""
-
-
-def run(run_or_checkpoint: str | Path, *, episodes: int = 1024, which: Which = "best") -> Report:
-    """Judges a policy and writes `evaluations/<env_steps>/report.json` into its run folder.
+def run(
+    run_or_checkpoint: str | Path,
+    *,
+    episodes: int = 1024,
+    which: Which = "best",
+    output: str | Path | None = None,
+) -> Report:
+    """Judges one policy and writes its report.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder.
+      output: the folder to write; None: `evaluations/<env_steps>/` of the run folder.
 
     Returns:
-      The report.
+      The report, which knows its folder.
 
     Raises:
-      UserError: there is no usable checkpoint.
+      UserError: there is no usable checkpoint, or the folder cannot be written.
     """
-    return next(iter(_judge([load_checkpoint(run_or_checkpoint, which)], episodes)))
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    folder = _report_folder(checkpoint) if output is None else Path(output)
+    return next(_judge([(checkpoint, folder)], episodes))
 
 
-def run_seeds(run_dir: Path, *, episodes: int = 1024, which: Which = "best") -> SeedsReport:
-    """Judges the policies of all seeds, and writes `evaluations/seeds.json` beside their reports.
+def run_comparison(
+    runs: Sequence[str | Path],
+    *,
+    episodes: int = 1024,
+    which: Which = "best",
+    output: str | Path | None = None,
+) -> Comparison:
+    """Judges the policies of several runs or seeds, reports on each, and compares them.
 
     Args:
-      run_dir: a run folder of several seeds.
+      runs: run folders, of one seed or several, or checkpoint folders.
       episodes: how many of the fixed goals, from the first on.
-      which: the checkpoint of each seed.
+      which: the checkpoint of a run folder, of each seed.
+      output: the folder for the comparison; None: `evaluations/comparison/` of the first run.
 
     Returns:
-      The report.
+      The comparison, which knows its folder; each report knows its own.
 
     Raises:
-      UserError: a seed has no usable checkpoint.
+      UserError: a checkpoint cannot be used or is named twice, the runs did not have the same to
+        do, or a folder cannot be written.
     """
-    folders = seed_folders(run_dir)
-    checkpoints = [load_checkpoint(folder, which) for folder in folders]
-    reports = dict(
-        zip((folder.name for folder in folders), _judge(checkpoints, episodes), strict=True)
-    )
-    mean, low, high = mean_interval([one.policy.success_rate for one in reports.values()])
-    make_folder(run_dir / "evaluations")
-    path = run_dir / "evaluations" / "seeds.json"
-    values = {
-        "mean": mean,
-        "low": low,
-        "high": high,
-        "seeds": {name: _as_json(report) for name, report in reports.items()},
+    entrants = _load([Path(path) for path in runs], which)
+    check_comparable({name: entrant.config for name, entrant in entrants.items()})
+    checkpoints = [one for entrant in entrants.values() for one in entrant.seeds.values()]
+    reports = _judge([(one, _report_folder(one)) for one in checkpoints], episodes)
+    judged = {
+        name: {seed: _without_paths(next(reports)) for seed in entrant.seeds}
+        for name, entrant in entrants.items()
     }
-    write_json(path, values)
-    return SeedsReport(path, reports, mean, low, high)
+    home = next(iter(entrants.values())).folder
+    folder = home / "evaluations" / "comparison" if output is None else Path(output)
+    comparison = compare(folder.absolute(), judged)
+    write_comparison(comparison)
+    return comparison
 
 
-def _judge(checkpoints: Sequence[Checkpoint], episodes: int) -> Iterator[Report]:
-    """Judges policies of one configuration, by one compiled program, and writes their reports."""
-    env = checkpoints[0].make_env()
-    evaluator = Evaluator(env, checkpoints[0].networks, baselines=True)
-    keys = report_keys(episodes)
-    baselines = {
-        name: summarize(each, env.dt)
-        for name, each in evaluator.run_baselines(checkpoints[0].params, keys).items()
-    }
-    for checkpoint in checkpoints:
-        folder = checkpoint.run_dir / "evaluations" / checkpoint.path.name
-        make_folder(folder)
-        policy = summarize(evaluator.run(checkpoint.params, keys), env.dt)
+class _Entrant(NamedTuple):
+    """A run that takes part in a comparison."""
+
+    folder: Path
+    seeds: Mapping[str, Checkpoint]
+
+    @property
+    def config(self) -> Config:
+        return next(iter(self.seeds.values())).config
+
+
+def _load(paths: Sequence[Path], which: Which) -> dict[str, _Entrant]:
+    """The runs by a name that tells them apart."""
+    entrants: list[_Entrant] = []
+    owners: dict[Path, Path] = {}
+    for path in paths:
+        folders = seed_folders(path)
+        seeds = {one.name: load_checkpoint(one, which) for one in folders or [path]}
+        for checkpoint in seeds.values():
+            place = checkpoint.path.resolve()
+            if place in owners:
+                raise UserError(
+                    f"{path} and {owners[place]} are the same policy, {_shown(checkpoint.path)}:"
+                    " name each once"
+                )
+            owners[place] = path
+        first = next(iter(seeds.values()))
+        entrants.append(_Entrant(first.run_dir.parent if folders else first.run_dir, seeds))
+    return dict(zip(_names(entrants), entrants, strict=True))
+
+
+def _names(entrants: Sequence[_Entrant]) -> list[str]:
+    """As much of the end of each folder's path as tells them apart, or else the steps too."""
+    folders = [entrant.folder for entrant in entrants]
+    different = set(folders)
+    length = 1
+    while len({folder.parts[-length:] for folder in different}) < len(different):
+        length += 1
+    names = []
+    for entrant in entrants:
+        name = "/".join(entrant.folder.parts[-length:])
+        if folders.count(entrant.folder) > 1:
+            name += f" @ {next(iter(entrant.seeds.values())).env_steps:,}"
+        names.append(name)
+    return names
+
+
+def _report_folder(checkpoint: Checkpoint) -> Path:
+    return checkpoint.run_dir / "evaluations" / checkpoint.path.name
+
+
+def _without_paths(report: Report) -> Report:
+    """Trajectories are drawn by now, and are all that is large."""
+    return report._replace(episodes=report.episodes._replace(qpos=None))
+
+
+def _judge(checkpoints: Sequence[tuple[Checkpoint, Path]], episodes: int) -> Iterator[Report]:
+    """Judges policies and writes their reports; what is compiled serves all it fits."""
+    keys, about = report_keys(episodes), versions()
+    # All of them first: what does not fit its task is refused before anything is written.
+    envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
+    evaluator, baselines, fits = None, {}, None
+    for (checkpoint, folder), env in zip(checkpoints, envs, strict=True):
+        if evaluator is None or _program(checkpoint.config) != fits:
+            evaluator = Evaluator(env, checkpoint.networks, baselines=True, record=True)
+            fits = _program(checkpoint.config)
+            beside = evaluator.run_baselines(checkpoint.params, keys)
+            baselines = {name: summarize(each, env.dt) for name, each in beside.items()}
+        driven = jax.device_get(evaluator.run(checkpoint.params, keys))
+        run_dir = _shown(checkpoint.run_dir)
         report = Report(
-            checkpoint.path, folder / "report.json", checkpoint.env_steps, policy, baselines
+            folder=folder,
+            run=run_dir,
+            checkpoint=checkpoint.path,
+            env_steps=checkpoint.env_steps,
+            config=checkpoint.config,
+            policy=summarize(driven, env.dt),
+            baselines=baselines,
+            cells=by_goal(driven, env.dt),
+            failures=find_failures(driven, run_dir, checkpoint.env_steps),
+            learning_curve=_learning_curve(checkpoint.run_dir),
+            episodes=driven,
+            versions=about,
         )
-        write_json(report.path, _as_json(report))
+        write_report(report)
         yield report
 
 
-def _as_json(report: Report) -> dict[str, Any]:
-    return {
-        "goal_set_version": GOAL_SET_VERSION,
-        "checkpoint": report.checkpoint.name,
-        "env_steps": report.env_steps,
-        "policy": report.policy._asdict(),
-        "baselines": {name: summary._asdict() for name, summary in report.baselines.items()},
-        "versions": versions(),
-    }
-
-
-def table(policies: Mapping[str, Report]) -> str:
-    """Policies by name, and the baselines below them, as a table for the terminal."""
-    head = (
-        f"{'':10}  {'success':>8}  {'95 % interval':>16}  {'to goal':>8}  {'p95':>7}"
-        f"  {'path':>5}  {'return':>7}"
-    )
-    rows = [_row(name, report.policy) for name, report in policies.items()]
-    baselines = next(iter(policies.values())).baselines
-    rows += [_row(name, summary) for name, summary in baselines.items()]
-    return "\n".join([head, *rows])
-
-
-def _row(name: str, summary: Summary) -> str:
-    def shown(value: float | None, form: str) -> str:
-        return form.format(value) if value is not None else "-"
-
-    interval = f"{summary.success_low:.2%} .. {summary.success_high:.2%}"
+def _program(config: Config) -> tuple[Any, ...]:
+    """All of a configuration that the compiled episodes depend on."""
+    ppo = config.ppo
     return (
-        f"{name:10}  {summary.success_rate:8.2%}  {interval:>16}"
-        f"  {shown(summary.time_to_goal_median, '{:.2f} s'):>8}"
-        f"  {shown(summary.time_to_goal_p95, '{:.2f} s'):>7}"
-        f"  {shown(summary.path_efficiency, '{:.0%}'):>5}  {summary.episode_return:+7.3f}"
+        config.task,
+        config.robot,
+        config.physics,
+        config.deterministic,
+        ppo.network,
+        ppo.normalize_observations,
     )
+
+
+def _shown(path: Path) -> Path:
+    """As a command names it: from here where it lies below."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _learning_curve(run_dir: Path) -> tuple[CurvePoint, ...]:
+    path = run_dir / "metrics.jsonl"
+    try:
+        history = read_history(path, sys.maxsize)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+    return learning_curve((line.env_steps, line.figures) for line in history)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -158,45 +212,71 @@ def main(arguments: Sequence[str] | None = None) -> int:
       arguments: without the program's name; None: those of the process.
 
     Returns:
-      0, or 1 where the success rate is below `--min-success`.
+      0, or 1 where a success rate is below `--min-success`.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.evaluate", description=__doc__)
-    cli.add_checkpoint_arguments(parser)
+    cli.add_checkpoint_arguments(parser, several=True)
     parser.add_argument("--episodes", type=cli.positive_int, default=1024)
+    parser.add_argument(
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="where the report goes, or of several runs or seeds the comparison",
+    )
     parser.add_argument(
         "--min-success", type=cli.fraction, help="exit with 1 below this success rate"
     )
     options = parser.parse_args(arguments)
     cli.require_device()
     cli.use_compilation_cache()
-    if seed_folders(Path(options.run)):
-        return _main_seeds(options)
-    report = run(options.run, episodes=options.episodes, which=options.checkpoint)
+    if len(options.run) > 1 or seed_folders(Path(options.run[0])):
+        return _main_comparison(options)
+    report = run(
+        options.run[0],
+        episodes=options.episodes,
+        which=options.checkpoint,
+        output=options.output,
+    )
     print(
         f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
-        f" {report.env_steps:,} steps\n{table({'policy': report})}\nreport: {report.path}"
+        f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
+        f"report: {report.folder / 'report.html'}"
     )
     if report.policy.nonfinite_worlds:
         print(f"{report.policy.nonfinite_worlds} episodes ended in a world that blew up")
-    return _verdict(report.policy.success_rate, options.min_success)
+    return _verdict({"": report.policy.success_rate}, options.min_success)
 
 
-def _main_seeds(options: argparse.Namespace) -> int:
-    report = run_seeds(Path(options.run), episodes=options.episodes, which=options.checkpoint)
-    print(
-        f"{options.episodes} fixed goals (set {GOAL_SET_VERSION}), {len(report.seeds)} seeds\n"
-        f"{table(report.seeds)}\n"
-        f"mean over seeds: {report.mean:.2%} (95 % interval {report.low:.2%} .. {report.high:.2%})"
-        f"\nreport: {report.path}"
+def _main_comparison(options: argparse.Namespace) -> int:
+    comparison = run_comparison(
+        options.run, episodes=options.episodes, which=options.checkpoint, output=options.output
     )
-    return _verdict(report.mean, options.min_success)
+    runs = comparison.runs
+    policies = {
+        seed if len(runs) == 1 else f"{run.name} {seed}" if len(run.seeds) > 1 else run.name: report
+        for run in runs
+        for seed, report in run.seeds.items()
+    }
+    print(
+        f"{comparison.episodes} fixed goals (set {GOAL_SET_VERSION}), {len(policies)} policies\n"
+        f"{policies_table(policies)}\n\n{runs_table(comparison)}"
+    )
+    if comparison.pairs:
+        print(f"\n{pairs_table(comparison)}")
+    print(f"report: {comparison.folder / 'comparison.html'}")
+    rates = {run.name: run.success_rate.mean.value or 0.0 for run in runs}
+    return _verdict(
+        rates if len(runs) > 1 else {"": next(iter(rates.values()))}, options.min_success
+    )
 
 
-def _verdict(success_rate: float, wanted: float | None) -> int:
-    if wanted is not None and success_rate < wanted:
-        print(f"success {success_rate:.2%} is below the {wanted:.2%} asked for")
-        return BELOW_TARGET
-    return 0
+def _verdict(success_rates: Mapping[str, float], wanted: float | None) -> int:
+    below = {name: rate for name, rate in success_rates.items() if rate < (wanted or 0.0)}
+    for name, rate in below.items():
+        print(
+            f"{name + ': ' if name else ''}success {rate:.2%} is below the {wanted:.2%} asked for"
+        )
+    return BELOW_TARGET if below else 0
 
 
 if __name__ == "__main__":

@@ -6,7 +6,6 @@ during training, by which the best checkpoint is chosen, and one for the report.
 """
 
 import math
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,9 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt32
-
-# Not scipy.stats: half a second of import, for a quantile of Student's t.
-from scipy.special import stdtrit
 
 from jetbot_mjx import kinematics
 from jetbot_mjx.env import JetBotEnv
@@ -87,9 +83,6 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
     count, wins = won.size, int(won.sum())
     low, high = wilson_interval(wins, count)
     seconds = host.steps[won] * ctrl_dt
-    straight = np.linalg.norm(host.end_w - host.start_w, axis=-1)[won]
-    efficiency = straight / np.maximum(host.path_length[won], 1e-9)
-    remaining = np.linalg.norm(host.goal_w[:, :2] - host.end_w, axis=-1)
     return Summary(
         episodes=count,
         successes=wins,
@@ -98,11 +91,30 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
         success_high=high,
         time_to_goal_median=float(np.median(seconds)) if wins else None,
         time_to_goal_p95=float(np.percentile(seconds, 95)) if wins else None,
-        path_efficiency=float(np.minimum(efficiency, 1.0).mean()) if wins else None,
+        path_efficiency=float(path_efficiencies(host)[won].mean()) if wins else None,
         episode_return=float(host.episode_return.mean()),
-        final_distance_median=float(np.median(remaining)),
+        final_distance_median=float(np.median(final_distances(host))),
         nonfinite_worlds=int(host.nonfinite.sum()),
     )
+
+
+def path_efficiencies(episodes: Episodes) -> Float[np.ndarray, " n"]:
+    """Straight line from start to end over the way travelled, at most 1.
+
+    Args:
+      episodes: on the host.
+    """
+    straight = np.linalg.norm(episodes.end_w - episodes.start_w, axis=-1)
+    return np.minimum(straight / np.maximum(episodes.path_length, 1e-9), 1.0)
+
+
+def final_distances(episodes: Episodes) -> Float[np.ndarray, " n"]:
+    """From where the robots ended to their goals, on the floor [m].
+
+    Args:
+      episodes: on the host.
+    """
+    return np.linalg.norm(episodes.goal_w[:, :2] - episodes.end_w, axis=-1)
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
@@ -125,24 +137,6 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     spread = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
-
-
-def mean_interval(values: Sequence[float]) -> tuple[float, float, float]:
-    """Mean of proportions over independent trainings, with Student's 95 % interval.
-
-    Args:
-      values: one proportion for each seed, at least two.
-
-    Returns:
-      Mean, lower and upper end, within [0, 1].
-
-    Source: Student, Biometrika 6 (1908), 1-25, doi:10.1093/biomet/6.1.1.
-    """
-    count = len(values)
-    mean = float(np.mean(values))
-    error = float(np.std(values, ddof=1)) / math.sqrt(count)
-    spread = float(stdtrit(count - 1, 0.975)) * error
-    return mean, max(0.0, mean - spread), min(1.0, mean + spread)
 
 
 def policy_controller(networks: ppo_networks.PPONetworks) -> Controller:

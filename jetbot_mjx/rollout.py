@@ -12,9 +12,10 @@ import jax.numpy as jnp
 from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from jetbot_mjx import kinematics
 from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.env import JetBotEnv
-from jetbot_mjx.model import QPOS_XYZ
+from jetbot_mjx.model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.state import State
 from jetbot_mjx.task import Goal
 from jetbot_mjx.wrappers import EpisodeWrapper
@@ -31,12 +32,16 @@ class Episodes(NamedTuple):
     """Environment steps until the end."""
     episode_return: Float[Array, " n"]
     """Sum of rewards."""
+    terminated: Float[Array, " n"]
+    """1 where the task ended the episode, in success or failure."""
     nonfinite: Float[Array, " n"]
     """1 where the episode was cut off because its world was no longer finite."""
     path_length: Float[Array, " n"]
     """Way travelled by the axle midpoint [m], on the floor."""
     start_w: Float[Array, "n 2"]
     """Where the robot started [m]."""
+    start_yaw: Float[Array, " n"]
+    """Where it headed then [rad], counter-clockwise from the world's x axis."""
     end_w: Float[Array, "n 2"]
     """Where it ended [m]."""
     goal_w: Float[Array, "n 3"]
@@ -56,6 +61,7 @@ class _Tally(NamedTuple):
     success: Float[Array, ""]
     steps: Float[Array, ""]
     episode_return: Float[Array, ""]
+    terminated: Float[Array, ""]
     nonfinite: Float[Array, ""]
     path_length: Float[Array, ""]
 
@@ -120,6 +126,7 @@ def rollout_fn(
             success=nstate.metrics["success"],
             steps=jnp.ones(()),
             episode_return=nstate.reward,
+            terminated=nstate.info["terminated"],
             nonfinite=nstate.metrics["nonfinite_worlds"],
             path_length=moved,
         )
@@ -131,7 +138,7 @@ def rollout_fn(
     def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = jax.vmap(episode_env.reset)(keys)
         zero = jnp.zeros(keys.shape[0])
-        tally = _Tally(jnp.ones_like(zero), zero, zero, zero, zero, zero)
+        tally = _Tally(jnp.ones_like(zero), *[zero] * 6)
 
         def act(state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
             branches = [lambda s, k, c=c: c(params, s, k) for c in controllers]
@@ -163,9 +170,11 @@ def rollout_fn(
             success=tally.success,
             steps=tally.steps,
             episode_return=tally.episode_return,
+            terminated=tally.terminated,
             nonfinite=tally.nonfinite,
             path_length=tally.path_length,
             start_w=start[:, QPOS_XYZ][:, :2],
+            start_yaw=jax.vmap(kinematics.yaw)(start[:, QPOS_QUAT]),
             end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],
             goal_w=jax.vmap(env.task.goal_position)(first.goal),
             goal=first.goal,

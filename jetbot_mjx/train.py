@@ -16,7 +16,7 @@ from jetbot_mjx import cli, resumable_ppo
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import Summary, mean_interval
+from jetbot_mjx.evaluation import Summary
 from jetbot_mjx.metrics import CompileClock
 from jetbot_mjx.preemption import STOPPED, Preemption, leave_now
 from jetbot_mjx.recording import RunRecorder, Standing
@@ -170,11 +170,14 @@ def summary(result: Result) -> str:
             f" {standing.best_steps:,} steps; last parameters: sha256 {fingerprint}"
         )
     if len(lines) > 1:
+        # Its statistics take half a second to import.
+        from jetbot_mjx.estimates import bootstrap, mean
+
         rates = [standing.best.success_rate for standing in result.standings if standing.best]
-        mean, low, high = mean_interval(rates)
+        over_seeds = bootstrap(mean, rates)
         lines.append(
-            f"{len(lines)} seeds: {mean:.2%} success in the mean"
-            f" (95 % interval {low:.2%} .. {high:.2%})"
+            f"{len(lines)} seeds: {over_seeds.value:.2%} success in the mean"
+            f" (95 % interval {over_seeds.low:.2%} .. {over_seeds.high:.2%})"
         )
     lines += [
         f"{result.wall_seconds:.1f} s in all",

@@ -14,12 +14,12 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 from brax.training.acme import running_statistics, specs
+from test_report import make_episodes, make_report
 
 from jetbot_mjx import cli, evaluate, render, replay, store, train
 from jetbot_mjx.checkpoint import FORMAT
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import Summary
 from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.task import WORLD
 
@@ -239,7 +239,7 @@ both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "
     ("arguments", "said"),
     [
         ([], "the following arguments are required: run"),
-        (["run", "more"], "unrecognized arguments: more"),
+        (["run", "--more"], "unrecognized arguments: --more"),
         (["run", "--episodes", "0"], "argument --episodes: 0 is too small: give at least 1"),
         (["run", "--episodes", "-3"], "argument --episodes: -3 is too small: give at least 1"),
         (["run", "--episodes", "many"], "argument --episodes: 'many' is no whole number"),
@@ -407,8 +407,7 @@ def test_help_is_no_mistake(capfd, name):
     [([], 0), (["--min-success", "0.5"], 0), (["--min-success", "0.51"], 1)],
 )
 def test_only_a_success_rate_below_the_target_gives_1(monkeypatch, capfd, arguments, code):
-    figures = Summary(2, 1, 0.5, 0.1, 0.9, 1.0, 1.0, 0.9, 0.3, 0.2, 0)
-    report = evaluate.Report(Path("c"), Path("report.json"), 2048, figures, {})
+    report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]))
     monkeypatch.setattr(evaluate, "run", lambda *args, **kwargs: report)
     assert evaluate.main(["run", *arguments]) == code
     assert ("is below the 51.00% asked for" in capfd.readouterr().out) == (code == 1)

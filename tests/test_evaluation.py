@@ -24,11 +24,12 @@ def test_the_interval_is_wilsons(wins, count):
     np.testing.assert_allclose(wilson_interval(wins, count), expected, atol=1e-6)
 
 
-def test_the_interval_covers_the_truth():
-    rng = np.random.default_rng(0)
-    truths = rng.uniform(0.8, 1.0, 1000)
-    intervals = [wilson_interval(rng.binomial(256, truth), 256) for truth in truths]
-    covered = np.mean([low <= t <= high for (low, high), t in zip(intervals, truths, strict=True)])
+@pytest.mark.parametrize("truth", [0.5, 0.9, 0.99])
+@pytest.mark.parametrize("count", [64, 256, 1024])
+def test_the_interval_covers_the_truth(truth, count):
+    wins = np.random.default_rng(0).binomial(count, truth, 1000)
+    intervals = np.array([wilson_interval(int(one), count) for one in wins])
+    covered = np.mean((intervals[:, 0] <= truth) & (truth <= intervals[:, 1]))
     assert covered >= 0.93
 
 
@@ -37,9 +38,11 @@ def test_the_figures_by_hand():
         success=jnp.array([1.0, 1.0, 0.0, 0.0]),
         steps=jnp.array([60.0, 120.0, 256.0, 7.0]),
         episode_return=jnp.array([0.9, 0.5, -0.4, 0.0]),
+        terminated=jnp.array([1.0, 1.0, 0.0, 0.0]),
         nonfinite=jnp.array([0.0, 0.0, 0.0, 1.0]),
         path_length=jnp.array([1.0, 1.0, 3.0, 0.0]),
         start_w=jnp.zeros((4, 2)),
+        start_yaw=jnp.zeros(4),
         end_w=jnp.array([[0.9, 0.0], [0.3, 0.4], [1.0, 0.0], [0.0, 0.0]]),
         goal_w=jnp.array([[1.0, 0, 0.05], [0.3, 0.5, 0.05], [0, 0, 0.05], [0.5, 0, 0.05]]),
         goal=None,
@@ -56,12 +59,9 @@ def test_the_figures_by_hand():
 
 
 def test_without_a_success_there_is_no_time_to_goal():
-    nothing = jnp.zeros(3)
-    planar = jnp.zeros((3, 2))
-    episodes = Episodes(
-        nothing, nothing, nothing, nothing, nothing, planar, planar, jnp.zeros((3, 3)), None, None
-    )
-    got = summarize(episodes, 1 / 60)
+    zeros = dict.fromkeys(Episodes._fields, jnp.zeros(3))
+    places = {"start_w": jnp.zeros((3, 2)), "end_w": jnp.zeros((3, 2)), "goal_w": jnp.zeros((3, 3))}
+    got = summarize(Episodes(**{**zeros, **places, "goal": None, "qpos": None}), 1 / 60)
     assert (got.time_to_goal_median, got.time_to_goal_p95, got.path_efficiency) == (None,) * 3
 
 
@@ -122,6 +122,8 @@ def test_an_episode_ends_at_its_success_and_the_robot_stands_still(driven):
         np.testing.assert_allclose(episodes.path_length[i], walked, rtol=1e-4)
         covered = distance[0] - distance[end]
         np.testing.assert_allclose(episodes.episode_return[i], covered, atol=1e-4)
+    np.testing.assert_array_equal(episodes.terminated, 1)
+    np.testing.assert_array_equal(episodes.start_yaw, 0)
 
 
 def test_constant_actions_drive_straight_ahead_until_time_is_up(driven):
@@ -129,4 +131,5 @@ def test_constant_actions_drive_straight_ahead_until_time_is_up(driven):
     episodes = runs["constant"]
     missed = episodes.success == 0
     np.testing.assert_array_equal(episodes.steps[missed], 256)
+    np.testing.assert_array_equal(episodes.terminated, ~missed)
     assert np.all(np.abs(episodes.end_w[missed, 1]) < 0.02)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 import jetbot_mjx
-from jetbot_mjx import train
+from jetbot_mjx import evaluate, train
 from jetbot_mjx.config import load_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import report_keys
 from jetbot_mjx.state import robot_state
 from jetbot_mjx.task import layout_size
 from jetbot_mjx.wrappers import wrap_for_training
@@ -190,9 +191,17 @@ def test_wrong_settings_are_refused(load, override, message):
         make_env(load(override))
 
 
-def test_training_runs_end_to_end(load, tmp_path):
+def test_training_and_judging_run_end_to_end(load, env, tmp_path):
     result = train.run(load(*TINY), tmp_path / "run")
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["env_steps"] for line in lines] == [0, 1024, 2048]
     policy = jetbot_mjx.load_policy(result.run_dir, "last")
     assert policy(jnp.zeros((3, 12))).shape == (3, 2)
+    # A goal that is more than a position is judged and told all the same.
+    report = evaluate.run(result.run_dir, episodes=4)
+    goals = jax.vmap(env.reset)(report_keys(4)).goal.goal_w
+    distances = np.linalg.norm(goals[:, :2], axis=-1)
+    told = {failure.goal: failure.distance for failure in report.failures}
+    assert told
+    assert all(distance == pytest.approx(distances[goal]) for goal, distance in told.items())
+    assert (report.folder / "report.html").is_file()

@@ -6,6 +6,7 @@ import os
 import re
 import subprocess
 import sys
+import tomllib
 import types
 from pathlib import Path
 
@@ -35,7 +36,12 @@ NOUNS = (
     "rollout",
     "evaluation",
     "robustness",
+    "report",
+    "estimates",
+    "comparison",
+    "tables",
     "plots",
+    "curves",
     "offscreen",
     "film",
     "store",
@@ -45,6 +51,7 @@ NOUNS = (
     "run_folder",
     "aliases",
     "metrics",
+    "report_files",
     "tracking",
     "terminal",
     "board",
@@ -116,6 +123,16 @@ def test_every_module_has_a_place():
     modules = {path.stem for path in (ROOT / PACKAGE).glob("*.py")} - {"__init__"}
     assert modules == set(ORDER)
     assert not [path for path in (ROOT / PACKAGE).iterdir() if (path / "__init__.py").exists()]
+
+
+def test_every_asset_is_shipped():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    shipped = {
+        path
+        for pattern in project["tool"]["setuptools"]["package-data"][PACKAGE]
+        for path in (ROOT / PACKAGE).glob(pattern)
+    }
+    assert set((ROOT / PACKAGE / "assets").iterdir()) <= shipped
 
 
 @pytest.mark.parametrize("name", ORDER)

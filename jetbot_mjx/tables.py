@@ -1,0 +1,76 @@
+"""Reports as text: what policies and runs reach, in tables for the terminal."""
+
+from collections.abc import Mapping
+
+from jetbot_mjx.comparison import Comparison
+from jetbot_mjx.estimates import Estimate
+from jetbot_mjx.evaluation import Summary
+from jetbot_mjx.report import Report
+
+
+def policies_table(policies: Mapping[str, Report]) -> str:
+    """Policies by name, and the baselines below them, as a table for the terminal."""
+    baselines = next(iter(policies.values())).baselines
+    rows = [*((name, report.policy) for name, report in policies.items()), *baselines.items()]
+    width = max(10, *(len(name) for name, _ in rows))
+    head = (
+        f"{'':{width}}  {'success':>8}  {'95 % interval':>16}  {'to goal':>8}  {'p95':>7}"
+        f"  {'path':>5}  {'return':>7}"
+    )
+    return "\n".join([head, *(_row(name, row, width) for name, row in rows)])
+
+
+def _row(name: str, summary: Summary, width: int) -> str:
+    interval = f"{summary.success_low:.2%} .. {summary.success_high:.2%}"
+    return (
+        f"{name:{width}}  {summary.success_rate:8.2%}  {interval:>16}"
+        f"  {_value(summary.time_to_goal_median, '{:.2f} s'):>8}"
+        f"  {_value(summary.time_to_goal_p95, '{:.2f} s'):>7}"
+        f"  {_value(summary.path_efficiency, '{:.0%}'):>5}  {summary.episode_return:+7.3f}"
+    )
+
+
+def runs_table(comparison: Comparison) -> str:
+    """What the runs reach over their seeds, as a table for the terminal."""
+    width = max(10, *(len(run.name) for run in comparison.runs))
+    lines = [
+        f"{'':{width}}  {'success, mean':>28}  {'interquartile mean':>28}"
+        f"  {'time to goal, mean':>24}  95 % intervals over"
+    ]
+    for run in comparison.runs:
+        lines.append(
+            f"{run.name:{width}}  {_estimate(run.success_rate.mean, '{:.2%}'):>28}"
+            f"  {_estimate(run.success_rate.iqm, '{:.2%}'):>28}"
+            f"  {_estimate(run.time_to_goal.mean, '{:.2f} s'):>24}"
+            f"  {run.success_rate.count:,} {run.success_rate.over}"
+        )
+    return "\n".join(lines)
+
+
+def pairs_table(comparison: Comparison) -> str:
+    """Every two runs against each other, as a table for the terminal."""
+    lines = []
+    for pair in comparison.pairs:
+        lines.append(f"{pair.a} against {pair.b}")
+        quantities = (
+            ("success", pair.success_rate, "{:+.2%}"),
+            ("time", pair.time_to_goal, "{:+.3f} s"),
+        )
+        for name, duel, form in quantities:
+            lines.append(
+                f"  {name:8}  difference {_estimate(duel.difference, form)},"
+                f" improvement {_estimate(duel.improvement, '{:.0%}')},"
+                f" goals {duel.wins} : {duel.losses} (p {duel.p:.2g})"
+            )
+    return "\n".join(lines)
+
+
+def _value(value: float | None, form: str) -> str:
+    return form.format(value) if value is not None else "-"
+
+
+def _estimate(estimate: Estimate, form: str) -> str:
+    text = _value(estimate.value, form)
+    if estimate.low is None:
+        return text
+    return f"{text} ({_value(estimate.low, form)} .. {_value(estimate.high, form)})"
