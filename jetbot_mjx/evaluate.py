@@ -15,13 +15,15 @@ from jetbot_mjx import cli
 from jetbot_mjx.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.comparison import Comparison, check_comparable, compare
 from jetbot_mjx.config import Config
+from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import GOAL_SET_VERSION, Evaluator, report_keys, summarize
 from jetbot_mjx.metrics import read_history
 from jetbot_mjx.report import CurvePoint, Report, by_goal, find_failures, learning_curve
 from jetbot_mjx.report_files import write_comparison, write_report
+from jetbot_mjx.robustness import SWEEP_GOALS, SweepResult, sweep
 from jetbot_mjx.run_folder import seed_folders, versions
-from jetbot_mjx.tables import pairs_table, policies_table, runs_table
+from jetbot_mjx.tables import pairs_table, policies_table, robustness_table, runs_table
 
 BELOW_TARGET = 1
 
@@ -32,6 +34,7 @@ def run(
     episodes: int = 1024,
     which: Which = "best",
     output: str | Path | None = None,
+    robustness: bool = False,
 ) -> Report:
     """Judges one policy and writes its report.
 
@@ -40,6 +43,7 @@ def run(
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder.
       output: the folder to write; None: `evaluations/<env_steps>/` of the run folder.
+      robustness: whether to judge it on robots that differ from the preset as well.
 
     Returns:
       The report, which knows its folder.
@@ -49,7 +53,7 @@ def run(
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     folder = _report_folder(checkpoint) if output is None else Path(output)
-    return next(_judge([(checkpoint, folder)], episodes))
+    return next(_judge([(checkpoint, folder)], episodes, robustness=robustness))
 
 
 def run_comparison(
@@ -58,6 +62,7 @@ def run_comparison(
     episodes: int = 1024,
     which: Which = "best",
     output: str | Path | None = None,
+    robustness: bool = False,
 ) -> Comparison:
     """Judges the policies of several runs or seeds, reports on each, and compares them.
 
@@ -66,6 +71,7 @@ def run_comparison(
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder, of each seed.
       output: the folder for the comparison; None: `evaluations/comparison/` of the first run.
+      robustness: whether each report judges its policy on other robots as well.
 
     Returns:
       The comparison, which knows its folder; each report knows its own.
@@ -77,7 +83,9 @@ def run_comparison(
     entrants = _load([Path(path) for path in runs], which)
     check_comparable({name: entrant.config for name, entrant in entrants.items()})
     checkpoints = [one for entrant in entrants.values() for one in entrant.seeds.values()]
-    reports = _judge([(one, _report_folder(one)) for one in checkpoints], episodes)
+    reports = _judge(
+        [(one, _report_folder(one)) for one in checkpoints], episodes, robustness=robustness
+    )
     judged = {
         name: {seed: _without_paths(next(reports)) for seed in entrant.seeds}
         for name, entrant in entrants.items()
@@ -145,7 +153,9 @@ def _without_paths(report: Report) -> Report:
     return report._replace(episodes=report.episodes._replace(qpos=None))
 
 
-def _judge(checkpoints: Sequence[tuple[Checkpoint, Path]], episodes: int) -> Iterator[Report]:
+def _judge(
+    checkpoints: Sequence[tuple[Checkpoint, Path]], episodes: int, *, robustness: bool
+) -> Iterator[Report]:
     """Judges policies and writes their reports; what is compiled serves all it fits."""
     keys, about = report_keys(episodes), versions()
     # All of them first: what does not fit its task is refused before anything is written.
@@ -172,9 +182,14 @@ def _judge(checkpoints: Sequence[tuple[Checkpoint, Path]], episodes: int) -> Ite
             learning_curve=_learning_curve(checkpoint.run_dir),
             episodes=driven,
             versions=about,
+            robustness=_sweep(checkpoint, env, min(episodes, SWEEP_GOALS)) if robustness else (),
         )
         write_report(report)
         yield report
+
+
+def _sweep(checkpoint: Checkpoint, env: JetBotEnv, goals: int) -> tuple[SweepResult, ...]:
+    return sweep(env, checkpoint.networks, checkpoint.params, report_keys(goals))
 
 
 def _program(config: Config) -> tuple[Any, ...]:
@@ -224,6 +239,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="where the report goes, or of several runs or seeds the comparison",
     )
     parser.add_argument(
+        "--sweep",
+        action="store_true",
+        help="judge on robots that differ from the preset too: friction, mass, motors, delay",
+    )
+    parser.add_argument(
         "--min-success", type=cli.fraction, help="exit with 1 below this success rate"
     )
     options = parser.parse_args(arguments)
@@ -236,11 +256,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes=options.episodes,
         which=options.checkpoint,
         output=options.output,
+        robustness=options.sweep,
     )
     print(
         f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
-        f"report: {report.folder / 'report.html'}"
+        f"{robustness_table(report)}report: {report.folder / 'report.html'}"
     )
     if report.policy.nonfinite_worlds:
         print(f"{report.policy.nonfinite_worlds} episodes ended in a world that blew up")
@@ -249,7 +270,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 def _main_comparison(options: argparse.Namespace) -> int:
     comparison = run_comparison(
-        options.run, episodes=options.episodes, which=options.checkpoint, output=options.output
+        options.run,
+        episodes=options.episodes,
+        which=options.checkpoint,
+        output=options.output,
+        robustness=options.sweep,
     )
     runs = comparison.runs
     policies = {

@@ -275,6 +275,7 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
         for result in results
         for summary in (*result.policy, *result.scripted)
     ]
+    ink = matplotlib.rcParams["text.color"]
     columns = min(3, len(results))
     lines = -(-len(results) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.6 * lines), layout="constrained")
@@ -289,9 +290,9 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
         ):
             _plot_over(success, time, result.sweep.values, summaries, label=name, color=colour)
         for axes in (success, time):
-            axes.axvline(result.sweep.nominal, color="black", linestyle="--", linewidth=0.8)
+            axes.axvline(result.sweep.nominal, color=ink, linestyle="--", linewidth=0.8)
             axes.grid(alpha=0.3)
-        success.axhline(CARRIES_AT, color="black", linestyle=":", linewidth=0.8)
+        success.axhline(CARRIES_AT, color=ink, linestyle=":", linewidth=0.8)
         success.set(ylim=(-0.03, 1.03), title=result.sweep.label)
         success.yaxis.set_major_formatter(PercentFormatter(1.0))
         success.tick_params(labelbottom=False)

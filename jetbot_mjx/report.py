@@ -14,6 +14,7 @@ from jaxtyping import Float
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.evaluation import GOAL_SET_VERSION, Summary, final_distances, wilson_interval
+from jetbot_mjx.robustness import SweepResult, as_json
 from jetbot_mjx.rollout import Episodes
 
 TIME_LIMIT = "time limit"
@@ -104,6 +105,8 @@ class Report(NamedTuple):
     episodes: Episodes
     """The policy's, on the host."""
     versions: Mapping[str, Any]
+    robustness: tuple[SweepResult, ...] = ()
+    """On robots that differ from the preset; empty where none were asked for."""
 
     @property
     def name(self) -> str:
@@ -117,6 +120,7 @@ class Report(NamedTuple):
         return (
             f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
+            f"{' --sweep' if self.robustness else ''}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -136,6 +140,7 @@ class Report(NamedTuple):
             "cells": [cell._asdict() for cell in self.cells],
             "failures": [failure._asdict() for failure in self.failures],
             "learning_curve": [point._asdict() for point in self.learning_curve],
+            "robustness": as_json(self.robustness) if self.robustness else None,
             "versions": dict(self.versions),
         }
 

@@ -21,6 +21,7 @@ from jetbot_mjx.plots import (
     THEMES,
     plot_by_goal,
     plot_distributions,
+    plot_robustness,
     plot_trajectories,
     shown_trajectories,
     theme,
@@ -42,6 +43,7 @@ _FORMS = {
     "signed metres": "{:+.3f} m",
     "count": "{:,}",
     "plain": "{}",
+    "short": "{:g}",
     "degrees": "{:+.0f}°",
     "signed percent": "{:+.2%}",
     "signed seconds": "{:+.3f} s",
@@ -93,6 +95,8 @@ def write_report(report: Report) -> Path:
     }
     if report.learning_curve:
         figures["learning_curve"] = lambda: plot_learning_curve(report)
+    if report.robustness:
+        figures["robustness"] = lambda: plot_robustness(report.robustness)
     goals = [failure.goal for failure in report.failures[:_REPLAYED]]
     return _write(
         report.folder,

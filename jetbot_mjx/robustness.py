@@ -33,6 +33,9 @@ from jetbot_mjx.policy import PolicyParams
 from jetbot_mjx.rollout import Episodes, rollout_fn
 from jetbot_mjx.variation import Variation, VariedEnv
 
+SWEEP_GOALS = 128
+"""How many of the report's fixed goals a sweep takes for each robot."""
+
 CARRIES_AT = 0.95
 """Success rate down to which a policy is said to carry."""
 
@@ -206,14 +209,20 @@ def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
     return {
         "goal_set_version": GOAL_SET_VERSION,
         "carries_at": CARRIES_AT,
+        "goals": results[0].policy[0].episodes,
         "quantities": [
             {
                 **result.sweep._asdict(),
                 "nominal": result.sweep.nominal,
-                "carries": carries(result),
+                "carries": _as_list(carries(result)),
+                "lowest": min(summary.success_rate for summary in result.policy),
                 "policy": [summary._asdict() for summary in result.policy],
                 "scripted": [summary._asdict() for summary in result.scripted],
             }
             for result in results
         ],
     }
+
+
+def _as_list(span: tuple[float, float] | None) -> list[float] | None:
+    return None if span is None else list(span)

@@ -6,6 +6,7 @@ from jetbot_mjx.comparison import Comparison
 from jetbot_mjx.estimates import Estimate
 from jetbot_mjx.evaluation import Summary
 from jetbot_mjx.report import Report
+from jetbot_mjx.robustness import CARRIES_AT, carries
 
 
 def policies_table(policies: Mapping[str, Report]) -> str:
@@ -27,6 +28,20 @@ def _row(name: str, summary: Summary, width: int) -> str:
         f"  {_value(summary.time_to_goal_median, '{:.2f} s'):>8}"
         f"  {_value(summary.time_to_goal_p95, '{:.2f} s'):>7}"
         f"  {_value(summary.path_efficiency, '{:.0%}'):>5}  {summary.episode_return:+7.3f}"
+    )
+
+
+def robustness_table(report: Report) -> str:
+    """How far a policy carries, a line for each quantity; nothing where it was not asked."""
+    lines = []
+    for result in report.robustness:
+        span = carries(result)
+        far = f"{span[0]:g} to {span[1]:g} {result.sweep.unit}" if span else "not even the preset"
+        lines.append(f"  {result.sweep.label:26}  {far}\n")
+    if not lines:
+        return ""
+    return (
+        f"success stays at {CARRIES_AT:.0%} or above (judged on fewer goals) over\n{''.join(lines)}"
     )
 
 
