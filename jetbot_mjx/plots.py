@@ -286,7 +286,7 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
         time = figure.add_subplot(grid[2 * line + 1, column], sharex=success)
         for name, summaries, colour in (
             ("scripted", result.scripted, "tab:gray"),
-            ("policy", result.policy, "tab:green"),
+            ("policy", result.policy, "C0"),
         ):
             _plot_over(success, time, result.sweep.values, summaries, label=name, color=colour)
         for axes in (success, time):
