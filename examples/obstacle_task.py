@@ -154,6 +154,10 @@ class ObstacleTask(GoalTask):
         """Where to go; all of `GoalTask` that needs the goal asks here."""
         return goal.goal_w
 
+    def move_goal(self, goal: ObstacleGoal, position_w: Float[Array, "3"]) -> ObstacleGoal:
+        """The cube moves, the pillar stays where it was drawn."""
+        return goal._replace(goal_w=position_w)
+
     def markers(self, goal: ObstacleGoal) -> Mapping[str, Float[Array, "3"]]:
         """The red cube stands on the goal, the pillar on its place."""
         return {**super().markers(goal), "pillar": goal.pillar_w}

@@ -111,17 +111,32 @@ def _processor() -> str:
 _LARGEST = 2**31 - 1
 
 
-def positive_int(text: str) -> int:
-    """An argument that counts something."""
-    try:
-        value = int(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
-    if value < 1:
-        raise argparse.ArgumentTypeError(f"{value} is too small: give at least 1")
-    if value > _LARGEST:
-        raise argparse.ArgumentTypeError(f"{value} is too large: give at most {_LARGEST}")
-    return value
+def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
+    """An argument that counts or numbers something.
+
+    Args:
+      least: the smallest that is taken.
+      most: the largest that is taken.
+
+    Returns:
+      What an argument parser calls a type.
+    """
+
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
+        if value > most:
+            raise argparse.ArgumentTypeError(f"{value} is too large: give at most {most}")
+        return value
+
+    return parse
+
+
+positive_int = whole_number(1)
 
 
 def fraction(text: str) -> float:

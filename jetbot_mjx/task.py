@@ -89,7 +89,10 @@ def layout_table(layout: Layout) -> str:
 
 @runtime_checkable
 class Task(Protocol):
-    """What the environment asks of a task. All methods are pure and see one robot."""
+    """What the environment asks of a task. All methods are pure and see one robot.
+
+    Optional beside these: `move_goal`, of `MovesGoal`.
+    """
 
     layout: Layout
     """The observation as data: name, size, unit and frame of each part."""
@@ -133,6 +136,23 @@ class Task(Protocol):
 
         What only shows wants `contype=0, conaffinity=0`: geoms that can collide stay in the
         physics model.
+        """
+        ...
+
+
+@runtime_checkable
+class MovesGoal(Protocol):
+    """What a task can offer beside the contract: a goal that a user moves while a robot drives."""
+
+    def move_goal(self, goal: Goal, position_w: Float[Array, "3"]) -> Goal:
+        """The same goal, elsewhere.
+
+        Args:
+          goal: what `sample` drew; all of it that is not the place to go stays.
+          position_w: where the robot is to go instead [m], world frame.
+
+        Returns:
+          A tree of the same structure, shapes and dtypes.
         """
         ...
 
@@ -207,6 +227,11 @@ class GoalTask:
     def goal_position(self, goal: Goal) -> Float[Array, "3"]:
         """The goal itself."""
         return goal
+
+    def move_goal(self, goal: Goal, position_w: Float[Array, "3"]) -> Goal:
+        """The position itself; a task that draws more has to say where in its draw that goes."""
+        del goal
+        return position_w
 
     def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]:
         """The red cube stands on the goal."""

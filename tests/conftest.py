@@ -1,6 +1,8 @@
 """Shared fixtures: the CPU, a compilation cache in the work tree, environments built once."""
 
 import os
+import socket
+from collections.abc import Callable
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -37,6 +39,17 @@ def world_env(world_config: Config) -> JetBotEnv:
 @pytest.fixture(scope="session", params=["isaac", "real"])
 def preset_env(request) -> JetBotEnv:
     return make_env(parse_config({"robot": {"preset": request.param}}))
+
+
+@pytest.fixture(scope="session")
+def unused_port() -> Callable[[], int]:
+    """Finds a port that nothing listens on, of those that nobody asks for by number."""
+
+    def find() -> int:
+        with socket.create_server(("127.0.0.1", 0)) as taken:
+            return taken.getsockname()[1]
+
+    return find
 
 
 @pytest.fixture(scope="session")

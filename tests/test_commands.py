@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, own_files
 
-from jetbot_mjx import render
+from jetbot_mjx import native, render
 from jetbot_mjx.config import load_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.faults import save_fault
@@ -206,6 +206,22 @@ def test_a_documented_replay_ends_where_the_world_did(page, words, reader, monke
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.play"))
+def test_a_documented_play_drives(page, words, reader, monkeypatch, capsys):
+    browser = pytest.importorskip("jetbot_mjx.browser")
+
+    def look_once(page):
+        page.work()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(browser.Browser, "run", look_once)
+    monkeypatch.setattr(native, "require_window", lambda: None)
+    monkeypatch.setattr(native, "run", lambda player: player.tick())
+    assert execute(page, words, reader, monkeypatch) == 0
+    assert "0 of 0 goals reached" in capsys.readouterr().out
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), of_kind("tensorboard"))
 def test_tensorboard_finds_events_where_it_is_told_to_look(page, words, reader):
     reader(page)
@@ -232,7 +248,7 @@ def test_a_documented_benchmark_measures(page, words, monkeypatch, tmp_path, cap
 def test_no_kind_of_command_is_left_out():
     # Installing needs a network; the tests that are named run among these; Python is run as it is.
     elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",)}
-    covered = {"train", "evaluate", "render", "replay"}
+    covered = {"train", "evaluate", "render", "replay", "play"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import pytest
 from ruamel.yaml import YAML
 
-from jetbot_mjx import cli, evaluate, metrics, render, replay, train
+from jetbot_mjx import cli, evaluate, metrics, play, render, replay, train
 from jetbot_mjx.aliases import aliases
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
 from jetbot_mjx.env import make_env
@@ -344,7 +344,7 @@ class Parsed(Exception):
 KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
 PLAIN = {"[", "break", "tensorboard", "apt-get"}
 VARIABLES = {"PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"}
-COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay}
+COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay, "play": play}
 
 
 def commands(block):
@@ -466,7 +466,7 @@ def check_install(arguments):
         ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --sed 1"),
         ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --set ppo.num_env=1"),
         ("a.md", "python -m jetbot_mjx.train --config configs/nothing.yaml"),
-        ("a.md", "python -m jetbot_mjx.play runs/mine"),
+        ("a.md", "python -m jetbot_mjx.dance runs/mine"),
         ("a.md", "make everything"),
         ("a.md", "pip install '.[gpu]'"),
         ("a.md", "rm -rf runs"),

@@ -60,9 +60,17 @@ NOUNS = (
     "preemption",
     "resumable_ppo",
     "brax_ppo",
+    "clock",
+    "live",
+    "player",
+    "geoms",
+    "scene",
+    "panel",
+    "browser",
+    "native",
     "cli",
 )
-VERBS = ("train", "evaluate", "render", "replay")
+VERBS = ("train", "evaluate", "render", "replay", "play")
 ORDER = (*NOUNS, *VERBS)
 """A module knows only those before it, and a verb no other verb."""
 
@@ -217,7 +225,8 @@ def test_importing_prints_nothing_and_starts_no_device(tmp_path):
         [
             sys.executable,
             "-c",
-            "import jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render, jetbot_mjx.replay",
+            "import jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render, jetbot_mjx.replay,"
+            " jetbot_mjx.play",
         ],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "nowhere"},

@@ -1,0 +1,151 @@
+"""Lets a policy drive live: `python -m jetbot_mjx.play RUN` serves it to the browser."""
+
+import getpass
+import socket
+import types
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from jetbot_mjx import cli, native
+from jetbot_mjx.checkpoint import Which
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.live import AGENTS
+from jetbot_mjx.player import Player
+
+_LARGEST_PORT = 65_535
+
+
+class Played(NamedTuple):
+    """What happened while it was looked at."""
+
+    successes: int
+    episodes: int
+
+
+def run(
+    run_or_checkpoint: str | Path,
+    *,
+    viewer: Literal["browser", "native"] = "browser",
+    agent: str = "policy",
+    which: Which = "best",
+    seed: int = 0,
+    host: str = "127.0.0.1",
+    port: int | None = None,
+    tell: Callable[[str], None] = print,
+) -> Played:
+    """Drives in real time until it is interrupted or the window is closed.
+
+    Args:
+      run_or_checkpoint: a run folder, or one checkpoint folder of it.
+      viewer: a page in the browser, or MuJoCo's own window.
+      agent: who drives at first, one of `AGENTS`.
+      which: the checkpoint of a run folder.
+      seed: of goals and of the random agent.
+      host: the address that the page is served at.
+      port: the port of it; None: the first from 8080 on that is free.
+      tell: is given what the user has to know, line by line.
+
+    Returns:
+      How many goals were reached.
+
+    Raises:
+      UserError: there is no usable checkpoint, no viewer, no display, or the port is taken.
+    """
+    # What can fail at once comes before what takes time.
+    if viewer == "browser":
+        browser = _browser()
+        free: int = browser.free_port(host, port)
+    else:
+        native.require_window()
+    tell(f"loading {run_or_checkpoint} and compiling: some seconds")
+    player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed)
+    try:
+        if viewer == "browser":
+            with browser.Browser(player, host=host, port=free) as page:
+                for line in addresses(host, free):
+                    tell(line)
+                page.run()
+        else:
+            native.run(player)
+    except KeyboardInterrupt:
+        # The way to end it.
+        pass
+    return Played(player.successes, player.episodes)
+
+
+def addresses(host: str, port: int) -> list[str]:
+    """Where the page is, on this machine and through ssh.
+
+    Args:
+      host: the address that is listened on.
+      port: the port of it.
+
+    Returns:
+      Lines for the terminal.
+    """
+    everywhere = host in ("0.0.0.0", "::")
+    here = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
+    name = socket.gethostname()
+    lines = [
+        f"it drives at http://{here}:{port} (Ctrl-C ends it)",
+        f"from elsewhere: ssh -N -L {port}:{here}:{port} {getpass.getuser()}@{name}, and open"
+        f" http://127.0.0.1:{port} there",
+    ]
+    if everywhere:
+        lines.append(f"--host {host}: everyone who reaches this machine can watch and interfere")
+    return lines
+
+
+def _browser() -> types.ModuleType:
+    try:
+        from jetbot_mjx import browser
+    except ModuleNotFoundError as error:
+        raise UserError(
+            f"the browser viewer is an extra ({error.name} is missing): pip install"
+            " 'jetbot_mjx[play]'"
+        ) from None
+    return browser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and drives.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+    """
+    parser = cli.Parser(prog="python -m jetbot_mjx.play", description=__doc__)
+    cli.add_checkpoint_arguments(parser)
+    parser.add_argument("--viewer", choices=("browser", "native"), default="browser")
+    parser.add_argument("--agent", choices=AGENTS, default="policy", help="who drives at first")
+    parser.add_argument("--seed", type=cli.whole_number(0), default=0, help="of the goals")
+    parser.add_argument(
+        "--host", default="127.0.0.1", help="address to listen on (default: this machine alone)"
+    )
+    parser.add_argument(
+        "--port",
+        type=cli.whole_number(1, _LARGEST_PORT),
+        help="port to listen on (default: 8080, or the next free one)",
+    )
+    options = parser.parse_args(arguments)
+    cli.require_device()
+    cli.use_compilation_cache()
+    played = run(
+        options.run,
+        viewer=options.viewer,
+        agent=options.agent,
+        which=options.checkpoint,
+        seed=options.seed,
+        host=options.host,
+        port=options.port,
+        tell=lambda line: print(line, flush=True),
+    )
+    print(f"{played.successes} of {played.episodes} goals reached")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
