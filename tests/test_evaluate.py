@@ -15,7 +15,8 @@ from PIL import Image
 from jetbot_mjx import cli, evaluate, report_files, store
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import BASELINES
+from jetbot_mjx.evaluation import BASELINES, Summary
+from jetbot_mjx.robustness import SWEEPS, SweepResult
 from jetbot_mjx.tables import policies_table
 
 EPISODES = 48
@@ -159,6 +160,40 @@ def test_the_markdown_shows_the_figures_beside_it(judged):
     tables = [block for block in text.split("\n\n") if block.startswith("|")]
     for table in tables:
         assert len({line.count("|") for line in table.strip().splitlines()}) == 1
+
+
+def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monkeypatch):
+    run_dir, _, (first, _), _ = judged
+
+    def sweep(env, networks, params, keys):
+        """Fails with every policy on everything but the preset, and asks for no compiler."""
+        assert len(keys) == EPISODES
+        values = json.loads(first["report.json"])["policy"]
+        good, bad = (
+            Summary(**values)._replace(success_rate=rate, success_low=0.9 * rate, success_high=rate)
+            for rate in (1.0, 0.25)
+        )
+        return tuple(
+            SweepResult(
+                one,
+                tuple(good if value == one.nominal else bad for value in one.values),
+                tuple(bad for _ in one.values),
+            )
+            for one in SWEEPS
+        )
+
+    monkeypatch.setattr(evaluate, "sweep", sweep)
+    code, said = judge(run_dir, "--sweep", "--output", tmp_path)
+    assert code == 0
+    assert "wheel-floor friction        1 to 1 × preset" in said
+    values = json.loads((tmp_path / "report.json").read_text())
+    places = check_numbers(tmp_path / "report.html", values)
+    assert {"robustness.quantities.0.carries.1", "robustness.quantities.5.lowest"} <= places
+    assert values["robustness"]["quantities"][4]["lowest"] == 0.25
+    assert (tmp_path / "robustness.png").is_file()
+    page = (tmp_path / "report.md").read_text()
+    assert "| delay of actions | control steps | 0 | 0 to 0 | 0 to 9 | 25.00% |" in page
+    assert json.loads(first["report.json"])["robustness"] is None
 
 
 def test_figures_are_drawn_for_light_and_dark_surroundings(judged):
