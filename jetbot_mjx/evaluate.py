@@ -17,7 +17,13 @@ from jetbot_mjx.comparison import Comparison, check_comparable, compare
 from jetbot_mjx.config import Config
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import GOAL_SET_VERSION, Evaluator, report_keys, summarize
+from jetbot_mjx.evaluation import (
+    GOAL_SET_VERSION,
+    REPORT_GOALS,
+    Evaluator,
+    report_keys,
+    summarize,
+)
 from jetbot_mjx.metrics import read_history
 from jetbot_mjx.report import CurvePoint, Report, by_goal, find_failures, learning_curve
 from jetbot_mjx.report_files import write_comparison, write_report
@@ -31,7 +37,7 @@ BELOW_TARGET = 1
 def run(
     run_or_checkpoint: str | Path,
     *,
-    episodes: int = 1024,
+    episodes: int = REPORT_GOALS,
     which: Which = "best",
     output: str | Path | None = None,
     robustness: bool = False,
@@ -59,7 +65,7 @@ def run(
 def run_comparison(
     runs: Sequence[str | Path],
     *,
-    episodes: int = 1024,
+    episodes: int = REPORT_GOALS,
     which: Which = "best",
     output: str | Path | None = None,
     robustness: bool = False,
@@ -231,7 +237,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.evaluate", description=__doc__)
     cli.add_checkpoint_arguments(parser, several=True)
-    parser.add_argument("--episodes", type=cli.positive_int, default=1024)
+    parser.add_argument("--episodes", type=cli.positive_int, default=REPORT_GOALS)
     parser.add_argument(
         "--output",
         type=Path,

@@ -13,7 +13,13 @@ import numpy as np
 from jaxtyping import Float
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.evaluation import GOAL_SET_VERSION, Summary, final_distances, wilson_interval
+from jetbot_mjx.evaluation import (
+    GOAL_SET_VERSION,
+    REPORT_GOALS,
+    Summary,
+    final_distances,
+    wilson_interval,
+)
 from jetbot_mjx.robustness import SweepResult, as_json
 from jetbot_mjx.rollout import Episodes
 
@@ -72,8 +78,8 @@ class Failure(NamedTuple):
     """[m] to the goal at the end, on the floor."""
     ended: str
     """`time limit`, `ended by the task`, or `world not finite`."""
-    replay: str
-    """The command that shows it."""
+    replay: str | None
+    """The command that shows it; None past the goals that can be filmed."""
 
 
 class CurvePoint(NamedTuple):
@@ -249,9 +255,11 @@ def _how_it_ended(episodes: Episodes, goal: int) -> str:
     return ENDED_BY_TASK if episodes.terminated[goal] > 0 else TIME_LIMIT
 
 
-def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str:
-    """The command line that films a policy on some of the goals."""
-    which = ",".join(str(goal) for goal in goals)
+def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | None:
+    """The command line that films a policy on some of the goals; None where none can be filmed."""
+    which = ",".join(str(goal) for goal in goals if goal < REPORT_GOALS)
+    if not which:
+        return None
     return (
         f"python -m jetbot_mjx.render {shlex.quote(str(run))}"
         f" --checkpoint {env_steps} --goals {which}"

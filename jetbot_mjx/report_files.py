@@ -97,7 +97,7 @@ def write_report(report: Report) -> Path:
         figures["learning_curve"] = lambda: plot_learning_curve(report)
     if report.robustness:
         figures["robustness"] = lambda: plot_robustness(report.robustness)
-    goals = [failure.goal for failure in report.failures[:_REPLAYED]]
+    goals = [failure.goal for failure in report.failures if failure.replay][:_REPLAYED]
     return _write(
         report.folder,
         "report",
@@ -106,7 +106,7 @@ def write_report(report: Report) -> Path:
         {
             "shown": {"successes": successes, "failures": len(shown) - successes},
             "listed": LISTED_FAILURES,
-            "replay": replay_command(report.run, report.env_steps, goals) if goals else None,
+            "replay": replay_command(report.run, report.env_steps, goals),
             "replayed": len(goals),
             "judge": report.judge_command(),
         },

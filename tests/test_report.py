@@ -144,6 +144,13 @@ def test_a_replay_command_survives_the_shell():
     assert words[3:] == ["my runs/it's", "--checkpoint", "2048", "--goals", "1"]
 
 
+def test_goals_that_cannot_be_filmed_have_no_command(monkeypatch):
+    monkeypatch.setattr("jetbot_mjx.report.REPORT_GOALS", 1)
+    found = find_failures(make_episodes([[1, 0], [0, 1]], [0, 0]), Path("runs/a"), 2048)
+    assert found[0].replay.endswith("--goals 0")
+    assert found[1].replay is None
+
+
 def test_a_learning_curve_is_made_of_the_evaluations_alone():
     judged = {f"eval/{name}": 0.5 for name in CurvePoint._fields[1:]}
     history = [
