@@ -28,7 +28,8 @@ train: setup
 	@echo "everything lies in $(RUN)"
 
 test: setup
-	$(BIN)/python -m pytest -m 'not slow' --numprocesses logical --maxprocesses 8 --dist loadfile
+	$(BIN)/python -m pytest -m 'not slow' --numprocesses logical --maxprocesses 8 --dist loadfile \
+		--no-loadscope-reorder
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow

@@ -20,6 +20,22 @@ import pytest
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.env import JetBotEnv, make_env
 
+_LONGEST = (
+    "test_notebooks",
+    "test_torture",
+    "test_ppo",
+    "test_resume",
+    "test_preemption",
+    "test_devices",
+    "test_train",
+)
+
+
+def pytest_collection_modifyitems(items):
+    """Begins with the files that take longest, so that no worker is left alone with one."""
+    rank = {name: index for index, name in enumerate(_LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(_LONGEST)))
+
 
 @pytest.fixture(scope="session")
 def root() -> Path:

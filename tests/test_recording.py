@@ -28,7 +28,20 @@ def recorder(root, tmp_path, monkeypatch):
 
         def run(self, params, keys):
             one, place = np.ones(len(keys)), np.zeros((len(keys), 2))
-            return Episodes(one, one, one, 0 * one, one, place, place, np.zeros((1, 3)), None, None)
+            return Episodes(
+                success=one,
+                steps=one,
+                episode_return=one,
+                terminated=one,
+                nonfinite=0 * one,
+                path_length=one,
+                start_w=place,
+                start_yaw=0 * one,
+                end_w=place,
+                goal_w=np.zeros((1, 3)),
+                goal=None,
+                qpos=None,
+            )
 
     monkeypatch.setattr(recording, "Evaluator", Evaluator)
     clocks = []

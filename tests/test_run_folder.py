@@ -147,14 +147,14 @@ class Killed(BaseException):
     """Stands for the end of the process."""
 
 
-@pytest.mark.parametrize("method", ["write_text", "replace"])
+@pytest.mark.parametrize("method", ["write_bytes", "replace"])
 def test_a_file_is_whole_or_as_it_was_whenever_the_process_ends(tmp_path, monkeypatch, method):
     path = tmp_path / "config.yaml"
     write_text(path, "before\n")
     original = getattr(Path, method)
 
     def die(self, argument, **keywords):
-        if method == "write_text":
+        if method == "write_bytes":
             original(self, argument[: len(argument) // 2], **keywords)
         raise Killed
 
