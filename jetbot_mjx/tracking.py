@@ -76,8 +76,7 @@ class WandbSink:
             self.write(entry.env_steps, entry.figures)
 
     def _begin(self, config: Config, run_dir: Path, seeds: int) -> Any:
-        import wandb
-
+        wandb: Any = importlib.import_module("wandb")
         group = run_dir.parent.name if seeds > 1 else None
         task = config.task.name.rpartition(":")[2]
         tags = (task, config.task.observation, config.robot.preset, config.trainer)
