@@ -1,0 +1,369 @@
+"""Arithmetic on single numbers, written down rather than done.
+
+A `Graph` records operations on scalars. What is known when it is recorded is computed at once,
+what was recorded before is not recorded again, and what a zero multiplies is gone: of the matrices
+of a robot's physics most entries are zeros, and most of the arithmetic goes with them.
+
+Two rules hold for finite numbers only: 0·x is 0, and x - x is 0.
+"""
+
+from collections.abc import Callable, Iterable
+from typing import Any
+
+import numpy as np
+
+
+class UnsupportedError(Exception):
+    """What a JAX function does cannot be written as arithmetic on single numbers here."""
+
+
+Scalar = Any
+"""A `Value`, or a NumPy scalar where the number is known."""
+
+
+class Value:
+    """A number that is known only when the program runs."""
+
+    __slots__ = ("dtype", "index", "op", "operands")
+
+    def __init__(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype, index: int) -> None:
+        """Describes one operation.
+
+        Args:
+          op: its name, as in `jax.lax`; `input` for what the program is given.
+          operands: numbers that it takes.
+          dtype: of the result: float32, int32 or bool.
+          index: place in the order of recording; operands have smaller ones.
+        """
+        self.op = op
+        self.operands = operands
+        self.dtype = dtype
+        self.index = index
+
+
+def is_known(x: Scalar) -> bool:
+    """Whether a number is known already."""
+    return not isinstance(x, Value)
+
+
+COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
+
+_FLOAT, _INT, _BOOL = np.dtype(np.float32), np.dtype(np.int32), np.dtype(bool)
+
+
+def _divide(a: Any, b: Any) -> Any:
+    if a.dtype.kind == "f":
+        return np.divide(a, b)
+    return np.trunc(np.divide(a, b)).astype(a.dtype)
+
+
+EVALUATE: dict[str, Callable[..., Any]] = {
+    "abs": np.abs,
+    "add": np.add,
+    "and": np.bitwise_and,
+    "atan2": np.arctan2,
+    "cos": np.cos,
+    "div": _divide,
+    "eq": np.equal,
+    "exp": np.exp,
+    "floor": np.floor,
+    "ge": np.greater_equal,
+    "gt": np.greater,
+    "is_finite": np.isfinite,
+    "le": np.less_equal,
+    "log": np.log,
+    "lt": np.less,
+    "max": np.maximum,
+    "min": np.minimum,
+    "mul": np.multiply,
+    "ne": np.not_equal,
+    "neg": np.negative,
+    "not": np.bitwise_not,
+    "or": np.bitwise_or,
+    "pow": np.power,
+    "rem": np.fmod,
+    "sign": np.sign,
+    "sin": np.sin,
+    "sqrt": np.sqrt,
+    "sub": np.subtract,
+    "tanh": np.tanh,
+    "xor": np.bitwise_xor,
+}
+"""Every operation but `select` and `convert`, as NumPy does it."""
+
+_COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
+
+
+class Graph:
+    """Operations on scalars, each recorded once."""
+
+    def __init__(self) -> None:
+        """Begins with none."""
+        self._values: dict[tuple[Any, ...], Value] = {}
+        self._count = 0
+
+    def input(self, dtype: np.dtype) -> Value:
+        """A number that the program will be given."""
+        return self._record("input", (np.int32(self._count),), np.dtype(dtype))
+
+    def apply(self, op: str, *operands: Scalar) -> Scalar:
+        """One operation, or its result.
+
+        Args:
+          op: a name in `EVALUATE`.
+          *operands: of one dtype.
+
+        Returns:
+          The number.
+
+        Raises:
+          UnsupportedError: the operation or the dtype is not known here.
+        """
+        if op not in EVALUATE:
+            raise UnsupportedError(f"the operation {op}")
+        if all(is_known(x) for x in operands):
+            with np.errstate(all="ignore"):
+                return np.asarray(EVALUATE[op](*operands))[()]
+        kind = next(x.dtype for x in operands if not is_known(x))
+        if kind not in (_FLOAT, _INT, _BOOL):
+            raise UnsupportedError(f"{op} of {kind}")
+        shorter = _SHORTER.get(op, _unchanged)(self, kind, *operands)
+        if shorter is not None:
+            return shorter
+        if op in _COMMUTATIVE:
+            operands = tuple(sorted(operands, key=_place))
+        dtype = _BOOL if op in COMPARISONS or op == "is_finite" else kind
+        return self._record(op, operands, dtype)
+
+    def select(self, which: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
+        """One of two numbers of one dtype, by a third that is bool."""
+        if is_known(which):
+            return on_true if which else on_false
+        if on_false is on_true or (_known_and(on_true, on_false) and on_false == on_true):
+            return on_false
+        if which.op == "not":
+            return self.select(which.operands[0], on_true, on_false)
+        dtype = on_true.dtype
+        if dtype == _BOOL:
+            # which & on_true | ~which & on_false
+            yes = self.apply("and", which, on_true)
+            return self.apply("or", yes, self.apply("and", self.apply("not", which), on_false))
+        return self._record("select", (which, on_false, on_true), dtype)
+
+    def convert(self, x: Scalar, dtype: np.dtype) -> Scalar:
+        """A number in another dtype."""
+        if is_known(x):
+            with np.errstate(all="ignore"):
+                return np.asarray(x).astype(dtype)[()]
+        # Without 64-bit types, as JAX has them by default, only these are met.
+        if dtype not in (_FLOAT, _INT, _BOOL):
+            raise UnsupportedError(f"a conversion to {dtype}")
+        if x.dtype == dtype:
+            return x
+        if dtype == _BOOL:
+            return self.apply("ne", x, x.dtype.type(0))
+        return self._record("convert", (x,), dtype)
+
+    def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Value:
+        key = (op, dtype, *map(_identity, operands))
+        if key not in self._values:
+            self._values[key] = Value(op, operands, dtype, self._count)
+            self._count += 1
+        return self._values[key]
+
+
+def in_order(results: Iterable[Scalar]) -> list[Value]:
+    """All that results depend on, every operand before what takes it.
+
+    Args:
+      results: numbers; the known ones need nothing.
+
+    Returns:
+      The values, inputs included.
+    """
+    needed: dict[int, Value] = {}
+    pending = [x for x in results if not is_known(x)]
+    while pending:
+        value = pending.pop()
+        if value.index not in needed:
+            needed[value.index] = value
+            pending += [x for x in value.operands if not is_known(x)]
+    return [needed[index] for index in sorted(needed)]
+
+
+def _identity(x: Scalar) -> Any:
+    # By bits, or 0.0 would be -0.0, and NaN not itself.
+    return x.index if isinstance(x, Value) else (x.dtype.str, x.tobytes())
+
+
+def _place(x: Scalar) -> int:
+    return x.index if isinstance(x, Value) else -1
+
+
+def _known_and(x: Scalar, *others: Scalar) -> bool:
+    return is_known(x) and all(is_known(other) for other in others)
+
+
+def _is(x: Scalar, number: float) -> bool:
+    return is_known(x) and x == number
+
+
+def _unchanged(graph: Graph, kind: np.dtype, *operands: Scalar) -> None:
+    return None
+
+
+def _shorter_add(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if _is(x, 0):
+        return y
+    return x if _is(y, 0) else None
+
+
+def _shorter_sub(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if x is y:
+        return kind.type(0)
+    if _is(x, 0):
+        return graph.apply("neg", y)
+    return x if _is(y, 0) else None
+
+
+def _shorter_mul(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    for one, other in ((x, y), (y, x)):
+        if _is(one, 0):
+            return kind.type(0)
+        if _is(one, 1):
+            return other
+        if _is(one, -1):
+            return graph.apply("neg", other)
+    return None
+
+
+def _shorter_div(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if _is(x, 0):
+        return kind.type(0)
+    if _is(y, 1):
+        return x
+    if is_known(y) and kind == _FLOAT and y != 0:
+        return graph.apply("mul", x, np.float32(1 / np.float64(y)))
+    return None
+
+
+def _shorter_neg(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar | None:
+    return x.operands[0] if x.op == "neg" else None
+
+
+def _shorter_not(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar | None:
+    return x.operands[0] if x.op == "not" else None
+
+
+def _shorter_and(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if x is y:
+        return x
+    for one, other in ((x, y), (y, x)):
+        if kind == _BOOL and is_known(one):
+            return other if one else np.bool_(False)
+    return None
+
+
+def _shorter_or(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if x is y:
+        return x
+    for one, other in ((x, y), (y, x)):
+        if kind == _BOOL and is_known(one):
+            return np.bool_(True) if one else other
+    return None
+
+
+def _shorter_xor(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    for one, other in ((x, y), (y, x)):
+        if kind == _BOOL and is_known(one):
+            return graph.apply("not", other) if one else other
+    return None
+
+
+def _shorter_extreme(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    return x if x is y else None
+
+
+def _shorter_pow(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if _is(y, 1):
+        return x
+    if _is(y, 2):
+        return graph.apply("mul", x, x)
+    return graph.apply("sqrt", x) if _is(y, 0.5) else None
+
+
+def _shorter_sign(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar:
+    zero, one = kind.type(0), kind.type(1)
+    below = graph.select(graph.apply("lt", x, zero), x, -one)
+    return graph.select(graph.apply("gt", x, zero), below, one)
+
+
+# π/2 in three parts, of which the first two have so few bits that a whole number times them is
+# exact: what is left of an angle after so many quarter turns loses nothing.
+_COARSE = np.float64(1.5703125)
+_FINE = np.float64((np.float32(np.pi / 2 - _COARSE).view(np.uint32) & 0xFFFFE000).view(np.float32))
+_QUARTER_TURN = [np.float32(part) for part in (_COARSE, _FINE, np.pi / 2 - _COARSE - _FINE)]
+
+
+def _polynomial(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[np.float32]:
+    """Coefficients in s = r², lowest first, that give a function of r up to an eighth of a turn."""
+    end = (np.pi / 4) ** 2
+    fit = np.polynomial.Chebyshev.interpolate(
+        lambda s: function(np.sqrt(s)), degree, domain=[0.0, end]
+    )
+    power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1], window=[-1, 1])
+    return [np.float32(c) for c in power.coef]
+
+
+_SINE = _polynomial(lambda r: np.sinc(r / np.pi), 4)  # sin(r)/r
+_COSINE = _polynomial(np.cos, 5)
+
+
+def _shorter_sine(graph: Graph, kind: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
+    """In basic arithmetic, so that every machine does the same; for |x| up to some 10⁴."""
+    do = graph.apply
+    turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
+    r = x
+    for part in _QUARTER_TURN:
+        r = do("sub", r, do("mul", turns, part))
+    s = do("mul", r, r)
+
+    def horner(coefficients: list[np.float32]) -> Scalar:
+        total: Scalar = coefficients[-1]
+        for coefficient in reversed(coefficients[:-1]):
+            total = do("add", do("mul", total, s), coefficient)
+        return total
+
+    def modulo(count: Scalar, of: float) -> Scalar:
+        whole = do("floor", do("mul", count, np.float32(1 / of)))
+        return do("sub", count, do("mul", whole, np.float32(of)))
+
+    sine, cosine = do("mul", r, horner(_SINE)), horner(_COSINE)
+    quarter = modulo(do("add", turns, np.float32(ahead)), 4.0)
+    odd = do("ge", modulo(quarter, 2.0), np.float32(1))
+    value = graph.select(odd, sine, cosine)
+    return graph.select(do("ge", quarter, np.float32(2)), value, do("neg", value))
+
+
+def _shorter_cosine(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar:
+    return _shorter_sine(graph, kind, x, ahead=1)
+
+
+_SHORTER: dict[str, Callable[..., Scalar | None]] = {
+    "add": _shorter_add,
+    "and": _shorter_and,
+    "cos": _shorter_cosine,
+    "div": _shorter_div,
+    "max": _shorter_extreme,
+    "min": _shorter_extreme,
+    "mul": _shorter_mul,
+    "neg": _shorter_neg,
+    "not": _shorter_not,
+    "or": _shorter_or,
+    "pow": _shorter_pow,
+    "sign": _shorter_sign,
+    "sin": _shorter_sine,
+    "sub": _shorter_sub,
+    "xor": _shorter_xor,
+}
+"""What else gives the same number; None: nothing does."""

@@ -1,0 +1,160 @@
+"""One kernel for all robots: its batches, and where there is none. What it computes: test_ptx."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import ptx_machine
+import pytest
+
+from jetbot_mjx import kernel
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.env import make_env
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.scalarize import scalarize
+from jetbot_mjx.scalars import UnsupportedError
+
+on_a_gpu = pytest.mark.skipif(jax.default_backend() != "gpu", reason="there is no GPU")
+
+
+@pytest.fixture
+def launches(monkeypatch):
+    """Kernels run by the machine in NumPy; the list tells how many robots each had."""
+    counts = []
+
+    def launch(written, leaves, results):
+        def run(*arrays):
+            arrays = [np.asarray(array) for array in arrays]
+            counts.append(len(arrays[0]))
+            outputs = [np.zeros(like.shape, np.float32) for like in results]
+            blocks = -(-len(arrays[0]) // written.threads)
+            ptx_machine.run(written.source, blocks, arrays, outputs)
+            return outputs
+
+        shapes = [jax.ShapeDtypeStruct(like.shape, jnp.float32) for like in results]
+        return jax.pure_callback(run, shapes, *leaves)
+
+    monkeypatch.setattr(kernel, "_launch", launch)
+    return counts
+
+
+@pytest.fixture(scope="module")
+def step():
+    def once(changing, held):
+        return {"x": changing["x"] * held, "n": changing["n"] + 1}
+
+    shapes = {"x": jnp.zeros(3), "n": jnp.zeros(())}
+    program = scalarize(once, shapes, jnp.zeros(()))
+    return kernel.as_kernel(program, carried=2, steps=2, name="it")
+
+
+def test_one_robot_needs_no_batch(step, launches):
+    result = step({"x": jnp.arange(3.0), "n": jnp.zeros(())}, jnp.float32(3))
+    np.testing.assert_array_equal(result["x"], [0, 9, 18])
+    assert result["n"] == 2
+    assert launches == [1]
+
+
+def test_a_batch_is_one_launch_and_what_is_common_to_all_is_given_to_each(step, launches):
+    states = {"x": jnp.ones((5, 3)), "n": jnp.arange(5.0)}
+    result = jax.jit(jax.vmap(step, in_axes=(0, None)))(states, jnp.float32(2))
+    np.testing.assert_array_equal(result["x"], np.full((5, 3), 4))
+    np.testing.assert_array_equal(result["n"], np.arange(5) + 2)
+    assert launches == [5]
+
+
+def test_a_batch_of_batches_is_one_launch(step, launches):
+    states = {"x": jnp.ones((2, 5, 3)), "n": jnp.zeros(5)}
+    held = jnp.arange(10.0).reshape(2, 5)
+    axes = {"x": 0, "n": None}
+    result = jax.vmap(jax.vmap(step), in_axes=(axes, 0))(states, held)
+    np.testing.assert_array_equal(result["x"][..., 1], np.arange(10).reshape(2, 5) ** 2)
+    assert result["n"].shape == (2, 5)
+    assert launches == [10]
+
+
+def test_it_can_be_looped_over(step, launches):
+    def body(states, _):
+        return jax.vmap(step, in_axes=(0, None))(states, jnp.float32(2)), states["n"][0]
+
+    states = {"x": jnp.ones((5, 3)), "n": jnp.zeros(5)}
+    last, counts = jax.jit(lambda s: jax.lax.scan(body, s, length=3))(states)
+    np.testing.assert_array_equal(counts, [0, 2, 4])
+    np.testing.assert_array_equal(last["x"], np.full((5, 3), 64))
+    assert launches == [5, 5, 5]
+
+
+def test_what_cannot_be_a_kernel_says_so_at_once():
+    program = scalarize(jnp.tanh, jnp.zeros(3))
+    with pytest.raises(UnsupportedError, match="tanh"):
+        kernel.as_kernel(program, carried=1, steps=1, name="it")
+
+
+@pytest.mark.skipif(jax.default_backend() == "gpu", reason="there is a GPU")
+def test_without_an_nvidia_gpu_there_is_none():
+    assert not kernel.is_available()
+    assert make_env(parse_config({})).physics_impl == "xla"
+    with pytest.raises(UserError, match=r"physics\.impl = ptx needs an NVIDIA GPU.* cpu"):
+        make_env(parse_config({"physics": {"impl": "ptx"}}))
+
+
+@pytest.fixture
+def gpu(monkeypatch, launches):
+    monkeypatch.setattr(kernel, "is_available", lambda: True)
+    return launches
+
+
+def test_the_environment_steps_by_the_kernel_where_there_is_one(gpu):
+    env = make_env(parse_config({}))
+    assert env.physics_impl == "ptx"
+    states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
+    ahead = jax.vmap(env.step)(states, jnp.ones((3, 2)))
+    assert gpu == [3]
+    assert np.all(ahead.pipeline_state.qpos[:, 0] > 0)
+    np.testing.assert_allclose(ahead.pipeline_state.time, 1 / 60, rtol=1e-5)
+
+
+def test_models_that_differ_from_robot_to_robot_go_into_the_kernel(gpu):
+    env = make_env(parse_config({}))
+    gains = jnp.float32([0.5, 1.0])
+
+    def drive(gain):
+        gainprm = env.mjx_model.actuator_gainprm * gain
+        here = env.with_model(env.mjx_model.replace(actuator_gainprm=gainprm))
+        state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+        return here.step_physics(state, jnp.ones(2)).qvel
+
+    ours = jax.vmap(drive)(gains)
+    assert gpu == [2]
+    plain = make_env(parse_config({"physics": {"impl": "xla"}}))
+    state = plain.reset(jax.random.PRNGKey(0)).pipeline_state
+    np.testing.assert_allclose(ours[1], plain.step_physics(state, jnp.ones(2)).qvel, atol=1e-5)
+    assert ours[0, 6] < 0.9 * ours[1, 6]
+
+
+@pytest.mark.parametrize("impl", ["auto", "ptx"])
+def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(gpu, impl):
+    # The library's Cholesky factor is a call, not arithmetic.
+    env = make_env(parse_config({"physics": {"impl": impl, "cholesky": "library"}}))
+    if impl == "auto":
+        assert env.physics_impl == "xla"
+        return
+    with pytest.raises(UserError, match=r"physics\.impl = ptx: one kernel cannot do.*cholesky"):
+        env.step_physics(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))
+
+
+@on_a_gpu
+@pytest.mark.parametrize("preset", ["isaac", "real"])
+def test_on_a_gpu_it_drives_as_xla_does(preset):
+    robots = 256
+    rng = np.random.default_rng(0)
+    targets = rng.uniform(-12, 31, (16, robots, 2)).astype(np.float32)
+    ends = []
+    for impl in ("ptx", "xla"):
+        env = make_env(parse_config({"robot": {"preset": preset}, "physics": {"impl": impl}}))
+        keys = jax.random.split(jax.random.PRNGKey(0), robots)
+        states = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
+        step = jax.jit(jax.vmap(env.step_physics))
+        for ctrl in np.repeat(targets, 16, 0):
+            states = step(states, ctrl)
+        ends.append(np.asarray(states.qpos))
+    np.testing.assert_allclose(*ends, atol=1e-3)
