@@ -4,27 +4,23 @@ Pure, unbatched and stateless: batch with `jax.vmap`, compile with `jax.jit`. Th
 only what physics integrates and what the task drew; `mjx.Data` is rebuilt inside `step`.
 """
 
-import contextlib
 import copy
 
 import brax.envs
 import jax
 import jax.numpy as jnp
 import mujoco
-from jax.core import Tracer
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx import cholesky, kernel, kinematics, mjx
+from jetbot_mjx import kinematics, mjx
 from jetbot_mjx.config import Config
-from jetbot_mjx.errors import UserError
 from jetbot_mjx.model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
     ROBOTS,
     make_mj_model,
 )
-from jetbot_mjx.scalarize import scalarize
-from jetbot_mjx.scalars import UnsupportedError
+from jetbot_mjx.physics import Physics
 from jetbot_mjx.state import PhysicsState, State, robot_state
 from jetbot_mjx.task import Task, layout_size, make_task
 
@@ -57,16 +53,12 @@ class JetBotEnv(brax.envs.Env):
         physics_model = make_mj_model(
             self.robot, config.physics, build_scene=self.task.build_scene, visual=False
         )
-        self.mjx_model: mjx.Model = mjx.put_model(physics_model)
-        self._data: mjx.Data = mjx.make_data(physics_model)
-        self._varied: tuple[int, ...] = ()
-        """Leaves of the model that are known only when a program runs, robot by robot."""
-        self._kernel: kernel.Step | UnsupportedError | None = None
-        if config.physics.impl == "ptx" and not kernel.is_available():
-            raise UserError(
-                f"physics.impl = ptx needs an NVIDIA GPU and an XLA that launches PTX; this is"
-                f" {jax.default_backend()}: choose xla or auto"
-            )
+        self.physics = Physics(physics_model, config.physics)
+
+    @property
+    def mjx_model(self) -> mjx.Model:
+        """The model that is stepped."""
+        return self.physics.model
 
     def with_model(self, mjx_model: mjx.Model) -> "JetBotEnv":
         """This environment on another physics model, as a new object.
@@ -78,10 +70,7 @@ class JetBotEnv(brax.envs.Env):
           A copy; `self` stays as it is.
         """
         env = copy.copy(self)
-        env.mjx_model = mjx_model
-        leaves = jax.tree.leaves(mjx_model)
-        env._varied = tuple(i for i, x in enumerate(leaves) if isinstance(x, Tracer))
-        env._kernel = None
+        env.physics = self.physics.with_model(mjx_model)
         return env
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
@@ -170,7 +159,7 @@ class JetBotEnv(brax.envs.Env):
         )
 
     def step_physics(self, physics: PhysicsState, ctrl: Float[Array, "2"]) -> PhysicsState:
-        """Integrates one environment step, `n_substeps` physics steps.
+        """Integrates one environment step.
 
         Args:
           physics: where to start.
@@ -179,78 +168,7 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           The physics state one `ctrl_dt` later.
         """
-        step = self._as_kernel()
-        if step is not None:
-            return step(physics, (ctrl, self._varied_leaves()))
-        held = ctrl, self._varied_leaves()
-        physics, _ = jax.lax.scan(
-            lambda physics, _: (self._substep(physics, held), None),
-            physics,
-            length=self.config.physics.n_substeps,
-        )
-        return physics
-
-    @property
-    def physics_impl(self) -> str:
-        """Who makes a step of physics, `ptx` or `xla`, as in `config.physics.impl`."""
-        return "xla" if self._as_kernel() is None else "ptx"
-
-    def _substep(self, physics: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
-        """One step of MJX, for wheel speed targets and the leaves in which its model differs."""
-        ctrl, leaves = held
-        model_leaves, treedef = jax.tree.flatten(self.mjx_model)
-        for place, leaf in zip(self._varied, leaves, strict=True):
-            model_leaves[place] = leaf
-        data = self._data.replace(
-            qpos=physics.qpos,
-            qvel=physics.qvel,
-            qacc_warmstart=physics.qacc_warmstart,
-            time=physics.time,
-            ctrl=ctrl,
-        )
-        # GPUs multiply float32 matrices in TF32 unless told otherwise, and the contact solver
-        # then diverges. Only physics asks for full precision; networks choose their own.
-        factorise = (
-            contextlib.nullcontext
-            if self.config.physics.cholesky == "library"
-            else cholesky.unrolled
-        )
-        with jax.default_matmul_precision("highest"), factorise():
-            data = mjx.step(jax.tree.unflatten(treedef, model_leaves), data)
-        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
-
-    def _varied_leaves(self) -> list[Array]:
-        leaves = jax.tree.leaves(self.mjx_model)
-        return [leaves[place] for place in self._varied]
-
-    def _as_kernel(self) -> kernel.Step | None:
-        """The step as one kernel; None where XLA makes it."""
-        impl = self.config.physics.impl
-        if impl == "xla" or not kernel.is_available():
-            return None
-        if self._kernel is None:
-            try:
-                self._kernel = self._write_kernel()
-            except UnsupportedError as error:
-                self._kernel = error
-        if not isinstance(self._kernel, UnsupportedError):
-            return self._kernel
-        if impl == "ptx":
-            raise UserError(
-                f"physics.impl = ptx: one kernel cannot do {self._kernel}; choose xla or auto"
-            )
-        return None
-
-    def _write_kernel(self) -> kernel.Step:
-        physics = jax.eval_shape(self.reset, jax.random.PRNGKey(0)).pipeline_state
-        held = jnp.zeros(self.mj_model.nu), self._varied_leaves()
-        program = scalarize(self._substep, physics, held)
-        return kernel.as_kernel(
-            program,
-            carried=len(jax.tree.leaves(physics)),
-            steps=self.config.physics.n_substeps,
-            name="physics",
-        )
+        return self.physics.step(physics, ctrl)
 
     @property
     def observation_size(self) -> int:

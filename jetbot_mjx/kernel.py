@@ -9,9 +9,14 @@ XLA launches it by its custom call for PTX, an internal mechanism: `is_available
 XLA whether it knows it.
 """
 
+import contextlib
 import functools
+import hashlib
+import json
 import math
+import tempfile
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -20,13 +25,11 @@ import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from jetbot_mjx import ptx
-from jetbot_mjx.scalarize import Program, scalarize
+from jetbot_mjx import ptx, scalars
+from jetbot_mjx import scalarize as scalarize_module
+from jetbot_mjx.scalarize import scalarize
 
 _TARGET = "__gpu$xla.gpu.ptx"
-_THREADS = 64
-"""In a block: so few that even some thousand robots keep all of a GPU's multiprocessors busy."""
-
 Step = Callable[[PyTree, PyTree], PyTree]
 """Of (what changes, what is held): what changes, some steps later."""
 
@@ -37,7 +40,7 @@ def is_available() -> bool:
     if jax.default_backend() != "gpu" or "cuda" not in jax.devices()[0].client.platform_version:
         return False
     program = scalarize(lambda x: x + 1.0, jnp.zeros(1))
-    probe = ptx.make_kernel(program, carried=1, steps=1, robots=2, threads=2, name="probe")
+    probe = ptx.make_kernel(program, carried=1, steps=1, name="probe")
     # Whoever asks may be in the middle of tracing something else.
     with jax.ensure_compile_time_eval():
         zeros = [jnp.zeros((2, 1))]
@@ -47,31 +50,22 @@ def is_available() -> bool:
             return False
 
 
-def as_kernel(program: Program, *, carried: int, steps: int, name: str) -> Step:
-    """A program repeated in one kernel, for any batch of robots.
+def batched(kernel: ptx.Kernel) -> Step:
+    """A kernel as a function of one robot, for any batch of them.
 
     Args:
-      program: a step of one robot, float32; its results have the shapes of its first arguments.
-      carried: how many leaves of the arguments that are: what changes.
-      steps: how often it is repeated.
-      name: of the kernel, a C identifier.
+      kernel: of a step; what changes are its first arguments, and its results.
 
     Returns:
-      A function of (what changes, what is held), pytrees with the leaves of the program's
+      A function of (what changes, what is held), pytrees with the leaves of the kernel's
       arguments, to be batched by `jax.vmap`. It cannot be differentiated.
-
-    Raises:
-      UnsupportedError: the program has an operation that is not written in PTX here.
     """
-    write = functools.partial(ptx.make_kernel, program, carried=carried, steps=steps, name=name)
-    write(robots=1, threads=1)
 
     @custom_vmap
     def batch(changing: PyTree, held: PyTree) -> PyTree:
         """For leaves with one batch axis."""
         leaves = jax.tree.leaves((changing, held))
-        kernel = write(robots=leaves[0].shape[0], threads=_THREADS)
-        results = _launch(kernel, leaves, leaves[:carried])
+        results = _launch(kernel, leaves, jax.tree.leaves(changing))
         return jax.tree.unflatten(jax.tree.structure(changing), results)
 
     @batch.def_vmap
@@ -100,6 +94,39 @@ def as_kernel(program: Program, *, carried: int, steps: int, name: str) -> Step:
     return one
 
 
+def kept(key: bytes, write: Callable[[], ptx.Kernel]) -> ptx.Kernel:
+    """A kernel's text, from the folder of compiled programs if it was written before.
+
+    Args:
+      key: all that the text depends on.
+      write: writes the kernel.
+
+    Returns:
+      The kernel.
+    """
+    cache = jax.config.values["jax_compilation_cache_dir"]
+    if cache is None:
+        return write()
+    path = Path(cache) / f"kernel-{hashlib.sha256(key + _own_source()).hexdigest()}.json"
+    try:
+        return ptx.Kernel(**json.loads(path.read_text()))
+    except (OSError, ValueError, TypeError):
+        kernel = write()
+    # As with compiled programs: a folder that cannot be written costs time, nothing else.
+    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=cache) as folder:
+        written = Path(folder) / path.name
+        written.write_text(json.dumps(kernel._asdict()))
+        written.replace(path)
+    return kernel
+
+
+@functools.cache
+def _own_source() -> bytes:
+    """What turns a step into a kernel."""
+    files = [Path(module.__file__ or "") for module in (scalars, scalarize_module, ptx)]
+    return b"".join(file.read_bytes() for file in files)
+
+
 def _broadcast(size: int, batched: Any, trees: PyTree) -> PyTree:
     """Gives every leaf the batch axis that some have."""
     return jax.tree.map(
@@ -109,6 +136,7 @@ def _broadcast(size: int, batched: Any, trees: PyTree) -> PyTree:
 
 def _launch(kernel: ptx.Kernel, leaves: Sequence[Array], results: Sequence[Array]) -> list[Array]:
     """Runs a kernel on leaves of (robots, ...), for results shaped as some of them are."""
+    robots = leaves[0].shape[0]
     call = jax.ffi.ffi_call(
         _TARGET, [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
     )
@@ -117,11 +145,11 @@ def _launch(kernel: ptx.Kernel, leaves: Sequence[Array], results: Sequence[Array
             *leaves,
             name=kernel.name,
             kernel_type="ptx",
-            kernel_data=kernel.source,
-            grid_x=np.int64(math.ceil(leaves[0].shape[0] / kernel.threads)),
+            kernel_data=kernel.source(robots),
+            grid_x=np.int64(math.ceil(robots / ptx.THREADS)),
             grid_y=np.int64(1),
             grid_z=np.int64(1),
-            block_x=np.int64(kernel.threads),
+            block_x=np.int64(ptx.THREADS),
             block_y=np.int64(1),
             block_z=np.int64(1),
             shared_mem_bytes=np.int64(0),

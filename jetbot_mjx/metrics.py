@@ -37,11 +37,15 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
 import jax
-from tensorboardX.event_file_writer import EventsWriter
-from tensorboardX.proto import event_pb2, summary_pb2
 
 from jetbot_mjx.aliases import Alias, with_aliases
+from jetbot_mjx.imports import standing_in
 from jetbot_mjx.run_folder import write_text
+
+# It would load PyTorch where there is one, seconds, for pictures of networks.
+with standing_in("torch", None):
+    from tensorboardX.event_file_writer import EventsWriter
+    from tensorboardX.proto import event_pb2, summary_pb2
 
 Figures = Mapping[str, float | None]
 

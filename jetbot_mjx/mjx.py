@@ -1,9 +1,30 @@
-"""MJX, imported without the two lines that it prints when its optional Warp part is absent."""
+"""MJX, imported without what it does not need here.
+
+It prints two lines when its optional Warp part is absent. And it loads trimesh, the better part of
+a second, for meshes that no robot here has: that is put off until one does.
+"""
 
 import contextlib
+import importlib
 import io
+import types
+from typing import Any
 
-with contextlib.redirect_stdout(io.StringIO()):
+from jetbot_mjx.imports import standing_in
+
+
+class _Trimesh(types.ModuleType):
+    """What MJX sees of trimesh: a name for its annotations, the library for its meshes."""
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(importlib.import_module("trimesh"), name)
+
+    @staticmethod
+    def Trimesh(*arguments: Any, **options: Any) -> Any:
+        return importlib.import_module("trimesh").Trimesh(*arguments, **options)
+
+
+with standing_in("trimesh", _Trimesh("trimesh")), contextlib.redirect_stdout(io.StringIO()):
     from mujoco.mjx import Data, Model, make_data, put_model, step
 
 __all__ = ["Data", "Model", "make_data", "put_model", "step"]

@@ -29,19 +29,26 @@ _FLOAT_OPS = {"add": "add", "div": "div.rn", "mul": "mul", "sub": "sub"}
 _INT_OPS = {"add": "add", "max": "max", "min": "min", "mul": "mul.lo", "sub": "sub"}
 
 
+THREADS = 64
+"""Robots in one block: so few that even thousands keep all multiprocessors of a GPU busy."""
+
+_ROBOTS = "$robots"
+"""Where in a kernel's text their number goes."""
+
+
 class Kernel(NamedTuple):
     """What a GPU is given to run."""
 
     name: str
-    source: str
-    """PTX."""
-    threads: int
-    """In one block, a robot each."""
+    text: str
+    """PTX, but for the number of robots."""
+
+    def source(self, robots: int) -> str:
+        """The PTX for so many robots."""
+        return self.text.replace(_ROBOTS, str(robots))
 
 
-def make_kernel(
-    program: Program, *, carried: int, steps: int, robots: int, threads: int, name: str
-) -> Kernel:
+def make_kernel(program: Program, *, carried: int, steps: int, name: str) -> Kernel:
     """Writes a kernel that repeats a program, its results becoming its first arguments.
 
     The kernel's parameters are the addresses of all leaves of the arguments and then of all
@@ -51,8 +58,6 @@ def make_kernel(
       program: a step; its results have the shapes of its first `carried` arguments.
       carried: how many leaves of the arguments are carried from step to step.
       steps: how often it is repeated.
-      robots: how many there are.
-      threads: in one block.
       name: of the kernel, a C identifier.
 
     Returns:
@@ -63,17 +68,15 @@ def make_kernel(
     """
     if any(x.dtype != np.float32 for array in program.inputs for x in array.ravel()):
         raise UnsupportedError("an argument that is not float32")
-    return Kernel(name, _Text(program, carried, robots, threads).text(steps, name), threads)
+    return Kernel(name, _Text(program, carried).text(steps, name))
 
 
 class _Text:
     """The lines of one kernel, and the registers that they name."""
 
-    def __init__(self, program: Program, carried: int, robots: int, threads: int) -> None:
+    def __init__(self, program: Program, carried: int) -> None:
         self._program = program
         self._carried = carried
-        self._robots = robots
-        self._threads = threads
         self._count = dict.fromkeys(_REGISTERS, 0)
         self._names: dict[int, str] = {}
         self._lines: list[str] = []
@@ -99,7 +102,7 @@ class _Text:
         parameters = ", ".join(f".param .u64 a{i}" for i in range(last))
         lines = [
             f".visible .entry {name}({parameters})",
-            f".maxntid {self._threads}, 1, 1",
+            f".maxntid {THREADS}, 1, 1",
             "{",
             ".reg .u32 %block, %thread, %robot, %step;",
             ".reg .pred %stop;",
@@ -107,8 +110,8 @@ class _Text:
             *self._declarations(),
             "mov.u32 %block, %ctaid.x;",
             "mov.u32 %thread, %tid.x;",
-            f"mad.lo.u32 %robot, %block, {self._threads}, %thread;",
-            f"setp.ge.u32 %stop, %robot, {self._robots};",
+            f"mad.lo.u32 %robot, %block, {THREADS}, %thread;",
+            f"setp.ge.u32 %stop, %robot, {_ROBOTS};",
             "@%stop ret;",
             *self._transfers("ld.global.f32 {register}, [%address+{offset}];", 0, inputs),
             "mov.u32 %step, 0;",

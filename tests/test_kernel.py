@@ -6,12 +6,11 @@ import numpy as np
 import ptx_machine
 import pytest
 
-from jetbot_mjx import kernel
+from jetbot_mjx import kernel, ptx
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.scalarize import scalarize
-from jetbot_mjx.scalars import UnsupportedError
 
 on_a_gpu = pytest.mark.skipif(jax.default_backend() != "gpu", reason="there is no GPU")
 
@@ -26,8 +25,9 @@ def launches(monkeypatch):
             arrays = [np.asarray(array) for array in arrays]
             counts.append(len(arrays[0]))
             outputs = [np.zeros(like.shape, np.float32) for like in results]
-            blocks = -(-len(arrays[0]) // written.threads)
-            ptx_machine.run(written.source, blocks, arrays, outputs)
+            robots = len(arrays[0])
+            blocks = -(-robots // ptx.THREADS)
+            ptx_machine.run(written.source(robots), blocks, arrays, outputs)
             return outputs
 
         shapes = [jax.ShapeDtypeStruct(like.shape, jnp.float32) for like in results]
@@ -44,7 +44,7 @@ def step():
 
     shapes = {"x": jnp.zeros(3), "n": jnp.zeros(())}
     program = scalarize(once, shapes, jnp.zeros(()))
-    return kernel.as_kernel(program, carried=2, steps=2, name="it")
+    return kernel.batched(ptx.make_kernel(program, carried=2, steps=2, name="it"))
 
 
 def test_one_robot_needs_no_batch(step, launches):
@@ -83,16 +83,59 @@ def test_it_can_be_looped_over(step, launches):
     assert launches == [5, 5, 5]
 
 
-def test_what_cannot_be_a_kernel_says_so_at_once():
-    program = scalarize(jnp.tanh, jnp.zeros(3))
-    with pytest.raises(UnsupportedError, match="tanh"):
-        kernel.as_kernel(program, carried=1, steps=1, name="it")
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def write(text="text"):
+    return ptx.Kernel("it", text)
+
+
+def never():
+    raise AssertionError("it is written already")
+
+
+def test_a_text_is_written_once_for_each_key(cache):
+    assert kernel.kept(b"key", write) == write()
+    assert kernel.kept(b"key", never) == write()
+    assert kernel.kept(b"other", lambda: write("more")) == write("more")
+    assert len(list(cache.iterdir())) == 2
+
+
+@pytest.mark.parametrize("damage", ["", "{", "[]", '{"name": "it"}', '{"a": 1}'])
+def test_a_damaged_text_is_written_again(cache, damage):
+    kernel.kept(b"key", write)
+    (path,) = cache.iterdir()
+    path.write_text(damage)
+    assert kernel.kept(b"key", write) == write()
+    assert kernel.kept(b"key", never) == write()
+
+
+def test_another_way_of_writing_is_another_text(cache, monkeypatch):
+    kernel.kept(b"key", write)
+    monkeypatch.setattr(kernel, "_own_source", lambda: b"another")
+    assert kernel.kept(b"key", lambda: write("more")) == write("more")
+
+
+def test_without_a_folder_it_is_written_every_time(tmp_path):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    try:
+        for folder in (None, str(tmp_path / "absent")):
+            jax.config.update("jax_compilation_cache_dir", folder)
+            assert kernel.kept(b"key", write) == write()
+            assert kernel.kept(b"key", lambda: write("more")) == write("more")
+    finally:
+        jax.config.update("jax_compilation_cache_dir", before)
 
 
 @pytest.mark.skipif(jax.default_backend() == "gpu", reason="there is a GPU")
 def test_without_an_nvidia_gpu_there_is_none():
     assert not kernel.is_available()
-    assert make_env(parse_config({})).physics_impl == "xla"
+    assert make_env(parse_config({})).physics.impl == "xla"
     with pytest.raises(UserError, match=r"physics\.impl = ptx needs an NVIDIA GPU.* cpu"):
         make_env(parse_config({"physics": {"impl": "ptx"}}))
 
@@ -105,7 +148,7 @@ def gpu(monkeypatch, launches):
 
 def test_the_environment_steps_by_the_kernel_where_there_is_one(gpu):
     env = make_env(parse_config({}))
-    assert env.physics_impl == "ptx"
+    assert env.physics.impl == "ptx"
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     ahead = jax.vmap(env.step)(states, jnp.ones((3, 2)))
     assert gpu == [3]
@@ -125,9 +168,9 @@ def test_models_that_differ_from_robot_to_robot_go_into_the_kernel(gpu):
 
     ours = jax.vmap(drive)(gains)
     assert gpu == [2]
-    plain = make_env(parse_config({"physics": {"impl": "xla"}}))
-    state = plain.reset(jax.random.PRNGKey(0)).pipeline_state
-    np.testing.assert_allclose(ours[1], plain.step_physics(state, jnp.ones(2)).qvel, atol=1e-5)
+    # The second robot has its preset's gain.
+    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    np.testing.assert_allclose(ours[1], env.step_physics(state, jnp.ones(2)).qvel, atol=1e-5)
     assert ours[0, 6] < 0.9 * ours[1, 6]
 
 
@@ -136,10 +179,26 @@ def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(gp
     # The library's Cholesky factor is a call, not arithmetic.
     env = make_env(parse_config({"physics": {"impl": impl, "cholesky": "library"}}))
     if impl == "auto":
-        assert env.physics_impl == "xla"
+        assert env.physics.impl == "xla"
         return
     with pytest.raises(UserError, match=r"physics\.impl = ptx: one kernel cannot do.*cholesky"):
         env.step_physics(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))
+
+
+def test_the_text_of_a_model_of_its_own_is_kept_and_of_another_is_not(gpu, cache, monkeypatch):
+    def writes(env):
+        before = len(list(cache.glob("kernel-*.json")))
+        assert env.physics.impl == "ptx"
+        return len(list(cache.glob("kernel-*.json"))) - before
+
+    env = make_env(parse_config({}))
+    assert writes(env) == 1
+    assert writes(make_env(parse_config({}))) == 0
+    assert writes(make_env(parse_config({"physics": {"iterations": 3}}))) == 1
+    assert writes(make_env(parse_config({"robot": {"preset": "real"}}))) == 1
+    # What it holds is no part of the key.
+    slippery = env.mjx_model.replace(pair_friction=env.mjx_model.pair_friction * 0.5)
+    assert writes(env.with_model(slippery)) == 0
 
 
 @on_a_gpu

@@ -35,13 +35,11 @@ FUNCTIONS = {
 }
 
 
-def run(program, arguments, steps=1, carried=1, threads=8):
+def run(program, arguments, steps=1, carried=1):
     robots = len(arguments[0])
-    kernel = ptx.make_kernel(
-        program, carried=carried, steps=steps, robots=robots, threads=threads, name="it"
-    )
+    kernel = ptx.make_kernel(program, carried=carried, steps=steps, name="it")
     outputs = [np.full_like(x, np.nan) for x in arguments[:carried]]
-    ptx_machine.run(kernel.source, -(-robots // threads), arguments, outputs)
+    ptx_machine.run(kernel.source(robots), -(-robots // ptx.THREADS), arguments, outputs)
     return outputs
 
 
@@ -71,10 +69,10 @@ def test_results_become_arguments_and_what_is_held_stays():
     np.testing.assert_allclose(ours, np.roll(x, 6, 1) + 6 * held, rtol=1e-5)
 
 
-@pytest.mark.parametrize("threads", [1, 8, 64])
-def test_robots_that_do_not_fill_their_last_block_are_all_there(threads):
-    x = np.arange(84, dtype=np.float32).reshape(21, 4)
-    (ours,) = run(scalarize(lambda x: x + 1, VECTOR), [x], threads=threads)
+@pytest.mark.parametrize("robots", [1, ptx.THREADS - 1, ptx.THREADS, 2 * ptx.THREADS + 5])
+def test_robots_that_do_not_fill_their_last_block_are_all_there(robots):
+    x = np.arange(4 * robots, dtype=np.float32).reshape(robots, 4)
+    (ours,) = run(scalarize(lambda x: x + 1, VECTOR), [x])
     np.testing.assert_array_equal(ours, x + 1)
 
 
@@ -91,7 +89,7 @@ def test_what_ptx_does_not_do_here_is_named():
 def test_the_kernel_of_physics_is_its_program(preset):
     env = make_env(parse_config({"robot": {"preset": preset}}))
     physics = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    program = scalarize(env._substep, physics, (jnp.zeros(2), []))
+    program = scalarize(env.physics.substep, physics, (jnp.zeros(2), []))
     rng = np.random.default_rng(0)
     robots = 20
     ours = theirs = [np.repeat(np.asarray(x)[None], robots, 0) for x in jax.tree.leaves(physics)]

@@ -110,7 +110,7 @@ def env():
 
 def test_the_arithmetic_of_mjx_is_mjxs_own(env):
     def step(physics, ctrl):
-        return env._substep(physics, (ctrl, []))
+        return env.physics.substep(physics, (ctrl, []))
 
     first = env.reset(jax.random.PRNGKey(0)).pipeline_state
     program = scalarize(step, first, jnp.zeros(2))
@@ -136,7 +136,7 @@ def test_of_the_arithmetic_of_mjx_most_is_multiplication_by_zero(env):
     data = mjx.make_data(env.mj_model)
     size = sum(leaf.size for leaf in jax.tree.leaves(data))
     step = scalarize(
-        lambda physics: env._substep(physics, (jnp.zeros(2), [])),
+        lambda physics: env.physics.substep(physics, (jnp.zeros(2), [])),
         env.reset(jax.random.PRNGKey(0)).pipeline_state,
     )
     # The traced step has some 15,000 operations on arrays of up to 64 numbers.

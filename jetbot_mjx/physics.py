@@ -1,0 +1,184 @@
+"""The physics of one environment step: MJX's arithmetic, as XLA compiles it or as one kernel."""
+
+import contextlib
+import copy
+import importlib.metadata
+import inspect
+import json
+import threading
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, Float
+
+from jetbot_mjx import cholesky, kernel, mjx, ptx
+from jetbot_mjx.config import PhysicsConfig
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.scalarize import scalarize
+from jetbot_mjx.scalars import UnsupportedError
+from jetbot_mjx.state import PhysicsState
+
+
+class Physics:
+    """A model and how it is stepped; pure and unbatched."""
+
+    def __init__(self, mj_model: mujoco.MjModel, config: PhysicsConfig) -> None:
+        """Hands the model over to MJX.
+
+        Args:
+          mj_model: of what moves and touches.
+          config: the physics of the run.
+
+        Raises:
+          UserError: one kernel is asked for where there can be none.
+        """
+        self._mj_model = mj_model
+        self._config = config
+        # On the host: a model's numbers become constants of programs, and a GPU would compile a
+        # small program to fill each.
+        with _host():
+            self.model: mjx.Model = mjx.put_model(mj_model)
+            self._data: mjx.Data = mjx.make_data(mj_model)
+        self._varied: tuple[int, ...] = ()
+        """Leaves of the model that are known only when a program runs, robot by robot."""
+        self._is_own_model = True
+        self._lock = threading.Lock()
+        self._kernel: kernel.Step | UnsupportedError | None = None
+        if config.impl == "ptx" and not kernel.is_available():
+            raise UserError(
+                "physics.impl = ptx needs an NVIDIA GPU and an XLA that launches PTX; this is"
+                f" {jax.default_backend()}: choose xla or auto"
+            )
+
+    def with_model(self, model: mjx.Model) -> "Physics":
+        """The same on another model, as a new object.
+
+        Args:
+          model: of the same structure, such as one with other friction.
+
+        Returns:
+          A copy; `self` stays as it is.
+        """
+        other = copy.copy(self)
+        other.model = model
+        leaves = jax.tree.leaves(model)
+        other._varied = tuple(i for i, x in enumerate(leaves) if isinstance(x, Tracer))
+        other._is_own_model = False
+        other._lock = threading.Lock()
+        other._kernel = None
+        return other
+
+    @property
+    def impl(self) -> str:
+        """Who makes a step, `ptx` or `xla`, as in `physics.impl`."""
+        return "xla" if self._as_kernel() is None else "ptx"
+
+    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
+        """Integrates one environment step, `n_substeps` physics steps.
+
+        Args:
+          state: where to start.
+          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
+
+        Returns:
+          The state one `ctrl_dt` later.
+        """
+        leaves = jax.tree.leaves(self.model)
+        held = ctrl, [leaves[place] for place in self._varied]
+        one_kernel = self._as_kernel()
+        if one_kernel is not None:
+            return one_kernel(state, held)
+        state, _ = jax.lax.scan(
+            lambda state, _: (self.substep(state, held), None),
+            state,
+            length=self._config.n_substeps,
+        )
+        return state
+
+    def substep(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
+        """One step of MJX.
+
+        Args:
+          state: where to start.
+          held: wheel speed targets (left, right) [rad/s], and those leaves of the model that are
+            known only when a program runs.
+
+        Returns:
+          The state one `sim_dt` later.
+        """
+        ctrl, varied = held
+        leaves, treedef = jax.tree.flatten(self.model)
+        for place, leaf in zip(self._varied, varied, strict=True):
+            leaves[place] = leaf
+        data = self._data.replace(
+            qpos=state.qpos,
+            qvel=state.qvel,
+            qacc_warmstart=state.qacc_warmstart,
+            time=state.time,
+            ctrl=ctrl,
+        )
+        factorise = (
+            contextlib.nullcontext if self._config.cholesky == "library" else cholesky.unrolled
+        )
+        # GPUs multiply float32 matrices in TF32 unless told otherwise, and the contact solver
+        # then diverges. Only physics asks for full precision; networks choose their own.
+        with jax.default_matmul_precision("highest"), factorise():
+            data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
+        return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
+
+    def _as_kernel(self) -> kernel.Step | None:
+        """The step as one kernel; None where XLA makes it."""
+        if self._config.impl == "xla" or not kernel.is_available():
+            return None
+        # Programs are traced in several threads; one is enough to write the kernel.
+        with self._lock:
+            if self._kernel is None:
+                try:
+                    self._kernel = kernel.batched(self._written())
+                except UnsupportedError as error:
+                    self._kernel = error
+        if not isinstance(self._kernel, UnsupportedError):
+            return self._kernel
+        if self._config.impl == "ptx":
+            raise UserError(
+                f"physics.impl = ptx: one kernel cannot do {self._kernel}; choose xla or auto"
+            )
+        return None
+
+    def _written(self) -> ptx.Kernel:
+        if not self._is_own_model:
+            return self._write()
+        # All that MJX's arithmetic depends on. What a task computes is no part of it.
+        model = np.zeros(mujoco.mj_sizeModel(self._mj_model), np.uint8)
+        mujoco.mj_saveModel(self._mj_model, None, model)
+        versions = [importlib.metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx")]
+        settings = json.dumps([versions, self._config.model_dump(mode="json")])
+        key = model.tobytes() + settings.encode() + inspect.getsource(Physics).encode()
+        return kernel.kept(key, self._write)
+
+    def _write(self) -> ptx.Kernel:
+        def zeros(count: int) -> Float[Array, " count"]:
+            return jnp.zeros(count)
+
+        model = self._mj_model
+        state = PhysicsState(zeros(model.nq), zeros(model.nv), zeros(model.nv), jnp.zeros(()))
+        leaves = jax.tree.leaves(self.model)
+        held = zeros(model.nu), [leaves[place] for place in self._varied]
+        return ptx.make_kernel(
+            scalarize(self.substep, state, held),
+            carried=len(jax.tree.leaves(state)),
+            steps=self._config.n_substeps,
+            name="physics",
+        )
+
+
+def _host() -> contextlib.AbstractContextManager[Any]:
+    try:
+        return jax.default_device(jax.local_devices(backend="cpu")[0])
+    except RuntimeError:
+        # JAX_PLATFORMS leaves it out.
+        return contextlib.nullcontext()
