@@ -3,12 +3,12 @@
 The modules in reading order, each knowing only those before it:
 `errors`, `config`, `compiling`, `imports`, `mjx`, `cholesky`, `scalars`, `scalarize`, `ptx`,
 `kernel`, `kinematics`, `model`, `task`, `state`, `physics`, `env`, `variation`, `wrappers`,
-`policy`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`, `report`, `estimates`,
-`comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`, `resume`,
-`faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`, `board`,
-`dashboard`, `recording`, `preemption`, `resumable_ppo`, `brax_ppo`, `clock`, `live`, `player`,
-`geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `train`, `evaluate`,
-`render`, `replay`, `play`. Commands meet only in the run folder.
+`policy`, `advantages`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`, `report`,
+`estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`,
+`resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`,
+`board`, `dashboard`, `recording`, `preemption`, `resumable_ppo`, `brax_ppo`, `clock`, `live`,
+`player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `train`,
+`evaluate`, `render`, `replay`, `play`. Commands meet only in the run folder.
 """
 
 # First, before Brax imports MJX and lets it print.

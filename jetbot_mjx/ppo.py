@@ -28,6 +28,7 @@ from brax.training.types import Transition, UInt64
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
+from jetbot_mjx import advantages
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.policy import PolicyParams, make_networks
 
@@ -370,20 +371,21 @@ class PPO:
         key: UInt32[Array, "2"],
     ) -> tuple[Array, Mapping[str, Array]]:
         """Brax's loss under this configuration."""
-        return losses.compute_ppo_loss(
-            params,
-            normalizer,
-            batch,
-            key,
-            ppo_network=self.networks,
-            entropy_cost=self.config.entropy_cost,
-            discounting=self.config.discounting,
-            reward_scaling=self.config.reward_scaling,
-            gae_lambda=self.config.gae_lambda,
-            clipping_epsilon=self.config.clipping_epsilon,
-            normalize_advantage=self.config.normalize_advantage,
-            vf_coefficient=self.config.vf_loss_coefficient,
-        )
+        with advantages.unrolled():
+            return losses.compute_ppo_loss(
+                params,
+                normalizer,
+                batch,
+                key,
+                ppo_network=self.networks,
+                entropy_cost=self.config.entropy_cost,
+                discounting=self.config.discounting,
+                reward_scaling=self.config.reward_scaling,
+                gae_lambda=self.config.gae_lambda,
+                clipping_epsilon=self.config.clipping_epsilon,
+                normalize_advantage=self.config.normalize_advantage,
+                vf_coefficient=self.config.vf_loss_coefficient,
+            )
 
     def _episode_sums(self, data: Transition) -> dict[str, Float[Array, ""]]:
         """Sums over the episodes that ended while collecting, all devices together."""

@@ -37,6 +37,7 @@ NOUNS = (
     "variation",
     "wrappers",
     "policy",
+    "advantages",
     "ppo",
     "trainer",
     "rollout",
