@@ -1,7 +1,8 @@
 """MJX, imported without what it does not need here.
 
 It prints two lines when its optional Warp part is absent. And it loads trimesh, the better part of
-a second, for meshes that no robot here has: that is put off until one does.
+a second, for meshes that no robot here has: that is put off until one does. It would put models on the
+first device of all, and of several processes only one has that: here it is the process's own.
 """
 
 import contextlib
@@ -9,6 +10,9 @@ import importlib
 import io
 import types
 from typing import Any
+
+import jax
+import mujoco
 
 from jetbot_mjx.imports import standing_in
 
@@ -25,6 +29,17 @@ class _Trimesh(types.ModuleType):
 
 
 with standing_in("trimesh", _Trimesh("trimesh")), contextlib.redirect_stdout(io.StringIO()):
-    from mujoco.mjx import Data, Model, make_data, put_model, step
+    from mujoco import mjx
+    from mujoco.mjx import Data, Model, step
 
 __all__ = ["Data", "Model", "make_data", "put_model", "step"]
+
+
+def put_model(model: mujoco.MjModel) -> Model:
+    """MuJoCo's model as arrays on a device."""
+    return mjx.put_model(model, device=jax.local_devices()[0])
+
+
+def make_data(model: mujoco.MjModel) -> Data:
+    """The model's state before the first step, on a device."""
+    return mjx.make_data(model, device=jax.local_devices()[0])

@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from types import FrameType
-from typing import Self
+from typing import NoReturn, Self
 
 STOPPED = 75
 """Exit code: stopped on request before the end; the same command goes on (`EX_TEMPFAIL`)."""
@@ -104,9 +104,9 @@ class Preemption:
                 _leave(f"second {name}")
 
 
-def leave_now(message: str) -> None:
+def leave_now() -> NoReturn:
     """Ends the process where a thread of a library cannot be stopped, such as a compiler's."""
-    print(message, file=sys.stdout, flush=True)
+    sys.stdout.flush()
     sys.stderr.flush()
     os._exit(STOPPED)
 

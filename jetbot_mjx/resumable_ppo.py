@@ -1,6 +1,7 @@
 """The resumable trainer: `ppo.PPO` compiled once, over all devices and all seeds.
 
-Each device holds its share of every seed's environments and a copy of the rest. How many
+Each device holds its share of every seed's environments and a copy of the rest; the devices may
+be those of several processes, which then all run this, call for call. How many
 training steps one call makes is an argument of the compiled program: short calls answer
 signals and tell of progress, and since figures are summed inside the state, what is logged and
 what is computed do not depend on how the steps were cut into calls.
@@ -12,10 +13,10 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from jetbot_mjx import processes
 from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.env import JetBotEnv
@@ -55,6 +56,7 @@ class Program:
         shared = jax.tree.map(lambda _: PartitionSpec(None, _AXIS), self._shapes.env_state)
         self._specs = replicated.replace(env_state=shared)
         self._shardings = jax.tree.map(lambda spec: NamedSharding(self._mesh, spec), self._specs)
+        self._whole = NamedSharding(self._mesh, PartitionSpec())
 
     def template(self) -> TrainState:
         """Shapes and dtypes of one seed's state."""
@@ -72,10 +74,17 @@ class Program:
     def put(self, states: Sequence[TrainState]) -> TrainState:
         """States of all seeds from the host, onto the devices."""
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
-        return jax.tree.map(jax.device_put, stacked, self._shardings)
+        return jax.tree.map(
+            lambda x, sharding: jax.make_array_from_callback(x.shape, sharding, x.__getitem__),
+            stacked,
+            self._shardings,
+        )
 
     def get(self, state: TrainState) -> list[TrainState]:
         """States of all seeds, on the host."""
+        if jax.process_count() > 1:
+            # What lies on another process's devices cannot be fetched.
+            state = jax.jit(_identity, out_shardings=self._whole)(state)
         host = jax.device_get(state)
         return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
 
@@ -101,14 +110,14 @@ class Program:
             # Brax's utilities average gradients themselves, as under `pmap`.
             check_vma=False,
         )
-        replicated = NamedSharding(self._mesh, PartitionSpec())
         jitted = jax.jit(
             sharded,
             donate_argnums=0,
-            in_shardings=(self._shardings, replicated, replicated),
-            out_shardings=(self._shardings, NamedSharding(self._mesh, PartitionSpec(_AXIS))),
+            in_shardings=(self._shardings, self._whole, self._whole),
+            # Every process sees the faults of all.
+            out_shardings=(self._shardings, self._whole),
         )
-        scalars = (jnp.zeros((), jnp.int32), jnp.zeros((), bool))
+        scalars = (np.zeros((), np.int32), np.zeros((), bool))
         program = jitted.lower(self._shapes, *scalars).compile(compiler_options=self._options)
 
         def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, Fault]:
@@ -116,8 +125,9 @@ class Program:
 
         return call
 
-    def _keys(self) -> jax.Array:
-        return jnp.stack([jax.random.PRNGKey(seed) for seed in self._seeds])
+    def _keys(self) -> np.ndarray:
+        # On the host, from where every process's devices can take them.
+        return np.stack([np.asarray(jax.random.PRNGKey(seed)) for seed in self._seeds])
 
 
 def train(
@@ -139,15 +149,18 @@ def train(
     compiling = _Background(program.compile)
     if states is None:
         state = program.init()
-        if not recorder.report(_reports(config, program.get(state), 0.0)):
+        if not _report(config, program, recorder, state, 0.0):
             return
         done = 0
     else:
         state = program.put(states)
         done = env_steps(states[0]) // config.ppo.steps_per_training_step
-    while compiling.running:
-        if preemption.wait(0.02):
+    running = True
+    while running:
+        heard = processes.exchange(preemption.wait(0.02), compiling.running)
+        if heard[:, 0].any():
             return
+        running = heard[:, 1].any()
     advance = compiling.result()
     recorder.compiled()
 
@@ -155,9 +168,12 @@ def train(
     interval = -(-config.checkpoint_interval // size)
     pace = _Pace(min(_CALL_SECONDS, config.preemption_notice / _CALLS_PER_NOTICE))
     seconds, restart = 0.0, False
-    while done < config.ppo.training_steps and not preemption.requested:
+    while done < config.ppo.training_steps:
         goal = min(config.ppo.training_steps, (done // interval + 1) * interval)
-        count = min(pace.steps, goal - done)
+        heard = processes.exchange(preemption.requested, min(pace.steps, goal - done))
+        if heard[:, 0].any():
+            break
+        count = int(heard[0, 1])
         began = time.perf_counter()
         state, faults = advance(state, count, restart)
         found = np.asarray(faults.found)
@@ -172,12 +188,41 @@ def train(
             figures = _figures(config, jax.tree.map(np.mean, tallies))
             recorder.tell(done * size, figures, seconds)
             continue
-        if not recorder.report(_reports(config, program.get(state), seconds)):
+        if not _report(config, program, recorder, state, seconds):
             return
         seconds, restart = 0.0, True
     # After a report there is nothing new to save.
     if seconds > 0:
-        recorder.pause([_progress(config, one, seconds) for one in program.get(state)])
+        _pause(config, program, recorder, state, seconds)
+
+
+def _report(
+    config: Config, program: Program, recorder: Recorder, state: TrainState, seconds: float
+) -> bool:
+    """At the end of an interval: whoever goes on from here begins a new tally."""
+    begins_anew = [
+        _progress(config, one, seconds)._replace(
+            state=one.replace(tally=jax.tree.map(np.zeros_like, one.tally))
+        )
+        for one in program.get(state)
+    ]
+    return bool(processes.led(lambda: recorder.report(begins_anew)))
+
+
+def _pause(
+    config: Config, program: Program, recorder: Recorder, state: TrainState, seconds: float
+) -> None:
+    progress = [_progress(config, one, seconds) for one in program.get(state)]
+
+    def save() -> int:
+        recorder.pause(progress)
+        return 0
+
+    processes.led(save)
+
+
+def _identity(state: TrainState) -> TrainState:
+    return state
 
 
 class _Pace:
@@ -221,16 +266,6 @@ class _Background:
 def env_steps(state: TrainState) -> int:
     """Environment steps of a state on the host."""
     return int(state.env_steps.to_numpy())
-
-
-def _reports(config: Config, states: Sequence[TrainState], seconds: float) -> list[Progress]:
-    """At the end of an interval: whoever goes on from here begins a new tally."""
-    return [
-        _progress(config, state, seconds)._replace(
-            state=state.replace(tally=jax.tree.map(np.zeros_like, state.tally))
-        )
-        for state in states
-    ]
 
 
 def _progress(config: Config, state: TrainState, seconds: float) -> Progress:

@@ -60,7 +60,8 @@ class Store:
         """
         self._success = {step: _success_rate(run_dir, step) for step in checkpoint_steps(run_dir)}
         options = ocp.CheckpointManagerOptions(
-            create=True,
+            create=False,
+            multiprocessing_options=_this_process_alone(),
             step_name_format=_step_names(),
             preservation_policy=_KeepSome(keep, self._success),
             cleanup_tmp_directories=True,
@@ -70,6 +71,7 @@ class Store:
         self._folder = (run_dir / FOLDER).absolute()
         self._clear_deleted()
         with self._writing():
+            self._folder.mkdir(exist_ok=True)
             self._manager = ocp.CheckpointManager(self._folder, options=options)
 
     def save(
@@ -91,10 +93,12 @@ class Store:
           CheckpointError: this one, or the one before, could not be written.
         """
         self._clear_deleted()
-        flat = {name: flatten(tree) for name, tree in trees.items()}
-        self._check_space(
-            sum(np.asarray(x).nbytes for tree in flat.values() for x in tree.values())
-        )
+        # Brax's counters are JAX arrays wherever they are.
+        flat = {
+            name: {key: np.asarray(x) for key, x in flatten(tree).items()}
+            for name, tree in trees.items()
+        }
+        self._check_space(sum(x.nbytes for tree in flat.values() for x in tree.values()))
         digests = {name: digest(tree) for name, tree in flat.items()}
         about = {**about, "env_steps": env_steps, _SUCCESS: success_rate, _DIGESTS: digests}
         about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
@@ -343,6 +347,14 @@ def _describe(array: Any) -> str:
         return "missing"
     dtype = getattr(array.dtype, "numpy_dtype", array.dtype)
     return f"{np.dtype(dtype)}{list(array.shape)}"
+
+
+def _this_process_alone() -> Any:
+    """Orbax would wait for the other processes of a training, which do not write."""
+    me = jax.process_index()
+    return ocp.options.MultiprocessingOptions(
+        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
+    )
 
 
 def _step_names() -> ocp.path.step.NameFormat[Any]:

@@ -1,7 +1,8 @@
 """Trains a policy into a run folder: `python -m jetbot_mjx.train --config configs/jetbot.yaml`.
 
 The same command with the same `--run-dir`, or `--resume RUN`, goes on where a run was stopped.
-SIGTERM and Ctrl-C stop it: all is saved, and the exit code is 75.
+SIGTERM and Ctrl-C stop it: all is saved, and the exit code is 75. With `--distributed` several
+processes, on one host or many, train one policy.
 """
 
 import contextlib
@@ -12,7 +13,7 @@ from typing import NamedTuple
 
 import jax
 
-from jetbot_mjx import cli, resumable_ppo
+from jetbot_mjx import cli, processes, resumable_ppo
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
@@ -31,18 +32,22 @@ from jetbot_mjx.run_folder import (
     write_run,
 )
 from jetbot_mjx.tracking import check_tracking
+from jetbot_mjx.trainer import Recorder
+
+_COMPLETE, _BEGINS, _RESUMES = range(3)
+"""How a training finds its folder."""
 
 
 class Result(NamedTuple):
-    """What a training leaves."""
+    """What a training leaves; of several processes the first tells, the others what all know."""
 
     run_dir: Path
     run_dirs: list[Path]
     """The folder of each seed; of a single one, the run folder."""
     standings: list[Standing]
-    """How far each seed has come."""
+    """How far each seed has come; empty in all processes but the first."""
     fingerprints: list[str]
-    """SHA-256 of each seed's last parameters; the same seed gives the same."""
+    """SHA-256 of each seed's last parameters; the same seed gives the same. Empty likewise."""
     finished: bool
     """Whether it came to its end; otherwise the same command goes on."""
     wall_seconds: float
@@ -74,9 +79,27 @@ def run(config: Config, run_dir: Path) -> Result:
       UserError: the folder holds something else, belongs to another training or cannot be
         written; the task cannot be built; the devices cannot share the environments.
     """
+    if jax.process_count() > 1:
+        _check_together(config)
     config.check_devices(jax.device_count())
     check_tracking(config)
     env = make_env(config)
+    if config.trainer == "brax":
+        return _run_brax(config, env, run_dir)
+    return _run_resumable(config, env, run_dir)
+
+
+def _check_together(config: Config) -> None:
+    """Refuses what several processes cannot do."""
+    if config.trainer == "brax":
+        raise UserError("--distributed is not known to trainer = 'brax': take 'resumable'")
+    if config.seeds > 1:
+        raise UserError(
+            f"--distributed trains one policy, not seeds = {config.seeds}: leave one of them out"
+        )
+
+
+def _check_folder(config: Config, run_dir: Path) -> None:
     stored = stored_config(run_dir)
     if stored is not None:
         if "brax" in (stored.trainer, config.trainer):
@@ -85,56 +108,79 @@ def run(config: Config, run_dir: Path) -> Result:
                 " cannot be continued: name a new folder"
             )
         stored.check_resume(config)
-    with occupied(run_dir), CompileClock() as clock:
-        if config.trainer == "brax":
-            return _run_brax(config, env, run_dir, clock)
-        return _run_resumable(config, env, run_dir, clock)
 
 
-def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock) -> Result:
+def _run_brax(config: Config, env: JetBotEnv, run_dir: Path) -> Result:
     # Brax's own trainer takes half a second to import.
     from jetbot_mjx import brax_ppo
 
-    write_run(run_dir, config)
-    with RunRecorder(config, env, [run_dir], clock) as recorder:
-        recorder.begin(_headline(config, run_dir))
-        brax_ppo.train(config, env, recorder)
+    _check_folder(config, run_dir)
+    with occupied(run_dir), CompileClock() as clock:
+        write_run(run_dir, config)
+        with RunRecorder(config, env, [run_dir], clock) as recorder:
+            recorder.begin(_headline(config, run_dir))
+            brax_ppo.train(config, env, recorder)
     return _result(run_dir, [run_dir], recorder, finished=True)
 
 
-def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, clock: CompileClock) -> Result:
-    run_dirs = seed_dirs(run_dir, config)
+def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path) -> Result:
+    opened: list[tuple[RunRecorder, Resumption | None]] = []
     with contextlib.ExitStack() as stack:
+        clock = stack.enter_context(CompileClock())
         preemption = stack.enter_context(Preemption(config.preemption_notice))
-        if config.seeds > 1:
-            for seed_dir in run_dirs:
-                stack.enter_context(occupied(seed_dir))
         program = resumable_ppo.Program(config, env)
-        resumption = resume(run_dirs, config.of_each_seed(), program.template())
-        if resumption is not None:
-            print(_welcome_back(run_dir, resumption), flush=True)
-        write_run(run_dir, config)
-        if config.seeds > 1:
-            for seed_dir, seed_config in zip(run_dirs, config.of_each_seed(), strict=True):
-                write_run(seed_dir, seed_config)
-        recorder = stack.enter_context(RunRecorder(config, env, run_dirs, clock, resumption))
-        if not recorder.complete:
+
+        def begin() -> int:
+            resumption = _open_folders(stack, config, run_dir, program)
+            run_dirs = seed_dirs(run_dir, config)
+            recorder = RunRecorder(config, env, run_dirs, clock, resumption)
+            opened.append((stack.enter_context(recorder), resumption))
+            if recorder.complete:
+                return _COMPLETE
             recorder.begin(_headline(config, run_dir))
-            states = resumption.states if resumption else None
+            return _RESUMES if resumption else _BEGINS
+
+        outset = processes.led(begin)
+        recorder, resumption = opened[0] if opened else (Recorder(), None)
+        states = None
+        if outset == _RESUMES:
+            stored = resumption.states if resumption else []
+            states = processes.from_first(stored, program.template(), config.seeds)
+        if outset != _COMPLETE:
             resumable_ppo.train(config, program, recorder, preemption, states)
-    return _result(run_dir, run_dirs, recorder, finished=recorder.complete)
+    first = recorder if isinstance(recorder, RunRecorder) else None
+    finished = bool(processes.led(lambda: first is not None and first.complete))
+    return _result(run_dir, seed_dirs(run_dir, config), first, finished=finished)
+
+
+def _open_folders(
+    stack: contextlib.ExitStack, config: Config, run_dir: Path, program: resumable_ppo.Program
+) -> Resumption | None:
+    """Makes the folders, and holds them until the stack ends; tells where the seeds stand."""
+    _check_folder(config, run_dir)
+    run_dirs, configs = seed_dirs(run_dir, config), config.of_each_seed()
+    for folder in dict.fromkeys([run_dir, *run_dirs]):
+        stack.enter_context(occupied(folder))
+    resumption = resume(run_dirs, configs, program.template())
+    if resumption is not None:
+        print(_welcome_back(run_dir, resumption), flush=True)
+    write_run(run_dir, config)
+    if config.seeds > 1:
+        for seed_dir, seed_config in zip(run_dirs, configs, strict=True):
+            write_run(seed_dir, seed_config)
+    return resumption
 
 
 def _result(
-    run_dir: Path, run_dirs: list[Path], recorder: RunRecorder, *, finished: bool
+    run_dir: Path, run_dirs: list[Path], recorder: RunRecorder | None, *, finished: bool
 ) -> Result:
     return Result(
         run_dir=run_dir,
         run_dirs=run_dirs,
-        standings=recorder.standings,
-        fingerprints=recorder.fingerprints,
+        standings=recorder.standings if recorder else [],
+        fingerprints=recorder.fingerprints if recorder else [],
         finished=finished,
-        wall_seconds=recorder.wall_seconds,
+        wall_seconds=recorder.wall_seconds if recorder else 0.0,
     )
 
 
@@ -148,12 +194,13 @@ def _welcome_back(run_dir: Path, resumption: Resumption) -> str:
 
 def _headline(config: Config, run_dir: Path) -> str:
     device = jax.devices()[0]
+    hosts = f" of {jax.process_count()} processes" if jax.process_count() > 1 else ""
     seeds = f", {config.seeds} seeds at once" if config.seeds > 1 else ""
     return (
         f"training {config.task.name} ({config.robot.preset} robot,"
         f" {config.task.observation} observation) with the {config.trainer} trainer:"
         f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
-        f" {jax.device_count()} x {device.device_kind}\nrun folder: {run_dir}"
+        f" {jax.device_count()} x {device.device_kind}{hosts}\nrun folder: {run_dir}"
     )
 
 
@@ -214,11 +261,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seed", type=int, help="the same as --set seed=N")
     parser.add_argument("--seeds", type=int, help="the same as --set seeds=N: N policies at once")
     parser.add_argument("--run-dir", type=Path, help="default: runs/<config>-<date>-<time>")
+    parser.add_argument(
+        "--distributed",
+        action="store_true",
+        help="one of several processes that train one policy, under srun, mpirun, or with"
+        " JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID",
+    )
     options = parser.parse_args(arguments)
     if options.resume and options.run_dir:
         parser.error("--run-dir: --resume names the folder already")
-    cli.require_device()
-    cli.use_compilation_cache()
     overrides = list(options.overrides)
     overrides += [f"seed={options.seed}"] if options.seed is not None else []
     overrides += [f"seeds={options.seeds}"] if options.seeds is not None else []
@@ -229,15 +280,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     else:
         config = load_config(options.config, overrides)
         run_dir = options.run_dir or default_run_dir(options.config)
+    if options.distributed:
+        _check_together(config)
+        processes.join()
+    cli.require_device()
+    cli.use_compilation_cache()
     result = run(config, run_dir)
+    if processes.is_first():
+        print(
+            summary(result)
+            if result.finished
+            else f"stopped; to go on: python -m jetbot_mjx.train --resume {run_dir}",
+            flush=True,
+        )
+    processes.leave()
     if result.finished:
-        print(summary(result))
         return 0
-    message = f"stopped; to go on: python -m jetbot_mjx.train --resume {run_dir}"
     if threading.active_count() > 1:
         # The compiler cannot be interrupted, and Python would wait for it.
-        leave_now(message)
-    print(message)
+        leave_now()
     return STOPPED
 
 
