@@ -6,8 +6,8 @@ The modules in reading order, each knowing only those before it:
 `policy`, `advantages`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`, `report`,
 `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`,
 `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`,
-`board`, `dashboard`, `recording`, `preemption`, `resumable_ppo`, `brax_ppo`, `clock`, `live`,
-`player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `train`,
+`board`, `dashboard`, `recording`, `preemption`, `processes`, `resumable_ppo`, `brax_ppo`, `clock`,
+`live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `train`,
 `evaluate`, `render`, `replay`, `play`. Commands meet only in the run folder.
 """
 

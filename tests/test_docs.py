@@ -343,7 +343,10 @@ class Parsed(Exception):
 
 KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
 PLAIN = {"[", "break", "tensorboard", "apt-get"}
-VARIABLES = {"PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"}
+VARIABLES = {
+    *("PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"),
+    *("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
+}
 COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay, "play": play}
 
 
@@ -419,6 +422,8 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
             assert Path(value).is_dir()
             monkeypatch.syspath_prepend(value)
         words = words[1:]
+    if words[0] == "srun":
+        words = words[words.index("python") :]
     match words:
         case ["python", "-m", "pytest", *arguments]:
             assert all(Path(one).is_file() for one in arguments if one[0] != "-")

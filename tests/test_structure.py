@@ -65,6 +65,7 @@ NOUNS = (
     "dashboard",
     "recording",
     "preemption",
+    "processes",
     "resumable_ppo",
     "brax_ppo",
     "clock",
