@@ -6,9 +6,9 @@ The modules in reading order, each knowing only those before it:
 `policy`, `advantages`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`, `report`,
 `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`,
 `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`,
-`board`, `dashboard`, `recording`, `preemption`, `processes`, `resumable_ppo`, `brax_ppo`, `clock`,
-`live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `train`,
-`evaluate`, `render`, `replay`, `play`. Commands meet only in the run folder.
+`board`, `dashboard`, `recording`, `preemption`, `processes`, `memory`, `resumable_ppo`, `brax_ppo`,
+`clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands
+`plan`, `train`, `evaluate`, `render`, `replay`, `play`. Commands meet only in the run folder.
 """
 
 # First, before Brax imports MJX and lets it print.

@@ -1,7 +1,8 @@
 """What the commands share: one line for a user's mistake, and exit codes that mean something.
 
-0 done · 1 done, and below what was asked for (`--min-success`) · 2 the user can mend it ·
-75 a training was asked to stop, is saved, and goes on by the same command · 130 interrupted.
+0 done · 1 done, and below what was asked for (`--min-success`), or a plan that does not fit ·
+2 the user can mend it · 75 a training was asked to stop, is saved, and goes on by the same
+command · 130 interrupted.
 """
 
 import argparse
@@ -17,6 +18,7 @@ import jax
 
 from jetbot_mjx.checkpoint import Which
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.memory import ran_out
 
 USER_ERROR = 2
 INTERRUPTED = 130
@@ -43,11 +45,10 @@ def run_command(command: Callable[[Sequence[str] | None], int]) -> NoReturn:
         print(f"error: {error}", file=sys.stderr)
         code = USER_ERROR
     except jax.errors.JaxRuntimeError as error:
-        if "RESOURCE_EXHAUSTED" not in str(error):
+        if not ran_out(error):
             raise
         print(
-            "error: the device's memory does not suffice: choose a smaller ppo.num_envs,"
-            " evaluation.episodes or --episodes",
+            "error: the device's memory does not suffice: choose a smaller --episodes",
             file=sys.stderr,
         )
         code = USER_ERROR
@@ -147,6 +148,17 @@ def fraction(text: str) -> float:
         raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
+    return value
+
+
+def positive_float(text: str) -> float:
+    """An argument above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    if not 0 < value < float("inf"):
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
     return value
 
 

@@ -222,7 +222,7 @@ class PPO:
             index = jax.lax.axis_index(self._axis)
             update_key = jax.random.fold_in(update_key, index)
             rollout_key = jax.random.fold_in(rollout_key, index)
-        env_state, data, fault = self._collect(state, rollout_key)
+        env_state, data, fault = self.collect(state, rollout_key)
         seen = running_statistics.update(
             state.normalizer, data.observation, pmap_axis_name=self._axis
         )
@@ -243,10 +243,19 @@ class PPO:
         )
         return state, Metrics(figures, fault)
 
-    def _collect(
+    def collect(
         self, state: TrainState, key: UInt32[Array, "2"]
     ) -> tuple[PyTree, Transition, Fault]:
-        """Unrolls, one after the other, until there are enough for all minibatches."""
+        """Unrolls, one after the other, until there are enough for all minibatches.
+
+        Args:
+          state: of this shard.
+          key: for the actions' noise.
+
+        Returns:
+          The environments' states after it, the unrolls of shape (unrolls, time, ...), of whose
+          `next_observation` only the last is kept, and the first world that blew up.
+        """
         policy = self._make_policy(tuple(state.policy_params))
 
         def unroll(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], PyTree]:

@@ -95,6 +95,15 @@ class Program:
           A function of (state, training steps, whether the tally starts anew), which takes the
           state's memory for its result. Faults have the axes (devices, seeds).
         """
+        program = self.lower().compile(compiler_options=self._options)
+
+        def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, Fault]:
+            return program(state, np.int32(steps), np.bool_(restart))
+
+        return call
+
+    def lower(self) -> jax.stages.Lowered:
+        """The training step for the devices, not yet compiled."""
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
             state, fault = jax.vmap(self._ppo.advance, in_axes=(0, None, None))(
@@ -118,12 +127,7 @@ class Program:
             out_shardings=(self._shardings, self._whole),
         )
         scalars = (np.zeros((), np.int32), np.zeros((), bool))
-        program = jitted.lower(self._shapes, *scalars).compile(compiler_options=self._options)
-
-        def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, Fault]:
-            return program(state, np.int32(steps), np.bool_(restart))
-
-        return call
+        return jitted.lower(self._shapes, *scalars)
 
     def _keys(self) -> np.ndarray:
         # On the host, from where every process's devices can take them.

@@ -18,6 +18,7 @@ from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import Summary
+from jetbot_mjx.memory import advice, device_memory, ran_out
 from jetbot_mjx.metrics import CompileClock
 from jetbot_mjx.preemption import STOPPED, Preemption, leave_now
 from jetbot_mjx.recording import RunRecorder, Standing
@@ -77,16 +78,22 @@ def run(config: Config, run_dir: Path) -> Result:
 
     Raises:
       UserError: the folder holds something else, belongs to another training or cannot be
-        written; the task cannot be built; the devices cannot share the environments.
+        written; the task cannot be built; the devices cannot share the environments, or their
+        memory does not suffice.
     """
     if jax.process_count() > 1:
         _check_together(config)
     config.check_devices(jax.device_count())
     check_tracking(config)
     env = make_env(config)
-    if config.trainer == "brax":
-        return _run_brax(config, env, run_dir)
-    return _run_resumable(config, env, run_dir)
+    train = _run_brax if config.trainer == "brax" else _run_resumable
+    try:
+        return train(config, env, run_dir)
+    except jax.errors.JaxRuntimeError as error:
+        if not ran_out(error):
+            raise
+        told = advice(config, env, jax.device_count(), device_memory())
+    raise UserError(told)
 
 
 def _check_together(config: Config) -> None:

@@ -16,7 +16,7 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from test_report import make_episodes, make_report
 
-from jetbot_mjx import cli, evaluate, render, replay, store, train
+from jetbot_mjx import cli, evaluate, plan, render, replay, store, train
 from jetbot_mjx.checkpoint import FORMAT
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
@@ -24,7 +24,13 @@ from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.task import WORLD
 
 SMOKE = str(Path(__file__).parents[1] / "configs" / "smoke.yaml")
-COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay}
+COMMANDS = {
+    "plan": plan,
+    "train": train,
+    "evaluate": evaluate,
+    "render": render,
+    "replay": replay,
+}
 
 
 @pytest.fixture

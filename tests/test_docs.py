@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import pytest
 from ruamel.yaml import YAML
 
-from jetbot_mjx import cli, evaluate, metrics, play, render, replay, train
+from jetbot_mjx import cli, evaluate, metrics, plan, play, render, replay, train
 from jetbot_mjx.aliases import aliases
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
 from jetbot_mjx.env import make_env
@@ -347,7 +347,14 @@ VARIABLES = {
     *("PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"),
     *("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
 }
-COMMANDS = {"train": train, "evaluate": evaluate, "render": render, "replay": replay, "play": play}
+COMMANDS = {
+    "plan": plan,
+    "train": train,
+    "evaluate": evaluate,
+    "render": render,
+    "replay": replay,
+    "play": play,
+}
 
 
 def commands(block):

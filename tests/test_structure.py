@@ -66,6 +66,7 @@ NOUNS = (
     "recording",
     "preemption",
     "processes",
+    "memory",
     "resumable_ppo",
     "brax_ppo",
     "clock",
@@ -78,7 +79,7 @@ NOUNS = (
     "native",
     "cli",
 )
-VERBS = ("train", "evaluate", "render", "replay", "play")
+VERBS = ("plan", "train", "evaluate", "render", "replay", "play")
 ORDER = (*NOUNS, *VERBS)
 """A module knows only those before it, and a verb no other verb."""
 
@@ -233,8 +234,8 @@ def test_importing_prints_nothing_and_starts_no_device(tmp_path):
         [
             sys.executable,
             "-c",
-            "import jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render, jetbot_mjx.replay,"
-            " jetbot_mjx.play",
+            "import jetbot_mjx.plan, jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render,"
+            " jetbot_mjx.replay, jetbot_mjx.play",
         ],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "nowhere"},
