@@ -1,8 +1,8 @@
 """MJX, imported without what it does not need here.
 
 It prints two lines when its optional Warp part is absent. And it loads trimesh, the better part of
-a second, for meshes that no robot here has: that is put off until one does. It would put models on the
-first device of all, and of several processes only one has that: here it is the process's own.
+a second, for meshes that no robot here has: that is put off until one does. It would put models on
+the first device of all, and of several processes only one has that: here it is the process's own.
 """
 
 import contextlib
