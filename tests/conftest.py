@@ -27,6 +27,7 @@ _LONGEST = (
     "test_resume",
     "test_preemption",
     "test_devices",
+    "test_distributed",
     "test_train",
 )
 
