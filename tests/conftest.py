@@ -23,12 +23,12 @@ from jetbot_mjx.env import JetBotEnv, make_env
 
 _LONGEST = (
     "test_notebooks",
-    "test_torture",
     "test_ppo",
     "test_resume",
-    "test_preemption",
-    "test_devices",
     "test_train",
+    "test_devices",
+    "test_preemption",
+    "test_torture",
 )
 
 
