@@ -7,10 +7,12 @@ it, and at the end not a bit may differ between the two. On the CPU.
 """
 
 import collections
+import contextlib
 import json
 import os
 import random
 import re
+import signal
 import subprocess
 import sys
 import tempfile
@@ -43,6 +45,9 @@ SAVING = "saving"
 CLEARING = "clearing old checkpoints"
 PHASES = (BEFORE_FIRST, STARTING, TRAINING, EVALUATING, SAVING, CLEARING)
 
+TRAINER = ("-m", "jetbot_mjx.train")
+"""Arguments of Python for the training command."""
+
 _PATIENCE = 300.0
 
 
@@ -57,7 +62,7 @@ class Process:
         self,
         run_dir: Path,
         settings: Sequence[str],
-        program: Sequence[str] = ("-m", "jetbot_mjx.train"),
+        program: Sequence[str] = TRAINER,
     ) -> None:
         """Starts it.
 
@@ -74,7 +79,10 @@ class Process:
             arguments += ["--set", setting]
         with self._out.open("w") as out, self._err.open("w") as err:
             self._process = subprocess.Popen(
-                [sys.executable, *program, *arguments], stdout=out, stderr=err
+                [sys.executable, *program, *arguments],
+                stdout=out,
+                stderr=err,
+                start_new_session=True,
             )
 
     @property
@@ -131,8 +139,11 @@ class Process:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Ends the process if it still runs."""
-        self._process.kill()
+        """Ends the process if it still runs, and whatever it has started."""
+        # What is left alone by its parent, such as the probe of a library that MuJoCo imports,
+        # would complain into the files of the next process.
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
 
@@ -149,14 +160,22 @@ class Outcome(NamedTuple):
     """The lines of `metrics.jsonl`, without their clocks."""
 
 
-def finish(run_dir: Path, settings: Sequence[str]) -> Outcome:
+def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAINER) -> Outcome:
     """Runs a training to its end, from wherever it stands.
+
+    Args:
+      run_dir: the run folder.
+      settings: as for `--set`.
+      program: arguments of Python that stand for the trainer.
+
+    Returns:
+      What it leaves.
 
     Raises:
       Broken: it did not end well.
     """
     known = checkpoint_steps(run_dir)
-    with Process(run_dir, settings) as process:
+    with Process(run_dir, settings, program) as process:
         code = process.wait()
     check_start(process, known)
     if code != 0:
@@ -251,7 +270,13 @@ def draw_aims(kills: int, rng: random.Random) -> list[Aim]:
     return [*early, *later][:kills]
 
 
-def kill(run_dir: Path, settings: Sequence[str], aim: Aim, template: TrainState) -> Kill:
+def kill(
+    run_dir: Path,
+    settings: Sequence[str],
+    aim: Aim,
+    template: TrainState,
+    program: Sequence[str] = TRAINER,
+) -> Kill:
     """Starts a training, kills it, and checks what it leaves.
 
     Args:
@@ -259,6 +284,7 @@ def kill(run_dir: Path, settings: Sequence[str], aim: Aim, template: TrainState)
       settings: as for `--set`.
       aim: when.
       template: shapes and dtypes of a state.
+      program: arguments of Python that stand for the trainer.
 
     Returns:
       In which phase the kill fell.
@@ -268,7 +294,7 @@ def kill(run_dir: Path, settings: Sequence[str], aim: Aim, template: TrainState)
       CheckpointError: the newest checkpoint is not whole.
     """
     known, damaged = checkpoint_steps(run_dir), _damaged(run_dir, template)
-    with Process(run_dir, settings) as process:
+    with Process(run_dir, settings, program) as process:
         process.until(_condition(process, known, aim))
         moment = time.monotonic() + aim.delay
         process.until(lambda: time.monotonic() > moment)

@@ -118,9 +118,11 @@ class Panel:
 
     def _switch_agent(self) -> None:
         self._player.agent = self.agent.value
-        self.wheel.visible = self.agent.value == KEYBOARD
+        by_hand = self.agent.value == KEYBOARD
+        # The wheel comes last: where a page shows it, the keys are heard.
         for command in self._keys:
-            command.disabled = not self.wheel.visible
+            command.disabled = not by_hand
+        self.wheel.visible = by_hand
 
     def _switch_checkpoint(self) -> None:
         wanted = int(self.checkpoint.value.partition(" ")[0].replace(",", ""))

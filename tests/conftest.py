@@ -1,5 +1,6 @@
 """Shared fixtures: the CPU, a compilation cache in the work tree, environments built once."""
 
+import fcntl
 import os
 import socket
 from collections.abc import Callable
@@ -9,9 +10,9 @@ ROOT = Path(__file__).parents[1]
 
 # Before JAX is imported. Subprocesses of the tests inherit all of it.
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
-# JAX writes an entry in place: processes that share a folder might read half of one.
-_WORKER = os.environ.get("PYTEST_XDIST_WORKER", "alone")
-os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / _WORKER))
+# One folder for all workers: what one has compiled, the others read. JAX writes an entry in place;
+# who reads half of one compiles again, after a warning that pyproject.toml lets pass.
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / "tests"))
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "agg")
 
@@ -22,13 +23,13 @@ from jetbot_mjx.env import JetBotEnv, make_env
 
 _LONGEST = (
     "test_notebooks",
-    "test_torture",
     "test_ppo",
     "test_resume",
-    "test_preemption",
-    "test_devices",
     "test_distributed",
     "test_train",
+    "test_devices",
+    "test_preemption",
+    "test_torture",
 )
 
 
@@ -75,6 +76,12 @@ def smoke_run(tmp_path_factory) -> Path:
     from jetbot_mjx import train
     from jetbot_mjx.config import load_config
 
-    run_dir = tmp_path_factory.mktemp("runs") / "smoke"
-    train.run(load_config(ROOT / "configs" / "smoke.yaml"), run_dir)
-    return run_dir
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent  # of all workers: the first that comes trains it
+    with (folder / "smoke.lock").open("a") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if os.fstat(lock.fileno()).st_size == 0:
+            train.run(load_config(ROOT / "configs" / "smoke.yaml"), folder / "smoke")
+            lock.write("trained")
+    return folder / "smoke"

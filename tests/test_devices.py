@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,6 +29,12 @@ from jetbot_mjx.wrappers import wrap_for_training
 DEVICES = 8
 STEPS = 3
 SMOKE = Path(__file__).parents[1] / "configs" / "smoke.yaml"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide():
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -211,4 +218,5 @@ def test_what_eight_devices_saved_goes_on_on_one(told, on_one):
 
 
 if __name__ == "__main__":
-    tell(*map(Path, sys.argv[1:]))
+    with gliding.everywhere():
+        tell(*map(Path, sys.argv[1:]))

@@ -1,5 +1,7 @@
 """The environment's contract: pure, one trace, one shape, the same under jit and vmap."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +15,9 @@ from jetbot_mjx.task import layout_size
 ENVS = 4
 STEPS = 20
 
+# So few steps are run that they may take longer, and compiling less.
+jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
+
 
 @pytest.fixture(scope="module", params=["world", "egocentric"])
 def env(request):
@@ -21,7 +26,7 @@ def env(request):
 
 @pytest.fixture(scope="module")
 def single_step(env):
-    return jax.jit(env.step)
+    return jit(env.step)
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +49,7 @@ def same_tree(one, other):
 
 def test_vmap_equals_a_loop_over_single_environments(env, single_step, keys, actions):
     batch = jax.vmap(env.reset)(keys)
-    step = jax.jit(jax.vmap(env.step))
+    step = jit(jax.vmap(env.step))
     singles = [env.reset(key) for key in keys]
     for t in range(STEPS):
         batch = step(batch, actions[t])
@@ -64,15 +69,15 @@ def test_step_traces_once(env, keys, actions):
         traces += 1
         return env.step(state, action)
 
-    compiled = jax.jit(step)
-    state = jax.jit(env.reset)(keys[0])
+    compiled = jit(step)
+    state = jit(env.reset)(keys[0])
     for t in range(5):
         state = compiled(state, actions[t, 0])
     assert traces == 1
 
 
 def test_the_state_keeps_its_tree_shapes_and_dtypes(env, single_step, keys):
-    state = jax.jit(env.reset)(keys[0])
+    state = jit(env.reset)(keys[0])
     same_tree(state, single_step(state, jnp.zeros(2)))
 
 

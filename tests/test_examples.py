@@ -2,6 +2,7 @@
 
 import json
 
+import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -192,13 +193,14 @@ def test_wrong_settings_are_refused(load, override, message):
 
 
 def test_training_and_judging_run_end_to_end(load, env, tmp_path):
-    result = train.run(load(*TINY), tmp_path / "run")
+    with gliding.everywhere():
+        result = train.run(load(*TINY), tmp_path / "run")
+        report = evaluate.run(result.run_dir, episodes=4)
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["env_steps"] for line in lines] == [0, 1024, 2048]
     policy = jetbot_mjx.load_policy(result.run_dir, "last")
     assert policy(jnp.zeros((3, 12))).shape == (3, 2)
     # A goal that is more than a position is judged and told all the same.
-    report = evaluate.run(result.run_dir, episodes=4)
     goals = jax.vmap(env.reset)(report_keys(4)).goal.goal_w
     distances = np.linalg.norm(goals[:, :2], axis=-1)
     told = {failure.goal: failure.distance for failure in report.failures}

@@ -1,6 +1,7 @@
 """The notebooks run from top to bottom, as a reader would, on the smallest configuration."""
 
 import os
+from pathlib import Path
 
 import nbformat
 import pytest
@@ -29,7 +30,8 @@ def execute(root, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
         patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
-        patch.setenv("JETBOT_EPISODES", "3")
+        # As many as the film of an evaluation shows, whose program is the same.
+        patch.setenv("JETBOT_EPISODES", "4")
         patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
         patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
         patch.setenv("PYTHONPATH", str(root), prepend=os.pathsep)
@@ -37,11 +39,11 @@ def execute(root, tmp_path_factory):
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
         patch.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))
         patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
-        patch.setenv("IPYTHONDIR", str(folder / "ipython"))
         # The kernel sets its own back end, which puts figures into the notebook.
         patch.delenv("MPLBACKEND", raising=False)
 
-        def run(name):
+        def run(name, profile="ipython"):
+            patch.setenv("IPYTHONDIR", str(folder / profile))
             notebook = nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4)
             client = NotebookClient(
                 notebook,
@@ -52,6 +54,19 @@ def execute(root, tmp_path_factory):
             return client.execute()
 
         yield run
+
+
+@pytest.fixture(scope="module")
+def gliding_profile(tmp_path_factory):
+    """A folder of IPython's from which every kernel begins with a robot that glides."""
+    profile = tmp_path_factory.mktemp("gliding")
+    startup = profile / "profile_default" / "startup" / "glide.py"
+    startup.parent.mkdir(parents=True)
+    tests = str(Path(__file__).parent)
+    startup.write_text(
+        f"import sys\nsys.path.append({tests!r})\nimport gliding\ngliding.everywhere().start()\n"
+    )
+    return profile
 
 
 @pytest.fixture(scope="module")
@@ -101,8 +116,8 @@ def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, tra
     assert "scripted" in text(notebook)
 
 
-def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, root):
-    notebook = execute("04_own_task")
+def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, gliding_profile):
+    notebook = execute("04_own_task", gliding_profile)
     assert images(notebook) == ["image/png", "image/gif"]
     assert "blank_task:BlankTask sees" in text(notebook)
     assert "training parking_task:ParkingTask" in text(notebook)

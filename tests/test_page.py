@@ -158,21 +158,31 @@ def test_the_goal_can_be_dragged_over_the_floor(served, page, see):
     assert player.shown.goal_w[2] == pytest.approx(0.05)
 
 
+def middle(page, element):
+    """Where an element is [pixels], once it has come to rest; the page's own words say which."""
+    where = f"""(() => {{
+        const box = ({element})?.getBoundingClientRect();
+        return box?.height ? [box.x + box.width / 2, box.y + box.height / 2] : null;
+    }})()"""
+    seen = []
+
+    def rests():
+        seen.append(page.evaluate(where))
+        return seen[-1] and seen[-3:] == [seen[-1]] * 3
+
+    wait_for("an element at rest", rests)
+    return seen[-1]
+
+
 def choose(page, label, option):
     """Chooses from a drop-down by mouse, as a user does."""
-    where = """(element) => {
-        const box = element.getBoundingClientRect();
-        return [box.x + box.width / 2, box.y + box.height / 2];
-    }"""
     field = f"[...document.querySelectorAll('input')].find((one) => one.value === {label!r})"
-    page.click(*page.evaluate(f"({where})({field})"))
+    page.click(*middle(page, field))
     entry = (
         "[...document.querySelectorAll('[role=option]')].find((one) =>"
         f" one.innerText === {option!r} && one.getBoundingClientRect().height > 0)"
     )
-    wait_for("the options", lambda: page.evaluate(f"!!({entry})"))
-    time.sleep(0.5)  # they unfold
-    page.click(*page.evaluate(f"({where})({entry})"))
+    page.click(*middle(page, entry))
 
 
 def test_another_checkpoint_is_chosen_on_the_page(served, page):
@@ -189,6 +199,8 @@ def test_keys_drive_once_the_user_is_the_agent(served, page):
     choose(page, "scripted", "keyboard")
     wait_for("the agent", lambda: player.agent == "keyboard")
     assert player.asked == (0.0, 0.0)
+    # The keys are heard once the page knows of it, some time after the player does.
+    wait_for("the wheel", lambda: "Ahead" in page.evaluate("document.body.innerText"))
     # A key that is pressed while a field has the focus belongs to the field.
     page.evaluate("document.activeElement.blur()")
     for key in "iij":

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +16,7 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
 from brax.training.types import Transition
+from gliding import Gliding
 
 from jetbot_mjx import brax_ppo, evaluate, resumable_ppo, train
 from jetbot_mjx.checkpoint import load_checkpoint
@@ -36,9 +38,11 @@ def smoke(root):
     return load_config(root / "configs" / "smoke.yaml")
 
 
-@pytest.fixture(scope="module")
-def smoke_env(smoke):
-    return make_env(smoke)
+@pytest.fixture
+def glide():
+    """What a training builds glides."""
+    with gliding.everywhere():
+        yield
 
 
 def with_ppo(config, **changes):
@@ -101,35 +105,46 @@ def epoch_keys(seed):
         yield jax.random.split(epoch, 1)[0]
 
 
-VARIANTS = [("NONE", 1.0), ("NONE", None), ("ADAPTIVE_KL", 1.0), ("ADAPTIVE_KL", None)]
+# The real robot, which compiles so long, in one of them. ("NONE", 1.0) has a whole epoch below.
+VARIANTS = [
+    (JetBotEnv, "ADAPTIVE_KL", 1.0),
+    (Gliding, "NONE", None),
+    (Gliding, "ADAPTIVE_KL", None),
+]
 
 
 @pytest.fixture(scope="module")
-def ours(smoke, smoke_env):
-    """A function from a variant to its compiled step."""
+def ours(smoke):
+    """A function from a variant to its environment and its compiled step."""
 
     @functools.cache
-    def make(schedule, max_grad_norm):
+    def make(env_type, schedule, max_grad_norm):
         # A KL so small that the schedule has something to do at every update.
         changes = {"learning_rate_schedule": schedule, "max_grad_norm": max_grad_norm}
-        return Jitted(with_ppo(smoke, **changes, desired_kl=0.003), smoke_env)
+        env = env_type(smoke)
+        return env, Jitted(with_ppo(smoke, **changes, desired_kl=0.003), env)
 
     return make
 
 
-@pytest.fixture(scope="module", params=VARIANTS, ids=lambda variant: f"{variant[0]}-{variant[1]}")
-def side_by_side(request, smoke, smoke_env, ours):
+def name_variant(variant):
+    env_type, schedule, max_grad_norm = variant
+    return f"{env_type.__name__}-{schedule}-{max_grad_norm}"
+
+
+@pytest.fixture(scope="module", params=VARIANTS, ids=name_variant)
+def side_by_side(request, smoke, ours):
     """The schedule, and (Brax's report, our state) after each training step, Brax's epochs."""
-    one = ours(*request.param)
+    env, one = ours(*request.param)
     ppo = one.ppo.config.model_copy(update={"num_timesteps": STEPS * SIZE})
     reports = Reports()
     config = smoke.model_copy(update={"checkpoint_interval": SIZE, "ppo": ppo})
-    brax_ppo.train(config, smoke_env, reports)
+    brax_ppo.train(config, env, reports)
     state, keys = one.init(jax.random.PRNGKey(smoke.seed)), epoch_keys(smoke.seed)
     states = [state]
     for _ in range(STEPS):
         states.append(one.advance(states[-1].replace(key=next(keys)), restart=True)[0])
-    return request.param[0], list(zip(reports.all, jax.device_get(states), strict=True))
+    return request.param[1], list(zip(reports.all, jax.device_get(states), strict=True))
 
 
 def test_training_begins_where_brax_begins(side_by_side):
@@ -174,12 +189,12 @@ def test_several_training_steps_are_brax_s(side_by_side):
         )
 
 
-def test_the_keys_go_on_as_within_an_epoch_of_brax(smoke, smoke_env, ours):
-    one = ours("NONE", 1.0)
+def test_the_keys_go_on_as_within_an_epoch_of_brax(smoke, ours):
+    env, one = ours(Gliding, "NONE", 1.0)
     ppo = one.ppo.config.model_copy(update={"num_timesteps": STEPS * SIZE})
     reports = Reports()
     config = smoke.model_copy(update={"checkpoint_interval": STEPS * SIZE, "ppo": ppo})
-    brax_ppo.train(config, smoke_env, reports)
+    brax_ppo.train(config, env, reports)
     state, _ = one.advance(one.init(jax.random.PRNGKey(smoke.seed)), STEPS)
     assert furthest(state.policy_params[1:], reports.all[-1].params[1:]) < 5e-3
     assert int(jax.device_get(state.normalizer.count).to_numpy()) == STEPS * SIZE
@@ -325,7 +340,7 @@ def test_where_every_gradient_is_bad_nothing_moves_by_a_bit():
 FUSE = 5  # environment steps that a brittle world lasts; too few to reach a goal
 
 
-class Brittle(JetBotEnv):
+class Brittle(Gliding):
     def step_physics(self, physics, ctrl):
         after = super().step_physics(physics, ctrl)
         spent = after.time > (FUSE - 0.5) * self.dt
@@ -389,7 +404,7 @@ def test_the_first_fault_leads_to_the_same_end(brittle, begun, at_once, smoke):
 
 
 def test_where_nothing_blew_up_there_is_no_fault(ours, smoke):
-    one = ours("NONE", 1.0)
+    _, one = ours(Gliding, "NONE", 1.0)
     _, fault = one.advance(one.init(jax.random.PRNGKey(smoke.seed)), 2)
     assert not bool(fault.found)
 
@@ -453,7 +468,7 @@ def lines(run_dir):
     return [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
 
 
-def test_training_bears_blown_worlds_and_bad_gradients(smoke, tmp_path, monkeypatch):
+def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, monkeypatch):
     config = with_ppo(smoke, num_timesteps=131_072, checkpoint_interval=32_768)
     clean = train.run(config, tmp_path / "clean")
 
@@ -484,10 +499,10 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, tmp_path, monkeypa
     assert 1 <= len(files) <= worlds
     stored = load_fault(files[0])
     assert stored.config.task.name == task.name
-    found = replayed(JetBotEnv(stored.config), stored.config, stored.fault)
+    found = replayed(Gliding(stored.config), stored.config, stored.fault)
     assert found.index(1.0) == int(stored.fault.step)
     again = subprocess.run(
-        [sys.executable, "-m", "jetbot_mjx.replay", str(files[0])],
+        [sys.executable, *gliding.program("replay"), str(files[0])],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
         capture_output=True,
         text=True,
@@ -498,7 +513,7 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, tmp_path, monkeypa
     assert last.endswith("reward")
 
 
-def test_a_training_compiles_its_step_once_and_nothing_later(smoke, tmp_path, monkeypatch):
+def test_a_training_compiles_its_step_once_and_nothing_later(smoke, glide, tmp_path, monkeypatch):
     compiled, after_report = [], []
 
     def listen(event, duration, *, fun_name="", **rest):
@@ -532,12 +547,13 @@ SEEDS = 3
 def several(smoke, tmp_path_factory):
     """Three seeds from 5 on, trained at once over two checkpoints, and their result."""
     config = with_ppo(smoke, num_timesteps=2 * SIZE, checkpoint_interval=SIZE, seed=5, seeds=SEEDS)
-    return config, train.run(config, tmp_path_factory.mktemp("seeds") / "run")
+    with gliding.everywhere():
+        return config, train.run(config, tmp_path_factory.mktemp("seeds") / "run")
 
 
 def test_each_of_several_seeds_is_trained_as_if_alone(several, ours):
     config, result = several
-    one = ours("NONE", 1.0)
+    _, one = ours(Gliding, "NONE", 1.0)
     for seed in range(config.seed, config.seed + SEEDS):
         state, _ = one.advance(one.init(jax.random.PRNGKey(seed)), 2)
         stored = load_checkpoint(result.run_dir / f"seed-{seed}", "last").params
@@ -546,7 +562,7 @@ def test_each_of_several_seeds_is_trained_as_if_alone(several, ours):
         assert furthest(state.policy_params[1:], stored[1:]) < 1e-3
 
 
-def test_each_of_several_seeds_has_a_run_of_its_own(several, capsys):
+def test_each_of_several_seeds_has_a_run_of_its_own(several, glide, capsys):
     config, result = several
     folders = sorted(path.name for path in result.run_dir.glob("seed-*"))
     assert folders == ["seed-5", "seed-6", "seed-7"]
@@ -562,7 +578,7 @@ def test_each_of_several_seeds_has_a_run_of_its_own(several, capsys):
     assert "policy" in capsys.readouterr().out
 
 
-def test_several_seeds_resume_to_the_bit(several, tmp_path, capsys):
+def test_several_seeds_resume_to_the_bit(several, glide, tmp_path, capsys):
     config, result = several
     train.run(with_ppo(config, num_timesteps=SIZE), tmp_path / "run")
     capsys.readouterr()

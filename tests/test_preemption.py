@@ -11,6 +11,7 @@ import threading
 import time
 from pathlib import Path
 
+import gliding
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -25,9 +26,13 @@ from jetbot_mjx.store import checkpoint_path, checkpoint_steps
 LONG = 3_600
 PATIENCE = 300
 
-# A trainer that tells when it comes to a moment, and stays there for a while.
+TRAINER = gliding.program("train")
+
+# The same trainer, which tells when it comes to a moment, and stays there for a while.
 DRIVER = """
 import sys, time
+
+sys.path.append({tests})
 
 def now(moment, seconds):
     print("now:", moment, flush=True)
@@ -48,19 +53,26 @@ def dwell_in_calls(seconds):
     Program.compile = compile
 
 {before_imports}
+import gliding
 from jetbot_mjx import cli, train
 from jetbot_mjx.evaluation import Evaluator
 from jetbot_mjx.resumable_ppo import Program
 from jetbot_mjx.store import Store
 {before_training}
-cli.run_command(train.main)
+with gliding.everywhere():
+    cli.run_command(train.main)
 """
 
 
 def training(run_dir, before_training="", before_imports="", notice=300):
-    program = DRIVER.replace("{before_training}", before_training)
+    program = DRIVER.replace("{tests}", repr(str(Path(__file__).parent)))
+    program = program.replace("{before_training}", before_training)
     program = program.replace("{before_imports}", before_imports)
     return torture.Process(run_dir, [*SETTINGS, f"preemption_notice={notice}"], ["-c", program])
+
+
+def finish(run_dir):
+    return torture.finish(run_dir, SETTINGS, TRAINER)
 
 
 def stop(process, moment, number=signal.SIGTERM):
@@ -82,13 +94,12 @@ def assert_saved_and_gone(process, code, number=signal.SIGTERM):
 
 @pytest.fixture(scope="module")
 def undisturbed_run(tmp_path_factory):
-    return tmp_path_factory.getbasetemp() / "undisturbed"
+    return tmp_path_factory.mktemp("preemption") / "undisturbed"
 
 
 @pytest.fixture(scope="module")
 def undisturbed(undisturbed_run):
-    # Another module may have finished it already: then it says the same once more.
-    return torture.finish(undisturbed_run, SETTINGS)
+    return finish(undisturbed_run)
 
 
 @pytest.fixture
@@ -118,7 +129,7 @@ def test_compiling_before_the_first_checkpoint_it_writes_that_and_goes_on(undist
         code = stop(process, "compile")
     assert_saved_and_gone(process, code)
     assert checkpoint_steps(tmp_path / "run") == [0]
-    assert torture.differences(undisturbed, torture.finish(tmp_path / "run", SETTINGS)) == []
+    assert torture.differences(undisturbed, finish(tmp_path / "run")) == []
 
 
 def test_compiling_after_a_checkpoint_it_does_not_wait_for_the_compiler(begun):
@@ -135,7 +146,7 @@ def test_between_two_reports_it_saves_where_it_is_and_goes_on(number, begun, und
     assert_saved_and_gone(process, code, number)
     assert checkpoint_steps(begun) == [0, INTERVAL, INTERVAL + INTERVAL // 2]
     if number == signal.SIGTERM:
-        assert torture.differences(undisturbed, torture.finish(begun, SETTINGS)) == []
+        assert torture.differences(undisturbed, finish(begun)) == []
 
 
 def test_while_evaluating_it_finishes_that_and_saves(begun):
@@ -165,7 +176,7 @@ def test_what_takes_longer_than_the_notice_is_cut_off(begun):
     assert "8 s after SIGTERM: leaving without another save" in process.stderr
     assert "Traceback" not in process.stderr
     assert checkpoint_steps(begun) == [0, INTERVAL]
-    with torture.Process(begun, SETTINGS) as process:
+    with torture.Process(begun, SETTINGS, TRAINER) as process:
         process.until(lambda: "run folder: " in process.stdout)
     torture.check_start(process, [0, INTERVAL])
 

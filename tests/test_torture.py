@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from types import SimpleNamespace
 
+import gliding
 import pytest
 
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
@@ -14,16 +15,19 @@ from torture import SETTINGS, Aim
 
 from jetbot_mjx.store import checkpoint_steps
 
+# A robot that glides needs more steps for the kills to fall into.
+LONGER = (*SETTINGS, "ppo.num_timesteps=131_072")
+TRAINER = gliding.program("train")
+
 
 @pytest.fixture(scope="module")
 def template():
-    return torture.make_template(SETTINGS)
+    return torture.make_template(LONGER)
 
 
 @pytest.fixture(scope="module")
 def undisturbed(tmp_path_factory):
-    # Another module may have finished it already: then it says the same once more.
-    return torture.finish(tmp_path_factory.getbasetemp() / "undisturbed", SETTINGS)
+    return torture.finish(tmp_path_factory.mktemp("torture") / "undisturbed", LONGER, TRAINER)
 
 
 def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undisturbed, tmp_path):
@@ -36,15 +40,16 @@ def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undi
         Aim("trained", rng.uniform(0.0, 1.0)),
         Aim("started", rng.uniform(0.2, 2.5)),
     ]
-    phases = [torture.kill(tmp_path / "run", SETTINGS, aim, template).phase for aim in aims]
+    run = tmp_path / "run"
+    phases = [torture.kill(run, LONGER, aim, template, TRAINER).phase for aim in aims]
     assert phases.count(torture.SAVING) >= 2, phases
     assert torture.BEFORE_FIRST in phases
-    assert checkpoint_steps(tmp_path / "run")[-1] > 0, "the last start must be from the middle"
-    killed = torture.finish(tmp_path / "run", SETTINGS)
+    assert checkpoint_steps(run)[-1] > 0, "the last start must be from the middle"
+    killed = torture.finish(run, LONGER, TRAINER)
     assert torture.differences(undisturbed, killed) == []
-    assert checkpoint_steps(tmp_path / "run") == [line["env_steps"] for line in killed.metrics]
-    for steps in checkpoint_steps(tmp_path / "run"):
-        torture.check_checkpoint(tmp_path / "run", steps, template)
+    assert checkpoint_steps(run) == [line["env_steps"] for line in killed.metrics]
+    for steps in checkpoint_steps(run):
+        torture.check_checkpoint(run, steps, template)
 
 
 @pytest.mark.parametrize(

@@ -7,9 +7,10 @@ import brax.training.agents.ppo.train as brax_ppo_train
 import jax
 import numpy as np
 import pytest
+from gliding import Gliding
 from test_metrics import read_events
 
-from jetbot_mjx import brax_ppo, evaluate, load_config, make_env, train, wrap_for_training
+from jetbot_mjx import brax_ppo, evaluate, load_config, train, wrap_for_training
 from jetbot_mjx.aliases import aliases
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.errors import UserError
@@ -130,7 +131,7 @@ def test_stock_brax_takes_wrap_for_training_as_its_wrap_env_fn(root):
     config = load_config(root / "configs" / "smoke.yaml")
     with brax_ppo.device_put_replicated():
         _, params, _ = brax_ppo_train.train(
-            environment=make_env(config),
+            environment=Gliding(config),
             num_timesteps=1,
             num_envs=8,
             batch_size=8,
