@@ -2,17 +2,21 @@
 
 It prints two lines when its optional Warp part is absent. And it loads trimesh, the better part of
 a second, for meshes that no robot here has: that is put off until one does. It would put models on
-the first device of all, and of several processes only one has that: here it is the process's own.
+the first device of all, which of several processes only one has, and compile a small program there
+for many an array; a model's numbers are constants of programs, and here they stay on the host.
 """
 
 import contextlib
 import importlib
 import io
 import types
+from collections.abc import Iterator
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import mujoco
+import numpy as np
 
 from jetbot_mjx.imports import standing_in
 
@@ -36,10 +40,28 @@ __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 
 
 def put_model(model: mujoco.MjModel) -> Model:
-    """MuJoCo's model as arrays on a device."""
-    return mjx.put_model(model, device=jax.local_devices()[0])
+    """MuJoCo's model as arrays."""
+    with _on_host() as device:
+        return _anywhere(mjx.put_model(model, device=device))
 
 
 def make_data(model: mujoco.MjModel) -> Data:
-    """The model's state before the first step, on a device."""
-    return mjx.make_data(model, device=jax.local_devices()[0])
+    """The model's state before the first step, as arrays."""
+    with _on_host() as device:
+        return _anywhere(mjx.make_data(model, device=device))
+
+
+@contextlib.contextmanager
+def _on_host() -> Iterator[Any]:
+    try:
+        device = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        # JAX_PLATFORMS leaves it out.
+        device = jax.local_devices()[0]
+    with jax.default_device(device):
+        yield device
+
+
+def _anywhere(tree: Any) -> Any:
+    """The same arrays, free to go wherever they are needed."""
+    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)

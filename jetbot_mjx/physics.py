@@ -38,11 +38,8 @@ class Physics:
         """
         self._mj_model = mj_model
         self._config = config
-        # On the host: a model's numbers become constants of programs, and a GPU would compile a
-        # small program to fill each.
-        with _host():
-            self.model: mjx.Model = mjx.put_model(mj_model)
-            self._data: mjx.Data = mjx.make_data(mj_model)
+        self.model: mjx.Model = mjx.put_model(mj_model)
+        self._data: mjx.Data = mjx.make_data(mj_model)
         self._varied: tuple[int, ...] = ()
         """Leaves of the model that are known only when a program runs, robot by robot."""
         self._is_own_model = True
@@ -161,24 +158,17 @@ class Physics:
         return kernel.kept(key, self._write)
 
     def _write(self) -> ptx.Kernel:
-        def zeros(count: int) -> Float[Array, " count"]:
-            return jnp.zeros(count)
+        # Shapes alone: arrays made here would become part of the program that is being traced.
+        def numbers(*shape: int) -> Any:
+            return jax.ShapeDtypeStruct(shape, jnp.float32)
 
         model = self._mj_model
-        state = PhysicsState(zeros(model.nq), zeros(model.nv), zeros(model.nv), jnp.zeros(()))
+        state = PhysicsState(numbers(model.nq), numbers(model.nv), numbers(model.nv), numbers())
         leaves = jax.tree.leaves(self.model)
-        held = zeros(model.nu), [leaves[place] for place in self._varied]
+        held = numbers(model.nu), [numbers(*leaves[place].shape) for place in self._varied]
         return ptx.make_kernel(
             scalarize(self.substep, state, held),
             carried=len(jax.tree.leaves(state)),
             steps=self._config.n_substeps,
             name="physics",
         )
-
-
-def _host() -> contextlib.AbstractContextManager[Any]:
-    try:
-        return jax.default_device(jax.local_devices(backend="cpu")[0])
-    except RuntimeError:
-        # JAX_PLATFORMS leaves it out.
-        return contextlib.nullcontext()

@@ -81,6 +81,7 @@ def run(config: Config, run_dir: Path) -> Result:
         written; the task cannot be built; the devices cannot share the environments, or their
         memory does not suffice.
     """
+    _wake_device()
     if jax.process_count() > 1:
         _check_together(config)
     config.check_devices(jax.device_count())
@@ -115,6 +116,17 @@ def _check_folder(config: Config, run_dir: Path) -> None:
                 " cannot be continued: name a new folder"
             )
         stored.check_resume(config)
+
+
+def _wake_device() -> None:
+    """Lets a GPU take its memory, a second and more, while the host builds the environment."""
+
+    def touch() -> None:
+        # Whoever needs the device hears of what is wrong with it.
+        with contextlib.suppress(jax.errors.JaxRuntimeError):
+            jax.block_until_ready(jax.device_put(0.0, jax.local_devices()[0]))
+
+    threading.Thread(target=touch, daemon=True).start()
 
 
 def _run_brax(config: Config, env: JetBotEnv, run_dir: Path) -> Result:

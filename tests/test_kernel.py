@@ -201,6 +201,21 @@ def test_the_text_of_a_model_of_its_own_is_kept_and_of_another_is_not(gpu, cache
     assert writes(env.with_model(slippery)) == 0
 
 
+def test_a_program_is_the_same_whether_its_kernel_is_written_or_found(cache, monkeypatch):
+    def launch(written, leaves, results):
+        return [x + len(written.text) for x in results]
+
+    monkeypatch.setattr(kernel, "is_available", lambda: True)
+    monkeypatch.setattr(kernel, "_launch", launch)
+    programs = []
+    for _ in range(2):
+        env = make_env(parse_config({}))
+        states = env.reset(jax.random.PRNGKey(0)).pipeline_state
+        programs.append(jax.jit(env.step_physics).lower(states, jnp.zeros(2)).as_text())
+    assert len(list(cache.glob("kernel-*.json"))) == 1
+    assert programs[0] == programs[1]
+
+
 @on_a_gpu
 @pytest.mark.parametrize("preset", ["isaac", "real"])
 def test_on_a_gpu_it_drives_as_xla_does(preset):
