@@ -10,29 +10,21 @@ README.md beside this file says how each is measured and how to read the table.
 """
 
 import argparse
-import datetime
-import os
-import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
-from measurements import (
-    MEASUREMENTS,
-    WARM_UP_CALLS,
-    WARM_UP_INTERVALS,
-    Row,
-    Sizes,
-    training_config,
-)
+from measurements import MEASUREMENTS, Sizes, training_config
+from rate_plots import draw
+from regressions import MOST_SLOWDOWN, Change, changes, read_baseline
+from results import check_output, conditions, counts, default_output, write
+from timing import Row
 
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.run_folder import versions, write_json
 
-_FOLDER = Path(__file__).resolve().parent
+_CONFIG = Path(__file__).resolve().parents[1] / "configs" / "jetbot.yaml"
 
 
 def run(
@@ -83,65 +75,12 @@ def _table_row(row: Row) -> str:
     )
 
 
-def _conditions(config: Config, sizes: Sizes) -> dict[str, Any]:
-    """What the rates hold for, as JSON."""
-    device = jax.devices()[0]
-    return {
-        "device": device.device_kind,
-        "platform": device.platform,
-        "device_count": jax.device_count(),
-        "cpu_cores": os.cpu_count(),
-        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
-        "versions": versions(),
-        "xla_flags": os.environ.get("XLA_FLAGS", ""),
-        "config": config.model_dump(mode="json"),
-        "conditions": {
-            **sizes._asdict(),
-            "warm_up_calls": WARM_UP_CALLS,
-            "warm_up_intervals": WARM_UP_INTERVALS,
-            # Of the networks; null is the back end's own choice. Physics sets its own.
-            "matmul_precision": jax.config.values["jax_default_matmul_precision"],
-            # Where there is one, a compile time may be that of reading from it.
-            "compilation_cache": jax.config.values["jax_compilation_cache_dir"] is not None,
-        },
-    }
-
-
-def _default_output() -> Path:
-    """`results/<device>.json` beside this file, with the number of devices if there are more."""
-    name = re.sub(r"[^a-z0-9]+", "-", jax.devices()[0].device_kind.lower()).strip("-")
-    count = jax.device_count()
-    return _FOLDER / "results" / (f"{name}-x{count}.json" if count > 1 else f"{name}.json")
-
-
-def _check_output(path: Path) -> None:
-    """Finds out before minutes of measuring whether the file can be written."""
-    if path.is_dir():
-        raise UserError(f"--output {path} is a folder: name a file in it")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"--output {path} cannot be written: {error.strerror}") from None
-
-
-def _write(path: Path, values: dict[str, Any]) -> None:
-    try:
-        write_json(path, values)
-    except OSError as error:
-        raise UserError(f"--output {path} cannot be written: {error.strerror}") from None
-
-
-def _counts(text: str) -> list[int]:
-    """An argument that counts several things, as in 256,1024."""
-    return [cli.positive_int(part) for part in text.split(",")]
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "--config",
         type=Path,
-        default=_FOLDER.parent / "configs" / "jetbot.yaml",
+        default=_CONFIG,
         help="default: configs/jetbot.yaml",
     )
     parser.add_argument(
@@ -153,7 +92,7 @@ def _parser() -> argparse.ArgumentParser:
         help="override one setting; may be given again",
     )
     parser.add_argument(
-        "--num-envs", type=_counts, metavar="N,N,...", help="default: the config's ppo.num_envs"
+        "--num-envs", type=counts, metavar="N,N,...", help="default: the config's ppo.num_envs"
     )
     for name, default in Sizes()._asdict().items():
         parser.add_argument(
@@ -171,6 +110,12 @@ def _parser() -> argparse.ArgumentParser:
         help="leave one rate out; may be given again",
     )
     parser.add_argument("--output", type=Path, help="default: benchmarks/results/<device>.json")
+    parser.add_argument(
+        "--compare",
+        type=Path,
+        metavar="OLD.json",
+        help=f"an earlier file; exit code 1 where a rate is {MOST_SLOWDOWN:.0%} slower than there",
+    )
     return parser
 
 
@@ -181,6 +126,14 @@ _SIZES_HELP = {
 }
 
 
+def _change_line(change: Change) -> str:
+    return (
+        f"{change.rate:8} at {change.num_envs:8,}: {change.before:13,.0f} ->"
+        f" {change.after:13,.0f} steps/s, {change.relative:+.1%}"
+        + (", SLOWER" if change.is_slower else "")
+    )
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parses the command line, measures, prints the table and writes the JSON file.
 
@@ -188,10 +141,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
       arguments: without the program's name; None: those of the process.
 
     Returns:
-      The exit code.
+      0, or 1 where a rate is slower than in the file that it is compared with.
 
     Raises:
-      UserError: as for `run`, or the file cannot be written.
+      UserError: as for `run`, or a file cannot be written or compared with.
     """
     options = _parser().parse_args(arguments)
     config = load_config(options.config, options.overrides)
@@ -204,19 +157,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # Said before minutes of measuring, not after them.
         for count in num_envs:
             training_config(config, count, sizes, config.trainer)
-    output = options.output or _default_output()
-    _check_output(output)
-    conditions = _conditions(config, sizes)
+    output = options.output or default_output()
+    check_output(output)
+    measured = conditions(config, sizes)
+    baseline = read_baseline(options.compare, measured) if options.compare else {}
+    if options.compare and not {(rate, count) for rate in rates for count in num_envs} & set(
+        baseline
+    ):
+        raise UserError(
+            f"--compare {options.compare} has none of these rates: it has"
+            f" {', '.join(f'{rate} at {count}' for rate, count in baseline) or 'no rate at all'}"
+        )
     rows: list[Row] = []
 
     def report(row: Row) -> None:
         rows.append(row)
         print(_table_row(row), flush=True)
         # After every row, so that a sweep that runs out of memory keeps what it had.
-        _write(output, {**conditions, "results": [row._asdict() for row in rows]})
+        write(output, {**measured, "results": [row._asdict() for row in rows]})
 
     print(
-        f"{options.config.name} on {jax.device_count()} x {conditions['device']}, median of"
+        f"{options.config.name} on {jax.device_count()} x {measured['device']}, median of"
         f" {sizes.repeats} repeats\n{_TABLE_HEAD}",
         flush=True,
     )
@@ -224,8 +185,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for row in rows:
         if row.nonfinite_worlds:
             print(f"{row.rate} at {row.num_envs}: {row.nonfinite_worlds} worlds blew up")
-    print(f"results: {output}")
-    return 0
+    picture = draw(output, {**measured, "results": [row._asdict() for row in rows]})
+    print(f"results: {output}, {picture.name}")
+    found = changes(rows, baseline)
+    for change in found:
+        print(_change_line(change))
+    return 1 if any(change.is_slower for change in found) else 0
 
 
 if __name__ == "__main__":

@@ -1,0 +1,228 @@
+"""What this project's rates are put beside: other ways to step the same robot, or one of its size.
+
+Each is prepared once, compiled and warm, and then timed as often as `repeat` is called, so that
+several can take turns. What a package of its own is needed for is imported only there.
+"""
+
+import importlib
+import math
+import os
+import time
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Array, Float
+from measurements import Sizes
+from one_robot import OneRobot, make_physics_model, wheel_targets
+from timing import (
+    REPEAT_SECONDS,
+    WARM_UP_CALLS,
+    Z_RANGE,
+    Carry,
+    Row,
+    Tally,
+    Timed,
+    env_keys,
+    make_row,
+    random_actions,
+    sums,
+)
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
+
+PLAYGROUND_ENV = "CartpoleBalance"
+_PLAYGROUND_EPISODE = 1000
+
+# The tutorial's, as the comments of configs/isaac_sb3.yaml have them.
+_SB3_STEPS = 2560
+_SB3: dict[str, Any] = {
+    "n_steps": _SB3_STEPS,
+    "batch_size": 64,
+    "n_epochs": 5,
+    "gamma": 0.9,
+    "gae_lambda": 1.0,
+    "learning_rate": 1.25e-4,
+    "clip_range": 0.3,
+    "ent_coef": 7.5e-8,
+    "vf_coef": 0.95,
+    "max_grad_norm": 0.9,
+}
+_SB3_LAYERS = [16, 128, 128, 128]
+
+
+class Contender(Protocol):
+    """What can be timed in turn with others."""
+
+    rate: str
+    num_envs: int
+
+    def repeat(self) -> float:
+        """Environment steps per second over one repeat."""
+        ...
+
+    def row(self, repeats: list[float]) -> Row:
+        """What was measured, from what `repeat` returned."""
+        ...
+
+
+class MujocoRollout:
+    """C MuJoCo's own thread pool, `mujoco.rollout`, with one thread for each core.
+
+    The controls are drawn before the clock starts, and every state comes back, as its interface
+    has it.
+    """
+
+    rate = "mujoco"
+
+    def __init__(self, config: Config, num_envs: int, sizes: Sizes) -> None:
+        """Starts the threads and takes the robots through some seconds of driving.
+
+        Args:
+          config: robot and physics.
+          num_envs: robots.
+          sizes: how many environment steps one call makes.
+        """
+        self.num_envs = num_envs
+        self._n_substeps = config.physics.n_substeps
+        self._env_steps = sizes.unroll
+        self._model = make_physics_model(config)
+        threads = os.cpu_count() or 1
+        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
+        self._pool = mujoco.rollout.Rollout(nthread=threads)
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        size = mujoco.mj_stateSize(self._model, kind)
+        first = np.zeros(size)
+        mujoco.mj_getState(self._model, self._data[0], first, kind)
+        self._states = np.tile(first, (num_envs, 1))
+        self._all_states = np.zeros((num_envs, sizes.unroll * self._n_substeps, size))
+        actions = np.random.default_rng(0).uniform(-1.0, 1.0, (num_envs, sizes.unroll, 2))
+        self._controls = np.repeat(wheel_targets(config, actions), self._n_substeps, axis=1)
+        seconds = math.inf
+        for _ in range(WARM_UP_CALLS):
+            seconds = self._clocked(1)
+        self._calls = max(1, math.ceil(REPEAT_SECONDS / seconds))
+
+    def repeat(self) -> float:
+        """Environment steps per second over one repeat."""
+        seconds = self._clocked(self._calls)
+        return self.num_envs * self._env_steps * self._calls / seconds
+
+    def row(self, repeats: list[float]) -> Row:
+        """What was measured.
+
+        Raises:
+          UserError: robots are no longer on the floor.
+        """
+        z = self._states[:, 1 + 2]  # after the time come x and y
+        if not (np.isfinite(self._states).all() and ((z > Z_RANGE[0]) & (z < Z_RANGE[1])).all()):
+            raise UserError(f"{self.rate} at {self.num_envs}: robots are no longer on the floor")
+        steps = self._calls * self._env_steps
+        return make_row(self.rate, self._n_substeps, self.num_envs, 0.0, repeats, steps)
+
+    def _clocked(self, calls: int) -> float:
+        lasted = 0.0
+        for _ in range(calls):
+            begun = time.perf_counter()
+            self._pool.rollout(
+                self._model, self._data, self._states, self._controls, state=self._all_states
+            )
+            lasted += time.perf_counter() - begun
+            self._states = self._all_states[:, -1].copy()
+        return lasted
+
+
+class Sb3:
+    """Stable-Baselines3's PPO with the tutorial's hyperparameters, one robot in C MuJoCo.
+
+    A repeat is one of its iterations: 2,560 steps, and the learning from them.
+    """
+
+    rate = "sb3"
+    num_envs = 1
+
+    def __init__(self, config: Config) -> None:
+        """Builds environment and trainer, and makes one iteration.
+
+        Args:
+          config: robot, task and physics.
+        """
+        sb3, torch = (importlib.import_module(name) for name in ("stable_baselines3", "torch"))
+        self._n_substeps = config.physics.n_substeps
+        policy = {
+            "activation_fn": torch.nn.Tanh,
+            "net_arch": {"pi": _SB3_LAYERS, "vf": _SB3_LAYERS},
+        }
+        env = _as_gymnasium(OneRobot(config))
+        self._ppo = sb3.PPO("MlpPolicy", env, policy_kwargs=policy, seed=0, device="cpu", **_SB3)
+        self.repeat()
+
+    def repeat(self) -> float:
+        """Environment steps per second over one iteration."""
+        begun = time.perf_counter()
+        self._ppo.learn(_SB3_STEPS, reset_num_timesteps=False)
+        return _SB3_STEPS / (time.perf_counter() - begun)
+
+    def row(self, repeats: list[float]) -> Row:
+        """What was measured."""
+        return make_row(self.rate, self._n_substeps, 1, 0.0, repeats, _SB3_STEPS)
+
+
+def _as_gymnasium(robot: OneRobot) -> Any:
+    gymnasium = importlib.import_module("gymnasium")
+
+    class Env(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (16,), np.float32)
+        action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+        def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[Any, dict]:
+            del options
+            super().reset(seed=seed)
+            return robot.reset(self.np_random), {}
+
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict]:
+            return robot.step(action)
+
+    return Env()
+
+
+def prepare_playground(num_envs: int, sizes: Sizes) -> Timed:
+    """An environment of MuJoCo Playground as its trainers see it, under random actions.
+
+    The cart and its pole have two degrees of freedom and no contact; the JetBot has eight and
+    four.
+    """
+    playground = importlib.import_module("mujoco_playground")
+    env = playground.registry.load(PLAYGROUND_ENV, config_overrides={"impl": "jax"})
+    batch = playground.wrapper.wrap_for_brax_training(env, episode_length=_PLAYGROUND_EPISODE)
+
+    def step(carry: Carry) -> Carry:
+        key, actions = random_actions(carry.key, num_envs, env.action_size)
+        state = batch.step(carry.state, actions)
+        checksum = sums((state.obs, state.reward, state.done, state.data.qpos, state.data.qvel))
+        tally = carry.tally
+        return Carry(
+            state,
+            key,
+            Tally(tally.checksum + checksum, tally.episodes + state.done, tally.nonfinite),
+        )
+
+    first = jax.jit(batch.reset)(env_keys(num_envs))
+    return Timed(
+        "playground",
+        step,
+        first,
+        n_substeps=env.n_substeps,
+        calls=sizes.unroll,
+        check=_check_playground,
+    )
+
+
+def _check_playground(rate: str, carry: Carry) -> None:
+    sound: Float[Array, ""] = jnp.isfinite(carry.tally.checksum).all()
+    if not sound:
+        raise UserError(f"{rate}: worlds are not finite, so that the rate means nothing")

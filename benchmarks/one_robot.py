@@ -1,0 +1,108 @@
+"""The tutorial's task on one robot in C MuJoCo, as people write it: NumPy, one step at a time.
+
+What Stable-Baselines3 is measured on. Observation, reward, goals, time limit and controller are
+those of `jetbot_mjx.task.GoalTask` with `observation: world`; a test holds the two together.
+"""
+
+import math
+from typing import Any
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.model import (
+    CONTROLLER_WHEEL_RADIUS,
+    CONTROLLER_WHEEL_SEPARATION,
+    QPOS_QUAT,
+    QPOS_XYZ,
+    QVEL_ANGULAR_B,
+    QVEL_LINEAR_W,
+    ROBOTS,
+    make_mj_model,
+)
+from jetbot_mjx.task import GOAL_HEIGHT
+
+
+def make_physics_model(config: Config) -> mujoco.MjModel:
+    """The C model that MJX is given: the same robot, time step, solver effort, nothing visual."""
+    return make_mj_model(ROBOTS[config.robot.preset], config.physics, visual=False)
+
+
+def wheel_targets(config: Config, actions: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
+    """Wheel speeds (left, right) [rad/s] that actions in [-1, 1]² command."""
+    drive, turn = np.moveaxis(np.clip(actions, -1.0, 1.0), -1, 0)
+    speed = 0.5 * (drive + 1.0) * config.task.max_speed
+    difference = 0.5 * turn * config.task.max_yaw_rate * CONTROLLER_WHEEL_SEPARATION
+    return np.stack([speed - difference, speed + difference], axis=-1) / CONTROLLER_WHEEL_RADIUS
+
+
+class OneRobot:
+    """One robot and its goal."""
+
+    def __init__(self, config: Config) -> None:
+        """Builds the model.
+
+        Args:
+          config: robot, task and physics.
+        """
+        self.config = config
+        self.model = make_physics_model(config)
+        self.data = mujoco.MjData(self.model)
+        self.goal = np.zeros(3)
+        self._steps = 0
+        self._distance = 0.0
+
+    def reset(self, rng: np.random.Generator) -> Float[np.ndarray, "16"]:
+        """Begins an episode: the robot at rest at the origin, a new goal.
+
+        Args:
+          rng: draws the goal.
+
+        Returns:
+          The first observation.
+        """
+        mujoco.mj_resetData(self.model, self.data)
+        task = self.config.task
+        angle = 2.0 * math.pi * rng.random()
+        distance = task.goal_distance_span * math.sqrt(rng.random()) + task.goal_distance_min
+        self.goal[:] = distance * math.sin(angle), distance * math.cos(angle), GOAL_HEIGHT
+        self._steps = 0
+        self._distance = self._distance_now()
+        return self._observe()
+
+    def step(
+        self, action: Float[np.ndarray, "2"]
+    ) -> tuple[Float[np.ndarray, "16"], float, bool, bool, dict[str, Any]]:
+        """Holds an action for one environment step.
+
+        Args:
+          action: in [-1, 1]².
+
+        Returns:
+          Observation, progress [m], terminated, truncated, and nothing else.
+        """
+        self.data.ctrl[:] = wheel_targets(self.config, action)
+        mujoco.mj_step(self.model, self.data, self.config.physics.n_substeps)
+        self._steps += 1
+        before, self._distance = self._distance, self._distance_now()
+        terminated = self._distance < self.config.task.success_radius
+        truncated = not terminated and self._steps >= self.config.task.episode_length
+        return self._observe(), before - self._distance, terminated, truncated, {}
+
+    def _distance_now(self) -> float:
+        return float(np.linalg.norm(self.goal - self.data.qpos[QPOS_XYZ]))
+
+    def _observe(self) -> Float[np.ndarray, "16"]:
+        quat = self.data.qpos[QPOS_QUAT]
+        angular_velocity_w = np.empty(3)
+        mujoco.mju_rotVecQuat(angular_velocity_w, self.data.qvel[QVEL_ANGULAR_B], quat)
+        parts = (
+            self.data.qpos[QPOS_XYZ],
+            quat,
+            self.data.qvel[QVEL_LINEAR_W],
+            angular_velocity_w,
+            self.goal,
+        )
+        return np.concatenate(parts).astype(np.float32)

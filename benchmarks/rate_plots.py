@@ -1,0 +1,115 @@
+"""Figures of rates: `python benchmarks/rate_plots.py FILE...` draws them again from their JSON."""
+
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator
+
+from jetbot_mjx import cli
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.plots import theme, to_png
+from jetbot_mjx.run_folder import write_bytes
+
+
+def plot_rates(values: Mapping[str, Any]) -> Figure:
+    """Steps per second, and the time of one step, against the number of environments.
+
+    Args:
+      values: content of a file that `steps_per_second.py` wrote.
+
+    Returns:
+      The figure; its colours are those of the theme in which it is drawn.
+    """
+    rows = values["results"]
+    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
+    rates, times = figure.subplots(1, 2)
+    for index, rate in enumerate(dict.fromkeys(row["rate"] for row in rows)):
+        points = sorted((row for row in rows if row["rate"] == rate), key=lambda x: x["num_envs"])
+        num_envs = [row["num_envs"] for row in points]
+        style: Any = {"color": f"C{index}", "marker": "o", "markersize": 4, "lw": 1.5}
+        medians = [row["env_steps_per_second"] for row in points]
+        rates.fill_between(
+            num_envs,
+            [min(row["repeats"]) for row in points],
+            [max(row["repeats"]) for row in points],
+            color=f"C{index}",
+            alpha=0.2,
+            lw=0,
+        )
+        rates.plot(num_envs, medians, label=rate, **style)
+        times.plot(num_envs, [row["microseconds_per_step"] for row in points], **style)
+    rates.set(title="environment steps per second", ylabel="steps/s")
+    times.set(title="time in which all environments make one step", ylabel="µs")
+    for axes in (rates, times):
+        _make_readable(axes, sorted({row["num_envs"] for row in rows}))
+    rates.legend(loc="best", fontsize="small")
+    figure.suptitle(f"{values['device_count']} x {values['device']}, {values['date']}", fontsize=9)
+    return figure
+
+
+def draw(path: Path, values: Mapping[str, Any]) -> Path:
+    """Draws the rates of a file beside it.
+
+    Args:
+      path: of the file.
+      values: its content.
+
+    Returns:
+      Where the figure lies.
+    """
+    picture = path.with_suffix(".png")
+    with theme("light"):
+        write_bytes(picture, to_png(plot_rates(values)))
+    return picture
+
+
+def _make_readable(axes: Axes, num_envs: Sequence[int]) -> None:
+    axes.set(xlabel="environments", xscale="log", yscale="log")
+    axes.set_xticks(num_envs, [f"{count:,}" for count in num_envs])
+    axes.xaxis.set_minor_locator(NullLocator())
+    low, high = axes.get_ylim()
+    if high < 10 * low:
+        # A logarithmic axis labels whole decades: let there be one on either side.
+        axes.set_ylim(low / 3, high * 3)
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axes.grid()
+    axes.set_axisbelow(True)
+
+
+def _short(count: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if count >= size:
+            return f"{count / size:g} {letter}"
+    return f"{count:g}"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and draws.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+
+    Raises:
+      UserError: a file holds no rates.
+    """
+    parser = cli.Parser(description=__doc__)
+    parser.add_argument("files", type=Path, nargs="+", help="JSON of steps_per_second.py")
+    for path in parser.parse_args(arguments).files:
+        try:
+            print(draw(path, json.loads(path.read_text(encoding="utf-8"))))
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            raise UserError(
+                f"{path} holds no rates: give a file that steps_per_second.py wrote"
+            ) from None
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)

@@ -1,0 +1,81 @@
+"""Files of results: the conditions that they hold for, and where they lie."""
+
+import datetime
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from measurements import WARM_UP_INTERVALS, Sizes
+from timing import WARM_UP_CALLS
+
+from jetbot_mjx import cli
+from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.run_folder import versions, write_json
+
+FOLDER = Path(__file__).resolve().parent / "results"
+
+
+def conditions(config: Config, sizes: Sizes) -> dict[str, Any]:
+    """What rates hold for, as JSON."""
+    device = jax.devices()[0]
+    return {
+        "device": device.device_kind,
+        "platform": device.platform,
+        "device_count": jax.device_count(),
+        "cpu_cores": os.cpu_count(),
+        "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
+        "versions": versions(),
+        "xla_flags": os.environ.get("XLA_FLAGS", ""),
+        "config": config.model_dump(mode="json"),
+        "conditions": {
+            **sizes._asdict(),
+            "warm_up_calls": WARM_UP_CALLS,
+            "warm_up_intervals": WARM_UP_INTERVALS,
+            # Of the networks; null is the back end's own choice. Physics sets its own.
+            "matmul_precision": jax.config.values["jax_default_matmul_precision"],
+            # Where there is one, a compile time may be that of reading from it.
+            "compilation_cache": jax.config.values["jax_compilation_cache_dir"] is not None,
+        },
+    }
+
+
+def default_output(prefix: str = "") -> Path:
+    """`results/<prefix><device>.json`, with the number of devices if there are more."""
+    name = re.sub(r"[^a-z0-9]+", "-", jax.devices()[0].device_kind.lower()).strip("-")
+    count = jax.device_count()
+    return FOLDER / (prefix + (f"{name}-x{count}.json" if count > 1 else f"{name}.json"))
+
+
+def check_output(path: Path) -> None:
+    """Finds out before minutes of measuring whether the file can be written.
+
+    Raises:
+      UserError: it cannot.
+    """
+    if path.is_dir():
+        raise UserError(f"--output {path} is a folder: name a file in it")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"--output {path} cannot be written: {error.strerror}") from None
+
+
+def write(path: Path, values: dict[str, Any]) -> None:
+    """Writes a file of results.
+
+    Raises:
+      UserError: it cannot be written.
+    """
+    try:
+        write_json(path, values)
+    except OSError as error:
+        raise UserError(f"--output {path} cannot be written: {error.strerror}") from None
+
+
+def counts(text: str) -> Sequence[int]:
+    """An argument that counts several things, as in 256,1024."""
+    return [cli.positive_int(part) for part in text.split(",")]
