@@ -68,8 +68,8 @@ def measure_physics(config: Config, num_envs: int, sizes: Sizes) -> Row:
     return row._replace(episodes_per_env_step=None, nonfinite_worlds=None)
 
 
-def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times the environment as trainers see it, under random actions."""
+def prepare_env(config: Config, num_envs: int, sizes: Sizes) -> Timed:
+    """The environment as trainers see it, under random actions."""
     env = make_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
 
@@ -81,8 +81,12 @@ def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Row:
 
     first = jax.jit(batch.reset)(env_keys(num_envs))
     n_substeps = config.physics.n_substeps
-    timed = Timed("env", step, first, n_substeps=n_substeps, calls=sizes.unroll)
-    return _measure(timed, sizes)
+    return Timed("env", step, first, n_substeps=n_substeps, calls=sizes.unroll)
+
+
+def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Row:
+    """Times the environment as trainers see it."""
+    return _measure(prepare_env(config, num_envs, sizes), sizes)
 
 
 def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:

@@ -7,7 +7,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, NullLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
@@ -47,7 +47,9 @@ def plot_rates(values: Mapping[str, Any]) -> Figure:
     for axes in (rates, times):
         _make_readable(axes, sorted({row["num_envs"] for row in rows}))
     rates.legend(loc="best", fontsize="small")
-    figure.suptitle(f"{values['device_count']} x {values['device']}, {values['date']}", fontsize=9)
+    cores = f", {values['cpu_cores']} cores" if values["platform"] == "cpu" else ""
+    device = f"{values['device_count']} x {values['device']}{cores}"
+    figure.suptitle(f"{device}, {values['date']}", fontsize=9)
     return figure
 
 
@@ -71,10 +73,8 @@ def _make_readable(axes: Axes, num_envs: Sequence[int]) -> None:
     axes.set(xlabel="environments", xscale="log", yscale="log")
     axes.set_xticks(num_envs, [f"{count:,}" for count in num_envs])
     axes.xaxis.set_minor_locator(NullLocator())
-    low, high = axes.get_ylim()
-    if high < 10 * low:
-        # A logarithmic axis labels whole decades: let there be one on either side.
-        axes.set_ylim(low / 3, high * 3)
+    axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
     axes.grid()
     axes.set_axisbelow(True)

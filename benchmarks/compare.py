@@ -1,0 +1,245 @@
+"""The same robot by several means in one run: `python benchmarks/compare.py`.
+
+  physics     this project's `JetBotEnv.step_physics` under random actions
+  mujoco      C MuJoCo's threaded `mujoco.rollout`: same model, sub-steps, actions held as long
+  env         this project's training environment under random actions
+  playground  MuJoCo Playground's CartpoleBalance, which is smaller, as its trainers see it
+  training    this project's PPO, rollouts and updates
+  stock       Brax's own `ppo.train` with the same hyperparameters
+  sb3         Stable-Baselines3's PPO with the tutorial's, on one robot in C MuJoCo
+
+All rates are environment steps per second. physics and mujoco take turns, so that what else the
+machine does meets both. What needs a package that is not installed is left out, in one line.
+"""
+
+import argparse
+import importlib.util
+import os
+import statistics
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+from contenders import Contender, MujocoRollout, Sb3, prepare_playground
+from measurements import MEASUREMENTS, Sizes, prepare_env, prepare_physics, training_config
+from results import check_output, conditions, counts, default_output, write
+from timing import Row
+
+from jetbot_mjx import cli
+from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.errors import UserError
+
+_CONFIG = Path(__file__).resolve().parents[1] / "configs" / "jetbot.yaml"
+_PAIR = ("physics", "mujoco")
+CONTENDERS = (*_PAIR, "env", "playground", "training", "stock", "sb3")
+_NEEDS = {
+    "playground": (
+        ("mujoco_playground", "lxml"),
+        # Its own requirements would replace MuJoCo by another release than MJX's.
+        "pip install --no-deps playground lxml",
+    ),
+    "sb3": (
+        ("torch", "stable_baselines3", "gymnasium"),
+        "pip install -c constraints.txt '.[sb3]', best after torch's build for CPUs",
+    ),
+}
+_BATCHES = {"cpu": (64, 128, 256, 512), "gpu": (4_096, 65_536)}
+_ROLLOUT_BATCHES = (16, 64, 256)
+"""For each core."""
+
+
+class Result(NamedTuple):
+    """What a run measured."""
+
+    rows: list[Row]
+    busy_cores: dict[str, float]
+    """Processor time over wall time while a contender was timed, by its name."""
+    ratios: list[float]
+    """physics over mujoco in each round, each at its best number of environments."""
+
+
+def run(
+    config: Config,
+    num_envs: Sequence[int],
+    sizes: Sizes,
+    *,
+    contenders: Sequence[str] = CONTENDERS,
+    report: Callable[[Row, float], None] = lambda row, cores: None,
+) -> Result:
+    """Measures.
+
+    Args:
+      config: robot, task, physics and hyperparameters.
+      num_envs: numbers of environments that physics is tried at; the rest takes the best.
+      sizes: how much is measured.
+      contenders: which, by their names in `CONTENDERS`; their packages are there.
+      report: called with every row and its busy cores as soon as it is there.
+
+    Returns:
+      The rows.
+
+    Raises:
+      UserError: worlds blew up, or the environments cannot be dealt out.
+    """
+    rows: list[Row] = []
+    busy: dict[str, float] = {}
+
+    def add(found: Sequence[tuple[Row, float]]) -> None:
+        for row, cores in found:
+            rows.append(row)
+            busy[row.rate] = cores
+            report(row, cores)
+
+    turns: list[Contender] = []
+    if "physics" in contenders:
+        turns += [prepare_physics(config, count, sizes) for count in num_envs]
+    if "mujoco" in contenders:
+        cores = os.cpu_count() or 1
+        turns += [MujocoRollout(config, count * cores, sizes) for count in _ROLLOUT_BATCHES]
+    add(_in_turns(turns, sizes.repeats))
+    best = {row.rate: row for row in sorted(rows, key=lambda row: row.env_steps_per_second)}
+    count = best["physics"].num_envs if "physics" in best else num_envs[0]
+    prepare: Mapping[str, Callable[[], Contender]] = {
+        "env": lambda: prepare_env(config, count, sizes),
+        "playground": lambda: prepare_playground(count, sizes),
+        "sb3": lambda: Sb3(config),
+    }
+    for name in contenders:
+        if name in prepare:
+            add(_in_turns([prepare[name]()], sizes.repeats))
+        elif name not in _PAIR:
+            # The trainers' own reports are their clock.
+            wall, cpu = time.perf_counter(), time.process_time()
+            row = MEASUREMENTS[name](config, config.ppo.num_envs, sizes)
+            add([(row, (time.process_time() - cpu) / (time.perf_counter() - wall))])
+    ratios = []
+    if set(_PAIR) <= set(best):
+        pairs = zip(*(best[name].repeats for name in _PAIR), strict=True)
+        ratios = [ours / theirs for ours, theirs in pairs]
+    return Result(rows, busy, ratios)
+
+
+def _in_turns(contenders: Sequence[Contender], rounds: int) -> list[tuple[Row, float]]:
+    """Times all of them once in every round; with each row the cores that it kept busy."""
+    rates: list[list[float]] = [[] for _ in contenders]
+    cores: list[list[float]] = [[] for _ in contenders]
+    for _ in range(rounds):
+        for index, contender in enumerate(contenders):
+            wall, cpu = time.perf_counter(), time.process_time()
+            rates[index].append(contender.repeat())
+            used = time.process_time() - cpu
+            cores[index].append(used / (time.perf_counter() - wall))
+    return [
+        (contender.row(one), statistics.median(used))
+        for contender, one, used in zip(contenders, rates, cores, strict=True)
+    ]
+
+
+def missing(contender: str) -> str | None:
+    """Why a contender has to be left out, in one line; None: nothing is missing."""
+    packages, remedy = _NEEDS.get(contender, ((), ""))
+    absent = [name for name in packages if importlib.util.find_spec(name) is None]
+    return f"{contender} left out, no {', '.join(absent)}: {remedy}" if absent else None
+
+
+_TABLE_HEAD = (
+    f"| {'':10} | {'num_envs':>8} | {'env_steps_per_second':>20} | {'compile':>8} |"
+    f" {'busy cores':>10} | {'min .. max':>18} |\n"
+    f"|:{'-' * 10}-|-{'-' * 8}:|-{'-' * 20}:|-{'-' * 8}:|-{'-' * 10}:|-{'-' * 18}:|"
+)
+
+
+def _table_row(row: Row, cores: float) -> str:
+    low, high = (end / row.env_steps_per_second - 1 for end in (min(row.repeats), max(row.repeats)))
+    spread = f"{low:+.1%} .. {high:+.1%}"
+    return (
+        f"| {row.rate:10} | {row.num_envs:8,} | {row.env_steps_per_second:20,.0f} |"
+        f" {row.compile_seconds:6.1f} s | {cores:10.2f} | {spread:>18} |"
+    )
+
+
+def ratio_line(ratios: Sequence[float]) -> str:
+    """How physics and mujoco compare."""
+    return (
+        f"physics makes {statistics.median(ratios):.2f} times the steps of mujoco, each at its best"
+        f" ({min(ratios):.2f} .. {max(ratios):.2f} over {len(ratios)} rounds)"
+    )
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", type=Path, default=_CONFIG, help="default: configs/jetbot.yaml")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument(
+        "--num-envs",
+        type=counts,
+        metavar="N,N,...",
+        help="that physics is tried at (default: 64,128,256,512, on a GPU 4096,65536)",
+    )
+    parser.add_argument("--repeats", type=cli.positive_int, default=5, help="rounds (default: 5)")
+    parser.add_argument("--training-steps", type=cli.positive_int, default=4, help="default: 4")
+    parser.add_argument("--skip", action="append", default=[], choices=CONTENDERS)
+    parser.add_argument("--output", type=Path, help="default: results/compare-<device>.json")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line, measures, prints the table and writes the JSON file.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+
+    Raises:
+      UserError: as for `run`, or the file cannot be written.
+    """
+    options = _parser().parse_args(arguments)
+    config = load_config(options.config, options.overrides)
+    sizes = Sizes(repeats=options.repeats, training_steps=options.training_steps)
+    lines = {name: missing(name) for name in CONTENDERS if name not in options.skip}
+    contenders = [name for name, line in lines.items() if line is None]
+    if not contenders:
+        raise UserError("--skip leaves nothing to compare: leave out fewer")
+    for name, trainer in {"training": "resumable", "stock": "brax"}.items():
+        if name in contenders:
+            # Said before minutes of measuring, not after them.
+            training_config(config, config.ppo.num_envs, sizes, trainer)
+    output = options.output or default_output("compare-")
+    check_output(output)
+    measured = conditions(config, sizes)
+    for line in filter(None, lines.values()):
+        print(line)
+    print(
+        f"{options.config.name} on {jax.device_count()} x {measured['device']} and"
+        f" {measured['cpu_cores']} CPU cores, median of {sizes.repeats}\n{_TABLE_HEAD}",
+        flush=True,
+    )
+    platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
+    result = run(
+        config,
+        options.num_envs or _BATCHES[platform],
+        sizes,
+        contenders=contenders,
+        report=lambda row, cores: print(_table_row(row, cores), flush=True),
+    )
+    write(
+        output,
+        {
+            **measured,
+            "comparison": [row._asdict() for row in result.rows],
+            "busy_cores": result.busy_cores,
+            "physics_over_mujoco": result.ratios,
+        },
+    )
+    if result.ratios:
+        print(ratio_line(result.ratios))
+    print(f"results: {output}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)

@@ -1,0 +1,182 @@
+"""What a step compiles to: `python benchmarks/kernels.py --config configs/jetbot.yaml`.
+
+Counts the instructions of the compiled programs that become kernels (on a CPU: loops and calls of
+their own), for one environment step of physics, one of the training environment and one training
+step, and the arithmetic of one physics step written out number by number, which is what a kernel
+in PTX does. No clock: a regression shows on any machine, however busy.
+"""
+
+import collections
+import re
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from timing import env_keys
+
+from jetbot_mjx import cli
+from jetbot_mjx.compiling import compiler_options
+from jetbot_mjx.config import Config, load_config, parse_config
+from jetbot_mjx.env import make_env
+from jetbot_mjx.ppo import PPO
+from jetbot_mjx.scalarize import scalarize
+from jetbot_mjx.wrappers import wrap_for_training
+
+PROGRAMS = ("physics", "env", "training")
+
+_FREE = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all"}
+_FREE |= {"partition-id", "replica-id", "opt-barrier", "add-dependency"}
+"""Instructions that only name what is there."""
+
+_COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.-]+) .*->.* \{$")
+_INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?[\w.-]+ = (?:\(.*?\)|\S+) ([a-z][\w-]*)\(")
+_CALLED = re.compile(
+    r"(?:to_apply|body|condition|true_computation|false_computation)=%?([\w.-]+)"
+    r"|branch_computations=\{([^}]*)\}"
+)
+_TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
+
+
+class Count(NamedTuple):
+    """What a compiled program consists of."""
+
+    kernels: Mapping[str, int]
+    """Instructions that become kernels, by their operation."""
+    launches: int
+    """The same, each as often as its loops turn; loops of unknown length count once."""
+    unknown_loops: int
+    """Loops whose length is known only when the program runs."""
+
+
+def count_kernels(text: str) -> Count:
+    """Counts what a compiled program launches.
+
+    Args:
+      text: of the program after all of XLA's passes, `compiled.as_text()`.
+
+    Returns:
+      The counts over the entry and all that it calls; what is fused counts as one.
+    """
+    computations, entry = _computations(text)
+    kernels: collections.Counter[str] = collections.Counter()
+    unknown = 0
+
+    def walk(name: str) -> int:
+        nonlocal unknown
+        launches = 0
+        for op, line in computations[name]:
+            if op in ("while", "call", "conditional"):
+                trips = _TRIPS.search(line)
+                unknown += op == "while" and trips is None
+                turns = int(trips[1]) if trips else 1
+                launches += turns * sum(walk(called) for called in _called(line))
+            elif op not in _FREE and not op.endswith("-done"):
+                kernels[op] += 1
+                launches += 1
+        return launches
+
+    launches = walk(entry)
+    return Count(dict(kernels.most_common()), launches, unknown)
+
+
+def _computations(text: str) -> tuple[dict[str, list[tuple[str, str]]], str]:
+    """(operation, line) of every instruction, by the computation it is in; the entry's name."""
+    found: dict[str, list[tuple[str, str]]] = {}
+    entry, current = "", ""
+    for line in text.splitlines():
+        if head := _COMPUTATION.match(line):
+            current = head[2]
+            found[current] = []
+            entry = current if head[1] else entry
+        elif current and (instruction := _INSTRUCTION.match(line)):
+            found[current].append((instruction[1], line))
+    return found, entry
+
+
+def _called(line: str) -> list[str]:
+    names = []
+    for one, several in _CALLED.findall(line):
+        names += [one] if one else [name.strip().lstrip("%") for name in several.split(",")]
+    return names
+
+
+def compiled_text(config: Config, program: str) -> str:
+    """What XLA makes of a step.
+
+    Args:
+      config: the run.
+      program: one of `PROGRAMS`.
+
+    Returns:
+      The text of the compiled program.
+    """
+    env = make_env(config)
+    batch = wrap_for_training(env, config.task.episode_length)
+    keys, actions = env_keys(config.ppo.num_envs), jnp.zeros((config.ppo.num_envs, 2))
+    if program == "physics":
+        first = jax.eval_shape(jax.vmap(env.reset), keys).pipeline_state
+        lowered = jax.jit(jax.vmap(env.step_physics)).lower(first, actions)
+    elif program == "env":
+        step: Any = batch.step
+        lowered = jax.jit(step).lower(jax.eval_shape(batch.reset, keys), actions)
+    else:
+        ppo = PPO(config.ppo, batch)
+        state = jax.eval_shape(ppo.init, jax.random.PRNGKey(0))
+        lowered = jax.jit(ppo.train_step).lower(state)
+    return lowered.compile(compiler_options=compiler_options(config)).as_text()
+
+
+def count_scalars(config: Config) -> dict[str, int]:
+    """Operations on single numbers in one physics step of one robot, by their kind."""
+    values = config.model_dump(mode="json")
+    values["physics"] |= {"impl": "xla", "ctrl_dt": config.physics.sim_dt}
+    env = make_env(parse_config(values))
+    physics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
+    program = scalarize(env.step_physics, physics, jnp.zeros(env.action_size))
+    return dict(collections.Counter(x.op for x in program.values if x.op != "input").most_common())
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line, compiles and prints.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+    """
+    parser = cli.Parser(description=__doc__)
+    parser.add_argument("--config", type=Path, required=True)
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument("--skip", action="append", default=[], choices=PROGRAMS)
+    options = parser.parse_args(arguments)
+    config = load_config(options.config, options.overrides)
+    print(
+        f"{options.config.name} with {config.ppo.num_envs} environments on"
+        f" {jax.devices()[0].device_kind}, physics.impl {make_env(config).physics_impl}"
+    )
+    for program in PROGRAMS:
+        if program not in options.skip:
+            count = count_kernels(compiled_text(config, program))
+            print(_line(program, count), flush=True)
+    scalars = count_scalars(config)
+    print(f"{'scalars':8} {sum(scalars.values()):6,} operations: {_kinds(scalars)}")
+    return 0
+
+
+def _line(program: str, count: Count) -> str:
+    least = "at least " if count.unknown_loops else ""
+    return (
+        f"{program:8} {sum(count.kernels.values()):6,} kernels, {least}{count.launches:,} launches:"
+        f" {_kinds(count.kernels)}"
+    )
+
+
+def _kinds(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {count:,}" for name, count in counts.items())
+
+
+if __name__ == "__main__":
+    cli.run_command(main)

@@ -1,0 +1,246 @@
+"""Writes the measured tables of the READMEs: `python benchmarks/readme_table.py`.
+
+All comes from benchmarks/results/*.json, whatever files are there: those of `time_to_success.py`,
+`steps_per_second.py` and `compare.py` are known by what is in them, others are passed over. Each
+table stands between two comments, `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`.
+"""
+
+import json
+import re
+import statistics
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from jetbot_mjx import cli
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.run_folder import write_text
+
+ROOT = Path(__file__).resolve().parents[1]
+_RATES = ("physics", "env", "rollout", "training", "stock")
+
+Results = Mapping[str, Mapping[str, Any]]
+"""Content of every file of results, by its name."""
+
+
+def read_results(folder: Path) -> Results:
+    """Reads all files of results.
+
+    Args:
+      folder: where they lie.
+
+    Returns:
+      Their content, in the order of their names.
+    """
+    return {
+        path.name: json.loads(path.read_text(encoding="utf-8"))
+        for path in sorted(folder.glob("*.json"))
+    }
+
+
+def success_table(results: Results) -> str:
+    """How long success takes: a row for each file of `time_to_success.py` and each start."""
+    head = (
+        "machine",
+        "observation",
+        "configuration",
+        "trainer",
+        "seeds",
+        "success",
+        "process, start to end",
+        "first training step after",
+        "{target} reached after",
+    )
+    rows, targets = [], set()
+    for values in _holding(results, "runs"):
+        targets.add(values["target"])
+        # Files of the stock trainer's first days do not say that each start was cold.
+        for start in dict.fromkeys(run.get("start", "cold") for run in values["runs"]):
+            runs = [run for run in values["runs"] if run.get("start", "cold") == start]
+            rows.append(_success_row(values, runs, warm=start == "warm"))
+    target = " or ".join(f"{target:.0%}" for target in sorted(targets))
+    head = [name.format(target=target) for name in head]
+    return _table(head, "llll" + "r" * 5, rows)
+
+
+def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) -> list[str]:
+    reached = [run["target_reached_seconds"] for run in runs]
+    success = min(run["policy"]["success_rate"] for run in runs)
+    first = [run.get("first_step_seconds") for run in runs]
+    observation = values["config"]["task"]["observation"]
+    return [
+        _machine(values, runs[0]["versions"]) + (", warm cache" if warm else ""),
+        "the 16 numbers" if observation == "world" else observation,
+        f"`{values['command'].split('/')[-1]}`",
+        values["config"]["trainer"],
+        str(len(runs)),
+        f"{success:.2%}",
+        f"{statistics.median(run['process_seconds'] for run in runs):.0f} s",
+        "-" if None in first else f"{statistics.median(first):.0f} s",
+        "not by all" if None in reached else f"{statistics.median(reached):.0f} s",
+    ]
+
+
+def best_rates_table(results: Results) -> str:
+    """The best of every rate, with the environments it takes: a row for each machine."""
+    rows = []
+    for values in _holding(results, "results"):
+        best = {
+            row["rate"]: row
+            for row in sorted(values["results"], key=lambda row: row["env_steps_per_second"])
+        }
+        cells = [_best(best[rate]) if rate in best else "-" for rate in _RATES]
+        rows.append([_machine(values, values), *cells])
+    return _table(["environment steps/s at the best batch", *_RATES], "l" + "r" * len(_RATES), rows)
+
+
+def _best(row: Mapping[str, Any]) -> str:
+    return f"{_short(row['env_steps_per_second'])} ({row['num_envs']:,})"
+
+
+def rates_tables(results: Results) -> str:
+    """All rates of every machine, each table under its conditions."""
+    head = ("rate", "num_envs", "env_steps_per_second", "physics_steps_per_second")
+    head = (*head, "µs/step", "compile", "min .. max", "peak memory")
+    parts = []
+    for name, values in results.items():
+        if not isinstance(values.get("results"), list):
+            continue
+        rows = [
+            [
+                row["rate"],
+                f"{row['num_envs']:,}",
+                f"{row['env_steps_per_second']:,.0f}",
+                f"{row['physics_steps_per_second']:,.0f}",
+                f"{row['microseconds_per_step']:,.1f}",
+                f"{row['compile_seconds']:.1f} s",
+                _spread(row),
+                _memory(row.get("peak_device_bytes")),
+            ]
+            for row in values["results"]
+        ]
+        parts += [_caption(name, values), _table(head, "l" + "r" * 7, rows)]
+    for name, values in results.items():
+        if "comparison" in values:
+            parts += [_caption(name, values), _comparison(values)]
+    return "\n\n".join(parts)
+
+
+def _comparison(values: Mapping[str, Any]) -> str:
+    head = ("", "num_envs", "env_steps_per_second", "busy cores", "min .. max")
+    rows = [
+        [
+            row["rate"],
+            f"{row['num_envs']:,}",
+            f"{row['env_steps_per_second']:,.0f}",
+            f"{values['busy_cores'][row['rate']]:.1f}",
+            _spread(row),
+        ]
+        for row in values["comparison"]
+    ]
+    table = _table(head, "lrrrr", rows)
+    ratios = values["physics_over_mujoco"]
+    if not ratios:
+        return table
+    return (
+        f"{table}\n\n`physics` over `mujoco`, each at its best, round by round:"
+        f" {statistics.median(ratios):.2f} ({min(ratios):.2f} .. {max(ratios):.2f})."
+    )
+
+
+def _caption(name: str, values: Mapping[str, Any]) -> str:
+    packages = values["versions"]["packages"]
+    physics = values["config"]["physics"].get("impl")
+    return (
+        f"`{name}`: {_machine(values, values)}, {values['date']}, JAX {packages['jax']}, MuJoCo"
+        f" {packages['mujoco']}, Brax {packages['brax']}"
+        + (f", `physics.impl: {physics}`" if physics else "")
+        + f", median of {values['conditions']['repeats']} repeats"
+    )
+
+
+def _spread(row: Mapping[str, Any]) -> str:
+    ends = (min(row["repeats"]), max(row["repeats"]))
+    low, high = (end / row["env_steps_per_second"] - 1 for end in ends)
+    return f"{low:+.1%} .. {high:+.1%}"
+
+
+def _memory(size: int | None) -> str:
+    return "-" if size is None else f"{size / 2**20:,.0f} MiB"
+
+
+def _machine(values: Mapping[str, Any], device: Mapping[str, Any]) -> str:
+    if device["device"] == "cpu":
+        return f"{values['cpu_cores']} CPU cores"
+    return f"{device['device_count']} {device['device']}"
+
+
+def _short(count: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if count >= size:
+            return f"{count / size:.3g} {letter}"
+    return f"{count:.3g}"
+
+
+def _holding(results: Results, key: str) -> list[Mapping[str, Any]]:
+    return [values for values in results.values() if isinstance(values.get(key), list)]
+
+
+def _table(head: Sequence[str], alignment: str, rows: Sequence[Sequence[str]]) -> str:
+    rule = ["---" if side == "l" else "--:" for side in alignment]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in (head, rule, *rows))
+
+
+BLOCKS: Mapping[str, Mapping[str, Callable[[Results], str]]] = {
+    "README.md": {"success": success_table, "rates": best_rates_table},
+    "benchmarks/README.md": {"results": rates_tables},
+}
+"""By file and by the name of the block: what stands there."""
+
+
+def with_tables(text: str, name: str, results: Results) -> str:
+    """A README with its tables as the results have them.
+
+    Args:
+      text: of the README.
+      name: a file in `BLOCKS`.
+      results: of `read_results`.
+
+    Returns:
+      The text, the same where nothing changed.
+
+    Raises:
+      UserError: a block has no comments to stand between.
+    """
+    for block, make in BLOCKS[name].items():
+        pattern = rf"(<!-- {block}: begin[^>]*-->\n).*?(<!-- {block}: end -->)"
+        found = re.search(pattern, text, flags=re.DOTALL)
+        if found is None:
+            raise UserError(f"{name} has no <!-- {block}: begin --> and <!-- {block}: end -->")
+        text = f"{text[: found.start()]}{found[1]}{make(results)}\n{found[2]}{text[found.end() :]}"
+    return text
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and writes.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+    """
+    cli.Parser(description=__doc__).parse_args(arguments)
+    results = read_results(ROOT / "benchmarks" / "results")
+    for name in BLOCKS:
+        path = ROOT / name
+        before = path.read_text(encoding="utf-8")
+        after = with_tables(before, name, results)
+        if after != before:
+            write_text(path, after)
+        print(f"{name}: {'written' if after != before else 'as it was'}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
