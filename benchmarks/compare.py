@@ -14,18 +14,17 @@ machine does meets both. What needs a package that is not installed is left out,
 
 import argparse
 import importlib.util
-import os
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any
 
 import jax
 from contenders import Contender, MujocoRollout, Sb3, prepare_playground
 from measurements import MEASUREMENTS, Sizes, prepare_env, prepare_physics, training_config
 from results import check_output, conditions, counts, default_output, write
-from timing import Row
+from timing import Row, available_cores
 
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
@@ -50,14 +49,8 @@ _ROLLOUT_BATCHES = (16, 64, 256)
 """For each core."""
 
 
-class Result(NamedTuple):
-    """What a run measured."""
-
-    rows: list[Row]
-    busy_cores: dict[str, float]
-    """Processor time over wall time while a contender was timed, by its name."""
-    ratios: list[float]
-    """physics over mujoco in each round, each at its best number of environments."""
+Result = tuple[Row, list[float]]
+"""What was measured, and the busy cores of each repeat: processor time over wall time."""
 
 
 def run(
@@ -65,9 +58,9 @@ def run(
     num_envs: Sequence[int],
     sizes: Sizes,
     *,
-    contenders: Sequence[str] = CONTENDERS,
-    report: Callable[[Row, float], None] = lambda row, cores: None,
-) -> Result:
+    contenders: Sequence[str],
+    report: Callable[[Sequence[Result]], None],
+) -> None:
     """Measures.
 
     Args:
@@ -75,31 +68,20 @@ def run(
       num_envs: numbers of environments that physics is tried at; the rest takes the best.
       sizes: how much is measured.
       contenders: which, by their names in `CONTENDERS`; their packages are there.
-      report: called with every row and its busy cores as soon as it is there.
-
-    Returns:
-      The rows.
+      report: called with results as soon as they are there.
 
     Raises:
       UserError: worlds blew up, or the environments cannot be dealt out.
     """
-    rows: list[Row] = []
-    busy: dict[str, float] = {}
-
-    def add(found: Sequence[tuple[Row, float]]) -> None:
-        for row, cores in found:
-            rows.append(row)
-            busy[row.rate] = cores
-            report(row, cores)
-
     turns: list[Contender] = []
     if "physics" in contenders:
         turns += [prepare_physics(config, count, sizes) for count in num_envs]
     if "mujoco" in contenders:
-        cores = os.cpu_count() or 1
-        turns += [MujocoRollout(config, count * cores, sizes) for count in _ROLLOUT_BATCHES]
-    add(_in_turns(turns, sizes.repeats))
-    best = {row.rate: row for row in sorted(rows, key=lambda row: row.env_steps_per_second)}
+        batches = [count * available_cores() for count in _ROLLOUT_BATCHES]
+        turns += [MujocoRollout(config, count, sizes) for count in batches]
+    measured = _in_turns(turns, sizes.repeats)
+    report(measured)
+    best = _best([row for row, _ in measured])
     count = best["physics"].num_envs if "physics" in best else num_envs[0]
     prepare: Mapping[str, Callable[[], Contender]] = {
         "env": lambda: prepare_env(config, count, sizes),
@@ -108,20 +90,41 @@ def run(
     }
     for name in contenders:
         if name in prepare:
-            add(_in_turns([prepare[name]()], sizes.repeats))
+            report(_in_turns([prepare[name]()], sizes.repeats))
         elif name not in _PAIR:
             # The trainers' own reports are their clock.
             wall, cpu = time.perf_counter(), time.process_time()
             row = MEASUREMENTS[name](config, config.ppo.num_envs, sizes)
-            add([(row, (time.process_time() - cpu) / (time.perf_counter() - wall))])
-    ratios = []
-    if set(_PAIR) <= set(best):
-        pairs = zip(*(best[name].repeats for name in _PAIR), strict=True)
-        ratios = [ours / theirs for ours, theirs in pairs]
-    return Result(rows, busy, ratios)
+            report([(row, [(time.process_time() - cpu) / (time.perf_counter() - wall)])])
 
 
-def _in_turns(contenders: Sequence[Contender], rounds: int) -> list[tuple[Row, float]]:
+def ratios(results: Sequence[Result], *, per_core: bool = False) -> list[float]:
+    """How `physics` compares with `mujoco`, each at its best number of environments.
+
+    Args:
+      results: what was measured.
+      per_core: compares steps per second of processor time, not of the clock on the wall.
+
+    Returns:
+      The ratio in each round; nothing where one of them was not measured.
+    """
+    best = _best([row for row, _ in results])
+    if not set(_PAIR) <= set(best):
+        return []
+    ours, theirs = (
+        [rate / (busy if per_core else 1.0) for rate, busy in zip(row.repeats, cores, strict=True)]
+        for name in _PAIR
+        for row, cores in results
+        if row is best[name]
+    )
+    return [one / other for one, other in zip(ours, theirs, strict=True)]
+
+
+def _best(rows: Sequence[Row]) -> dict[str, Row]:
+    return {row.rate: row for row in sorted(rows, key=lambda row: row.env_steps_per_second)}
+
+
+def _in_turns(contenders: Sequence[Contender], rounds: int) -> list[Result]:
     """Times all of them once in every round; with each row the cores that it kept busy."""
     rates: list[list[float]] = [[] for _ in contenders]
     cores: list[list[float]] = [[] for _ in contenders]
@@ -132,7 +135,7 @@ def _in_turns(contenders: Sequence[Contender], rounds: int) -> list[tuple[Row, f
             used = time.process_time() - cpu
             cores[index].append(used / (time.perf_counter() - wall))
     return [
-        (contender.row(one), statistics.median(used))
+        (contender.row(one), used)
         for contender, one, used in zip(contenders, rates, cores, strict=True)
     ]
 
@@ -151,21 +154,33 @@ _TABLE_HEAD = (
 )
 
 
-def _table_row(row: Row, cores: float) -> str:
+def _table_row(row: Row, busy: Sequence[float]) -> str:
     low, high = (end / row.env_steps_per_second - 1 for end in (min(row.repeats), max(row.repeats)))
     spread = f"{low:+.1%} .. {high:+.1%}"
     return (
         f"| {row.rate:10} | {row.num_envs:8,} | {row.env_steps_per_second:20,.0f} |"
-        f" {row.compile_seconds:6.1f} s | {cores:10.2f} | {spread:>18} |"
+        f" {row.compile_seconds:6.1f} s | {statistics.median(busy):10.2f} | {spread:>18} |"
     )
 
 
-def ratio_line(ratios: Sequence[float]) -> str:
-    """How physics and mujoco compare."""
-    return (
-        f"physics makes {statistics.median(ratios):.2f} times the steps of mujoco, each at its best"
-        f" ({min(ratios):.2f} .. {max(ratios):.2f} over {len(ratios)} rounds)"
-    )
+def _as_json(results: Sequence[Result]) -> dict[str, Any]:
+    return {
+        "comparison": [{**row._asdict(), "busy_cores": busy} for row, busy in results],
+        "physics_over_mujoco": ratios(results),
+        "physics_over_mujoco_per_core": ratios(results, per_core=True),
+    }
+
+
+def ratio_lines(results: Sequence[Result]) -> list[str]:
+    """How `physics` compares with `mujoco`, for people; nothing where one was not measured."""
+    lines = []
+    for per_core, unit in ((False, "second"), (True, "second of processor time")):
+        if found := ratios(results, per_core=per_core):
+            lines.append(
+                f"physics over mujoco, steps per {unit}: {statistics.median(found):.2f}"
+                f" ({min(found):.2f} .. {max(found):.2f} over {len(found)} rounds)"
+            )
+    return lines
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -219,24 +234,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
         flush=True,
     )
     platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
-    result = run(
+    found: list[Result] = []
+
+    def report(more: Sequence[Result]) -> None:
+        found.extend(more)
+        for row, busy in more:
+            print(_table_row(row, busy), flush=True)
+        write(output, {**measured, **_as_json(found)})
+
+    run(
         config,
         options.num_envs or _BATCHES[platform],
         sizes,
         contenders=contenders,
-        report=lambda row, cores: print(_table_row(row, cores), flush=True),
+        report=report,
     )
-    write(
-        output,
-        {
-            **measured,
-            "comparison": [row._asdict() for row in result.rows],
-            "busy_cores": result.busy_cores,
-            "physics_over_mujoco": result.ratios,
-        },
-    )
-    if result.ratios:
-        print(ratio_line(result.ratios))
+    for line in ratio_lines(found):
+        print(line)
     print(f"results: {output}")
     return 0
 

@@ -6,7 +6,6 @@ several can take turns. What a package of its own is needed for is imported only
 
 import importlib
 import math
-import os
 import time
 from typing import Any, Protocol
 
@@ -26,6 +25,7 @@ from timing import (
     Row,
     Tally,
     Timed,
+    available_cores,
     env_keys,
     make_row,
     random_actions,
@@ -91,7 +91,7 @@ class MujocoRollout:
         self._n_substeps = config.physics.n_substeps
         self._env_steps = sizes.unroll
         self._model = make_physics_model(config)
-        threads = os.cpu_count() or 1
+        threads = available_cores()
         self._data = [mujoco.MjData(self._model) for _ in range(threads)]
         self._pool = mujoco.rollout.Rollout(nthread=threads)
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS

@@ -125,7 +125,7 @@ def compiled_text(config: Config, program: str) -> str:
         ppo = PPO(config.ppo, batch)
         state = jax.eval_shape(ppo.init, jax.random.PRNGKey(0))
         lowered = jax.jit(ppo.train_step).lower(state)
-    return lowered.compile(compiler_options=compiler_options(config)).as_text()
+    return str(lowered.compile(compiler_options=compiler_options(config)).as_text())
 
 
 def count_scalars(config: Config) -> dict[str, int]:

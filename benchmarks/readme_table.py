@@ -133,18 +133,22 @@ def _comparison(values: Mapping[str, Any]) -> str:
             row["rate"],
             f"{row['num_envs']:,}",
             f"{row['env_steps_per_second']:,.0f}",
-            f"{values['busy_cores'][row['rate']]:.1f}",
+            f"{statistics.median(row['busy_cores']):.2f}",
             _spread(row),
         ]
         for row in values["comparison"]
     ]
     table = _table(head, "lrrrr", rows)
-    ratios = values["physics_over_mujoco"]
-    if not ratios:
+    told = []
+    for key, unit in (("", "second"), ("_per_core", "second of processor time")):
+        if ratios := values[f"physics_over_mujoco{key}"]:
+            ends = f"{min(ratios):.2f} .. {max(ratios):.2f}"
+            told.append(f"{statistics.median(ratios):.2f} ({ends}) per {unit}")
+    if not told:
         return table
     return (
-        f"{table}\n\n`physics` over `mujoco`, each at its best, round by round:"
-        f" {statistics.median(ratios):.2f} ({min(ratios):.2f} .. {max(ratios):.2f})."
+        f"{table}\n\n`physics` over `mujoco`, each at its best, median over rounds:"
+        f" {', '.join(told)}."
     )
 
 

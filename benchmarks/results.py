@@ -9,7 +9,7 @@ from typing import Any
 
 import jax
 from measurements import WARM_UP_INTERVALS, Sizes
-from timing import WARM_UP_CALLS
+from timing import WARM_UP_CALLS, available_cores
 
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config
@@ -26,7 +26,7 @@ def conditions(config: Config, sizes: Sizes) -> dict[str, Any]:
         "device": device.device_kind,
         "platform": device.platform,
         "device_count": jax.device_count(),
-        "cpu_cores": os.cpu_count(),
+        "cpu_cores": available_cores(),
         "date": datetime.datetime.now(datetime.UTC).date().isoformat(),
         "versions": versions(),
         "xla_flags": os.environ.get("XLA_FLAGS", ""),

@@ -4,6 +4,7 @@ Of the robots nothing is known here but that they must still stand at the end.
 """
 
 import math
+import os
 import statistics
 import time
 from collections.abc import Callable
@@ -195,6 +196,13 @@ def _check_robots(rate: str, carry: Carry) -> None:
             f"{rate} at {z.size} environments: {z.size - sound.sum()} worlds are not finite, or"
             " their robots not on the floor, so that the rate means nothing"
         )
+
+
+def available_cores() -> int:
+    """CPU cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def env_keys(num_envs: int) -> UInt32[Array, "n 2"]:

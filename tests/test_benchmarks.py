@@ -130,13 +130,17 @@ def test_the_readmes_hold_what_the_results_say():
         )
 
 
-def test_a_result_that_changes_changes_the_table():
-    measured = readme_table.read_results(ROOT / "benchmarks" / "results")
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    for values in measured.values():
-        for run in values.get("runs", []):
-            run["process_seconds"] += 1000.0
-    assert readme_table.with_tables(text, "README.md", measured) != text
+def test_the_table_holds_the_median_time_and_the_worst_success_of_all_seeds():
+    values = json.loads((ROOT / "benchmarks" / "results" / "gpu-world.json").read_text())
+    runs = [{**values["runs"][0], "start": "warm"} for _ in range(3)]
+    for run, seconds, success in zip(runs, (50.0, 70.0, 300.0), (0.5, 1.0, 0.9), strict=True):
+        run |= {"process_seconds": seconds, "policy": {"success_rate": success}}
+    runs[2]["target_reached_seconds"] = None
+    row = readme_table.success_table({"one.json": {**values, "runs": runs}}).splitlines()[-1]
+    assert row == (
+        "| 1 NVIDIA H200, warm cache | the 16 numbers | `gpu.yaml` | brax | 3 | 50.00% | 70 s | - |"
+        " not by all |"
+    )
 
 
 HLO = """\
@@ -291,12 +295,21 @@ def test_physics_and_mujoco_take_turns_and_are_compared_at_their_best(world_conf
         "MujocoRollout",
         lambda _, count, sizes: Fake("mujoco", count, [20.0, 10.0, 10.0], order),
     )
-    result = compare.run(
-        world_config, [64, 128], SMALL._replace(repeats=3), contenders=["physics", "mujoco"]
+    found = []
+    compare.run(
+        world_config,
+        [64, 128],
+        SMALL._replace(repeats=3),
+        contenders=["physics", "mujoco"],
+        report=found.extend,
     )
     assert order[: len(order) // 3] * 3 == order
-    assert result.ratios == [1.5, 6.0, 2.0]
-    assert compare.ratio_line(result.ratios).startswith("physics makes 2.00 times")
+    assert compare.ratios(found) == [1.5, 6.0, 2.0]
+    assert "per second: 2.00 (1.50 .. 6.00 over 3 rounds)" in compare.ratio_lines(found)[0]
+    # As if physics had had two cores and mujoco one.
+    busy = [(row, [2.0 if row.rate == "physics" else 1.0] * 3) for row, _ in found]
+    assert compare.ratios(busy, per_core=True) == [0.75, 3.0, 1.0]
+    assert compare.ratios(found[:2]) == []
 
 
 def test_a_contender_without_its_package_is_left_out_in_one_line(monkeypatch):
