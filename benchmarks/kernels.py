@@ -155,7 +155,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = load_config(options.config, options.overrides)
     print(
         f"{options.config.name} with {config.ppo.num_envs} environments on"
-        f" {jax.devices()[0].device_kind}, physics.impl {make_env(config).physics_impl}"
+        f" {jax.devices()[0].device_kind}, physics.impl {make_env(config).physics.impl}"
     )
     for program in PROGRAMS:
         if program not in options.skip:
