@@ -7,6 +7,7 @@ included; what the trainer says of itself stands beside it. `--set trainer=brax`
 stock trainer.
 """
 
+import argparse
 import json
 import os
 import re
@@ -20,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from jetbot_mjx import cli
-from jetbot_mjx.config import load_config
+from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.run_folder import write_json
 
@@ -131,6 +132,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "|:------------------:|",
         flush=True,
     )
+    options.output.parent.mkdir(parents=True, exist_ok=True)
     runs = []
     for seed in range(options.seeds):
         with tempfile.TemporaryDirectory() as cache:
@@ -138,6 +140,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 run = measure(options.config, options.overrides, seed, options.target, Path(cache))
                 runs.append(run)
                 print(_row(run), flush=True)
+                # After every row, so that what is cut short keeps what it had.
+                write_json(options.output, _results(options, config, runs))
     machine = runs[0]["versions"]
     for start in dict.fromkeys(run["start"] for run in runs):
         seconds = [run["process_seconds"] for run in runs if run["start"] == start]
@@ -145,20 +149,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{start}: median of the process's time {statistics.median(seconds):.1f} s on"
             f" {machine['device_count']} x {machine['device']}, {os.cpu_count()} CPU cores"
         )
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    write_json(
-        options.output,
-        {
-            "command": f"train --config configs/{options.config.name}",
-            "overrides": options.overrides,
-            "target": options.target,
-            "cpu_cores": os.cpu_count(),
-            "config": config.model_dump(mode="json"),
-            "runs": runs,
-        },
-    )
     print(f"results: {options.output}")
     return 1 if any(run["policy"]["success_rate"] < options.target for run in runs) else 0
+
+
+def _results(
+    options: argparse.Namespace, config: Config, runs: list[dict[str, Any]]
+) -> dict[str, Any]:
+    return {
+        "command": f"train --config configs/{options.config.name}",
+        "overrides": options.overrides,
+        "target": options.target,
+        "cpu_cores": os.cpu_count(),
+        "config": config.model_dump(mode="json"),
+        "runs": runs,
+    }
 
 
 if __name__ == "__main__":

@@ -17,7 +17,7 @@ import pytest
 from ruamel.yaml import YAML
 from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, own_files
 
-from jetbot_mjx import native, render
+from jetbot_mjx import native, plan, render
 from jetbot_mjx.config import load_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.faults import save_fault
@@ -63,6 +63,8 @@ def of_kind(*start):
     """Documented commands that begin with these words, variables before them set aside."""
     found = []
     for text, (page, words) in DOCUMENTED.items():
+        if "--distributed" in words:  # one of several processes: test_distributed.py
+            continue
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if tuple(bare[: len(start)]) == start:
             found.append(pytest.param(page, words, id=text))
@@ -221,6 +223,13 @@ def test_a_documented_play_drives(page, words, reader, monkeypatch, capsys):
     assert "0 of 0 goals reached" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.plan"))
+def test_a_documented_plan_tells_what_fits(page, words, monkeypatch, capsys):
+    monkeypatch.chdir(ROOT)
+    assert plan.main(words[3:]) == 0
+    assert "4,096" in capsys.readouterr().out
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), of_kind("tensorboard"))
 def test_tensorboard_finds_events_where_it_is_told_to_look(page, words, reader):
@@ -246,9 +255,10 @@ def test_a_documented_benchmark_measures(page, words, monkeypatch, tmp_path, cap
 
 
 def test_no_kind_of_command_is_left_out():
-    # Installing needs a network; the tests that are named run among these; Python is run as it is.
-    elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",)}
-    covered = {"train", "evaluate", "render", "replay", "play"}
+    # Installing needs a network, Slurm a cluster; the tests that are named run among these; Python
+    # is run as it is.
+    elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",), ("srun",)}
+    covered = {"train", "evaluate", "render", "replay", "play", "plan"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":
