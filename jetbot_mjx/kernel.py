@@ -1,6 +1,6 @@
 """A step of one robot as one GPU kernel for all of them.
 
-What `jax.vmap` and XLA make of MJX's step is some 150 kernels, and every number that passes from
+What `jax.vmap` and XLA make of MJX's step is hundreds of kernels, and every number that passes from
 one to the next goes through memory. Written out number by number (`scalarize`) the same step is
 one kernel (`ptx`) that reads a robot's state, makes all physics steps of an environment
 step, and writes the state back.

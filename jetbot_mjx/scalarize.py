@@ -243,7 +243,7 @@ class _Writer:
     def _copy(self, equation: Any, params: Any, x: Numbers) -> Numbers:
         return x
 
-    _stop_gradient = _copy_p = _copy
+    _stop_gradient = _copy
 
     def _reshape(self, equation: Any, params: Any, x: Numbers) -> Numbers:
         return x.reshape(_shape(equation.outvars[0]))
@@ -391,11 +391,11 @@ class _Writer:
         return self._each("mul", x, x)
 
     def _integer_pow(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        power = result = x
-        for _ in range(abs(params["y"]) - 1):
-            result = self._each("mul", result, power)
-        one = _known_array(np.ones((), equation.outvars[0].aval.dtype))
-        return result if params["y"] > 0 else self._each("div", one, result)
+        one = _known_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
+        result = one
+        for _ in range(abs(params["y"])):
+            result = self._each("mul", result, x)
+        return result if params["y"] >= 0 else self._each("div", one, result)
 
     def _rsqrt(self, equation: Any, params: Any, x: Numbers) -> Numbers:
         return self._each("div", _known_array(np.float32(1)), self._each("sqrt", x))

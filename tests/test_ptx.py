@@ -52,14 +52,13 @@ def test_a_kernel_does_what_the_function_does(name):
 
 
 def test_what_is_not_a_number_stays_so_in_an_extreme():
-    x = np.float32([[np.nan, 1, 2, np.nan]])
+    x = np.float32([[np.nan, 1, 2, 3]])
     (ours,) = run(scalarize(lambda x: jnp.maximum(x, x[::-1]) + jnp.minimum(x, 1.5), VECTOR), [x])
     np.testing.assert_array_equal(np.isnan(ours), [[True, False, False, True]])
 
 
 def test_results_become_arguments_and_what_is_held_stays():
     def step(x, held):
-        # Each number goes where another was: all are read before any is written.
         return jnp.roll(x, 1) + held
 
     x = np.float32(np.random.default_rng(0).normal(size=(5, 4)))
@@ -67,6 +66,12 @@ def test_results_become_arguments_and_what_is_held_stays():
     program = scalarize(step, VECTOR, jax.ShapeDtypeStruct((1,), jnp.float32))
     (ours,) = run(program, [x, held], steps=6)
     np.testing.assert_allclose(ours, np.roll(x, 6, 1) + 6 * held, rtol=1e-5)
+
+
+def test_all_results_are_read_before_any_argument_is_written():
+    x = np.arange(8, dtype=np.float32).reshape(2, 4)
+    (ours,) = run(scalarize(lambda x: jnp.roll(x, 1), VECTOR), [x], steps=3)
+    np.testing.assert_array_equal(ours, np.roll(x, 3, 1))
 
 
 @pytest.mark.parametrize("robots", [1, ptx.THREADS - 1, ptx.THREADS, 2 * ptx.THREADS + 5])

@@ -65,7 +65,14 @@ FUNCTIONS = {
     "a place that depends": lambda x: jax.lax.dynamic_slice(
         x, (jnp.argmax(x[:, 0]), jnp.int32(1)), (1, 2)
     ),
-    "powers": lambda x: (x**3, x**-2, jnp.square(x), jax.lax.rsqrt(x * x), x**2.0),
+    "powers": lambda x: (
+        x**3,
+        x**-2,
+        jax.lax.integer_pow(x, 0),
+        jnp.square(x),
+        jax.lax.rsqrt(x * x),
+        x**2.0,
+    ),
     "angles": lambda x: (jnp.sin(9 * x), jnp.cos(9 * x), jnp.arctan2(x, x[::-1]), jnp.floor(x)),
     "whole numbers": lambda x: ((x > 0).astype(jnp.int32) * 3 + 1, (x * 3).astype(jnp.int32)),
     "a loop that ends early": newton,

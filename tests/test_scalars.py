@@ -48,6 +48,10 @@ def test_what_comes_to_nothing_is_zero(graph, x, op, other):
     assert result == 0
 
 
+def test_minus_one_times_a_number_is_its_negative(graph, x):
+    assert graph.apply("mul", x, -ONE) is graph.apply("neg", x)
+
+
 def test_logic_with_a_known_side_is_the_other_or_known(graph, flag):
     assert graph.apply("and", flag, YES) is flag
     assert not graph.apply("and", NO, flag)
