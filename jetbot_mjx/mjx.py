@@ -14,7 +14,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import mujoco
 import numpy as np
 
@@ -64,4 +63,5 @@ def _on_host() -> Iterator[Any]:
 
 def _anywhere(tree: Any) -> Any:
     """The same arrays, free to go wherever they are needed."""
-    return jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)), tree)
+    # `jnp.asarray` would compile a program for every shape among them.
+    return jax.device_put(jax.tree.map(np.asarray, tree))
