@@ -7,19 +7,47 @@ The modules in reading order, each knowing only those before it:
 `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`,
 `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`,
 `board`, `dashboard`, `recording`, `preemption`, `processes`, `memory`, `resumable_ppo`, `brax_ppo`,
-`clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands
-`plan`, `train`, `evaluate`, `render`, `replay`, `play`. Commands meet only in the run folder.
+`training`, `clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and
+the commands `plan`, `train`, `evaluate`, `render`, `replay`, `play`. Commands meet only in the run
+folder.
+
+What the package itself offers is imported at its first use: a command that is mistyped says so at
+once, and a GPU wakes while the rest loads.
 """
 
-# First, before Brax imports MJX and lets it print.
-from jetbot_mjx import mjx as _mjx  # isort: skip
+import importlib
+from typing import TYPE_CHECKING, Any
 
-from jetbot_mjx.checkpoint import load_policy as load_policy
-from jetbot_mjx.config import load_config as load_config
-from jetbot_mjx.env import JetBotEnv as JetBotEnv
-from jetbot_mjx.env import make_env as make_env
-from jetbot_mjx.state import State as State
-from jetbot_mjx.task import Task as Task
-from jetbot_mjx.wrappers import wrap_for_training as wrap_for_training
+from jetbot_mjx.imports import lighten as _lighten
 
-del _mjx
+if TYPE_CHECKING:
+    from jetbot_mjx.checkpoint import load_policy as load_policy
+    from jetbot_mjx.config import load_config as load_config
+    from jetbot_mjx.env import JetBotEnv as JetBotEnv
+    from jetbot_mjx.env import make_env as make_env
+    from jetbot_mjx.state import State as State
+    from jetbot_mjx.task import Task as Task
+    from jetbot_mjx.wrappers import wrap_for_training as wrap_for_training
+
+_HOMES = {
+    "JetBotEnv": "env",
+    "State": "state",
+    "Task": "task",
+    "load_config": "config",
+    "load_policy": "checkpoint",
+    "make_env": "env",
+    "wrap_for_training": "wrappers",
+}
+"""Public names, and the modules they live in."""
+
+_lighten()
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

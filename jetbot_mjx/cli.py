@@ -6,19 +6,18 @@ command · 130 interrupted.
 """
 
 import argparse
-import hashlib
+import contextlib
 import os
-import platform
 import sys
+import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Literal, NoReturn
 
 import jax
 
-from jetbot_mjx.checkpoint import Which
-from jetbot_mjx.errors import UserError
-from jetbot_mjx.memory import ran_out
+from jetbot_mjx.errors import UserError, ran_out
+from jetbot_mjx.programs import processor
 
 USER_ERROR = 2
 INTERRUPTED = 130
@@ -33,11 +32,16 @@ class Parser(argparse.ArgumentParser):
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
-def run_command(command: Callable[[Sequence[str] | None], int]) -> NoReturn:
+def run_command(
+    command: Callable[[Sequence[str] | None], int], *, at_once: bool = False
+) -> NoReturn:
     """Runs a command's `main` and exits.
 
     Args:
       command: takes the arguments and returns the exit code.
+      at_once: whether to leave the rest to the system, for a command that has closed all that it
+        opened: JAX takes a second to give a GPU back, and a compiler's thread, which cannot be
+        interrupted, may abort the process.
     """
     try:
         code = command(None)
@@ -59,6 +63,11 @@ def run_command(command: Callable[[Sequence[str] | None], int]) -> NoReturn:
         # Whoever read our output has gone: nothing is left to say.
         sys.stderr.close()
         code = USER_ERROR
+    if at_once:
+        with contextlib.suppress(BrokenPipeError, ValueError):
+            sys.stdout.flush()
+            sys.stderr.flush()
+        os._exit(code)
     sys.exit(code)
 
 
@@ -78,6 +87,17 @@ def require_device() -> None:
         ) from None
 
 
+def wake_device() -> None:
+    """Lets a GPU make itself ready, two seconds and more, while the host does something else."""
+
+    def touch() -> None:
+        # Whoever needs the device hears of what is wrong with it.
+        with contextlib.suppress(RuntimeError, AssertionError):
+            jax.block_until_ready(jax.device_put(0.0, jax.local_devices()[0]))
+
+    threading.Thread(target=touch, daemon=True).start()
+
+
 def use_compilation_cache() -> None:
     """Lets JAX keep what it compiles in the user's cache folder, for the next process.
 
@@ -89,7 +109,7 @@ def use_compilation_cache() -> None:
     if settings.jax_compilation_cache_dir or not settings.jax_enable_compilation_cache:
         return
     root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    folder = root / "jetbot_mjx" / f"jax-{jax.__version__}-{_processor()}"
+    folder = root / "jetbot_mjx" / f"jax-{jax.__version__}-{processor()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -97,16 +117,6 @@ def use_compilation_cache() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-
-
-def _processor() -> str:
-    """A short name for this processor's instruction set."""
-    try:
-        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
-    except OSError:
-        lines = [platform.machine(), platform.processor()]
-    kind = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
-    return hashlib.sha256("\n".join(kind or lines).encode()).hexdigest()[:8]
 
 
 _LARGEST = 2**31 - 1
@@ -162,7 +172,7 @@ def positive_float(text: str) -> float:
     return value
 
 
-def which_checkpoint(text: str) -> Which:
+def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     """An argument that names a checkpoint of a run."""
     if text == "best":
         return "best"

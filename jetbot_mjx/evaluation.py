@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, UInt32
 from jetbot_mjx import kinematics
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.policy import PolicyParams, make_policy
-from jetbot_mjx.rollout import Controller, Episodes, make_rollout
+from jetbot_mjx.programs import Programs, programs_of
+from jetbot_mjx.rollout import Controller, Episodes, rollout_fn
 from jetbot_mjx.state import State, robot_state
 
 GOAL_SET_VERSION = 1
@@ -166,6 +167,7 @@ class Evaluator:
         *,
         baselines: bool = False,
         record: bool = False,
+        programs: Programs | None = None,
     ) -> None:
         """Prepares the program; it compiles at its first use.
 
@@ -174,6 +176,7 @@ class Evaluator:
           networks: of the policies to judge.
           baselines: whether `run_baselines` will be wanted.
           record: whether to keep trajectories.
+          programs: of the environment's configuration; None: they are not kept.
         """
         self._env = env
         self._names = ["policy", *(BASELINES if baselines else ())]
@@ -181,7 +184,10 @@ class Evaluator:
         if baselines:
             controllers += [make(env) for make in BASELINES.values()]
         length = env.config.task.episode_length
-        self._rollout = make_rollout(env, controllers, length, record=record)
+        self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
+        self._name = f"episodes of {self._names}{', recorded' if record else ''}"
+        self._programs = programs or programs_of(env.config, keep=False)
+        self._compiled: dict[int, jax.stages.Compiled] = {}
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
         """Deterministic episodes of a policy.
@@ -193,9 +199,7 @@ class Evaluator:
         Returns:
           The episodes.
         """
-        # On the host: parameters straight from a trainer carry its sharding, and a program
-        # compiled for one sharding would compile again for the next.
-        return self._rollout(0, jax.device_get(params), keys)
+        return self._episodes(0, params, keys)
 
     def run_baselines(
         self, params: PolicyParams, keys: UInt32[Array, "n 2"]
@@ -209,12 +213,22 @@ class Evaluator:
         Returns:
           The episodes by the baseline's name.
         """
-        host = jax.device_get(params)
         return {
-            name: self._rollout(index, host, keys)
+            name: self._episodes(index, params, keys)
             for index, name in enumerate(self._names)
             if index > 0
         }
+
+    def _episodes(self, index: int, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
+        # On the host: parameters straight from a trainer carry its sharding, and what is compiled
+        # takes one alone.
+        arguments = np.int32(index), jax.device_get(params), np.asarray(keys)
+        count = len(keys)
+        if count not in self._compiled:
+            self._compiled[count] = self._programs.compile(
+                f"{count} {self._name}", lambda: self._run.trace(*arguments)
+            )
+        return self._compiled[count](*arguments)
 
 
 def _random(env: JetBotEnv) -> Controller:

@@ -1,9 +1,38 @@
-"""Imports that leave out what another library would load and nobody here needs."""
+"""Imports that leave out, or put off, what another library would load and nobody here needs.
+
+MJX loads trimesh and SciPy's geometry for meshes that no robot here has, and prints two lines when
+its optional Warp part is absent; Brax loads JAXopt for an engine that is not used here. On a slow
+machine that is the better part of two seconds, before anything has begun.
+"""
 
 import contextlib
+import importlib
+import importlib.abc
+import importlib.machinery
+import io
 import sys
 import types
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+_Around = Callable[[], contextlib.AbstractContextManager[None]]
+
+
+class PutOff(types.ModuleType):
+    """Stands for a module that is imported when something in it is first asked for."""
+
+    def __getattr__(self, name: str) -> Any:
+        if sys.modules.get(self.__name__) is self:
+            del sys.modules[self.__name__]
+        return getattr(importlib.import_module(self.__name__), name)
+
+
+class _Trimesh(PutOff):
+    """MJX's annotations name a class of it as soon as they are read."""
+
+    @staticmethod
+    def Trimesh(*arguments: Any, **options: Any) -> Any:
+        return importlib.import_module("trimesh").Trimesh(*arguments, **options)
 
 
 @contextlib.contextmanager
@@ -11,7 +40,7 @@ def standing_in(name: str, module: types.ModuleType | None) -> Iterator[None]:
     """Lets what is imported inside find something else under a module's name.
 
     Args:
-      name: of a top-level module; where it is already loaded, nothing is changed.
+      name: of a module; where it is already loaded, nothing is changed.
       module: what is found; None: there is no such module.
     """
     if name in sys.modules:
@@ -22,4 +51,64 @@ def standing_in(name: str, module: types.ModuleType | None) -> Iterator[None]:
     try:
         yield
     finally:
-        del sys.modules[name]
+        # One that was put off may have been needed inside.
+        if sys.modules.get(name) is module:
+            del sys.modules[name]
+
+
+class _Finder(importlib.abc.MetaPathFinder):
+    """Finds modules where they are, and has something done around their execution."""
+
+    def __init__(self, around: Mapping[str, _Around]) -> None:
+        self._around = around
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
+    ) -> importlib.machinery.ModuleSpec | None:
+        if fullname not in self._around:
+            return None
+        spec = importlib.machinery.PathFinder.find_spec(fullname, path, target)
+        if spec is not None and spec.loader is not None:
+            spec.loader = _Loader(spec.loader, self._around[fullname])
+        return spec
+
+
+class _Loader(importlib.abc.Loader):
+    """Another loader, and something done around it."""
+
+    def __init__(self, loader: importlib.abc.Loader, around: _Around) -> None:
+        self._loader = loader
+        self._do_around = around
+
+    def create_module(self, spec: importlib.machinery.ModuleSpec) -> types.ModuleType | None:
+        return self._loader.create_module(spec)
+
+    def exec_module(self, module: types.ModuleType) -> None:
+        with self._do_around():
+            self._loader.exec_module(module)
+
+    def __getattr__(self, name: str) -> Any:
+        # Whatever else one may ask a loader, such as the source of its module.
+        return getattr(self._loader, name)
+
+
+@contextlib.contextmanager
+def _mjx() -> Iterator[None]:
+    with (
+        standing_in("trimesh", _Trimesh("trimesh")),
+        standing_in("scipy.spatial", PutOff("scipy.spatial")),
+        contextlib.redirect_stdout(io.StringIO()),
+    ):
+        yield
+
+
+@contextlib.contextmanager
+def _brax_constraint() -> Iterator[None]:
+    with standing_in("jaxopt", PutOff("jaxopt")):
+        yield
+
+
+def lighten() -> None:
+    """Makes MJX and Brax light to import, from now on and whoever imports them."""
+    around = {"mujoco.mjx": _mjx, "brax.generalized.constraint": _brax_constraint}
+    sys.meta_path.insert(0, _Finder(around))

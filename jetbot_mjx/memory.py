@@ -205,11 +205,6 @@ def next_that_fits(
     return None
 
 
-def ran_out(error: Exception) -> bool:
-    """Whether JAX failed because a device's memory did not suffice."""
-    return "RESOURCE_EXHAUSTED" in str(error)
-
-
 def advice(config: Config, env: JetBotEnv, device_count: int, limit: int | None) -> str:
     """What to say of a training that ran out of memory.
 

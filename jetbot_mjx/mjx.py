@@ -1,39 +1,18 @@
-"""MJX, imported without what it does not need here.
+"""MJX, with models that stay on the host until they are needed.
 
-It prints two lines when its optional Warp part is absent. And it loads trimesh, the better part of
-a second, for meshes that no robot here has: that is put off until one does. It would put models on
-the first device of all, which of several processes only one has, and compile a small program there
-for many an array; a model's numbers are constants of programs, and here they stay on the host.
+MJX would put them on the first device of all, which of several processes only one has, and compile
+a small program there for many an array; a model's numbers are constants of programs.
 """
 
 import contextlib
-import importlib
-import io
-import types
 from collections.abc import Iterator
 from typing import Any
 
 import jax
 import mujoco
 import numpy as np
-
-from jetbot_mjx.imports import standing_in
-
-
-class _Trimesh(types.ModuleType):
-    """What MJX sees of trimesh: a name for its annotations, the library for its meshes."""
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(importlib.import_module("trimesh"), name)
-
-    @staticmethod
-    def Trimesh(*arguments: Any, **options: Any) -> Any:
-        return importlib.import_module("trimesh").Trimesh(*arguments, **options)
-
-
-with standing_in("trimesh", _Trimesh("trimesh")), contextlib.redirect_stdout(io.StringIO()):
-    from mujoco import mjx
-    from mujoco.mjx import Data, Model, step
+from mujoco import mjx
+from mujoco.mjx import Data, Model, step
 
 __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 

@@ -107,7 +107,7 @@ def plot_trajectories(
       The figure.
     """
     if episodes.qpos is None:
-        raise ValueError("these episodes were not recorded: make_rollout(..., record=True)")
+        raise ValueError("these episodes were not recorded: rollout_fn(..., record=True)")
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
     for index in range(episodes.success.size) if which is None else which:

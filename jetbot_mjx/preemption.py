@@ -11,7 +11,7 @@ import sys
 import threading
 import time
 from types import FrameType
-from typing import NoReturn, Self
+from typing import Self
 
 STOPPED = 75
 """Exit code: stopped on request before the end; the same command goes on (`EX_TEMPFAIL`)."""
@@ -102,13 +102,6 @@ class Preemption:
             # Schedulers and terminals may send the same signal to a whole group, twice over.
             elif time.monotonic() - began > 0.5:
                 _leave(f"second {name}")
-
-
-def leave_now() -> NoReturn:
-    """Ends the process where a thread of a library cannot be stopped, such as a compiler's."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    os._exit(STOPPED)
 
 
 def _leave(reason: str) -> None:

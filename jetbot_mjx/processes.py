@@ -16,6 +16,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jaxtyping import Int, PyTree
 
+from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 
 JOIN_SECONDS = 120
@@ -29,6 +30,23 @@ _PART_SECONDS = 10
 
 _FAILED = -1
 _USER_ERROR = 2
+
+
+def check(config: Config) -> None:
+    """Refuses what several processes cannot do.
+
+    Args:
+      config: the run.
+
+    Raises:
+      UserError: it asks for that.
+    """
+    if config.trainer == "brax":
+        raise UserError("--distributed is not known to trainer = 'brax': take 'resumable'")
+    if config.seeds > 1:
+        raise UserError(
+            f"--distributed trains one policy, not seeds = {config.seeds}: leave one of them out"
+        )
 
 
 def join() -> None:

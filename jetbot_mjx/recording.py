@@ -7,6 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
+import jax
+
 from jetbot_mjx.aliases import aliases
 from jetbot_mjx.checkpoint import POLICY, about_policy
 from jetbot_mjx.config import Config
@@ -30,6 +32,7 @@ from jetbot_mjx.metrics import (
 from jetbot_mjx.offscreen import find_backend
 from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.ppo import Fault
+from jetbot_mjx.programs import Programs, programs_of
 from jetbot_mjx.resume import Resumption, to_trees
 from jetbot_mjx.run_folder import make_folder, versions, writing_to
 from jetbot_mjx.store import Store, checkpoint_path, digest
@@ -80,6 +83,7 @@ class RunRecorder(Recorder):
         run_dirs: Sequence[Path],
         clock: CompileClock,
         resumption: Resumption | None = None,
+        programs: Programs | None = None,
     ) -> None:
         """Opens the logs and the checkpoint folders.
 
@@ -89,6 +93,7 @@ class RunRecorder(Recorder):
           run_dirs: the folder of each seed.
           clock: of the compiler.
           resumption: where the seeds stand; None: at the beginning.
+          programs: of that configuration; None: they are not kept.
 
         Raises:
           UserError: a folder cannot be written.
@@ -100,8 +105,12 @@ class RunRecorder(Recorder):
             normalize=config.ppo.normalize_observations,
         )
         self._config = config
-        self._evaluator = Evaluator(env, networks)
-        self._keys = training_keys(config.evaluation.episodes)
+        programs = programs or programs_of(config, keep=False)
+        self._evaluator = Evaluator(env, networks, programs=programs)
+        # As one program: operation by operation it would be half a dozen.
+        keys = jax.jit(training_keys, static_argnums=0)
+        episodes = config.evaluation.episodes
+        self._keys = programs.compile(f"{episodes} keys", lambda: keys.trace(episodes))()
         self._film = EvaluationFilm(env, networks) if config.evaluation.video else None
         self._clock = clock
         resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])

@@ -15,13 +15,14 @@ from typing import Any
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Array, Int
 
 from jetbot_mjx import processes
-from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.ppo import LOSSES, PPO, Fault, TrainState
 from jetbot_mjx.preemption import Preemption
+from jetbot_mjx.programs import Programs, programs_of
 from jetbot_mjx.trainer import Progress, Recorder
 from jetbot_mjx.wrappers import wrap_for_training
 
@@ -33,24 +34,33 @@ _CALLS_PER_NOTICE = 10
 class Program:
     """One configuration's training, over all devices and all its seeds."""
 
-    def __init__(self, config: Config, env: JetBotEnv) -> None:
+    def __init__(self, config: Config, env: JetBotEnv, programs: Programs | None = None) -> None:
         """Prepares the program; nothing is compiled yet.
 
         Args:
           config: the run; `check_devices` has passed it.
           env: the environment, unwrapped.
+          programs: of that configuration; None: they are not kept.
         """
+        self._programs = programs or programs_of(config, keep=False)
         devices = jax.devices()
         self._mesh = Mesh(np.array(devices), (_AXIS,))
-        self._options = compiler_options(config)
-        self._seeds = list(range(config.seed, config.seed + config.seeds))
+        # On the host, from where every process's devices can take them.
+        self._seeds = np.arange(config.seed, config.seed + config.seeds, dtype=np.int32)
         self._ppo = PPO(
             config.ppo,
             wrap_for_training(env, config.task.episode_length),
             axis_name=_AXIS,
             device_count=len(devices),
         )
-        self._shapes = jax.eval_shape(jax.vmap(self._ppo.init), self._keys())
+        self._compiled_init = self._programs.find("init")
+        self._shapes = (
+            jax.eval_shape(self._init, self._seeds)
+            if self._compiled_init is None
+            else jax.tree.map(
+                lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), self._compiled_init.out_info
+            )
+        )
         # Seeds come first, and environments second.
         replicated = jax.tree.map(lambda _: PartitionSpec(), self._shapes)
         shared = jax.tree.map(lambda _: PartitionSpec(None, _AXIS), self._shapes.env_state)
@@ -64,12 +74,14 @@ class Program:
 
     def init(self) -> TrainState:
         """The state before the first step, on the devices."""
-        init = jax.jit(
-            jax.vmap(self._ppo.init),
-            out_shardings=self._shardings,
-            compiler_options=self._options,
-        )
-        return init(self._keys())
+        program = self._compiled_init
+        if program is None:
+            jitted = jax.jit(self._init, in_shardings=self._whole, out_shardings=self._shardings)
+            program = self._programs.compile("init", lambda: jitted.trace(self._seeds))
+        return program(self._seeds)
+
+    def _init(self, seeds: Int[Array, " seeds"]) -> TrainState:
+        return jax.vmap(lambda seed: self._ppo.init(jax.random.PRNGKey(seed)))(seeds)
 
     def put(self, states: Sequence[TrainState]) -> TrainState:
         """States of all seeds from the host, onto the devices."""
@@ -95,14 +107,14 @@ class Program:
           A function of (state, training steps, whether the tally starts anew), which takes the
           state's memory for its result. Faults have the axes (devices, seeds).
         """
-        program = self.lower().compile(compiler_options=self._options)
+        program = self._programs.compile("advance", self.trace)
 
         def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, Fault]:
             return program(state, np.int32(steps), np.bool_(restart))
 
         return call
 
-    def lower(self) -> jax.stages.Lowered:
+    def trace(self) -> jax.stages.Traced:
         """The training step for the devices, not yet compiled."""
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
@@ -127,11 +139,7 @@ class Program:
             out_shardings=(self._shardings, self._whole),
         )
         scalars = (np.zeros((), np.int32), np.zeros((), bool))
-        return jitted.lower(self._shapes, *scalars)
-
-    def _keys(self) -> np.ndarray:
-        # On the host, from where every process's devices can take them.
-        return np.stack([np.asarray(jax.random.PRNGKey(seed)) for seed in self._seeds])
+        return jitted.trace(self._shapes, *scalars)
 
 
 def train(

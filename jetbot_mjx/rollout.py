@@ -13,7 +13,6 @@ from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jetbot_mjx import kinematics
-from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.state import State
@@ -73,29 +72,6 @@ class _Carry(NamedTuple):
     qpos: Float[Array, "n time nq"] | None
 
 
-def make_rollout(
-    env: JetBotEnv,
-    controllers: Sequence[Controller],
-    episode_length: int,
-    *,
-    record: bool = False,
-) -> Rollout:
-    """Compiles episodes under any one of several controllers into one program.
-
-    Args:
-      env: one environment, unwrapped.
-      controllers: what can drive.
-      episode_length: environment steps after which an episode is truncated.
-      record: whether to keep the trajectories.
-
-    Returns:
-      A function of (index of the controller, its parameters, one reset key for each
-      environment). The reset key also seeds the controller's own randomness.
-    """
-    run = rollout_fn(env, controllers, episode_length, record=record)
-    return jax.jit(run, compiler_options=compiler_options(env.config))
-
-
 def rollout_fn(
     env: JetBotEnv | Wrapper,
     controllers: Sequence[Controller],
@@ -103,7 +79,7 @@ def rollout_fn(
     *,
     record: bool = False,
 ) -> Rollout:
-    """What `make_rollout` compiles, for those who make it part of a larger program.
+    """Makes episodes under any one of several controllers into one program.
 
     Args:
       env: one environment, or one in a wrapper that leaves its state a `State`.
@@ -112,7 +88,9 @@ def rollout_fn(
       record: whether to keep the trajectories.
 
     Returns:
-      The same function as `make_rollout`'s, not compiled.
+      A function of (index of the controller, its parameters, one reset key for each
+      environment), to be compiled by `jax.jit`. The reset key also seeds the controller's own
+      randomness.
     """
     episode_env = EpisodeWrapper(env, episode_length)
 

@@ -73,7 +73,7 @@ def unused_port() -> Callable[[], int]:
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory) -> Path:
     """A run folder, trained once with `configs/smoke.yaml` and never written to by a test."""
-    from jetbot_mjx import train
+    from jetbot_mjx import training
     from jetbot_mjx.config import load_config
 
     folder = tmp_path_factory.getbasetemp()
@@ -82,6 +82,6 @@ def smoke_run(tmp_path_factory) -> Path:
     with (folder / "smoke.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if os.fstat(lock.fileno()).st_size == 0:
-            train.run(load_config(ROOT / "configs" / "smoke.yaml"), folder / "smoke")
+            training.run(load_config(ROOT / "configs" / "smoke.yaml"), folder / "smoke")
             lock.write("trained")
     return folder / "smoke"

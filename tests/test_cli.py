@@ -16,7 +16,7 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from test_report import make_episodes, make_report
 
-from jetbot_mjx import cli, evaluate, plan, render, replay, store, train
+from jetbot_mjx import cli, evaluate, plan, render, replay, store, train, training
 from jetbot_mjx.checkpoint import FORMAT
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
@@ -426,11 +426,11 @@ def asked(monkeypatch):
     def asked(*arguments):
         calls = []
 
-        def run(config, run_dir):
+        def run(config, run_dir, programs):
             calls.append((config, run_dir))
             raise UserError("no training here")
 
-        monkeypatch.setattr(train, "run", run)
+        monkeypatch.setattr(training, "run", run)
         with pytest.raises(UserError):
             train.main(arguments)
         return calls[0]

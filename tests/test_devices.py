@@ -16,7 +16,7 @@ import pytest
 from jax.sharding import Mesh, PartitionSpec
 from test_ppo import OBS, SIZE, TINY, beginning, furthest, lines, made_up, with_ppo
 
-from jetbot_mjx import train
+from jetbot_mjx import train, training
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.env import make_env
@@ -41,7 +41,9 @@ def glide():
 def on_one(tmp_path_factory):
     """A run of one training step on one device, which the other process goes on with."""
     run_dir = tmp_path_factory.mktemp("devices") / "one"
-    train.run(with_ppo(load_config(SMOKE), num_timesteps=SIZE, checkpoint_interval=SIZE), run_dir)
+    training.run(
+        with_ppo(load_config(SMOKE), num_timesteps=SIZE, checkpoint_interval=SIZE), run_dir
+    )
     return run_dir
 
 
@@ -64,7 +66,7 @@ def tell(one, eight, answer):
     """The other process: everything that eight devices are needed for."""
     config = load_config(SMOKE)
     known = {"device_count": jax.device_count(), "averaging": averaging()}
-    known |= training(config)
+    known |= trained_program(config)
     known["restored"] = restored(one)
     known["went_on"] = said("--resume", one, "--set", f"ppo.num_timesteps={2 * SIZE}")
     said("--config", SMOKE, "--run-dir", eight, "--set", "checkpoint_interval=32768")
@@ -78,7 +80,7 @@ def said(*arguments):
     return stream.getvalue()
 
 
-def training(config):
+def trained_program(config):
     program = Program(config, make_env(config))
     begun = program.init()
     (first,) = program.get(begun)

@@ -13,7 +13,7 @@ from jetbot_mjx.evaluation import (
     training_keys,
     wilson_interval,
 )
-from jetbot_mjx.rollout import Episodes, make_rollout
+from jetbot_mjx.rollout import Episodes, rollout_fn
 
 EPISODES = 32
 
@@ -85,7 +85,7 @@ def test_the_reports_goals_are_those_of_version_1(world_env):
 def driven(request):
     env = make_env(parse_config({"robot": {"preset": request.param}}))
     controllers = [make(env) for make in BASELINES.values()]
-    rollout = make_rollout(env, controllers, 256, record=True)
+    rollout = jax.jit(rollout_fn(env, controllers, 256, record=True))
     keys = report_keys(EPISODES)
     runs = {name: jax.device_get(rollout(i, None, keys)) for i, name in enumerate(BASELINES)}
     return env, rollout, runs

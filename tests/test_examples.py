@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import jetbot_mjx
-from jetbot_mjx import evaluate, train
+from jetbot_mjx import evaluate, training
 from jetbot_mjx.config import load_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
@@ -194,7 +194,7 @@ def test_wrong_settings_are_refused(load, override, message):
 
 def test_training_and_judging_run_end_to_end(load, env, tmp_path):
     with gliding.everywhere():
-        result = train.run(load(*TINY), tmp_path / "run")
+        result = training.run(load(*TINY), tmp_path / "run")
         report = evaluate.run(result.run_dir, episodes=4)
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["env_steps"] for line in lines] == [0, 1024, 2048]

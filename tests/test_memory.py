@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from jetbot_mjx import memory, train
+from jetbot_mjx import memory, training
 from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.config import load_config
 from jetbot_mjx.env import make_env
@@ -40,7 +40,7 @@ def test_xla_sets_aside_what_was_told(root, settings, fullest):
     env = make_env(config)
     told = footprint(config, sizes(config, env), 1)
     program = Program(config, env)
-    stats = program.lower().compile(compiler_options(config)).memory_analysis()
+    stats = program.trace().lower().compile(compiler_options(config)).memory_analysis()
     taken = (
         stats.argument_size_in_bytes
         + stats.output_size_in_bytes
@@ -107,10 +107,10 @@ def test_out_of_memory_the_next_size_that_fits_is_named(config, tmp_path, monkey
     def train_too_large(*arguments):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating")
 
-    monkeypatch.setattr(train.resumable_ppo, "train", train_too_large)
-    monkeypatch.setattr(train, "device_memory", lambda: 8 * GIB)
+    monkeypatch.setattr(training.resumable_ppo, "train", train_too_large)
+    monkeypatch.setattr(training, "device_memory", lambda: 8 * GIB)
     with pytest.raises(UserError) as caught:
-        train.run(config, tmp_path / "run")
+        training.run(config, tmp_path / "run")
     line = str(caught.value)
     assert "\n" not in line
     assert "the device's memory (8.00 GiB) does not suffice for ppo.num_envs = 128" in line
@@ -121,6 +121,6 @@ def test_other_failures_of_jax_pass_through(config, tmp_path, monkeypatch):
     def fail(*arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: no")
 
-    monkeypatch.setattr(train.resumable_ppo, "train", fail)
+    monkeypatch.setattr(training.resumable_ppo, "train", fail)
     with pytest.raises(jax.errors.JaxRuntimeError, match="INTERNAL"):
-        train.run(config, tmp_path / "run")
+        training.run(config, tmp_path / "run")

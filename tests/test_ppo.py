@@ -18,7 +18,7 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 from gliding import Gliding
 
-from jetbot_mjx import brax_ppo, evaluate, resumable_ppo, train
+from jetbot_mjx import brax_ppo, evaluate, resumable_ppo, training
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.env import JetBotEnv, make_env
@@ -470,7 +470,7 @@ def lines(run_dir):
 
 def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, monkeypatch):
     config = with_ppo(smoke, num_timesteps=131_072, checkpoint_interval=32_768)
-    clean = train.run(config, tmp_path / "clean")
+    clean = training.run(config, tmp_path / "clean")
 
     sound = losses.compute_ppo_loss
 
@@ -481,7 +481,7 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
 
     monkeypatch.setattr(losses, "compute_ppo_loss", now_and_then)
     task = smoke.task.model_copy(update={"name": f"{__name__}:Doomed"})
-    spoiled = train.run(config.model_copy(update={"task": task}), tmp_path / "spoiled")
+    spoiled = training.run(config.model_copy(update={"task": task}), tmp_path / "spoiled")
 
     history = lines(tmp_path / "spoiled")
     worlds = sum(line.get("train/nonfinite_worlds", 0) for line in history)
@@ -531,7 +531,7 @@ def test_a_training_compiles_its_step_once_and_nothing_later(smoke, glide, tmp_p
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         config = with_ppo(smoke, num_timesteps=6 * SIZE, checkpoint_interval=2 * SIZE)
-        train.run(config, tmp_path / "run")
+        training.run(config, tmp_path / "run")
     finally:
         jax.monitoring.unregister_event_duration_listener(listen)
     assert len(after_report) == 4
@@ -548,7 +548,7 @@ def several(smoke, tmp_path_factory):
     """Three seeds from 5 on, trained at once over two checkpoints, and their result."""
     config = with_ppo(smoke, num_timesteps=2 * SIZE, checkpoint_interval=SIZE, seed=5, seeds=SEEDS)
     with gliding.everywhere():
-        return config, train.run(config, tmp_path_factory.mktemp("seeds") / "run")
+        return config, training.run(config, tmp_path_factory.mktemp("seeds") / "run")
 
 
 def test_each_of_several_seeds_is_trained_as_if_alone(several, ours):
@@ -580,8 +580,8 @@ def test_each_of_several_seeds_has_a_run_of_its_own(several, glide, capsys):
 
 def test_several_seeds_resume_to_the_bit(several, glide, tmp_path, capsys):
     config, result = several
-    train.run(with_ppo(config, num_timesteps=SIZE), tmp_path / "run")
+    training.run(with_ppo(config, num_timesteps=SIZE), tmp_path / "run")
     capsys.readouterr()
-    resumed = train.run(config, tmp_path / "run")
+    resumed = training.run(config, tmp_path / "run")
     assert f"going on after {SIZE:,} steps" in capsys.readouterr().out
     assert resumed.fingerprints == result.fingerprints

@@ -7,7 +7,7 @@ import imageio.v3 as iio
 import numpy as np
 import pytest
 
-from jetbot_mjx import film, load_config, make_env, offscreen, recording, train
+from jetbot_mjx import film, load_config, make_env, offscreen, recording, training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.metrics import CompileClock
 from jetbot_mjx.policy import PolicyParams
@@ -160,7 +160,7 @@ def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
     monkeypatch.setattr(film.EvaluationFilm, "_FPS", 2.0)
     settings = ["evaluation.video=true", "ppo.num_timesteps=16384"]
     config = load_config(root / "configs" / "smoke.yaml", settings)
-    train.run(config, tmp_path / "run")
+    training.run(config, tmp_path / "run")
     assert checkpoint_steps(tmp_path / "run") == [0, 16_384]
     for steps in (0, 16_384):
         ours, theirs = (

@@ -21,7 +21,7 @@ import pytest
 from test_metrics import read_events
 from test_tracking import FakeWandb
 
-from jetbot_mjx import load_config, make_env, metrics, recording, resumable_ppo, train
+from jetbot_mjx import load_config, make_env, metrics, recording, resumable_ppo, train, training
 from jetbot_mjx.checkpoint import POLICY
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME
 from jetbot_mjx.errors import UserError
@@ -201,7 +201,7 @@ def stop_after(monkeypatch):
     pace = types.SimpleNamespace(steps=1, learn=lambda steps, seconds: None)
 
     def stop_after(training_steps):
-        monkeypatch.setattr(train, "Preemption", lambda notice: StopAfter(training_steps))
+        monkeypatch.setattr(training, "Preemption", lambda notice: StopAfter(training_steps))
         monkeypatch.setattr(resumable_ppo, "_Pace", lambda seconds: pace)
 
     return stop_after
@@ -215,14 +215,14 @@ def test_stopped_anywhere_and_continued_is_never_stopped(
     done = 0
     for count in stops:
         stop_after(count)
-        result = train.run(config, run_dir)
+        result = training.run(config, run_dir)
         done += count
         assert not result.finished
         assert checkpoint_steps(run_dir)[-1] == done * TRAINING_STEP
         logged = [line["env_steps"] for line in lines(run_dir)]
         assert logged == [steps for steps in STEPS if steps <= done * TRAINING_STEP]
     monkeypatch.undo()
-    assert train.run(config, run_dir).finished
+    assert training.run(config, run_dir).finished
     same(run_dir)
 
 
@@ -230,7 +230,7 @@ def test_a_state_between_two_reports_is_saved_with_what_was_summed_up(
     config, tmp_path, stop_after, template
 ):
     stop_after(6)
-    train.run(config, tmp_path)
+    training.run(config, tmp_path)
     found = resume([tmp_path], [config], template)
     assert found.env_steps == 24_576
     assert found.states[0].tally["training_steps"] == 2
@@ -240,7 +240,7 @@ def test_a_state_between_two_reports_is_saved_with_what_was_summed_up(
 
 def test_a_finished_run_is_not_trained_again(config, smoke_run, run_copy, same, monkeypatch):
     monkeypatch.delattr(resumable_ppo, "train")
-    result = train.run(config, run_copy)
+    result = training.run(config, run_copy)
     assert result.finished
     about = read_about(checkpoint_path(smoke_run, LAST))
     assert result.fingerprints == [about["sha256"][POLICY]]
@@ -255,7 +255,7 @@ def test_a_run_without_a_checkpoint_begins_anew(config, smoke_run, tmp_path, sam
         shutil.copy(smoke_run / name, tmp_path)
     left = tmp_path / FOLDER / "000000000000.orbax-checkpoint-tmp"
     left.mkdir(parents=True)
-    assert train.run(config, tmp_path).finished
+    assert training.run(config, tmp_path).finished
     assert not left.exists()
     same(tmp_path)
 
@@ -559,7 +559,7 @@ def test_where_all_are_damaged_nothing_is_moved_and_one_line_says_so(
     before = contents(run_copy)
     for use in (
         lambda: resume([run_copy], [config], template),
-        lambda: train.run(config, run_copy),
+        lambda: training.run(config, run_copy),
     ):
         with pytest.raises(CheckpointError) as caught:
             use()
@@ -601,7 +601,7 @@ def test_training_after_damage_ends_where_it_would_have(
     DAMAGES[kind][0](checkpoint_path(run_copy, LAST), states[LAST])
     with (run_copy / "metrics.jsonl").open("a") as file:
         file.write('{"env_steps": 81920, "timestamp": 1.0}\n{"env_steps": 98304, "timest')
-    assert train.run(config, run_copy).finished
+    assert training.run(config, run_copy).finished
     same(run_copy)
     out, err = capfd.readouterr()
     assert f"passed over: checkpoint {checkpoint_path(run_copy, LAST)} " in out
@@ -615,7 +615,7 @@ def test_lines_that_no_checkpoint_holds_are_written_again(run_copy, smoke_run, c
     path = run_copy / "metrics.jsonl"
     kept = path.read_text().splitlines()[:2]
     path.write_text(path.read_text()[:-40])
-    assert train.run(config, run_copy).finished
+    assert training.run(config, run_copy).finished
     assert path.read_text().splitlines()[:2] == kept
     same(run_copy)
 
@@ -625,9 +625,9 @@ def test_what_is_not_as_it_was_is_said(run_copy, config, capsys):
     found = json.loads(path.read_text())
     found["packages"]["brax"] = "0.0.1"
     path.write_text(json.dumps(found))
-    train.run(config, run_copy)
+    training.run(config, run_copy)
     assert "not as it was, so the bits may differ: brax 0.0.1, now " in capsys.readouterr().out
-    train.run(config, run_copy)
+    training.run(config, run_copy)
     assert "the bits may differ" not in capsys.readouterr().out
 
 
@@ -693,10 +693,10 @@ def test_a_changed_interval_moves_the_reports_and_nothing_else(
     config, tmp_path, stop_after, monkeypatch, states
 ):
     stop_after(5)
-    train.run(config, tmp_path)
+    training.run(config, tmp_path)
     monkeypatch.undo()
     changed = config.model_copy(update={"checkpoint_interval": 2 * TRAINING_STEP})
-    assert train.run(changed, tmp_path).finished
+    assert training.run(changed, tmp_path).finished
     steps = [0, *range(16_384, LAST + 1, 8_192)]
     assert [line["env_steps"] for line in lines(tmp_path)] == steps
     about = read_about(checkpoint_path(tmp_path, LAST))
@@ -740,7 +740,7 @@ def test_a_run_of_the_stock_trainer_is_not_continued(config, run_copy, stored):
     if stored == "brax":
         (run_copy / "config.yaml").write_text(brax.to_yaml())
     before = contents(run_copy)
-    said = refused(train.run, config if stored == "brax" else brax, run_copy)
+    said = refused(training.run, config if stored == "brax" else brax, run_copy)
     assert f"in use by a run of trainer = {stored!r}, which cannot be continued" in said
     assert contents(run_copy) == before
 
@@ -750,21 +750,21 @@ def test_a_run_that_another_training_holds_is_refused_and_left_alone(config, run
         fcntl.flock(file, fcntl.LOCK_EX)
         print(12345, file=file, flush=True)
         before = contents(run_copy)
-        assert "held by another training (process 12345)" in refused(train.run, config, run_copy)
+        assert "held by another training (process 12345)" in refused(training.run, config, run_copy)
         assert contents(run_copy) == before
-    assert train.run(config, run_copy).finished
+    assert training.run(config, run_copy).finished
 
 
 def test_a_folder_that_is_no_run_is_refused_and_left_alone(config, tmp_path):
     (tmp_path / "thesis.txt").write_text("mine")
     before = contents(tmp_path)
-    assert "holds no run" in refused(train.run, config, tmp_path)
+    assert "holds no run" in refused(training.run, config, tmp_path)
     assert contents(tmp_path) == before
 
 
 def test_a_folder_that_cannot_be_made_costs_one_line(config, tmp_path):
     (tmp_path / "file").write_text("")
-    assert "Not a directory" in refused(train.run, config, tmp_path / "file" / "run")
+    assert "Not a directory" in refused(training.run, config, tmp_path / "file" / "run")
 
 
 def no_space(*arguments, **keywords):
@@ -815,7 +815,7 @@ def test_a_full_disk_costs_one_line_and_the_same_command_goes_on(
 ):
     fill, said = FULL[kind]
     fill(monkeypatch)
-    line = refused(train.run, config, tmp_path)
+    line = refused(training.run, config, tmp_path)
     assert str(tmp_path) in line
     assert said in line
     monkeypatch.undo()
@@ -823,7 +823,7 @@ def test_a_full_disk_costs_one_line_and_the_same_command_goes_on(
     assert found.env_steps in STEPS[:2]
     assert digest(found.states[0]) == digest(states[found.env_steps])
     if kind == "store":
-        assert train.run(config, tmp_path).finished
+        assert training.run(config, tmp_path).finished
         same(tmp_path)
     assert capfd.readouterr().err == ""
     assert not caplog.records

@@ -10,7 +10,7 @@ import pytest
 from gliding import Gliding
 from test_metrics import read_events
 
-from jetbot_mjx import brax_ppo, evaluate, load_config, train, wrap_for_training
+from jetbot_mjx import brax_ppo, evaluate, load_config, train, training, wrap_for_training
 from jetbot_mjx.aliases import aliases
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.errors import UserError
@@ -121,7 +121,7 @@ def test_the_stock_trainer_leaves_the_same_kind_of_run(root, tmp_path, capsys):
 
 def test_training_stops_at_the_success_asked_for(root, tmp_path, capsys):
     config = load_config(root / "configs" / "smoke.yaml", ["stop_at_success=0.01"])
-    result = train.run(config, tmp_path / "run")
+    result = training.run(config, tmp_path / "run")
     assert result.finished
     assert result.standings[0].env_steps < 65_536
     assert result.standings[0].last.success_rate >= 0.01
@@ -151,5 +151,5 @@ def test_stock_brax_takes_wrap_for_training_as_its_wrap_env_fn(root):
     ("name", "least"), [("jetbot_egocentric.yaml", 0.99), ("jetbot.yaml", 0.98)]
 )
 def test_the_shipped_configurations_reach_their_success(name, least, root, tmp_path):
-    train.run(load_config(root / "configs" / name), tmp_path / "run")
+    training.run(load_config(root / "configs" / name), tmp_path / "run")
     assert evaluate.run(tmp_path / "run").policy.success_rate >= least
