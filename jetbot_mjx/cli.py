@@ -88,7 +88,12 @@ def require_device() -> None:
 
 
 def wake_device() -> None:
-    """Lets a GPU make itself ready, two seconds and more, while the host does something else."""
+    """Lets a GPU make itself ready while the host does something else.
+
+    It takes memory as it needs it, unless `XLA_PYTHON_CLIENT_PREALLOCATE` asks for JAX's habit of
+    taking three quarters of it at once: that lasts two seconds, and leaves others none.
+    """
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
     def touch() -> None:
         # Whoever needs the device hears of what is wrong with it.

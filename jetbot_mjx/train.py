@@ -65,13 +65,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         processes.check(config)
         processes.join()
     cli.wake_device()
-    # A GPU wakes while this loads.
-    from jetbot_mjx import training
+    # What is heavy loads while the GPU wakes, and the programs while the rest of it loads.
+    from jetbot_mjx import resumable_ppo  # noqa: F401
 
     cli.require_device()
     cli.use_compilation_cache()
     programs = programs_of(config, keep=True)
     programs.prefetch("advance", "init")
+    from jetbot_mjx import training
+
     result = training.run(config, run_dir, programs)
     if processes.is_first():
         print(
