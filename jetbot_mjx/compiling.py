@@ -5,7 +5,9 @@ that takes less. Do not turn the fusion emitters off as well, which saves still 
 without them the same program has given other bits from one call to the next.
 """
 
+import contextlib
 import functools
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -48,3 +50,19 @@ def _is_known(name: str, value: Any) -> bool:
             raise
         return False
     return True
+
+
+@contextlib.contextmanager
+def on_host() -> Iterator[Any]:
+    """Lets what is computed inside be computed on the host, where small programs compile at once.
+
+    Yields:
+      The device that stands for the host.
+    """
+    try:
+        device = jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        # JAX_PLATFORMS leaves it out.
+        device = jax.local_devices()[0]
+    with jax.default_device(device):
+        yield device

@@ -1,8 +1,9 @@
 """Imports that leave out, or put off, what another library would load and nobody here needs.
 
-MJX loads trimesh and SciPy's geometry for meshes that no robot here has, and prints two lines when
-its optional Warp part is absent; Brax loads JAXopt for an engine that is not used here. On a slow
-machine that is the better part of two seconds, before anything has begun.
+MuJoCo loads GLFW before anyone asks for a window; MJX trimesh and SciPy's geometry for meshes that
+no robot here has, and it prints two lines when its optional Warp part is absent; Brax JAXopt for an
+engine that is not used here; tensorboardX a service that nobody logs to. On a slow machine that is
+the better part of two seconds, before anything has begun.
 """
 
 import contextlib
@@ -33,6 +34,15 @@ class _Trimesh(PutOff):
     @staticmethod
     def Trimesh(*arguments: Any, **options: Any) -> Any:
         return importlib.import_module("trimesh").Trimesh(*arguments, **options)
+
+
+class _Comet(types.ModuleType):
+    """What tensorboardX's own writer, which nobody here uses, would log to."""
+
+    CometLogger = None
+
+    def __init__(self) -> None:
+        super().__init__("tensorboardX.comet_utils")
 
 
 @contextlib.contextmanager
@@ -102,13 +112,15 @@ def _mjx() -> Iterator[None]:
         yield
 
 
-@contextlib.contextmanager
-def _brax_constraint() -> Iterator[None]:
-    with standing_in("jaxopt", PutOff("jaxopt")):
-        yield
+_AROUND: Mapping[str, _Around] = {
+    "brax.generalized.constraint": lambda: standing_in("jaxopt", PutOff("jaxopt")),
+    "mujoco.glfw": lambda: standing_in("glfw", PutOff("glfw")),
+    "mujoco.mjx": _mjx,
+    "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _Comet()),
+}
+"""By the module that imports them."""
 
 
 def lighten() -> None:
-    """Makes MJX and Brax light to import, from now on and whoever imports them."""
-    around = {"mujoco.mjx": _mjx, "brax.generalized.constraint": _brax_constraint}
-    sys.meta_path.insert(0, _Finder(around))
+    """Makes these libraries light to import, from now on and whoever imports them."""
+    sys.meta_path.insert(0, _Finder(_AROUND))

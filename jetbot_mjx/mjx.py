@@ -4,8 +4,6 @@ MJX would put them on the first device of all, which of several processes only o
 a small program there for many an array; a model's numbers are constants of programs.
 """
 
-import contextlib
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -14,30 +12,22 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx import Data, Model, step
 
+from jetbot_mjx.compiling import on_host
+
 __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 
 
 def put_model(model: mujoco.MjModel) -> Model:
     """MuJoCo's model as arrays."""
-    with _on_host() as device:
+    # Whoever asks may be in the middle of tracing something.
+    with jax.ensure_compile_time_eval(), on_host() as device:
         return _anywhere(mjx.put_model(model, device=device))
 
 
 def make_data(model: mujoco.MjModel) -> Data:
     """The model's state before the first step, as arrays."""
-    with _on_host() as device:
+    with jax.ensure_compile_time_eval(), on_host() as device:
         return _anywhere(mjx.make_data(model, device=device))
-
-
-@contextlib.contextmanager
-def _on_host() -> Iterator[Any]:
-    try:
-        device = jax.local_devices(backend="cpu")[0]
-    except RuntimeError:
-        # JAX_PLATFORMS leaves it out.
-        device = jax.local_devices()[0]
-    with jax.default_device(device):
-        yield device
 
 
 def _anywhere(tree: Any) -> Any:

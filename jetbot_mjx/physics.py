@@ -2,6 +2,7 @@
 
 import contextlib
 import copy
+import functools
 import importlib.metadata
 import inspect
 import json
@@ -38,8 +39,6 @@ class Physics:
         """
         self._mj_model = mj_model
         self._config = config
-        self.model: mjx.Model = mjx.put_model(mj_model)
-        self._data: mjx.Data = mjx.make_data(mj_model)
         self._varied: tuple[int, ...] = ()
         """Leaves of the model that are known only when a program runs, robot by robot."""
         self._is_own_model = True
@@ -50,6 +49,16 @@ class Physics:
                 "physics.impl = ptx needs an NVIDIA GPU and an XLA that launches PTX; this is"
                 f" {jax.default_backend()}: choose xla or auto"
             )
+
+    @functools.cached_property
+    def model(self) -> mjx.Model:
+        """The model that is stepped."""
+        return mjx.put_model(self._mj_model)
+
+    @functools.cached_property
+    def _data(self) -> mjx.Data:
+        """Of which a step replaces what a `PhysicsState` holds."""
+        return mjx.make_data(self._mj_model)
 
     def with_model(self, model: mjx.Model) -> "Physics":
         """The same on another model, as a new object.

@@ -12,6 +12,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import identity_observation_preprocessor
 from jaxtyping import Array, Float, UInt32
 
+from jetbot_mjx.compiling import on_host
 from jetbot_mjx.config import NetworkConfig
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -87,9 +88,11 @@ def make_networks(
       Brax's networks.
     """
     preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
-    return network_factory(config)(
-        observation_size, action_size, preprocess_observations_fn=preprocess
-    )
+    # Brax's networks keep an observation of zeros, which has no need of a GPU.
+    with jax.ensure_compile_time_eval(), on_host():
+        return network_factory(config)(
+            observation_size, action_size, preprocess_observations_fn=preprocess
+        )
 
 
 def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Policy:
