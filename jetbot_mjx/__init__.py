@@ -1,8 +1,8 @@
 """A JetBot that learns to drive to goals, thousands at a time: MuJoCo MJX and Brax's PPO.
 
 The modules in reading order, each knowing only those before it:
-`errors`, `config`, `compiling`, `imports`, `mjx`, `cholesky`, `scalars`, `scalarize`, `ptx`,
-`kernel`, `kinematics`, `model`, `task`, `state`, `physics`, `env`, `variation`, `wrappers`,
+`errors`, `config`, `compiling`, `programs`, `imports`, `mjx`, `cholesky`, `scalars`, `scalarize`,
+`ptx`, `kernel`, `kinematics`, `model`, `task`, `state`, `physics`, `env`, `variation`, `wrappers`,
 `policy`, `advantages`, `ppo`, `trainer`, `rollout`, `evaluation`, `robustness`, `report`,
 `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`,
 `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`,
@@ -50,4 +50,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return sorted([*globals(), *_HOMES])
+    return sorted(_HOMES)

@@ -30,7 +30,12 @@ from jax.experimental import serialize_executable
 from jetbot_mjx.compiling import Options, compiler_options
 from jetbot_mjx.config import Config
 
-_PACKAGE = __package__ or "jetbot_mjx"
+TRUSTED = f"{__package__}."
+"""How tasks begin whose source is part of the key."""
+
+SOURCES = {".py", ".xml"}
+"""Of what programs are made from, as files of this package end."""
+
 _LIBRARIES = ("jax", "jaxlib", "brax", "flax", "mujoco", "mujoco-mjx", "numpy", "optax")
 _UNUSED_DAYS = 30
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
@@ -114,7 +119,7 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
     """
     options = compiler_options(config)
     folder = jax.config.values["jax_compilation_cache_dir"]
-    own_task = not config.task.name.startswith(f"{_PACKAGE}.")
+    own_task = not config.task.name.startswith(TRUSTED)
     if not keep or folder is None or own_task or jax.process_count() > 1:
         return Programs(options)
     devices = jax.devices()
@@ -171,7 +176,7 @@ def _own_source() -> str:
     digest = hashlib.sha256()
     root = Path(__file__).parent
     for path in sorted(root.rglob("*")):
-        if path.suffix in (".py", ".xml"):
+        if path.suffix in SOURCES:
             digest.update(str(path.relative_to(root)).encode() + path.read_bytes())
     return digest.hexdigest()
 

@@ -124,13 +124,13 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: Prog
         program = resumable_ppo.Program(config, env, programs)
 
         def begin() -> int:
-            resumption = _open_folders(stack, config, run_dir, program)
+            resumption, welcome = _open_folders(stack, config, run_dir, program)
             run_dirs = seed_dirs(run_dir, config)
             recorder = RunRecorder(config, env, run_dirs, clock, resumption, programs)
             opened.append((stack.enter_context(recorder), resumption))
             if recorder.complete:
                 return _COMPLETE
-            recorder.begin(_headline(config, run_dir))
+            recorder.begin("\n".join([*welcome, _headline(config, run_dir)]))
             return _RESUMES if resumption else _BEGINS
 
         outset = processes.led(begin)
@@ -148,20 +148,24 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: Prog
 
 def _open_folders(
     stack: contextlib.ExitStack, config: Config, run_dir: Path, program: resumable_ppo.Program
-) -> Resumption | None:
-    """Makes the folders, and holds them until the stack ends; tells where the seeds stand."""
+) -> tuple[Resumption | None, list[str]]:
+    """Makes the folders, and holds them until the stack ends.
+
+    Returns:
+      Where the seeds stand, and what there is to say of it.
+    """
     _check_folder(config, run_dir)
     run_dirs, configs = seed_dirs(run_dir, config), config.of_each_seed()
     for folder in dict.fromkeys([run_dir, *run_dirs]):
         stack.enter_context(occupied(folder))
     resumption = resume(run_dirs, configs, program.template())
-    if resumption is not None:
-        print(_welcome_back(run_dir, resumption), flush=True)
+    # Before this run's versions take the place of the stored ones.
+    welcome = [_welcome_back(run_dir, resumption)] if resumption else []
     write_run(run_dir, config)
     if config.seeds > 1:
         for seed_dir, seed_config in zip(run_dirs, configs, strict=True):
             write_run(seed_dir, seed_config)
-    return resumption
+    return resumption, welcome
 
 
 def _result(

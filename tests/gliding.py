@@ -5,13 +5,14 @@ the environment stays as it is. As a program it is one of the package's commands
 `python gliding.py train --config …`.
 """
 
+import contextlib
 import importlib
 import sys
 from unittest import mock
 
 import jax.numpy as jnp
 
-from jetbot_mjx import cli, kinematics
+from jetbot_mjx import cli, kinematics, programs
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import (
     CONTROLLER_WHEEL_RADIUS,
@@ -44,9 +45,14 @@ class Gliding(JetBotEnv):
         return physics.replace(qpos=qpos, qvel=qvel, time=physics.time + self.dt)
 
 
+@contextlib.contextmanager
 def everywhere():
-    """A context within which every robot of this process glides."""
-    return mock.patch.object(JetBotEnv, "step_physics", Gliding.step_physics)
+    """A context within which every robot of this process glides, and no program is kept."""
+    with (
+        mock.patch.object(JetBotEnv, "step_physics", Gliding.step_physics),
+        mock.patch.object(programs, "TRUSTED", "no task at all"),
+    ):
+        yield
 
 
 def program(command):

@@ -64,7 +64,8 @@ def gliding_profile(tmp_path_factory):
     startup.parent.mkdir(parents=True)
     tests = str(Path(__file__).parent)
     startup.write_text(
-        f"import sys\nsys.path.append({tests!r})\nimport gliding\ngliding.everywhere().start()\n"
+        f"import sys\nsys.path.append({tests!r})\nimport gliding\n"
+        "everywhere = gliding.everywhere()\neverywhere.__enter__()\n"
     )
     return profile
 

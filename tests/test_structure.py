@@ -7,7 +7,6 @@ import re
 import subprocess
 import sys
 import tomllib
-import types
 from pathlib import Path
 
 import pytest
@@ -222,12 +221,9 @@ def test_a_public_name_is_that_of_its_module(name, home):
 
 
 def test_nothing_else_is_public():
-    public = {
-        name
-        for name, value in vars(jetbot_mjx).items()
-        if not name.startswith("_") and not isinstance(value, types.ModuleType)
-    }
-    assert public == set(PUBLIC)
+    assert set(dir(jetbot_mjx)) == set(PUBLIC)
+    with pytest.raises(AttributeError, match="'jetbot_mjx' has no attribute 'nothing'"):
+        _ = jetbot_mjx.nothing
 
 
 def test_importing_prints_nothing_and_starts_no_device(tmp_path):
