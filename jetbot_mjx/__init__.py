@@ -7,9 +7,9 @@ The modules in reading order, each knowing only those before it:
 `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`, `store`, `checkpoint`,
 `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`, `tracking`, `terminal`,
 `board`, `dashboard`, `recording`, `preemption`, `processes`, `memory`, `resumable_ppo`, `brax_ppo`,
-`training`, `clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and
-the commands `plan`, `train`, `evaluate`, `render`, `replay`, `play`. Commands meet only in the run
-folder.
+`training`, `portable`, `contract`, `formats`, `stand_in`, `drive_log`, `clock`, `live`, `player`,
+`geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `plan`, `train`, `evaluate`,
+`render`, `replay`, `play`, `export`, `sim2real`. Commands meet only in the run folder.
 
 What the package itself offers is imported at its first use: a command that is mistyped says so at
 once, and a GPU wakes while the rest loads.

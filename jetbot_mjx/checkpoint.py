@@ -179,7 +179,8 @@ def _find(path: Path, which: Which) -> Path:
         raise CheckpointError(
             f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
         )
-    if (path / POLICY).is_dir():
+    # A run folder may hold `policy/` too: what `export` made.
+    if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():
         return path
     if seeds := sorted(path.glob("seed-*")):
         raise CheckpointError(

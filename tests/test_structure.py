@@ -70,6 +70,11 @@ NOUNS = (
     "resumable_ppo",
     "brax_ppo",
     "training",
+    "portable",
+    "contract",
+    "formats",
+    "stand_in",
+    "drive_log",
     "clock",
     "live",
     "player",
@@ -80,7 +85,7 @@ NOUNS = (
     "native",
     "cli",
 )
-VERBS = ("plan", "train", "evaluate", "render", "replay", "play")
+VERBS = ("plan", "train", "evaluate", "render", "replay", "play", "export", "sim2real")
 ORDER = (*NOUNS, *VERBS)
 """A module knows only those before it, and a verb no other verb."""
 
@@ -233,7 +238,7 @@ def test_importing_prints_nothing_and_starts_no_device(tmp_path):
             sys.executable,
             "-c",
             "import jetbot_mjx.plan, jetbot_mjx.train, jetbot_mjx.evaluate, jetbot_mjx.render,"
-            " jetbot_mjx.replay, jetbot_mjx.play",
+            " jetbot_mjx.replay, jetbot_mjx.play, jetbot_mjx.export, jetbot_mjx.sim2real",
         ],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "nowhere"},

@@ -1,0 +1,115 @@
+"""How long one action takes, on one core: each file of an export.
+
+    python benchmarks/action_latency.py runs/mine/policy
+
+The folder is one that `python -m jetbot_mjx.export RUN --format all` wrote, or `--format numpy` with
+fewer rows. One observation a call, as on a robot, from NumPy to NumPy; StableHLO is compiled by
+`jax.jit`, so its row is JAX's.
+"""
+
+import argparse
+import json
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jetbot_mjx.contract import FILE
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.formats import FORMATS, Act, require
+
+CALLS = 2000
+_WARM_UP = 100
+
+
+class Latency(NamedTuple):
+    """Of one call [µs]."""
+
+    name: str
+    median: float
+    p99: float
+    worst: float
+
+
+def measure(name: str, act: Act, observations: np.ndarray, calls: int = CALLS) -> Latency:
+    """Times single calls.
+
+    Args:
+      name: of the row.
+      act: what is called.
+      observations: [n, obs]; one a call, over and over.
+      calls: how many, after a warm-up.
+
+    Returns:
+      Median, 99th percentile and worst.
+    """
+    times = []
+    for index in range(_WARM_UP + calls):
+        obs = observations[index % len(observations)][None]
+        start = time.perf_counter_ns()
+        action, wheel_speeds = act(obs)
+        np.asarray(action), np.asarray(wheel_speeds)
+        times.append(1e-3 * (time.perf_counter_ns() - start))
+    kept = np.array(times[_WARM_UP:])
+    return Latency(name, *(float(np.percentile(kept, at)) for at in (50, 99, 100)))
+
+
+def run(folder: Path, calls: int = CALLS) -> Iterator[Latency]:
+    """Times every file of an export, on the core that this process is left with.
+
+    Args:
+      folder: of an export.
+      calls: of each.
+
+    Yields:
+      One row for each file.
+
+    Raises:
+      UserError: it is no such folder, or a package is missing.
+    """
+    try:
+        files = json.loads((folder / FILE).read_text("utf-8"))["files"]
+        with np.load(folder / "recording.npz") as recording:
+            observations = recording["obs"][:1000]
+    except (OSError, ValueError, LookupError) as error:
+        raise UserError(f"{folder} is no export: {error}") from None
+    for name, file in files.items():
+        require(name)
+        act = FORMATS[name].read(folder / file["file"])
+        yield measure(name, act, observations, calls)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line, takes one core and prints the table.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      0, or 2 after a mistake.
+    """
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("policy", type=Path, help="the folder that jetbot_mjx.export wrote")
+    parser.add_argument("--calls", type=int, default=CALLS)
+    options = parser.parse_args(arguments)
+    cores = os.sched_getaffinity(0)
+    try:
+        # Threads that start from here on inherit it.
+        os.sched_setaffinity(0, {min(cores)})
+        print(f"{'one action [µs]':16} {'median':>8} {'p99':>8} {'worst':>8}")
+        for row in run(options.policy, options.calls):
+            print(f"{row.name:16} {row.median:8.1f} {row.p99:8.1f} {row.worst:8.1f}")
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    finally:
+        os.sched_setaffinity(0, cores)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
