@@ -2,9 +2,8 @@
 
     python benchmarks/action_latency.py runs/mine/policy
 
-The folder is one that `python -m jetbot_mjx.export RUN --format all` wrote, or `--format numpy` with
-fewer rows. One observation a call, as on a robot, from NumPy to NumPy; StableHLO is compiled by
-`jax.jit`, so its row is JAX's.
+The folder is one that `python -m jetbot_mjx.export RUN --format all` wrote. One observation a call,
+as on a robot, from NumPy to NumPy; StableHLO is compiled by `jax.jit`, so its row is JAX's.
 """
 
 import argparse

@@ -334,9 +334,6 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
         calibration = default_calibration()
         if options.calibration:
             calibration = read_calibration(options.calibration)
-        poses = Odometry(calibration)
-        if options.tracker is not None:
-            poses = udp_tracker(options.tracker)
         settings = Settings(
             tuple(options.goal),
             options.timeout,
@@ -344,7 +341,10 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
             arrival_radius(policy.contract),
         )
         robot = NoRobot() if options.dry_run else make_robot()
-        with _log_file(options.log) as log, _leaving_by_signals():
+        poses = Odometry(calibration)
+        if options.tracker is not None:
+            poses = udp_tracker(options.tracker)
+        with contextlib.closing(poses), _log_file(options.log) as log, _leaving_by_signals():
             if log is not None:
                 log(log_header(policy, calibration, settings, poses.name))
             outcome = drive(robot, clock or WallClock(), poses, policy, calibration, settings, log)

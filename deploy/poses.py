@@ -1,7 +1,7 @@
 """Where the robot is: by dead reckoning, or from a tracker that sends datagrams.
 
-Python 3.6 and the standard library. A source has two methods: `read(now)` gives the newest pose,
-or None, and `commanded(now, left, right)` is told what the motors were set to.
+Python 3.6 and the standard library. A source has three methods: `read(now)` gives the newest pose,
+or None, `commanded(now, left, right)` is told what the motors were set to, and `close()` ends it.
 
 `Odometry` needs nothing and sees nothing: a JetBot has no encoders, so it adds up the speeds that
 were commanded. It drifts, by centimetres for every metre on a calibrated robot, and never grows
@@ -73,6 +73,9 @@ class Odometry:
         self.read(now)
         self._targets = (left, right)
 
+    def close(self) -> None:
+        """Does nothing."""
+
     def _advance(self, pose: Pose, now: float) -> Pose:
         lag, dt = self._calibration.lag, now - pose.time
         if dt <= 0.0:
@@ -105,13 +108,16 @@ class Tracker:
 
     name = "tracker"
 
-    def __init__(self, receive: Callable[[], list]) -> None:
+    def __init__(
+        self, receive: Callable[[], list], close: Callable[[], None] = lambda: None
+    ) -> None:
         """Begins without a pose.
 
         Args:
-          receive: a function that returns the datagrams that have come since it was last called.
+          receive: returns the datagrams that have come since it was last called.
+          close: is called at the end.
         """
-        self._receive = receive
+        self._receive, self.close = receive, close
         self._pose = None  # type: Optional[Pose]
         self._sent = 0.0
         self.rejected = 0
@@ -192,4 +198,4 @@ def udp_tracker(port: int, host: str = "0.0.0.0") -> Tracker:
             except BlockingIOError:
                 return found
 
-    return Tracker(receive)
+    return Tracker(receive, listener.close)

@@ -17,8 +17,7 @@ from drive import Outcome, Policy, Settings, arrival_radius, drive, load_policy
 from motors import Calibration, DriveError, default_calibration
 from poses import Tracker
 
-from jetbot_mjx.model import WHEEL_RADIUS
-from jetbot_mjx.stand_in import MotorModel, Pose, StandIn
+from jetbot_mjx.stand_in import ROLLING_RADIUS, MotorModel, Pose, StandIn
 
 
 class Camera:
@@ -106,7 +105,7 @@ def true_calibration(motors: MotorModel) -> Calibration:
     """What a perfect measurement of a stand-in would give."""
     wheel = default_calibration().left
     left, right = (
-        wheel._replace(dead_band=dead_band, full_speed=WHEEL_RADIUS * full_speed)
+        wheel._replace(dead_band=dead_band, full_speed=ROLLING_RADIUS * full_speed)
         for dead_band, full_speed in zip(motors.dead_band, motors.full_speed, strict=True)
     )
     return default_calibration()._replace(left=left, right=right, lag=motors.lag)

@@ -10,8 +10,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.model import WHEEL_RADIUS
-from jetbot_mjx.stand_in import MotorModel, Pose, replayed
+from jetbot_mjx.stand_in import ROLLING_RADIUS, MotorModel, Pose, replayed
 
 FORMAT = "jetbot_mjx-drive/1"
 """Of a log's first line."""
@@ -162,7 +161,7 @@ def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Re
     left, right = calibration.full_speed
     motors = MotorModel(
         dead_band=calibration.dead_band,
-        full_speed=(left / WHEEL_RADIUS, right / WHEEL_RADIUS),
+        full_speed=(left / ROLLING_RADIUS, right / ROLLING_RADIUS),
         lag=calibration.lag if lag is None else lag,
         delay=delay,
     )
@@ -225,10 +224,11 @@ def plot(replay: Replay) -> Figure:
     plan.plot(*replay.simulated[:, :2].T, color="C1", linestyle="--", label="simulated")
     plan.plot(*log.poses[0, :2], "o", color="C0", markersize=5)
     plan.plot(*log.goal_w, "s", color="C2", label="goal")
-    plan.set(xlabel="x [m]", ylabel="y [m]", title="From above", aspect="equal")
-    plan.margins(0.15)
+    plan.set(xlabel="x [m]", ylabel="y [m]", title="From above")
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.margins(0.1)
     plan.grid(visible=True)
-    plan.legend()
+    figure.legend(*plan.get_legend_handles_labels(), loc="outside lower left", ncols=3)
     place, turn = axes["place"], axes["turn"]
     place.plot(log.pose_times, 1e3 * replay.distances, color="C0")
     place.set(ylabel="apart [mm]", title="Simulated from logged")

@@ -21,6 +21,9 @@ from jaxtyping import Float
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.model import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
 
+ROLLING_RADIUS = 0.0321
+"""Way over the floor for each radian that a wheel turns [m]: loaded, it sinks in by 0.4 mm."""
+
 
 class MotorModel(NamedTuple):
     """What lies between a motor value and a wheel. Pairs are (left, right)."""

@@ -1,0 +1,541 @@
+"""The driver: at its goal in the stand-in, and with its motors at zero whenever it must be."""
+
+import json
+import math
+import os
+import signal
+import socket
+import sys
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_export import NUMPY, alone, site_with
+
+from jetbot_mjx import export, sim2real, train
+from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.drive_log import read_log, replay
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.stand_in import ROLLING_RADIUS, MotorModel, Pose, StandIn
+from jetbot_mjx.task import GOAL_HEIGHT, LAYOUTS, GoalTask, RobotState
+
+ROOT = Path(__file__).parents[1]
+sys.path.append(str(ROOT / "deploy"))
+
+import calibrate
+import drive
+import motors
+import observations
+import poses
+import rehearse
+
+PERIOD = 1 / 60
+IDEAL = MotorModel(dead_band=(0.0, 0.0), lag=0.0, delay=0.0)
+
+
+@pytest.fixture(scope="module")
+def exported(smoke_run, tmp_path_factory):
+    """An export of a policy that has learnt next to nothing."""
+    folder = tmp_path_factory.mktemp("deploy") / "policy"
+    export.run(smoke_run, output=folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def policy(exported):
+    """What `scripted` decides, as if it had been exported."""
+    contract = drive.load_policy(str(exported)).contract
+    return drive.Policy(scripted, {**contract, "observation": layout("egocentric")})
+
+
+def layout(name):
+    found, start = [], 0
+    for field in LAYOUTS[name]:
+        index = list(range(start, start + field.size))
+        found.append({"name": field.name, "frame": field.frame, "index": index})
+        start += field.size
+    return found
+
+
+def scripted(obs):
+    """Turns towards the goal, and drives the faster the better it is aligned."""
+    error = math.atan2(obs[3], obs[2])
+    speed = 0.35 * max((math.cos(error) - 0.8) / 0.2, 0.0)
+    yaw_rate = max(-math.pi, min(math.pi, 2.5 * error))
+    turn = 0.5 * yaw_rate * 0.1125
+    return (speed, yaw_rate), ((speed - turn) / 0.0325, (speed + turn) / 0.0325)
+
+
+def settings(goal=(0.6, 0.5), timeout=10.0):
+    return drive.Settings(goal, timeout, drive.STALE_AFTER, 0.0983)
+
+
+def camera(robot, rate=60.0):
+    return rehearse.Camera(robot, rate, 0.0, np.random.default_rng(0))
+
+
+# In the stand-in.
+
+
+def test_the_driver_reaches_goals_through_delay_dead_band_and_lag(policy):
+    model = MotorModel()
+    assert (model.delay, model.lag > 0, min(model.dead_band) > 0) == (0.05, True, True)
+    goals = rehearse.draw_goals(6)
+    outcomes = rehearse.rehearse(policy, goals, motors=model)
+    assert [one.reached for one in outcomes] == [True] * 6
+    assert max(one.distance for one in outcomes) < 0.0983
+    assert min(one.ticks for one in outcomes) > 30
+    # The dead-band is real: a driver that does not know of it stays behind.
+    blind = motors.default_calibration()
+    blind = blind._replace(left=motors.Wheel(0.0, 1.4), right=motors.Wheel(0.0, 1.4))
+    outcomes = rehearse.rehearse(policy, goals[:2], motors=model, calibration=blind, timeout=6.0)
+    assert not any(one.reached for one in outcomes)
+
+
+@pytest.mark.slow
+def test_a_trained_policy_reaches_95_of_100_goals(tmp_path, monkeypatch, capsys):
+    config = load_config(ROOT / "configs" / "jetbot_egocentric.yaml", ["robot.preset=real"])
+    train.run(config, tmp_path / "run")
+    assert export.main([str(tmp_path / "run")]) == 0
+    for noise in ("0", "0.003"):
+        arguments = [str(tmp_path / "run" / "policy"), "--noise", noise]
+        assert rehearse.main(arguments) == 0
+    assert "100 goals reached" in capsys.readouterr().out
+
+
+def test_a_stale_pose_stops_the_motors_within_100_ms(policy):
+    robot = StandIn()
+    eye = camera(robot)
+    lines = []
+
+    def log(line):
+        lines.append((robot.now(), line))
+        eye.blind = 1.0 <= robot.now() < 1.6
+
+    outcome = drive.drive(
+        robot,
+        robot,
+        poses.Tracker(eye.receive),
+        policy,
+        motors.default_calibration(),
+        settings((1.2, 0.0)),
+        log,
+    )
+    seen = [time for time, line in lines if line["pose_age"] == 0.0 and time < 1.1]
+    stopped = next(time for time, line in lines if line["motors"] == [0.0, 0.0])
+    assert max(lines[40][1]["motors"]) > 0.3
+    assert 0.0 < stopped - max(seen) <= 0.1
+    while_blind = [line["motors"] for time, line in lines if stopped <= time < 1.6]
+    assert len(while_blind) > 20
+    assert not np.any(while_blind)
+    # The robot sees again, and goes on.
+    assert outcome.reached
+    assert outcome.stale_ticks >= len(while_blind)
+
+
+def test_the_robot_stands_still_without_a_pose(policy):
+    robot = StandIn()
+    outcome = drive.drive(
+        robot,
+        robot,
+        poses.Tracker(list),
+        policy,
+        motors.default_calibration(),
+        settings(timeout=1.0),
+    )
+    assert (outcome.reached, outcome.distance) == (False, None)
+    assert robot.pose() == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
+
+
+class Recorder:
+    """A robot and a clock that keep what they are told."""
+
+    def __init__(self, at=0.5, happens=None):
+        self.values, self.time, self._at, self._happens = [], 0.0, at, happens
+
+    def set_motors(self, left, right):
+        self.values.append((left, right))
+
+    def now(self):
+        return self.time
+
+    def sleep(self, seconds):
+        self.time += seconds
+        if self._happens and self.time > self._at:
+            happens, self._happens = self._happens, None
+            happens()
+
+
+def failing(error):
+    def fail(*arguments):
+        raise error
+
+    return fail
+
+
+@pytest.mark.parametrize("where", ["clock", "poses", "policy", "log", "start"])
+@pytest.mark.parametrize("error", [ValueError("!"), KeyboardInterrupt(), SystemExit(143)])
+def test_whatever_goes_wrong_stops_the_motors(where, error, policy):
+    robot = Recorder(happens=failing(error) if where == "clock" else None)
+    source = poses.Odometry(motors.default_calibration())
+    count = iter(range(1000))
+
+    def after_a_while(then):
+        def work(*arguments):
+            if next(count) > 20:
+                raise error
+            return then(*arguments)
+
+        return work
+
+    log = None
+    if where == "poses":
+        source.read = after_a_while(source.read)
+    elif where == "policy":
+        policy = policy._replace(act=after_a_while(policy.act))
+    elif where == "log":
+        log = after_a_while(lambda line: None)
+    elif where == "start":
+        policy = policy._replace(act=failing(error))
+    with pytest.raises(type(error)):
+        drive.drive(robot, robot, source, policy, motors.default_calibration(), settings(), log)
+    assert robot.values[0] == robot.values[-1] == (0.0, 0.0)
+    assert (np.abs(robot.values).max() > 0.2) == (where != "start")
+
+
+def test_a_bus_that_refuses_once_is_asked_again(policy):
+    robot = Recorder()
+    refusals = [OSError(121, "Remote I/O error")] * 4
+
+    def set_motors(left, right):
+        if (left, right) == (0.0, 0.0) and refusals:
+            raise refusals.pop()
+        robot.values.append((left, right))
+
+    flaky = type("Flaky", (), {"set_motors": staticmethod(set_motors)})
+    motors.stop(flaky)
+    assert robot.values == [(0.0, 0.0)]
+    refusals[:] = [OSError(121, "Remote I/O error")] * 5
+    with pytest.raises(OSError, match="Remote"):
+        motors.stop(flaky)
+
+
+def test_a_policy_that_gives_no_numbers_stands_still(policy):
+    robot = Recorder()
+    lost = policy._replace(act=lambda obs: ((0.0, 0.0), (math.nan, 5.0)))
+    source = poses.Odometry(motors.default_calibration())
+    drive.drive(robot, robot, source, lost, motors.default_calibration(), settings(timeout=0.5))
+    assert not np.any(robot.values)
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_stops_the_motors_and_tells_its_number(number, exported, monkeypatch):
+    robot = Recorder(happens=lambda: os.kill(os.getpid(), number))
+    monkeypatch.setattr(drive, "NoRobot", lambda: robot)
+    before = signal.getsignal(number)
+    with pytest.raises(SystemExit) as left:
+        drive.main([str(exported), "--goal", "1", "0", "--dry-run"], clock=robot)
+    assert left.value.code == 128 + number
+    assert robot.values[-1] == (0.0, 0.0)
+    assert np.any(robot.values)
+    assert signal.getsignal(number) is before
+
+
+def test_late_periods_are_counted_and_do_not_pile_up(policy):
+    robot = Recorder()
+    slow = policy._replace(act=lambda obs: robot.sleep(0.03) or scripted(obs))
+    source = poses.Odometry(motors.default_calibration())
+    lines = []
+    outcome = drive.drive(
+        robot,
+        robot,
+        source,
+        slow,
+        motors.default_calibration(),
+        settings((2.0, 0.0), timeout=1.0),
+        lines.append,
+    )
+    assert outcome.late_ticks == outcome.ticks == 34
+    assert lines[3]["latency"] == pytest.approx(0.03)
+    assert np.diff([line["t"] for line in lines]) == pytest.approx(0.03)
+
+
+# Its parts.
+
+
+def test_motor_values_undo_dead_band_and_full_speed():
+    wheel = motors.Wheel(dead_band=0.2, full_speed=0.4)
+    for speed in (-0.4, -0.1, 0.0, 0.006, 0.4):
+        assert motors.wheel_speed(motors.motor_value(speed, wheel), wheel) == pytest.approx(speed)
+    assert motors.motor_value(0.006, wheel) > 0.2
+    assert motors.motor_value(0.004, wheel) == 0.0
+    assert motors.motor_value(9.0, wheel) == 1.0
+    assert motors.motor_value(-9.0, wheel) == -1.0
+    # As the stand-in's motors do.
+    robot = StandIn(IDEAL._replace(dead_band=(0.2, 0.2)))
+    robot.set_motors(*[motors.motor_value(0.3, motors.Wheel(0.2, 12.56 * ROLLING_RADIUS))] * 2)
+    robot.sleep(1.0)
+    assert robot.speed() == pytest.approx(0.3, rel=2e-3)
+
+
+@pytest.mark.parametrize("name", ["world", "egocentric"])
+def test_observations_are_those_of_training(name, exported):
+    contract = drive.load_policy(str(exported)).contract
+    observe = observations.Observer({**contract, "observation": layout(name)})
+    task = GoalTask(parse_config({"task": {"observation": name}}).task)
+    rng = np.random.default_rng(0)
+    for x, y, yaw, speed, rate, goal_x, goal_y in rng.uniform(-3, 3, (20, 7)):
+        seen = observe(poses.Pose(0.0, x, y, yaw, speed, rate), (goal_x, goal_y))
+        pitch = 2 * math.asin(contract["rest_quaternion"][2])
+        half = [math.cos(yaw / 2), math.sin(yaw / 2)]
+        ahead, tilt = math.cos(pitch / 2), math.sin(pitch / 2)
+        robot = RobotState(
+            jnp.array([x, y, contract["rest_height"]]),
+            jnp.array([half[0] * ahead, -half[1] * tilt, half[0] * tilt, half[1] * ahead]),
+            jnp.array([speed * math.cos(yaw), speed * math.sin(yaw), 0.0]),
+            jnp.array([0.0, 0.0, rate]),
+        )
+        wanted = task.observe(robot, jnp.array([goal_x, goal_y, GOAL_HEIGHT]))
+        np.testing.assert_allclose(seen, wanted, atol=2e-5)
+    assert contract["goal_height"] == GOAL_HEIGHT
+
+
+def test_an_observation_that_cannot_be_made_is_told(policy):
+    part = {"name": "pillar_position", "frame": "body", "index": [7, 8]}
+    other = {**policy.contract, "observation": [*policy.contract["observation"], part]}
+    with pytest.raises(motors.DriveError, match=r"wants pillar_position \(2 numbers, body frame\)"):
+        observations.Observer(other)
+
+
+def test_dead_reckoning_follows_the_stand_in(policy):
+    model = MotorModel(delay=0.0)
+    robot = StandIn(model)
+    calibration = rehearse.true_calibration(model)
+    source = poses.Odometry(calibration)
+    outcome = drive.drive(robot, robot, source, policy, calibration, settings((0.8, 0.6)))
+    assert outcome.reached
+    reckoned, true = source.read(robot.now()), robot.pose()
+    assert math.hypot(reckoned.x - true.x, reckoned.y - true.y) < 0.04
+    assert 0.5 < math.hypot(true.x, true.y) < 1.0
+
+
+def datagram(time, x=0.0, y=0.0, yaw=0.0):
+    return json.dumps({"time": time, "x": x, "y": y, "yaw": yaw}).encode()
+
+
+def test_a_tracker_tells_speeds_and_turns_without_jumps():
+    inbox = []
+    tracker = poses.Tracker(lambda: [inbox.pop(0)] if inbox else [])
+    assert tracker.read(0.0) is None
+    radius, rate = 0.3, 2.0  # a circle to the left
+    for index in range(400):
+        time = index * PERIOD
+        x, y = radius * math.sin(rate * time), radius * (1 - math.cos(rate * time))
+        inbox.append(datagram(5.0 + time, x, y, math.remainder(rate * time, 2 * math.pi)))
+        pose = tracker.read(time)
+    assert pose.speed == pytest.approx(radius * rate, rel=1e-3)
+    assert pose.yaw_rate == pytest.approx(rate, rel=1e-3)
+    assert pose.yaw == pytest.approx(rate * time, abs=1e-6)
+
+
+def test_a_tracker_takes_no_repeats_and_no_rubbish():
+    inbox = [datagram(1.0, x=0.1)]
+    tracker = poses.Tracker(lambda: [inbox.pop(0)] if inbox else [])
+    first = tracker.read(0.0)
+    rubbish = [b"\xff", b"1", b"{}", b'{"time": 2, "x": "a", "y": 0, "yaw": 0}', datagram(math.nan)]
+    for index, content in enumerate([datagram(1.0, x=0.2), datagram(0.9, x=0.3), *rubbish]):
+        inbox.append(content)
+        assert tracker.read(0.01 * (index + 1)) == first
+    assert tracker.rejected == len(rubbish)
+    # One that was restarted counts its time anew.
+    inbox.append(datagram(0.1, x=0.4))
+    assert tracker.read(0.7).x == 0.4
+
+
+def test_poses_come_by_udp(unused_port):
+    port = unused_port()
+    tracker = poses.udp_tracker(port, "127.0.0.1")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for index in range(3):
+            sender.sendto(datagram(1.0 + index, x=index), ("127.0.0.1", port))
+    assert tracker.read(1.0).x == 2
+    with pytest.raises(motors.DriveError, match=f"--tracker {port}: .*in use"):
+        poses.udp_tracker(port, "127.0.0.1")
+
+
+# Calibration.
+
+
+def test_calibration_finds_dead_bands_and_full_speeds(tmp_path, monkeypatch, capsys):
+    model = MotorModel(dead_band=(0.1, 0.16), full_speed=(12.0, 11.0))
+    robot = StandIn(model)
+    places = [robot.pose()]
+
+    def measure():
+        places.append(robot.pose())
+        before, after = places[-2:]
+        return math.hypot(after.x - before.x, after.y - before.y), after.yaw - before.yaw
+
+    path = tmp_path / "calibration.json"
+    assert calibrate.main(["--output", str(path)], robot, robot, measure) == 0
+    found, true = motors.read_calibration(str(path)), rehearse.true_calibration(model)
+    for side in ("left", "right"):
+        assert getattr(found, side).dead_band == pytest.approx(
+            getattr(true, side).dead_band, abs=5e-3
+        )
+        assert getattr(found, side).full_speed == pytest.approx(
+            getattr(true, side).full_speed, rel=0.02
+        )
+    assert robot.motors == (0.0, 0.0)
+    measured = iter([(0.3, 0.0), (0.2, 0.0)])
+    assert calibrate.main(["--output", "x"], robot, robot, lambda: next(measured)) == 2
+    assert "did not drive faster at 0.5" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.pop("lag"), "lacks 'lag'"),
+        (
+            lambda c: c["left"].update(dead_band=0.9),
+            "left.dead_band = 0.9 is not between 0 and 0.6",
+        ),
+        (lambda c: c["right"].update(full_speed="fast"), "right.full_speed = 'fast' is no number"),
+        (lambda c: c["right"].update(speed=1), "is no calibration"),
+    ],
+)
+def test_a_wrong_calibration_is_told(change, message, tmp_path):
+    values = motors.as_json(motors.default_calibration())
+    change(values)
+    path = tmp_path / "calibration.json"
+    path.write_text(json.dumps(values))
+    with pytest.raises(motors.DriveError, match=message):
+        motors.read_calibration(str(path))
+
+
+# The command.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["{policy}", "--goal", "1", "0"], "no robot here"),
+        (["nowhere", "--goal", "1", "0"], "nowhere is no exported policy: No such file"),
+        (
+            ["{policy}", "--goal", "1", "0", "--calibration", "c.json"],
+            "--calibration c.json: No such",
+        ),
+        (["{policy}", "--goal", "1", "0", "--tracker", "99999"], "--tracker 99999"),
+        (["{policy}", "--goal", "1", "0", "--dry-run", "--log", "no/log"], "--log no/log: No such"),
+    ],
+)
+def test_a_mistake_is_one_line(arguments, message, exported, capsys):
+    assert drive.main([word.format(policy=exported) for word in arguments]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+
+
+def test_a_number_that_is_none_is_told(exported, capsys):
+    with pytest.raises(SystemExit) as left:
+        drive.main([str(exported), "--goal", "1", "nan"])
+    assert left.value.code == 2
+    assert "nan is not at least" in capsys.readouterr().err
+
+
+def test_a_dry_run_needs_numpy_alone(exported, tmp_path):
+    site = site_with(tmp_path, NUMPY)
+    log = tmp_path / "drive.jsonl"
+    arguments = [str(exported), "--goal", "1", "0", "--dry-run", "--timeout", "0.2"]
+    arguments += ["--log", str(log)]
+    done = alone(
+        site,
+        f"sys.path.insert(0, {str(ROOT / 'deploy')!r})\n"
+        f"import drive\nsys.exit(drive.main({arguments!r}))",
+    )
+    assert (done.returncode, done.stderr) == (1, "")
+    assert "not reached after 0.2" in done.stdout
+    assert read_log(log).outcome == "timed out"
+
+
+def test_a_rehearsal_tells_how_many_goals_were_reached(exported, capsys):
+    assert rehearse.main([str(exported), "--goals", "2", "--timeout", "0.2"]) == 1
+    assert "0 of 2 goals reached; delay 0.05 s, lag 0.1 s" in capsys.readouterr().out
+    assert rehearse.main(["nowhere"]) == 2
+
+
+# A log in the simulator.
+
+
+@pytest.fixture(scope="module")
+def driven(policy, tmp_path_factory):
+    """The log of a drive in a stand-in whose calibration is known, but for its delay."""
+    model = MotorModel(full_speed=(12.0, 11.5), dead_band=(0.1, 0.15))
+    robot, calibration = StandIn(model), rehearse.true_calibration(model)
+    robot.place(Pose(0.2, -0.1, 3.0))
+    path = tmp_path_factory.mktemp("log") / "drive.jsonl"
+    where = settings((-0.6, 0.5))
+    with path.open("w") as file:
+
+        def log(line):
+            file.write(json.dumps(line) + "\n")
+
+        log(drive.log_header(policy, calibration, where, "tracker"))
+        source = poses.Tracker(camera(robot, 30.0).receive)
+        assert drive.drive(robot, robot, source, policy, calibration, where, log).reached
+    return path
+
+
+def test_a_replay_with_the_same_motors_ends_where_the_drive_did(driven):
+    same = replay(read_log(driven), delay=0.05)
+    assert len(same.log.poses) < 0.6 * len(same.log.times)
+    assert same.distances.max() < 2e-3
+    assert np.abs(same.turns).max() < 0.01
+    late = replay(read_log(driven), delay=0.0)
+    assert late.distances.max() > 5 * same.distances.max()
+
+
+def test_a_log_is_told_in_figures_and_a_picture(driven, tmp_path, capsys):
+    assert sim2real.main([str(driven), "--delay", "0.05", "--output", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert "reached after" in out
+    assert "mm at the end" in out
+    found = json.loads((tmp_path / "drive.sim2real.json").read_text())
+    assert found["position_error_final"] < 2e-3
+    assert found["goal_distance_logged"] < 0.0983
+    assert found["rate"] == pytest.approx(60.0, rel=1e-3)
+    assert found["path_length_logged"] == pytest.approx(found["path_length_simulated"], rel=0.01)
+    assert (tmp_path / "drive.sim2real.png").read_bytes()[1:4] == b"PNG"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda lines: [], "line 1"),
+        (lambda lines: ["{}", *lines[1:]], "line 1: lacks 'format'"),
+        (lambda lines: [lines[0].replace("drive/1", "drive/9"), *lines[1:]], "its format is"),
+        (lambda lines: [*lines[:5], "rubbish", *lines[5:]], "line 6"),
+        (lambda lines: [*lines[:5], '{"t": 1}', *lines[5:]], "line 6: lacks 'motors'"),
+        (lambda lines: lines[:1], "has 0 poses"),
+        (lambda lines: [lines[0], *lines[:0:-1]], "its times do not ascend"),
+    ],
+)
+def test_a_bad_log_is_told(change, message, driven, tmp_path):
+    path = tmp_path / "bad.jsonl"
+    path.write_text("\n".join(change(driven.read_text().splitlines())))
+    with pytest.raises(UserError, match=message):
+        sim2real.run(path)
+    assert os.listdir(tmp_path) == ["bad.jsonl"]
+
+
+def test_a_log_that_was_cut_off_is_read_to_its_end(driven, tmp_path):
+    path = tmp_path / "cut.jsonl"
+    path.write_text(driven.read_text()[:20_000])
+    cut = read_log(path)
+    assert (cut.outcome, len(cut.times) > 20) == ("interrupted", True)
+    (tmp_path / "no.jsonl").write_bytes(b"\xff\xfe")
+    with pytest.raises(UserError, match="it is no text"):
+        read_log(tmp_path / "no.jsonl")
+    with pytest.raises(UserError, match="cannot be read: No such file"):
+        read_log(tmp_path / "nothing.jsonl")
