@@ -1,8 +1,8 @@
 """A run is one folder, and everything after training needs only that folder.
 
 config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/, checkpoints/<env_steps>/,
-evaluations/<env_steps>/, videos/, faults/; of several seeds trained at once, seed-<n>/ with all of
-that in each.
+evaluations/<env_steps>/, videos/, policy/, faults/; of several seeds trained at once, seed-<n>/
+with all of that in each.
 """
 
 import contextlib

@@ -5,7 +5,9 @@ Every training compiles a program of its own, so most of this is slow: `make tes
 """
 
 import functools
+import importlib
 import re
+import runpy
 import shutil
 import sys
 from pathlib import Path
@@ -23,6 +25,7 @@ from jetbot_mjx.env import make_env
 from jetbot_mjx.faults import save_fault
 from jetbot_mjx.film import Studio
 from jetbot_mjx.ppo import Fault
+from jetbot_mjx.stand_in import StandIn
 from jetbot_mjx.wrappers import wrap_for_training
 
 TEXTS = {**PAGES, "README.md": (ROOT / "README.md").read_text("utf-8")}
@@ -254,16 +257,83 @@ def test_a_documented_benchmark_measures(page, words, monkeypatch, tmp_path, cap
     assert "training" in capsys.readouterr().out
 
 
+@pytest.mark.slow
+@pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.export"))
+def test_a_documented_export_is_held_to_jax(page, words, reader, real_run, monkeypatch, capsys):
+    assert execute(page, words, reader, monkeypatch) == 0
+    assert "on 10,000 observations" in capsys.readouterr().out
+
+
+@pytest.fixture
+def real_run(reader, monkeypatch):
+    """The run of the page about real robots, unless it is there."""
+    page, words = next(
+        (page, words)
+        for page, words in DOCUMENTED.values()
+        if page == "deploy.md" and words[2] == "jetbot_mjx.train"
+    )
+    reader(page)
+    if not Path("runs/real").exists():
+        assert execute(page, words, reader, monkeypatch) == 0
+
+
+@pytest.mark.slow
+def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monkeypatch, capsys):
+    # In order, as a reader would: the stand-in is the robot and its clock, and copies are links.
+    monkeypatch.syspath_prepend(ROOT / "deploy")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import calibrate
+    import drive
+    from poses import Tracker
+    from rehearse import Camera
+
+    robot = StandIn()
+    eye = Camera(robot, 60.0, 0.0, np.random.default_rng(0))
+    distances = iter([0.14, 0.33])
+    monkeypatch.setattr(drive, "make_robot", lambda: robot)
+    monkeypatch.setattr(drive, "udp_tracker", lambda port: Tracker(eye.receive))
+    mains = {
+        "calibrate": lambda words: calibrate.main(
+            words, robot, robot, lambda: (next(distances), 0.0)
+        ),
+        "drive": lambda words: drive.main(words, clock=robot),
+    }
+    done = []
+    for page, words in DOCUMENTED.values():
+        if page != "deploy.md" or words[:3] == ["python", "-m", "jetbot_mjx.train"]:
+            continue
+        if words[0] == "scp":
+            if words[1] == "-r":  # to the robot
+                Path("policy").symlink_to("runs/real/policy")
+            continue
+        if words[1] == "-m":
+            assert execute(page, words, reader, monkeypatch) == 0
+        elif words[1].endswith("policy/policy.py"):
+            with pytest.raises(SystemExit) as left:
+                runpy.run_path(words[1], run_name="__main__")
+            assert left.value.code == 0
+        else:
+            name = Path(words[1]).stem
+            main = mains.get(name) or importlib.import_module(name).main
+            # What has learnt nothing reaches nothing.
+            assert main(words[2:]) == int(name in {"drive", "rehearse"})
+        done.append(Path(words[1]).stem)
+    assert {"rehearse", "action_latency", "policy", "calibrate", "drive"} <= set(done)
+    assert Path("seen.sim2real.png").is_file()
+    assert "mm at the end" in capsys.readouterr().out
+
+
 def test_no_kind_of_command_is_left_out():
-    # Installing needs a network, Slurm a cluster; the tests that are named run among these; Python
-    # is run as it is.
+    # Installing needs a network, Slurm a cluster, copying a robot; the tests that are named run
+    # among these; Python is run as it is.
     elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",), ("srun",)}
-    covered = {"train", "evaluate", "render", "replay", "play", "plan"}
+    elsewhere |= {("scp",)}
+    covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":
             assert bare[2].removeprefix("jetbot_mjx.") in covered, text
-        elif bare[0] != "python":
+        elif bare[0] not in {"python", "python3"}:
             known = bare[0] in {"make", "tensorboard"} or tuple(bare[:2]) in elsewhere
             assert known or tuple(bare[:1]) in elsewhere, text
 

@@ -1,5 +1,7 @@
 """The driver: at its goal in the stand-in, and with its motors at zero whenever it must be."""
 
+import contextlib
+import functools
 import json
 import math
 import os
@@ -17,6 +19,7 @@ from jetbot_mjx import export, sim2real, train
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.drive_log import read_log, replay
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.portable import record
 from jetbot_mjx.stand_in import ROLLING_RADIUS, MotorModel, Pose, StandIn
 from jetbot_mjx.task import GOAL_HEIGHT, LAYOUTS, GoalTask, RobotState
 
@@ -38,7 +41,9 @@ IDEAL = MotorModel(dead_band=(0.0, 0.0), lag=0.0, delay=0.0)
 def exported(smoke_run, tmp_path_factory):
     """An export of a policy that has learnt next to nothing."""
     folder = tmp_path_factory.mktemp("deploy") / "policy"
-    export.run(smoke_run, output=folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(export, "record", functools.partial(record, count=50))
+        export.run(smoke_run, output=folder)
     return folder
 
 
@@ -360,7 +365,10 @@ def test_poses_come_by_udp(unused_port):
         for index in range(3):
             sender.sendto(datagram(1.0 + index, x=index), ("127.0.0.1", port))
     assert tracker.read(1.0).x == 2
-    with pytest.raises(motors.DriveError, match=f"--tracker {port}: .*in use"):
+    with (
+        contextlib.closing(tracker),
+        pytest.raises(motors.DriveError, match=f"--tracker {port}: .*in use"),
+    ):
         poses.udp_tracker(port, "127.0.0.1")
 
 
@@ -426,7 +434,7 @@ def test_a_wrong_calibration_is_told(change, message, tmp_path):
             ["{policy}", "--goal", "1", "0", "--calibration", "c.json"],
             "--calibration c.json: No such",
         ),
-        (["{policy}", "--goal", "1", "0", "--tracker", "99999"], "--tracker 99999"),
+        (["{policy}", "--goal", "1", "0", "--dry-run", "--tracker", "99999"], "--tracker 99999"),
         (["{policy}", "--goal", "1", "0", "--dry-run", "--log", "no/log"], "--log no/log: No such"),
     ],
 )

@@ -1,5 +1,6 @@
 """The documentation: complete, in step with the code, and every command and example of it works."""
 
+import argparse
 import contextlib
 import importlib.util
 import json
@@ -16,7 +17,18 @@ import jax.numpy as jnp
 import pytest
 from ruamel.yaml import YAML
 
-from jetbot_mjx import cli, evaluate, metrics, plan, play, render, replay, train
+from jetbot_mjx import (
+    cli,
+    evaluate,
+    export,
+    metrics,
+    plan,
+    play,
+    render,
+    replay,
+    sim2real,
+    train,
+)
 from jetbot_mjx.aliases import aliases
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
 from jetbot_mjx.env import make_env
@@ -95,7 +107,7 @@ def test_links_lead_somewhere(page):
 @pytest.mark.parametrize("page", ALL_PAGES)
 def test_files_that_are_named_exist(page):
     named = re.findall(
-        r"\b(?:configs|examples|benchmarks|jetbot_mjx|tests|notebooks)/[\w/.-]+\.\w+",
+        r"\b(?:configs|examples|benchmarks|deploy|jetbot_mjx|tests|notebooks)/[\w/.-]+\.\w+",
         ALL_PAGES[page],
     )
     assert [name for name in named if not (ROOT / name).is_file()] == []
@@ -342,7 +354,9 @@ class Parsed(Exception):
 
 
 KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
-PLAIN = {"[", "break", "tensorboard", "apt-get"}
+PLAIN = {"[", "break", "tensorboard", "apt-get", "scp"}
+EXPORTED = "policy/policy.py"
+"""Where an export lies, in a run folder or on a robot; it takes no arguments."""
 VARIABLES = {
     *("PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"),
     *("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
@@ -354,6 +368,8 @@ COMMANDS = {
     "render": render,
     "replay": replay,
     "play": play,
+    "export": export,
+    "sim2real": sim2real,
 }
 
 
@@ -395,7 +411,15 @@ def reader(tmp_path, monkeypatch):
     """Sits in a folder with all of the checkout, and the files that a page tells to write."""
 
     def sit(page):
-        for name in ("configs", "examples", "benchmarks", "tests", "Makefile", "pyproject.toml"):
+        for name in (
+            "configs",
+            "examples",
+            "benchmarks",
+            "deploy",
+            "tests",
+            "Makefile",
+            "pyproject.toml",
+        ):
             (tmp_path / name).symlink_to(ROOT / name)
         for name, text in own_files(page).items():
             (tmp_path / name).write_text(text, encoding="utf-8")
@@ -438,6 +462,8 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
             check_arguments(COMMANDS[module.removeprefix("jetbot_mjx.")], arguments, monkeypatch)
         case ["python", "-c", source]:
             compile(source, page, "exec")
+        case ["python" | "python3", script, *arguments]:
+            check_script(script, arguments, monkeypatch)
         case ["make", *targets]:
             known = re.findall(r"^([\w-]+):", Path("Makefile").read_text(), re.MULTILINE)
             assert set(targets) <= set(known)
@@ -445,6 +471,22 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
             check_install(arguments)
         case [first, *_]:
             assert first in PLAIN
+
+
+def check_script(script, arguments, monkeypatch):
+    """It is one of the checkout, or an export's, and takes the arguments."""
+    if script.endswith(EXPORTED):
+        assert arguments == []
+        return
+    monkeypatch.syspath_prepend(str((ROOT / script).parent))
+
+    def stop_after_parsing(parser, given=None):
+        raise Parsed(parse(parser, given))
+
+    parse = argparse.ArgumentParser.parse_args
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop_after_parsing)
+    with pytest.raises(Parsed):
+        load(ROOT / script).main(arguments)
 
 
 def check_arguments(command, arguments, monkeypatch):
@@ -479,6 +521,8 @@ def check_install(arguments):
         ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --set ppo.num_env=1"),
         ("a.md", "python -m jetbot_mjx.train --config configs/nothing.yaml"),
         ("a.md", "python -m jetbot_mjx.dance runs/mine"),
+        ("a.md", "python3 deploy/drive.py policy --gaol 1 0"),
+        ("a.md", "python deploy/dance.py policy"),
         ("a.md", "make everything"),
         ("a.md", "pip install '.[gpu]'"),
         ("a.md", "rm -rf runs"),
@@ -487,7 +531,7 @@ def check_install(arguments):
 def test_a_command_that_is_none_is_seen(page, block, reader, monkeypatch):
     monkeypatch.setitem(PAGES, "a.md", f"```sh\n{block}\n```\n")
     ((found,),) = [list(commands(one)) for one in blocks(PAGES[page], "sh")]
-    with pytest.raises((AssertionError, ConfigError, KeyError, SystemExit)):
+    with pytest.raises((AssertionError, ConfigError, FileNotFoundError, KeyError, SystemExit)):
         test_a_command_of_the_pages_is_one(page, found, reader, monkeypatch)
 
 
