@@ -8,7 +8,7 @@ table stands between two comments, `<!-- NAME: begin ... -->` and `<!-- NAME: en
 import json
 import re
 import statistics
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -68,17 +68,23 @@ def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) 
     success = min(run["policy"]["success_rate"] for run in runs)
     first = [run.get("first_step_seconds") for run in runs]
     observation = values["config"]["task"]["observation"]
+    impl = values["config"]["physics"].get("impl")
     return [
         _machine(values, runs[0]["versions"]) + (", warm cache" if warm else ""),
         "the 16 numbers" if observation == "world" else observation,
         f"`{values['command'].split('/')[-1]}`",
-        values["config"]["trainer"],
+        values["config"]["trainer"] + (", XLA's physics" if impl == "xla" else ""),
         str(len(runs)),
         f"{success:.2%}",
-        f"{statistics.median(run['process_seconds'] for run in runs):.0f} s",
-        "-" if None in first else f"{statistics.median(first):.0f} s",
-        "not by all" if None in reached else f"{statistics.median(reached):.0f} s",
+        _seconds(run["process_seconds"] for run in runs),
+        "-" if None in first else _seconds(first),
+        "not by all" if None in reached else _seconds(reached),
     ]
+
+
+def _seconds(times: Iterable[float]) -> str:
+    median = statistics.median(times)
+    return f"{median:.{1 if median < 10 else 0}f} s"
 
 
 def best_rates_table(results: Results) -> str:
