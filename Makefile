@@ -7,8 +7,9 @@ RUN ?= runs/$(notdir $(basename $(CONFIG)))-$(shell date +%Y%m%d-%H%M%S)
 BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
+SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup train test test-slow check format benchmark docs clean
+.PHONY: setup sb3 train test test-slow check format benchmark docs clean
 
 setup: $(STAMP)
 
@@ -16,6 +17,14 @@ $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: Python %d.%d is too old: jetbot_mjx needs 3.11 or newer; say make PYTHON=python3.11" % sys.version_info[:2])'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	@touch $@
+
+# Stable-Baselines3, whose tests are otherwise left out. Not part of `setup`: on Linux pip takes torch
+# with gigabytes of CUDA, unless torch's build for CPUs is there already.
+sb3: $(SB3_STAMP)
+
+$(SB3_STAMP): $(STAMP)
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sb3]'
 	@touch $@
 
 # Trains the tutorial's task on whatever JAX finds, then judges it and shows it. A machine without

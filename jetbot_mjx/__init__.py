@@ -10,6 +10,8 @@ The modules in reading order, each knowing only those before it:
 `training`, `portable`, `contract`, `formats`, `stand_in`, `drive_log`, `clock`, `live`, `player`,
 `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands `plan`, `train`, `evaluate`,
 `render`, `replay`, `play`, `export`, `sim2real`. Commands meet only in the run folder.
+Beside them stand the adapters, for programs of Gymnasium and Stable-Baselines3; none but they
+import those, and no other module imports an adapter.
 
 What the package itself offers is imported at its first use: a command that is mistyped says so at
 once, and a GPU wakes while the rest loads.

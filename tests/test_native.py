@@ -31,10 +31,7 @@ class Window:
         self._model, self._data, self._press = model, data, key_callback
         return self
 
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
+    def close(self):
         self.closed = True
 
     def is_running(self):
@@ -58,7 +55,7 @@ def test_the_window_shows_the_robot_drive_and_hears_the_arrow_keys(player, monke
     player.reset()
     player.drive(0.0, 0.0)
     window = Window(pictures=20, key=key)
-    monkeypatch.setattr(native, "require_window", lambda: window)
+    monkeypatch.setattr(native, "require_window", lambda *_: window)
     native.run(player)
     assert window.closed
     assert len(window.shown) == 20
@@ -86,6 +83,6 @@ def test_what_keeps_the_window_shut_is_told_in_one_line(player, monkeypatch):
         raise RuntimeError("requires mjpython")
 
     viewer = types.SimpleNamespace(launch_passive=launch_passive)
-    monkeypatch.setattr(native, "require_window", lambda: viewer)
+    monkeypatch.setattr(native, "require_window", lambda *_: viewer)
     with pytest.raises(UserError, match=r"\(requires mjpython\): use --viewer browser"):
         native.run(player)

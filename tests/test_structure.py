@@ -85,9 +85,21 @@ NOUNS = (
     "native",
     "cli",
 )
+ADAPTERS = tuple(
+    f"adapters.{name}"
+    for name in (
+        "view",
+        "settings",
+        "batch",
+        "robot_in_c",
+        "gymnasium",
+        "vector",
+        "stable_baselines3",
+    )
+)
 VERBS = ("plan", "train", "evaluate", "render", "replay", "play", "export", "sim2real")
-ORDER = (*NOUNS, *VERBS)
-"""A module knows only those before it, and a verb no other verb."""
+ORDER = (*NOUNS, *ADAPTERS, *VERBS)
+"""A module knows only those before it, a verb no other verb, and none but adapters an adapter."""
 
 MAY_PRINT_AND_PARSE = ("cli", *VERBS)
 
@@ -97,6 +109,13 @@ OUTSIDERS = {
     "kinematics": {"jax", "jaxtyping"},
 }
 """All that these import from outside the standard library and the package."""
+
+OPTIONAL = {
+    "gymnasium": ("adapters.gymnasium", "adapters.vector", "adapters.stable_baselines3"),
+    "stable_baselines3": ("adapters.stable_baselines3",),
+    "torch": (),
+}
+"""What only these may import."""
 
 PUBLIC = {
     "load_config": "config",
@@ -126,7 +145,14 @@ def complaints(name, source):
     known = ORDER[: ORDER.index(name)]
     for imported in imports(source):
         top, _, rest = imported.partition(".")
-        own = rest.partition(".")[0]
+        own, _, deeper = rest.partition(".")
+        if own == "adapters":
+            own = f"{own}.{deeper.partition('.')[0]}"
+            if name not in ADAPTERS:
+                yield f"{name} imports {imported}: adapters are for others' programs"
+                continue
+        elif top in OPTIONAL and name not in OPTIONAL[top]:
+            yield f"{name} imports {imported}, which is optional"
         if top == PACKAGE and own not in known:
             yield f"{name} imports {imported}, which does not stand before it"
         elif top == PACKAGE and name in VERBS and own in VERBS:
@@ -144,8 +170,17 @@ def complaints(name, source):
 
 def test_every_module_has_a_place():
     modules = {path.stem for path in (ROOT / PACKAGE).glob("*.py")} - {"__init__"}
-    assert modules == set(ORDER)
-    assert not [path for path in (ROOT / PACKAGE).iterdir() if (path / "__init__.py").exists()]
+    adapters = {path.stem for path in (ROOT / PACKAGE / "adapters").glob("*.py")} - {"__init__"}
+    assert modules | {f"adapters.{name}" for name in adapters} == set(ORDER)
+    folders = [path for path in (ROOT / PACKAGE).rglob("*") if (path / "__init__.py").exists()]
+    assert folders == [ROOT / PACKAGE / "adapters"]
+
+
+def test_every_package_is_shipped():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
+    folders = [path.parent for path in (ROOT / PACKAGE).rglob("__init__.py")]
+    packages = [".".join(folder.relative_to(ROOT).parts) for folder in folders]
+    assert sorted(project["tool"]["setuptools"]["packages"]) == sorted(packages)
 
 
 def test_every_asset_is_shipped():
@@ -160,7 +195,8 @@ def test_every_asset_is_shipped():
 
 @pytest.mark.parametrize("name", ORDER)
 def test_a_module_keeps_to_its_place(name):
-    assert list(complaints(name, (ROOT / PACKAGE / f"{name}.py").read_text("utf-8"))) == []
+    path = ROOT / PACKAGE / f"{name.replace('.', '/')}.py"
+    assert list(complaints(name, path.read_text("utf-8"))) == []
 
 
 @pytest.mark.parametrize(
@@ -185,6 +221,14 @@ def test_a_module_keeps_to_its_place(name):
         ("env", "from argparse import ArgumentParser"),
         ("env", "def step():\n    print('stepping')"),
         ("metrics", "print('line', flush=True)"),
+        ("play", "from jetbot_mjx.adapters import JetBotGymEnv"),
+        ("play", "from jetbot_mjx.adapters.gymnasium import JetBotGymEnv"),
+        ("cli", "import jetbot_mjx.adapters.gymnasium"),
+        ("env", "import gymnasium"),
+        ("adapters.vector", "import stable_baselines3"),
+        ("adapters.gymnasium", "import torch"),
+        ("adapters.batch", "from jetbot_mjx.adapters.gymnasium import JetBotGymEnv"),
+        ("adapters.gymnasium", "from jetbot_mjx.train import run"),
     ],
 )
 def test_a_breach_of_the_order_is_seen(name, source):
@@ -198,6 +242,8 @@ def test_a_breach_of_the_order_is_seen(name, source):
         ("evaluate", "from jetbot_mjx import cli\nprint('done')"),
         ("cli", "import argparse"),
         ("metrics", "print('line', file=stream)"),
+        ("adapters.vector", "import gymnasium\nfrom jetbot_mjx.adapters.batch import Batch"),
+        ("adapters.vector", "from jetbot_mjx import cli\nfrom jetbot_mjx.env import make_env"),
     ],
 )
 def test_what_is_allowed_is_not_taken_for_a_breach(name, source):
@@ -205,7 +251,7 @@ def test_what_is_allowed_is_not_taken_for_a_breach(name, source):
 
 
 def test_the_package_tells_the_order_that_holds():
-    told = re.findall(r"`(\w+)`", jetbot_mjx.__doc__)
+    told = re.findall(r"`([\w.]+)`", jetbot_mjx.__doc__)
     assert told == [name for name in ORDER if name in told]
     assert set(VERBS) < set(told)
 

@@ -1,0 +1,105 @@
+"""How an adapted environment shows itself: as pictures, or in MuJoCo's window."""
+
+import time
+import weakref
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PyTree, UInt8
+
+from jetbot_mjx import native
+from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.model import QPOS_XYZ
+from jetbot_mjx.offscreen import Renderer, overview
+
+_REMEDY = "take render_mode='rgb_array', which needs none"
+_AROUND = np.array([0.15, 0.15, 0.0])  # [m] of a thing's middle, which belongs to it
+
+
+class View:
+    """Shows one robot and its goal; opens nothing before the first picture."""
+
+    def __init__(self, env: JetBotEnv, mode: str, rendering_dt: float) -> None:
+        """Looks whether there is a display, where one is needed.
+
+        Args:
+          env: whose robot and task are shown.
+          mode: `human` or `rgb_array`.
+          rendering_dt: [s] of simulated time between two pictures in the window.
+
+        Raises:
+          UserError: there is no display.
+        """
+        self._env, self._mode, self._rendering_dt = env, mode, rendering_dt
+        self._renderer: Renderer | None = None
+        self._window: native.Window | None = None
+        self._closing: list[Callable[[], None]] = []
+        self._next = (0.0, 0.0)
+        """When the next picture is due, in simulated and in real time [s]."""
+        if mode == "human":
+            native.require_window(_REMEDY)
+
+    def frame(
+        self, qpos: Float[np.ndarray, " nq"], goal: PyTree
+    ) -> UInt8[np.ndarray, "height width 3"]:
+        """A picture from the nearest camera that has robot, goal and origin in its frame.
+
+        Args:
+          qpos: the robot's pose.
+          goal: of the episode.
+
+        Returns:
+          The picture, RGB.
+
+        Raises:
+          UserError: this machine has no OpenGL that works without a screen.
+        """
+        if self._renderer is None:
+            self._renderer = Renderer(self._env.mj_model)
+            # For who forgets to close it: at Python's end OpenGL is gone before the renderer.
+            self._closing.append(weakref.finalize(self, _exit, self._renderer))
+        markers = self._markers(goal)
+        middles = np.stack([np.zeros(3), qpos[QPOS_XYZ], *markers.values()])
+        points = np.concatenate([middles - _AROUND, middles + _AROUND])
+        camera = overview(points, float(self._env.mj_model.vis.global_.fovy))
+        return self._renderer.frame(qpos, markers, camera)
+
+    def show(self, qpos: Float[np.ndarray, " nq"], goal: PyTree, now: float) -> None:
+        """Puts a pose into the window, as fast as the robot would move.
+
+        Args:
+          qpos: the robot's pose.
+          goal: of the episode.
+          now: simulated time since the episode began [s].
+
+        Raises:
+          UserError: the window cannot be opened.
+        """
+        if self._window is None:
+            self._window = native.Window(self._env.mj_model, remedy=_REMEDY)
+            self._closing.append(weakref.finalize(self, _exit, self._window))
+        due, at = self._next
+        if now == 0.0:
+            due, at = 0.0, time.monotonic()
+        if now < due - 1e-9 or not self._window.is_running():
+            return
+        time.sleep(max(0.0, at - time.monotonic()))
+        self._window.show(qpos, self._markers(goal))
+        self._next = now + self._rendering_dt, time.monotonic() + self._rendering_dt
+
+    def close(self) -> None:
+        """Closes what was opened."""
+        for close in self._closing:
+            close()
+        self._renderer = self._window = None
+
+    def _markers(self, goal: PyTree) -> dict[str, Any]:
+        markers = self._env.task.markers(jax.tree.map(jnp.asarray, goal))
+        return jax.device_get(dict(markers))
+
+
+def _exit(shown: Renderer | native.Window) -> None:
+    shown.__exit__(None, None, None)

@@ -1,0 +1,429 @@
+"""The environment for Gymnasium: one robot in C MuJoCo and a batch in MJX, which are the same."""
+
+import contextlib
+import importlib
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+gymnasium = pytest.importorskip("gymnasium")
+
+from gliding import everywhere
+from gymnasium.utils.env_checker import check_env
+from gymnasium.vector import AutoresetMode, SyncVectorEnv
+from gymnasium.wrappers.vector import RecordEpisodeStatistics
+
+from jetbot_mjx import native
+from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
+from jetbot_mjx.config import Config, parse_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
+from jetbot_mjx.task import GOAL_HEIGHT
+
+ID = "jetbot_mjx.adapters:JetBot-v0"
+GOAL = slice(13, 16)
+ENDS = {"task": {"success_radius": 0.6}}  # near goals are reached within some steps
+
+
+class Window:
+    """In place of MuJoCo's, for no test machine has a display."""
+
+    def __init__(self):
+        self.shown = []
+
+    def launch_passive(self, model, data, **_):
+        self._data = data
+        return self
+
+    def is_running(self):
+        return True
+
+    def lock(self):
+        return contextlib.nullcontext()
+
+    def sync(self):
+        self.shown.append((self._data.qpos.copy(), self._data.mocap_pos.copy()))
+
+    def close(self):
+        self.shown.append("closed")
+
+
+@pytest.fixture
+def window(monkeypatch):
+    opened = Window()
+    monkeypatch.setattr(native, "require_window", lambda *_: opened)
+    return opened
+
+
+@pytest.fixture
+def env():
+    return JetBotGymEnv()
+
+
+@pytest.fixture(scope="module")
+def gliding():
+    """Four robots that glide, and compile in no time; episodes end in both ways."""
+    with everywhere():
+        vector = JetBotVectorEnv(4, max_episode_length=8, config=ENDS)
+        vector.reset(seed=0)
+        vector.step(np.zeros((4, 2)))
+        yield vector
+
+
+def drive(env, actions):
+    """Observations, rewards, ends and infos of an environment under given actions."""
+    return list(zip(*(env.step(action) for action in actions), strict=True))
+
+
+# Contracts.
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
+def test_gymnasiums_checker_passes_with_every_render_mode(window):
+    check_env(gymnasium.make(ID).unwrapped)
+    assert window.shown[-1] == "closed"
+
+
+def test_the_tutorials_arguments_are_taken_by_name_and_place():
+    by_name = gymnasium.make(
+        ID,
+        skip_frame=2,
+        physics_dt=1 / 120,
+        rendering_dt=1 / 30,
+        max_episode_length=100,
+        seed=3,
+        headless=True,
+    ).unwrapped
+    by_place = JetBotGymEnv(2, 1 / 120, 1 / 30, 100, 3, True)
+    for env in (by_name, by_place):
+        assert env.config.physics.ctrl_dt == pytest.approx(1 / 60)
+        assert env.config.physics.n_substeps == 2
+        assert env.config.task.episode_length == 100
+        assert env.render_mode is None
+        np.testing.assert_array_equal(env.reset()[0], JetBotGymEnv().reset(seed=3)[0])
+
+
+def test_nothing_given_is_the_tutorials_environment(env):
+    assert env.config == Config()
+    assert env.metadata["render_fps"] == 60
+    assert (env.observation_space.shape, env.observation_space.dtype) == ((16,), np.float32)
+    assert (env.observation_space.low == -np.inf).all()
+    assert (env.observation_space.high == np.inf).all()
+    assert (env.action_space.low.tolist(), env.action_space.high.tolist()) == ([-1, -1], [1, 1])
+
+
+@pytest.mark.parametrize("form", ["path", "mapping", "config"])
+def test_all_else_comes_from_a_configuration(form, tmp_path):
+    path = tmp_path / "a.yaml"
+    path.write_text("task: {observation: egocentric, episode_length: 7}")
+    mapping = {"task": {"observation": "egocentric", "episode_length": 7}}
+    source = {"path": path, "mapping": mapping, "config": parse_config(mapping)}[form]
+    env = JetBotGymEnv(config=source)
+    assert env.observation_space.contains(env.reset()[0])
+    assert env.observation_space.shape == (7,)
+    assert env.config.task.episode_length == 7
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ({"skip_frame": 0}, "skip_frame = 0"),
+        ({"skip_frame": 1.5}, "skip_frame = 1.5"),
+        ({"physics_dt": 0.0}, "physics_dt = 0.0"),
+        ({"physics_dt": float("inf")}, "physics_dt = inf"),
+        ({"rendering_dt": "a"}, "rendering_dt = 'a'"),
+        ({"max_episode_length": 0}, "max_episode_length = 0"),
+        ({"render_mode": "ascii"}, "render_mode = 'ascii' is unknown: known are human"),
+        ({"seed": -1}, "seed = -1"),
+        ({"config": 3}, "config = 3"),
+        ({"config": {"task": {"observatoin": "world"}}}, "did you mean observation"),
+        ({"config": "nothing.yaml"}, "does not exist"),
+    ],
+)
+def test_a_wrong_argument_costs_one_line(arguments, said):
+    with pytest.raises(UserError) as caught:
+        JetBotGymEnv(**arguments)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_package_costs_one_line(monkeypatch):
+    name = "jetbot_mjx.adapters.gymnasium"
+    monkeypatch.setitem(sys.modules, "gymnasium", None)
+    monkeypatch.delitem(sys.modules, name)
+    with pytest.raises(UserError, match=r"pip install 'jetbot_mjx\[gymnasium\]'"):
+        importlib.import_module(name)
+
+
+@pytest.mark.parametrize("make", [JetBotGymEnv, JetBotVectorEnv])
+def test_a_step_before_the_first_reset_is_refused(make):
+    env = make(render_mode="rgb_array")
+    for act in (lambda: env.step(env.action_space.sample()), env.render):
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            act()
+
+
+# One robot.
+
+
+def test_wheel_speeds_are_the_controllers(env):
+    env.reset()
+    actions = np.random.default_rng(0).uniform(-1, 1, (100, 2)).astype(np.float32)
+    actions[:4] = [[1, 1], [1, -1], [-1, 1], [-1, -1]]
+    for action in actions:
+        v, yaw_rate = (float(action[0]) + 1) / 2 * 1.0, float(action[1]) * np.pi
+        wanted = [
+            (2 * v + sign * yaw_rate * CONTROLLER_WHEEL_SEPARATION) / (2 * CONTROLLER_WHEEL_RADIUS)
+            for sign in (-1, 1)
+        ]
+        env.step(action)
+        np.testing.assert_allclose(env.robot.data.ctrl, wanted, rtol=0, atol=1e-6)
+        # In float32 a number of 36 rad/s is known to 4e-6.
+        in_jax = env.robot.env.wheel_targets(jnp.asarray(action))
+        np.testing.assert_allclose(in_jax, wanted, rtol=1e-6, atol=1e-6)
+
+
+def test_actions_outside_are_clipped(env):
+    env.reset()
+    env.step(np.array([3.0, -3.0]))
+    outside = env.robot.data.ctrl.copy()
+    env.step(np.array([1.0, -1.0]))
+    np.testing.assert_array_equal(outside, env.robot.data.ctrl)
+
+
+def test_an_episode_that_arrives_is_terminated_and_a_success():
+    env = JetBotGymEnv(max_episode_length=60, config=ENDS)
+    arrived = []
+    for _ in range(10):
+        obs, _ = env.reset()
+        before, over = np.linalg.norm(obs[GOAL] - obs[:3]), False
+        while not over:
+            obs, reward, terminated, truncated, info = env.step(np.array([1.0, 0.2]))
+            distance = np.linalg.norm(obs[GOAL] - obs[:3])
+            assert terminated == info["is_success"] == (distance < 0.6)
+            assert reward == pytest.approx(before - distance, abs=1e-6)
+            before, over = distance, terminated or truncated
+        arrived.append(terminated)
+    assert set(arrived) == {True, False}
+
+
+def test_the_time_limit_truncates_and_is_no_success():
+    env = JetBotGymEnv(max_episode_length=5)
+    for _ in range(2):
+        env.reset()
+        _, _, terminated, truncated, infos = drive(env, [np.array([-1.0, 0.0])] * 5)
+        assert terminated == (False,) * 5
+        assert truncated == (False,) * 4 + (True,)
+        assert not any(info["is_success"] for info in infos)
+
+
+def test_a_longer_frame_is_made_of_more_physics_steps():
+    env = JetBotGymEnv(skip_frame=3, max_episode_length=4)
+    assert env.config.physics.n_substeps == 6
+    assert env.metadata["render_fps"] == 20
+    env.reset()
+    truncated = drive(env, [np.zeros(2)] * 4)[3]
+    assert truncated == (False, False, False, True)  # environment steps, not physics steps
+    assert env.robot.data.time == pytest.approx(12 / 60)
+
+
+def test_the_same_seed_gives_the_same_episodes_and_each_has_a_goal_of_its_own():
+    def goals(env, seed):
+        return np.array([env.reset(seed=seed)[0][GOAL], *(env.reset()[0][GOAL] for _ in range(9))])
+
+    first, again, other = (goals(JetBotGymEnv(), seed) for seed in (0, 0, 1))
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_array_equal(goals(JetBotGymEnv(seed=1), None), other)
+    assert len(np.unique(np.concatenate([first, other])[:, 0])) == 20
+    assert (first[:, 2] == np.float32(GOAL_HEIGHT)).all()
+    reach = np.linalg.norm(first[:, :2], axis=1)
+    assert ((reach > 0.2) & (reach < 1.2)).all()
+
+
+@pytest.mark.parametrize("blow_up", ["velocity", "action"])
+def test_a_world_that_blows_up_is_truncated_and_told(env, blow_up, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes a log of its own
+    before, _ = env.reset()
+    action = np.zeros(2)
+    if blow_up == "velocity":
+        env.robot.data.qvel[0] = np.nan
+    else:
+        action[1] = np.nan
+    obs, reward, terminated, truncated, info = env.step(action)
+    assert (reward, terminated, truncated) == (0.0, False, True)
+    assert info == {"is_success": False, "nonfinite_world": True}
+    np.testing.assert_array_equal(obs, before)
+    env.reset()
+    assert drive(env, [np.zeros(2)] * 3)[3] == (False,) * 3
+
+
+def test_a_picture_shows_the_robot_where_it_is():
+    env = gymnasium.make(ID, render_mode="rgb_array")
+    env.reset(seed=0)
+    first = env.render()
+    assert first.shape == (480, 480, 3)
+    assert first.dtype == np.uint8
+    for _ in range(30):
+        env.step(np.array([0.5, 1.0]))
+    assert np.abs(env.render().astype(int) - first).mean() > 5
+    env.close()
+
+
+def test_a_window_follows_the_robot_in_real_time(window):
+    env = JetBotGymEnv(headless=False, rendering_dt=1 / 30)
+    obs, _ = env.reset()
+    for _ in range(8):
+        env.step(np.array([1.0, 0.0]))
+    assert len(window.shown) == 1 + 4
+    qpos, mocap = window.shown[-1]
+    np.testing.assert_allclose(qpos, env.robot.data.qpos)
+    np.testing.assert_allclose(mocap[0], obs[GOAL], atol=1e-6)
+    env.close()
+    env.close()
+    assert window.shown[-1] == "closed"
+
+
+def test_without_a_display_one_line_names_the_other_way(monkeypatch):
+    if sys.platform != "linux":
+        pytest.skip("a missing display is told on Linux only")
+    monkeypatch.setitem(sys.modules, "glfw", type(sys)("glfw"))
+    sys.modules["glfw"].init = lambda: False
+    monkeypatch.setitem(sys.modules, "mujoco.viewer", type(sys)("mujoco.viewer"))
+    for make in (JetBotGymEnv, JetBotVectorEnv):
+        with pytest.raises(UserError, match="no display: take render_mode='rgb_array'") as caught:
+            make(headless=False)
+        assert "\n" not in str(caught.value)
+
+
+# Many robots.
+
+
+@pytest.mark.parametrize("preset", ["isaac", pytest.param("real", marks=pytest.mark.slow)])
+def test_robots_in_mjx_do_what_as_many_in_c_do(preset):
+    """Episodes to their end and on, with what Gymnasium prescribes to be told of them."""
+    config = {"robot": {"preset": preset}, "task": {"episode_length": 128, "success_radius": 0.4}}
+    ours = JetBotVectorEnv(4, config=config)
+    theirs = SyncVectorEnv(
+        [lambda: JetBotGymEnv(config=config)] * 4, autoreset_mode=AutoresetMode.SAME_STEP
+    )
+    rng, ends = np.random.default_rng(0), []
+    np.testing.assert_array_equal(ours.reset(seed=5)[0], theirs.reset(seed=5)[0])
+    assert ours.observation_space == theirs.observation_space
+    assert ours.action_space == theirs.action_space
+    action = np.zeros((4, 2))
+    for index in range(300):
+        if index % 16 == 0:
+            action = rng.uniform(-1.2, 1.2, (4, 2)).astype(np.float32)
+        mine, wanted = ours.step(action), theirs.step(action)
+        _check_same_obs(mine[0], wanted[0])
+        np.testing.assert_allclose(mine[1], wanted[1], atol=1e-4)
+        for flags, others in zip(mine[2:4], wanted[2:4], strict=True):
+            assert flags.dtype == others.dtype
+            np.testing.assert_array_equal(flags, others)
+        _check_same_infos(mine[4], wanted[4])
+        ends += [*mine[2][mine[2] | mine[3]]]
+    assert {True, False} == set(ends)
+    assert len(ends) >= 8
+
+
+def _check_same_obs(mine, wanted):
+    assert mine.dtype == wanted.dtype
+    np.testing.assert_allclose(mine[..., :7], wanted[..., :7], atol=1e-3)  # [m], 1
+    np.testing.assert_allclose(mine[..., 7:10], wanted[..., 7:10], atol=2e-3)  # [m/s]
+    np.testing.assert_allclose(mine[..., 10:13], wanted[..., 10:13], atol=2e-2)  # [rad/s]
+    np.testing.assert_array_equal(mine[..., GOAL], wanted[..., GOAL])
+
+
+def _check_same_infos(mine, wanted):
+    assert set(mine) == set(wanted)
+    for name, value in wanted.items():
+        if isinstance(value, dict):
+            _check_same_infos(mine[name], value)
+        elif name == "final_obs":
+            for one, other in zip(mine[name], value, strict=True):
+                assert (one is None) == (other is None)
+                if one is not None:
+                    _check_same_obs(one, other)
+        else:
+            assert mine[name].dtype == value.dtype
+            np.testing.assert_array_equal(mine[name], value)
+
+
+def test_every_environment_draws_goals_of_its_own(gliding):
+    seen = [gliding.reset(seed=0)[0][:, GOAL]]
+    for _ in range(40):
+        obs, _, terminated, truncated, infos = gliding.step(np.zeros((4, 2)))
+        done = terminated | truncated
+        for index in np.flatnonzero(done):
+            # The end belongs to the old episode, the observation to the new one.
+            assert tuple(infos["final_obs"][index][GOAL]) in {
+                tuple(x) for x in np.concatenate(seen)
+            }
+            assert np.linalg.norm(obs[index, :2]) < 1e-6
+        seen.append(obs[done, GOAL])
+    seen = np.concatenate(seen)
+    assert len(seen) > 20
+    assert len(np.unique(seen[:, 0])) == len(seen)
+
+
+def test_a_seed_for_each_or_one_that_counts_on(gliding):
+    one = gliding.reset(seed=7)[0]
+    np.testing.assert_array_equal(gliding.reset(seed=[7, 8, 9, 10])[0], one)
+    np.testing.assert_array_equal(one[2], JetBotGymEnv().reset(seed=9)[0])
+    on = gliding.reset()[0]
+    np.testing.assert_array_equal(gliding.reset(seed=[None, 8, None, 10])[0][[1, 3]], one[[1, 3]])
+    assert not (on[:, 13] == one[:, 13]).any()
+    for seed, said in ([1, 2], "seed has 2 numbers"), (-1, "seed = -1"):
+        with pytest.raises(UserError, match=said):
+            gliding.reset(seed=seed)
+
+
+def test_gymnasiums_statistics_count_whole_episodes(gliding):
+    counted = RecordEpisodeStatistics(gliding)
+    counted.reset(seed=0)
+    lengths = []
+    for _ in range(30):
+        *_, infos = counted.step(np.zeros((4, 2)))
+        if "episode" in infos:
+            lengths += list(infos["episode"]["l"][infos["_episode"]])
+    assert max(lengths) == 8
+    assert min(lengths) < 8
+    assert sum(lengths) <= 120
+
+
+def test_what_a_step_returns_is_the_callers(gliding):
+    gliding.reset(seed=0)
+    obs, rewards, terminated, *_ = gliding.step(np.zeros((4, 2)))
+    before = obs.copy(), rewards.copy(), terminated.copy()
+    gliding.step(np.ones((4, 2)))
+    for array, kept in zip((obs, rewards, terminated), before, strict=True):
+        np.testing.assert_array_equal(array, kept)
+        array[:] = 0  # and may be written to
+
+
+def test_a_batch_is_made_by_its_name():
+    vector = gymnasium.make_vec(ID, num_envs=3, max_episode_length=9)
+    assert isinstance(vector, JetBotVectorEnv)
+    assert vector.num_envs == 3
+    assert vector.metadata["autoreset_mode"] == AutoresetMode.SAME_STEP
+    assert vector.config.task.episode_length == 9
+    with pytest.raises(UserError, match="num_envs = 0"):
+        JetBotVectorEnv(0)
+
+
+def test_a_batch_shows_every_robot_or_the_first_in_a_window(window):
+    with everywhere():
+        vector = JetBotVectorEnv(2, render_mode="rgb_array")
+        obs, _ = vector.reset(seed=0)
+        frames = vector.render()
+        assert [frame.shape for frame in frames] == [(480, 480, 3)] * 2
+        assert (frames[0] != frames[1]).any()
+        vector.close()
+        vector = JetBotVectorEnv(2, render_mode="human")
+        obs, _ = vector.reset(seed=0)
+    np.testing.assert_allclose(window.shown[-1][1][0], obs[0, GOAL], atol=1e-6)
+    assert vector.render() is None
+    vector.close()
+    assert window.shown[-1] == "closed"
