@@ -79,7 +79,7 @@ def run(
     if "mujoco" in contenders:
         batches = [count * available_cores() for count in _ROLLOUT_BATCHES]
         turns += [MujocoRollout(config, count, sizes) for count in batches]
-    measured = _in_turns(turns, sizes.repeats)
+    measured = in_turns(turns, sizes.repeats)
     report(measured)
     best = _best([row for row, _ in measured])
     count = best["physics"].num_envs if "physics" in best else num_envs[0]
@@ -90,7 +90,7 @@ def run(
     }
     for name in contenders:
         if name in prepare:
-            report(_in_turns([prepare[name]()], sizes.repeats))
+            report(in_turns([prepare[name]()], sizes.repeats))
         elif name not in _PAIR:
             # The trainers' own reports are their clock.
             wall, cpu = time.perf_counter(), time.process_time()
@@ -124,7 +124,7 @@ def _best(rows: Sequence[Row]) -> dict[str, Row]:
     return {row.rate: row for row in sorted(rows, key=lambda row: row.env_steps_per_second)}
 
 
-def _in_turns(contenders: Sequence[Contender], rounds: int) -> list[Result]:
+def in_turns(contenders: Sequence[Contender], rounds: int) -> list[Result]:
     """Times all of them once in every round; with each row the cores that it kept busy."""
     rates: list[list[float]] = [[] for _ in contenders]
     cores: list[list[float]] = [[] for _ in contenders]
@@ -147,14 +147,15 @@ def missing(contender: str) -> str | None:
     return f"{contender} left out, no {', '.join(absent)}: {remedy}" if absent else None
 
 
-_TABLE_HEAD = (
+TABLE_HEAD = (
     f"| {'':10} | {'num_envs':>8} | {'env_steps_per_second':>20} | {'compile':>8} |"
     f" {'busy cores':>10} | {'min .. max':>18} |\n"
     f"|:{'-' * 10}-|-{'-' * 8}:|-{'-' * 20}:|-{'-' * 8}:|-{'-' * 10}:|-{'-' * 18}:|"
 )
 
 
-def _table_row(row: Row, busy: Sequence[float]) -> str:
+def table_row(row: Row, busy: Sequence[float]) -> str:
+    """One result, for people."""
     low, high = (end / row.env_steps_per_second - 1 for end in (min(row.repeats), max(row.repeats)))
     spread = f"{low:+.1%} .. {high:+.1%}"
     return (
@@ -230,7 +231,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(line)
     print(
         f"{options.config.name} on {jax.device_count()} x {measured['device']} and"
-        f" {measured['cpu_cores']} CPU cores, median of {sizes.repeats}\n{_TABLE_HEAD}",
+        f" {measured['cpu_cores']} CPU cores, median of {sizes.repeats}\n{TABLE_HEAD}",
         flush=True,
     )
     platform = "cpu" if jax.default_backend() == "cpu" else "gpu"
@@ -239,7 +240,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def report(more: Sequence[Result]) -> None:
         found.extend(more)
         for row, busy in more:
-            print(_table_row(row, busy), flush=True)
+            print(table_row(row, busy), flush=True)
         write(output, {**measured, **_as_json(found)})
 
     run(

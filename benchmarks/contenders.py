@@ -142,23 +142,26 @@ class Sb3:
     A repeat is one of its iterations: 2,560 steps, and the learning from them.
     """
 
-    rate = "sb3"
-    num_envs = 1
-
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, env: Any = None, *, rate: str = "sb3") -> None:
         """Builds environment and trainer, and makes one iteration.
 
         Args:
           config: robot, task and physics.
+          env: a `gymnasium.Env` or `VecEnv` to learn from; None: the robot of `one_robot.py`.
+          rate: what the row is called.
         """
         sb3, torch = (importlib.import_module(name) for name in ("stable_baselines3", "torch"))
+        self.rate, self.num_envs = rate, getattr(env, "num_envs", 1)
         self._n_substeps = config.physics.n_substeps
         policy = {
             "activation_fn": torch.nn.Tanh,
             "net_arch": {"pi": _SB3_LAYERS, "vf": _SB3_LAYERS},
         }
-        env = _as_gymnasium(OneRobot(config))
-        self._ppo = sb3.PPO("MlpPolicy", env, policy_kwargs=policy, seed=0, device="cpu", **_SB3)
+        env = as_gymnasium(OneRobot(config)) if env is None else env
+        settings = {**_SB3, "n_steps": _SB3_STEPS // self.num_envs}
+        self._ppo = sb3.PPO(
+            "MlpPolicy", env, policy_kwargs=policy, seed=0, device="cpu", **settings
+        )
         self.repeat()
 
     def repeat(self) -> float:
@@ -169,10 +172,12 @@ class Sb3:
 
     def row(self, repeats: list[float]) -> Row:
         """What was measured."""
-        return make_row(self.rate, self._n_substeps, 1, 0.0, repeats, _SB3_STEPS)
+        calls = _SB3_STEPS // self.num_envs
+        return make_row(self.rate, self._n_substeps, self.num_envs, 0.0, repeats, calls)
 
 
-def _as_gymnasium(robot: OneRobot) -> Any:
+def as_gymnasium(robot: OneRobot) -> Any:
+    """One robot in NumPy as a `gymnasium.Env`."""
     gymnasium = importlib.import_module("gymnasium")
 
     class Env(gymnasium.Env):

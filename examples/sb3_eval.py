@@ -1,0 +1,61 @@
+"""Watches a policy of `sb3_train.py` drive, and counts the goals that it reaches.
+
+python examples/sb3_eval.py                        # twenty goals, in a window
+python examples/sb3_eval.py --headless             # without one
+"""
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO
+
+from jetbot_mjx import cli
+from jetbot_mjx.adapters import JetBotGymEnv
+from jetbot_mjx.errors import UserError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Drives to goals and prints how many were reached.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+
+    Raises:
+      UserError: there is no policy, or no display.
+    """
+    parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--policy", type=Path, default=Path("sb3_policy/jetbot.zip"))
+    parser.add_argument("--episodes", type=cli.positive_int, default=20, help="default: 20")
+    parser.add_argument("--headless", action="store_true", help="no window")
+    options = parser.parse_args(arguments)
+    if not options.policy.is_file():
+        raise UserError(
+            f"--policy {options.policy} does not exist: examples/sb3_train.py saves one"
+        )
+
+    env = JetBotGymEnv(headless=options.headless, seed=1)
+    torch.set_num_threads(1)
+    policy = PPO.load(options.policy, device="cpu")
+    reached, lengths = [], []
+    for _ in range(options.episodes):
+        obs, info = env.reset()
+        over, length = False, 0
+        while not over:
+            action, _ = policy.predict(obs, deterministic=True)
+            obs, _, terminated, truncated, info = env.step(action)
+            over, length = terminated or truncated, length + 1
+        reached.append(info["is_success"])
+        lengths.append(length)
+    env.close()
+    print(f"{sum(reached)} of {len(reached)} goals, {np.mean(lengths):.0f} steps on average")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
