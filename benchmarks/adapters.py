@@ -86,8 +86,6 @@ def prepare(config: Config, num_envs: Sequence[int]) -> list[Contender]:
     Returns:
       The contenders.
     """
-    torch = importlib.import_module("torch")
-    torch.set_num_threads(1)
     adapters = importlib.import_module("jetbot_mjx.adapters")
     sb3 = importlib.import_module("jetbot_mjx.adapters.stable_baselines3")
     makers: dict[str, Callable[..., Any]] = {

@@ -151,6 +151,8 @@ class Sb3:
           rate: what the row is called.
         """
         sb3, torch = (importlib.import_module(name) for name in ("stable_baselines3", "torch"))
+        # Networks of this size gain nothing from more, and lose much where other programs run.
+        torch.set_num_threads(1)
         self.rate, self.num_envs = rate, getattr(env, "num_envs", 1)
         self._n_substeps = config.physics.n_substeps
         policy = {

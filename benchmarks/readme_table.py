@@ -1,8 +1,9 @@
 """Writes the measured tables of the READMEs: `python benchmarks/readme_table.py`.
 
 All comes from benchmarks/results/*.json, whatever files are there: those of `time_to_success.py`,
-`steps_per_second.py` and `compare.py` are known by what is in them, others are passed over. Each
-table stands between two comments, `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`.
+`steps_per_second.py`, `compare.py` and `adapters.py` are known by what is in them, others are
+passed over. Each table stands between two comments, `<!-- NAME: begin ... -->` and
+`<!-- NAME: end -->`.
 """
 
 import json
@@ -158,6 +159,29 @@ def _comparison(values: Mapping[str, Any]) -> str:
     )
 
 
+def adapters_table(results: Results) -> str:
+    """What the adapters make of the robot, every table under its conditions."""
+    head = ("", "robots", "steps/s", "per second of processor time", "min .. max")
+    parts = []
+    for name, values in results.items():
+        if "adapters" not in values:
+            continue
+        rows = [
+            [
+                f"`{row['rate']}`",
+                f"{row['num_envs']:,}",
+                _short(row["env_steps_per_second"]),
+                _short(row["env_steps_per_second"] / statistics.median(row["busy_cores"])),
+                _spread(row),
+            ]
+            for row in values["adapters"]
+        ]
+        packages, repeats = values["versions"]["packages"], values["conditions"]["repeats"]
+        told = f"{_machine(values, values)}, JAX {packages['jax']}, MuJoCo {packages['mujoco']}"
+        parts += [f"`{name}`: {told}, median of {repeats}", _table(head, "lrrrr", rows)]
+    return "\n\n".join(parts)
+
+
 def _caption(name: str, values: Mapping[str, Any]) -> str:
     packages = values["versions"]["packages"]
     physics = values["config"]["physics"].get("impl")
@@ -204,6 +228,7 @@ def _table(head: Sequence[str], alignment: str, rows: Sequence[Sequence[str]]) -
 BLOCKS: Mapping[str, Mapping[str, Callable[[Results], str]]] = {
     "README.md": {"success": success_table, "rates": best_rates_table},
     "benchmarks/README.md": {"results": rates_tables},
+    "docs/from-the-tutorial.md": {"adapters": adapters_table},
 }
 """By file and by the name of the block: what stands there."""
 

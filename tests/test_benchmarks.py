@@ -13,6 +13,7 @@ import scipy.stats
 ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "benchmarks"))
 
+import adapters
 import compare
 import contenders
 import kernels
@@ -22,6 +23,7 @@ import readme_table
 import regressions
 import results
 import steps_per_second
+from gliding import everywhere
 from measurements import Sizes
 from timing import make_row
 
@@ -321,10 +323,25 @@ def test_a_contender_without_its_package_is_left_out_in_one_line(monkeypatch):
     assert compare.missing("physics") is None
 
 
-def test_stable_baselines3_learns_from_one_robot(world_config):
+def test_every_adapter_is_timed_in_turn(world_config, monkeypatch, tmp_path, capsys):
     for name in ("torch", "stable_baselines3", "gymnasium"):
         pytest.importorskip(name)
-    contender = contenders.Sb3(world_config)
-    row = contender.row([contender.repeat()])
-    assert (row.rate, row.num_envs) == ("sb3", 1)
-    assert row.env_steps_per_second > 0
+    monkeypatch.setattr(adapters, "REPEAT_SECONDS", 0.01)
+    monkeypatch.setattr(adapters, "WARM_UP_CALLS", 1)
+    monkeypatch.setattr(contenders, "_SB3_STEPS", 64)
+    output = tmp_path / "a.json"
+    with everywhere():
+        arguments = ["--num-envs", "2", "--repeats", "2", "--output", str(output)]
+        assert adapters.main(arguments) == 0
+    rows = json.loads(output.read_text())["adapters"]
+    assert [(row["rate"], row["num_envs"]) for row in rows] == [
+        ("numpy", 1),
+        ("gym", 1),
+        ("vector", 2),
+        ("vecenv", 2),
+        ("sb3", 1),
+        ("sb3-gym", 1),
+        ("sb3-vec", 2),
+    ]
+    assert all(row["env_steps_per_second"] > 0 and len(row["repeats"]) == 2 for row in rows)
+    assert capsys.readouterr().out.count("| sb3") == 3

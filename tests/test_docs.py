@@ -84,10 +84,13 @@ def test_every_page_is_in_the_navigation():
 
 
 def test_every_module_has_its_place_in_the_reference():
-    told = re.findall(r"^::: jetbot_mjx\.(\w+)$", "\n".join(PAGES.values()), flags=re.MULTILINE)
+    told = re.findall(r"^::: jetbot_mjx\.([\w.]+)$", "\n".join(PAGES.values()), flags=re.MULTILINE)
     # `mjx` is MJX itself.
-    modules = {path.stem for path in (ROOT / "jetbot_mjx").glob("*.py")} - {"__init__", "mjx"}
-    assert sorted(told) == sorted(modules)
+    package = ROOT / "jetbot_mjx"
+    found = (*package.glob("*.py"), *package.glob("adapters/*.py"))
+    paths = [path for path in found if path.stem != "__init__"]
+    modules = {".".join(path.relative_to(package).with_suffix("").parts) for path in paths}
+    assert sorted(told) == sorted(modules - {"mjx"})
 
 
 def test_every_public_name_is_listed(root):
@@ -460,6 +463,9 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
             assert all(Path(one).is_file() for one in arguments if one[0] != "-")
         case ["python", "-m", module, *arguments]:
             check_arguments(COMMANDS[module.removeprefix("jetbot_mjx.")], arguments, monkeypatch)
+        case ["python", script, *arguments] if script.startswith("examples/"):
+            pytest.importorskip("stable_baselines3")
+            check_arguments(load(Path(script)), arguments, monkeypatch)
         case ["python", "-c", source]:
             compile(source, page, "exec")
         case ["python" | "python3", script, *arguments]:
@@ -510,8 +516,9 @@ def check_install(arguments):
     if arguments[0] == "-c":
         assert (ROOT / arguments[1]).is_file()
         arguments = arguments[2:]
-    assert re.match(r"\.(?:\[(\w+)\])?$", arguments[0])
-    assert set(re.findall(r"\[(\w+)\]", arguments[0])) <= set(extras)
+    found = re.match(r"\.(?:\[([\w,]+)\])?$", arguments[0])
+    assert found
+    assert set((found[1] or "dev").split(",")) <= set(extras)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """The environment for Stable-Baselines3: its own checker, its PPO, and what its PPO relies on."""
 
 import itertools
+import re
+import sys
 
 import jax.numpy as jnp
 import numpy as np
@@ -225,3 +227,22 @@ def test_robots_are_drawn_side_by_side():
     assert image.shape == (960, 480, 3) or image.shape == (480, 960, 3)
     assert image.std() > 5
     env.close()
+
+
+@pytest.mark.parametrize("num_envs", [1, 4])
+def test_the_examples_train_and_judge(num_envs, root, tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(str(root / "examples"))
+    for name in ("sb3_train", "sb3_eval"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    import sb3_eval
+    import sb3_train
+
+    monkeypatch.setattr(sb3_train, "_STEPS", 64)
+    folder = ["--folder", str(tmp_path)]
+    with everywhere():
+        assert sb3_train.main(["--steps", "64", "--num-envs", str(num_envs), *folder]) == 0
+    policy = str(tmp_path / "jetbot.zip")
+    assert sb3_eval.main(["--policy", policy, "--episodes", "2", "--headless"]) == 0
+    assert re.search(r"^[012] of 2 goals, \d+ steps", capsys.readouterr().out, re.MULTILINE)
+    with pytest.raises(UserError, match="does not exist"):
+        sb3_eval.main(["--policy", "nothing"])

@@ -1,4 +1,4 @@
-"""One robot in C MuJoCo, for who takes one step at a time: four times as fast as a step of MJX.
+"""One robot in C MuJoCo, for who takes one step at a time: that of MJX takes several times as long.
 
 The model is the one that MJX is given. All that is not physics, the draw of the goal, observation,
 reward and the end, is the environment's own code, compiled by JAX for the CPU.
