@@ -20,6 +20,7 @@ from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
+from jetbot_mjx.offscreen import find_backend
 from jetbot_mjx.task import GOAL_HEIGHT
 
 ID = "jetbot_mjx.adapters:JetBot-v0"
@@ -58,6 +59,14 @@ def window(monkeypatch):
 
 
 @pytest.fixture
+def needs_opengl():
+    try:
+        find_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+@pytest.fixture
 def env():
     return JetBotGymEnv()
 
@@ -81,7 +90,7 @@ def drive(env, actions):
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
-def test_gymnasiums_checker_passes_with_every_render_mode(window):
+def test_gymnasiums_checker_passes_with_every_render_mode(window, needs_opengl):
     check_env(gymnasium.make(ID).unwrapped)
     assert window.shown[-1] == "closed"
 
@@ -259,7 +268,7 @@ def test_a_world_that_blows_up_is_truncated_and_told(env, blow_up, tmp_path, mon
     assert drive(env, [np.zeros(2)] * 3)[3] == (False,) * 3
 
 
-def test_a_picture_shows_the_robot_where_it_is():
+def test_a_picture_shows_the_robot_where_it_is(needs_opengl):
     env = gymnasium.make(ID, render_mode="rgb_array")
     env.reset(seed=0)
     first = env.render()
@@ -413,7 +422,7 @@ def test_a_batch_is_made_by_its_name():
         JetBotVectorEnv(0)
 
 
-def test_a_batch_shows_every_robot_or_the_first_in_a_window(window):
+def test_a_batch_shows_every_robot_or_the_first_in_a_window(window, needs_opengl):
     with everywhere():
         vector = JetBotVectorEnv(2, render_mode="rgb_array")
         obs, _ = vector.reset(seed=0)

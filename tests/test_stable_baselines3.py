@@ -20,6 +20,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMoni
 from jetbot_mjx.adapters import JetBotGymEnv
 from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.offscreen import find_backend
 
 GOAL = slice(13, 16)
 ENDS = {"task": {"success_radius": 0.75}}  # near goals are reached within some steps
@@ -52,6 +53,14 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def needs_opengl():
+    try:
+        find_backend()
+    except UserError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture(scope="module")
@@ -219,7 +228,7 @@ def test_attributes_are_those_of_the_environments_or_kept_beside_them(vec_env):
     assert vec_env.env_is_wrapped(Monitor) == [False] * 4
 
 
-def test_robots_are_drawn_side_by_side():
+def test_robots_are_drawn_side_by_side(needs_opengl):
     with everywhere():
         env = JetBotVecEnv(2, render_mode="rgb_array")
         env.reset()
