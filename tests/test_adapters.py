@@ -2,6 +2,8 @@
 
 import contextlib
 import importlib
+import os
+import subprocess
 import sys
 
 import jax.numpy as jnp
@@ -278,6 +280,23 @@ def test_a_picture_shows_the_robot_where_it_is(needs_opengl):
         env.step(np.array([0.5, 1.0]))
     assert np.abs(env.render().astype(int) - first).mean() > 5
     env.close()
+
+
+def test_who_forgets_to_close_reads_no_complaint_at_the_end(needs_opengl, root):
+    told = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from jetbot_mjx.adapters import JetBotGymEnv\n"
+            "env = JetBotGymEnv(render_mode='rgb_array')\n"
+            "env.reset()\n"
+            "print(env.render().shape)",
+        ],
+        env={**os.environ, "PYTHONPATH": str(root)},
+        capture_output=True,
+        text=True,
+    )
+    assert (told.returncode, told.stdout, told.stderr) == (0, "(480, 480, 3)\n", "")
 
 
 def test_a_window_follows_the_robot_in_real_time(window):

@@ -1,8 +1,7 @@
 """How an adapted environment shows itself: as pictures, or in MuJoCo's window."""
 
+import atexit
 import time
-import weakref
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -36,7 +35,6 @@ class View:
         self._env, self._mode, self._rendering_dt = env, mode, rendering_dt
         self._renderer: Renderer | None = None
         self._window: native.Window | None = None
-        self._closing: list[Callable[[], None]] = []
         self._next = (0.0, 0.0)
         """When the next picture is due, in simulated and in real time [s]."""
         if mode == "human":
@@ -59,8 +57,8 @@ class View:
         """
         if self._renderer is None:
             self._renderer = Renderer(self._env.mj_model)
-            # For who forgets to close it: at Python's end OpenGL is gone before the renderer.
-            self._closing.append(weakref.finalize(self, _exit, self._renderer))
+            # For who forgets to: after Python's end OpenGL is gone before the renderer is.
+            atexit.register(self.close)
         markers = self._markers(goal)
         middles = np.stack([np.zeros(3), qpos[QPOS_XYZ], *markers.values()])
         points = np.concatenate([middles - _AROUND, middles + _AROUND])
@@ -80,7 +78,6 @@ class View:
         """
         if self._window is None:
             self._window = native.Window(self._env.mj_model, remedy=_REMEDY)
-            self._closing.append(weakref.finalize(self, _exit, self._window))
         due, at = self._next
         if now == 0.0:
             due, at = 0.0, time.monotonic()
@@ -92,14 +89,12 @@ class View:
 
     def close(self) -> None:
         """Closes what was opened."""
-        for close in self._closing:
-            close()
+        atexit.unregister(self.close)
+        for shown in (self._renderer, self._window):
+            if shown is not None:
+                shown.__exit__(None, None, None)
         self._renderer = self._window = None
 
     def _markers(self, goal: PyTree) -> dict[str, Any]:
         markers = self._env.task.markers(jax.tree.map(jnp.asarray, goal))
         return jax.device_get(dict(markers))
-
-
-def _exit(shown: Renderer | native.Window) -> None:
-    shown.__exit__(None, None, None)
