@@ -117,9 +117,10 @@ class PhysicsConfig(_Section):
     cholesky: Literal["unrolled", "library"] = "unrolled"
     """How MJX factorises its matrices: `unrolled` into scalar arithmetic, or by a call of LAPACK or
     cuSOLVER, which keeps a GPU from running a step as one kernel or CUDA graph."""
-    impl: Literal["auto", "ptx", "xla"] = "auto"
-    """Who makes a step of MJX's arithmetic: `ptx`, one kernel for NVIDIA GPUs, written number by
-    number; `xla`, as many kernels as XLA makes of it; `auto`: the former where it can be had."""
+    impl: Literal["auto", "llvm", "ptx", "xla"] = "auto"
+    """Who makes a step of MJX's arithmetic: one kernel, written number by number, `ptx` for NVIDIA
+    GPUs and `llvm` for CPUs; `xla`, as many kernels as XLA makes of it; `auto`: one kernel where it
+    can be had."""
 
     @property
     def n_substeps(self) -> int:

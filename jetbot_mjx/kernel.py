@@ -1,59 +1,99 @@
-"""A step of one robot as one GPU kernel for all of them.
+"""A step of one robot as one kernel for all of them.
 
 What `jax.vmap` and XLA make of MJX's step is hundreds of kernels, and every number that passes from
 one to the next goes through memory. Written out number by number (`scalarize`) the same step is
-one kernel (`ptx`) that reads a robot's state, makes all physics steps of an environment
-step, and writes the state back.
-
-XLA launches it by its custom call for PTX, an internal mechanism: `is_available` asks the installed
-XLA whether it knows it.
+one kernel that reads a robot's state, makes all physics steps of an environment step, and writes
+the state back. In which language, and who launches it, is a back end's affair: `gpu` and `cpu`.
 """
 
 import contextlib
 import functools
 import hashlib
 import json
-import math
 import tempfile
+import types
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from jetbot_mjx import ptx, scalars
+from jetbot_mjx import scalars
 from jetbot_mjx import scalarize as scalarize_module
-from jetbot_mjx.scalarize import scalarize
+from jetbot_mjx.scalarize import Program
 
-_TARGET = "__gpu$xla.gpu.ptx"
 Step = Callable[[PyTree, PyTree], PyTree]
 """Of (what changes, what is held): what changes, some steps later."""
 
 
-@functools.cache
-def is_available() -> bool:
-    """Whether JAX runs on an NVIDIA GPU and its XLA launches kernels in PTX."""
-    if jax.default_backend() != "gpu" or "cuda" not in jax.devices()[0].client.platform_version:
-        return False
-    program = scalarize(lambda x: x + 1.0, jnp.zeros(1))
-    probe = ptx.make_kernel(program, carried=1, steps=1, name="probe")
-    # Whoever asks may be in the middle of tracing something else.
-    with jax.ensure_compile_time_eval():
-        zeros = [jnp.zeros((2, 1))]
-        try:
-            return bool((_launch(probe, zeros, zeros)[0] == 1.0).all())
-        except jax.errors.JaxRuntimeError:
-            return False
+class Kernel(NamedTuple):
+    """What a back end is given to run."""
+
+    name: str
+    text: str
 
 
-def batched(kernel: ptx.Kernel) -> Step:
+class Backend(Protocol):
+    """Who runs kernels, and in which language; the modules `gpu` and `cpu` are."""
+
+    @property
+    def IMPL(self) -> str:
+        """Its name in `physics.impl`."""
+        ...
+
+    @property
+    def NEEDS(self) -> str:
+        """What there must be, in words."""
+        ...
+
+    def is_available(self) -> bool:
+        """Whether JAX runs where this back end does, and all that it needs is there."""
+        ...
+
+    def depends_on(self) -> bytes:
+        """All that a kernel's text depends on, beside its program."""
+        ...
+
+    def write(self, program: Program, *, carried: int, steps: int) -> Kernel:
+        """Writes a kernel that repeats a program, its results becoming its first arguments.
+
+        Args:
+          program: a step; its results have the shapes of its first `carried` arguments.
+          carried: how many leaves of the arguments are carried from step to step.
+          steps: how often it is repeated.
+
+        Returns:
+          The kernel.
+
+        Raises:
+          UnsupportedError: the program has an operation that the back end does not know.
+        """
+        ...
+
+    def launch(
+        self, kernel: Kernel, leaves: Sequence[Array], results: Sequence[Array]
+    ) -> list[Array]:
+        """Runs a kernel.
+
+        Args:
+          kernel: as `write` wrote it.
+          leaves: its arguments, float32 of (robots, ...).
+          results: those of them that are carried, for their shapes.
+
+        Returns:
+          What became of them.
+        """
+        ...
+
+
+def batched(backend: Backend, kernel: Kernel) -> Step:
     """A kernel as a function of one robot, for any batch of them.
 
     Args:
+      backend: who runs it.
       kernel: of a step; what changes are its first arguments, and its results.
 
     Returns:
@@ -65,7 +105,7 @@ def batched(kernel: ptx.Kernel) -> Step:
     def batch(changing: PyTree, held: PyTree) -> PyTree:
         """For leaves with one batch axis."""
         leaves = jax.tree.leaves((changing, held))
-        results = _launch(kernel, leaves, jax.tree.leaves(changing))
+        results = backend.launch(kernel, leaves, jax.tree.leaves(changing))
         return jax.tree.unflatten(jax.tree.structure(changing), results)
 
     @batch.def_vmap
@@ -94,65 +134,61 @@ def batched(kernel: ptx.Kernel) -> Step:
     return one
 
 
-def kept(key: bytes, write: Callable[[], ptx.Kernel]) -> ptx.Kernel:
+def kept(key: bytes, write: Callable[[], Kernel]) -> Kernel:
     """A kernel's text, from the folder of compiled programs if it was written before.
 
     Args:
-      key: all that the text depends on.
+      key: all that the text depends on, but for how a step is taken apart into numbers.
       write: writes the kernel.
 
     Returns:
       The kernel.
     """
+    key = key + source_of(scalars, scalarize_module)
+    content = kept_bytes("kernel", key, lambda: json.dumps(write()._asdict()).encode())
+    return Kernel(**json.loads(content))
+
+
+def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
+    """What was made before, from the folder of compiled programs, or what is made now.
+
+    Args:
+      kind: with what its file's name begins.
+      key: all that it depends on.
+      make: makes it.
+
+    Returns:
+      The content.
+    """
     cache = jax.config.values["jax_compilation_cache_dir"]
-    if cache is None:
-        return write()
-    path = Path(cache) / f"kernel-{hashlib.sha256(key + _own_source()).hexdigest()}.json"
-    try:
-        return ptx.Kernel(**json.loads(path.read_text()))
-    except (OSError, ValueError, TypeError):
-        kernel = write()
+    if cache is None or not jax.config.values["jax_enable_compilation_cache"]:
+        return make()
+    path = Path(cache) / f"{kind}-{hashlib.sha256(key).hexdigest()}"
+    with contextlib.suppress(OSError):
+        digest, _, content = path.read_bytes().partition(b"\n")
+        if digest == _digest(content):
+            return content
+    content = make()
     # As with compiled programs: a folder that cannot be written costs time, nothing else.
     with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=cache) as folder:
         written = Path(folder) / path.name
-        written.write_text(json.dumps(kernel._asdict()))
+        written.write_bytes(_digest(content) + b"\n" + content)
         written.replace(path)
-    return kernel
+    return content
+
+
+def _digest(content: bytes) -> bytes:
+    return hashlib.sha256(content).hexdigest().encode()
 
 
 @functools.cache
-def _own_source() -> bytes:
-    """What turns a step into a kernel."""
-    files = [Path(module.__file__ or "") for module in (scalars, scalarize_module, ptx)]
-    return b"".join(file.read_bytes() for file in files)
+def source_of(*modules: types.ModuleType) -> bytes:
+    """The source of modules: what they write depends on it."""
+    return b"".join(Path(module.__file__ or "").read_bytes() for module in modules)
 
 
 def _broadcast(size: int, batched: Any, trees: PyTree) -> PyTree:
     """Gives every leaf the batch axis that some have."""
     return jax.tree.map(
         lambda has, x: x if has else jnp.broadcast_to(x, (size, *x.shape)), batched, trees
-    )
-
-
-def _launch(kernel: ptx.Kernel, leaves: Sequence[Array], results: Sequence[Array]) -> list[Array]:
-    """Runs a kernel on leaves of (robots, ...), for results shaped as some of them are."""
-    robots = leaves[0].shape[0]
-    call = jax.ffi.ffi_call(
-        _TARGET, [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
-    )
-    return list(
-        call(
-            *leaves,
-            name=kernel.name,
-            kernel_type="ptx",
-            kernel_data=kernel.source(robots),
-            grid_x=np.int64(math.ceil(robots / ptx.THREADS)),
-            grid_y=np.int64(1),
-            grid_z=np.int64(1),
-            block_x=np.int64(ptx.THREADS),
-            block_y=np.int64(1),
-            block_z=np.int64(1),
-            shared_mem_bytes=np.int64(0),
-            output_indices=tuple(range(len(leaves), len(leaves) + len(results))),
-        )
     )

@@ -16,12 +16,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jetbot_mjx import cholesky, kernel, mjx, ptx
+from jetbot_mjx import cholesky, cpu, gpu, kernel, mjx
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.scalarize import scalarize
 from jetbot_mjx.scalars import UnsupportedError
 from jetbot_mjx.state import PhysicsState
+
+BACKENDS: tuple[kernel.Backend, ...] = (gpu, cpu)
+"""Who can make a step as one kernel."""
 
 
 class Physics:
@@ -41,14 +44,14 @@ class Physics:
         self._config = config
         self._varied: tuple[int, ...] = ()
         """Leaves of the model that are known only when a program runs, robot by robot."""
-        self._is_own_model = True
         self._lock = threading.Lock()
         self._kernel: kernel.Step | UnsupportedError | None = None
-        if config.impl == "ptx" and not kernel.is_available():
-            raise UserError(
-                "physics.impl = ptx needs an NVIDIA GPU and an XLA that launches PTX; this is"
-                f" {jax.default_backend()}: choose xla or auto"
-            )
+        for backend in BACKENDS:
+            if backend.IMPL == config.impl and not backend.is_available():
+                raise UserError(
+                    f"physics.impl = {config.impl} needs {backend.NEEDS}; this is"
+                    f" {jax.default_backend()}: choose xla or auto"
+                )
 
     @functools.cached_property
     def model(self) -> mjx.Model:
@@ -73,15 +76,15 @@ class Physics:
         other.model = model
         leaves = jax.tree.leaves(model)
         other._varied = tuple(i for i, x in enumerate(leaves) if isinstance(x, Tracer))
-        other._is_own_model = False
         other._lock = threading.Lock()
         other._kernel = None
         return other
 
     @property
     def impl(self) -> str:
-        """Who makes a step, `ptx` or `xla`, as in `physics.impl`."""
-        return "xla" if self._as_kernel() is None else "ptx"
+        """Who makes a step, as in `physics.impl`, but never `auto`."""
+        backend = self._backend()
+        return "xla" if backend is None or self._as_kernel() is None else backend.IMPL
 
     def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
         """Integrates one environment step, `n_substeps` physics steps.
@@ -136,37 +139,48 @@ class Physics:
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
+    def _backend(self) -> kernel.Backend | None:
+        """Who makes a step as one kernel, if it can be made so; None where XLA is to make it."""
+        fit = (x for x in BACKENDS if self._config.impl in ("auto", x.IMPL) and x.is_available())
+        return next(fit, None)
+
     def _as_kernel(self) -> kernel.Step | None:
         """The step as one kernel; None where XLA makes it."""
-        if self._config.impl == "xla" or not kernel.is_available():
+        backend = self._backend()
+        if backend is None:
             return None
         # Programs are traced in several threads; one is enough to write the kernel.
         with self._lock:
             if self._kernel is None:
                 try:
-                    self._kernel = kernel.batched(self._written())
+                    self._kernel = kernel.batched(backend, self._written(backend))
                 except UnsupportedError as error:
                     self._kernel = error
         if not isinstance(self._kernel, UnsupportedError):
             return self._kernel
-        if self._config.impl == "ptx":
+        if self._config.impl == backend.IMPL:
             raise UserError(
-                f"physics.impl = ptx: one kernel cannot do {self._kernel}; choose xla or auto"
+                f"physics.impl = {backend.IMPL}: one kernel cannot do {self._kernel};"
+                " choose xla or auto"
             )
         return None
 
-    def _written(self) -> ptx.Kernel:
-        if not self._is_own_model:
-            return self._write()
+    def _written(self, backend: kernel.Backend) -> kernel.Kernel:
         # All that MJX's arithmetic depends on. What a task computes is no part of it.
         model = np.zeros(mujoco.mj_sizeModel(self._mj_model), np.uint8)
         mujoco.mj_saveModel(self._mj_model, None, model)
         versions = [importlib.metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx")]
-        settings = json.dumps([versions, self._config.model_dump(mode="json")])
-        key = model.tobytes() + settings.encode() + inspect.getsource(Physics).encode()
-        return kernel.kept(key, self._write)
+        settings = json.dumps([versions, self._config.model_dump(mode="json"), self._varied])
+        known = b"".join(
+            np.asarray(leaf).tobytes()
+            for place, leaf in enumerate(jax.tree.leaves(self.model))
+            if place not in self._varied
+        )
+        own = settings.encode() + inspect.getsource(Physics).encode()
+        key = model.tobytes() + known + own + backend.depends_on()
+        return kernel.kept(key, lambda: self._write(backend))
 
-    def _write(self) -> ptx.Kernel:
+    def _write(self, backend: kernel.Backend) -> kernel.Kernel:
         # Shapes alone: arrays made here would become part of the program that is being traced.
         def numbers(*shape: int) -> Any:
             return jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -174,10 +188,9 @@ class Physics:
         model = self._mj_model
         state = PhysicsState(numbers(model.nq), numbers(model.nv), numbers(model.nv), numbers())
         leaves = jax.tree.leaves(self.model)
-        held = numbers(model.nu), [numbers(*leaves[place].shape) for place in self._varied]
-        return ptx.make_kernel(
-            scalarize(self.substep, state, held),
+        varied = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied]
+        return backend.write(
+            scalarize(self.substep, state, (numbers(model.nu), varied)),
             carried=len(jax.tree.leaves(state)),
             steps=self._config.n_substeps,
-            name="physics",
         )

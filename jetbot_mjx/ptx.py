@@ -9,10 +9,10 @@ Source: NVIDIA, Parallel Thread Execution ISA, version 7.0.
 import math
 import struct
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
+from jetbot_mjx.kernel import Kernel
 from jetbot_mjx.scalarize import Program
 from jetbot_mjx.scalars import COMPARISONS, Scalar, UnsupportedError, Value, is_known
 
@@ -36,16 +36,17 @@ _ROBOTS = "$robots"
 """Where in a kernel's text their number goes."""
 
 
-class Kernel(NamedTuple):
-    """What a GPU is given to run."""
+def source(kernel: Kernel, robots: int) -> str:
+    """The PTX for so many robots.
 
-    name: str
-    text: str
-    """PTX, but for the number of robots."""
+    Args:
+      kernel: as `make_kernel` writes it.
+      robots: how many.
 
-    def source(self, robots: int) -> str:
-        """The PTX for so many robots."""
-        return self.text.replace(_ROBOTS, str(robots))
+    Returns:
+      What NVIDIA's assembler takes.
+    """
+    return kernel.text.replace(_ROBOTS, str(robots))
 
 
 def make_kernel(program: Program, *, carried: int, steps: int, name: str) -> Kernel:

@@ -1,0 +1,166 @@
+"""Kernels in LLVM's representation on CPUs: a `jetbot_mjx.kernel.Backend`.
+
+`llvmlite` compiles them for the very processor; XLA calls them by its foreign function interface,
+of which `is_available` tries a small one. Each has a name of its own, from its content: a compiled
+program that JAX kept asks for the kernel that it was compiled with.
+"""
+
+import ctypes
+import functools
+import hashlib
+import importlib
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jetbot_mjx import kernel, llvm, xla_ffi
+from jetbot_mjx.kernel import Kernel
+from jetbot_mjx.scalarize import Program, scalarize
+
+IMPL = "llvm"
+NEEDS = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
+
+_NAME = "physics"
+_LEVEL = 2
+"""Of code generation; there are no passes before it, for a program has nothing left to shorten."""
+
+_lock = threading.Lock()
+_loaded: dict[str, Any] = {}
+"""Machine code by its name in XLA, which may call it as long as the process lives."""
+
+
+class _Host(NamedTuple):
+    """The processor, in LLVM's words."""
+
+    machine: str
+    name: str
+    features: str
+    lanes: int
+    """Numbers in a vector register."""
+    version: str
+    """Of what compiles for it."""
+
+
+@functools.cache
+def is_available() -> bool:
+    """Whether JAX runs on a CPU, llvmlite is here, and XLA calls a kernel of it."""
+    if jax.default_backend() != "cpu":
+        return False
+    try:
+        host = _host()
+    except (ImportError, OSError, RuntimeError, AttributeError, TypeError):
+        # No llvmlite, one that knows this processor not, or a C library that lacks a function.
+        return False
+    if host.machine not in xla_ffi.MACHINES:
+        return False
+    probe = write(scalarize(lambda x: 2.0 * x + 1.0, jnp.zeros(2)), carried=1, steps=2)
+    numbers = np.arange(4 * host.lanes + 2, dtype=np.float32).reshape(-1, 2)
+    # Whoever asks may be in the middle of tracing something else.
+    with jax.ensure_compile_time_eval():
+        leaves = [jnp.asarray(numbers)]
+        try:
+            (result,) = launch(probe, leaves, leaves)
+        except jax.errors.JaxRuntimeError:
+            return False
+        return bool((np.asarray(result) == 4 * numbers + 3).all())
+
+
+def depends_on() -> bytes:
+    """All that a kernel's text depends on, beside its program."""
+    host = _host()
+    return kernel.source_of(llvm, xla_ffi) + f"{host.machine} {host.lanes}".encode()
+
+
+def write(program: Program, *, carried: int, steps: int) -> Kernel:
+    """Writes a kernel, as `jetbot_mjx.kernel.Backend` has it."""
+    host = _host()
+    text = xla_ffi.kernel_text(
+        llvm.step_text(program, carried=carried, lanes=host.lanes),
+        [numbers.size for numbers in program.inputs],
+        carried=carried,
+        lanes=host.lanes,
+        steps=steps,
+        name=_NAME,
+        machine=host.machine,
+    )
+    return Kernel(_NAME, text)
+
+
+def launch(kernel: Kernel, leaves: Sequence[Array], results: Sequence[Array]) -> list[Array]:
+    """Runs a kernel, as `jetbot_mjx.kernel.Backend` has it."""
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
+    return list(jax.ffi.ffi_call(_registered(kernel), shapes)(*leaves))
+
+
+def _registered(written: Kernel) -> str:
+    """The name by which XLA knows a kernel; compiles it when it is first asked for."""
+    host = _host()
+    key = "\n".join([host.version, host.name, host.features, str(_LEVEL), written.text]).encode()
+    name = f"jetbot_mjx_{hashlib.sha256(key).hexdigest()}"
+    # Programs are traced in several threads.
+    with _lock:
+        if name not in _loaded:
+            code = kernel.kept_bytes("object", key, lambda: _compile(written.text))
+            engine = _load(code)
+            address = ctypes.c_void_p(engine.get_function_address(written.name))
+            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
+            _loaded[name] = engine
+    return name
+
+
+def _compile(text: str) -> bytes:
+    binding = _binding()
+    module = binding.parse_assembly(text, binding.create_context())
+    module.triple = binding.get_process_triple()
+    return _target_machine().emit_object(module)
+
+
+def _load(code: bytes) -> Any:
+    binding = _binding()
+    empty = binding.parse_assembly("", binding.create_context())
+    engine = binding.create_mcjit_compiler(empty, _target_machine())
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return engine
+
+
+def _target_machine() -> Any:
+    binding, host = _binding(), _host()
+    target = binding.Target.from_triple(binding.get_process_triple())
+    return target.create_target_machine(
+        cpu=host.name, features=host.features, opt=_LEVEL, codemodel="jitdefault", jit=True
+    )
+
+
+@functools.cache
+def _binding() -> Any:
+    """LLVM, which takes a while to load."""
+    binding = importlib.import_module("llvmlite.binding")
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    process = ctypes.CDLL(None)
+    for name in xla_ffi.SYMBOLS:
+        address = ctypes.cast(getattr(process, name), ctypes.c_void_p).value
+        binding.add_symbol(name, address)
+    return binding
+
+
+@functools.cache
+def _host() -> _Host:
+    binding = _binding()
+    features = binding.get_host_cpu_features()
+    lanes = 16 if features.get("avx512f") else 8 if features.get("avx2") else 4
+    machine = binding.get_process_triple().partition("-")[0]
+    version = f"{importlib.import_module('llvmlite').__version__} {binding.llvm_version_info}"
+    return _Host(
+        machine="aarch64" if machine == "arm64" else machine,
+        name=binding.get_host_cpu_name(),
+        features=features.flatten(),
+        lanes=lanes,
+        version=version,
+    )
