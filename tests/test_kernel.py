@@ -6,7 +6,7 @@ import numpy as np
 import ptx_machine
 import pytest
 
-from jetbot_mjx import kernel, ptx
+from jetbot_mjx import gpu, kernel, ptx
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
@@ -27,13 +27,13 @@ def launches(monkeypatch):
             outputs = [np.zeros(like.shape, np.float32) for like in results]
             robots = len(arrays[0])
             blocks = -(-robots // ptx.THREADS)
-            ptx_machine.run(written.source(robots), blocks, arrays, outputs)
+            ptx_machine.run(ptx.source(written, robots), blocks, arrays, outputs)
             return outputs
 
         shapes = [jax.ShapeDtypeStruct(like.shape, jnp.float32) for like in results]
         return jax.pure_callback(run, shapes, *leaves)
 
-    monkeypatch.setattr(kernel, "_launch", launch)
+    monkeypatch.setattr(gpu, "launch", launch)
     return counts
 
 
@@ -44,7 +44,7 @@ def step():
 
     shapes = {"x": jnp.zeros(3), "n": jnp.zeros(())}
     program = scalarize(once, shapes, jnp.zeros(()))
-    return kernel.batched(ptx.make_kernel(program, carried=2, steps=2, name="it"))
+    return kernel.batched(gpu, gpu.write(program, carried=2, steps=2))
 
 
 def test_one_robot_needs_no_batch(step, launches):
@@ -92,7 +92,7 @@ def cache(tmp_path, monkeypatch):
 
 
 def write(text="text"):
-    return ptx.Kernel("it", text)
+    return kernel.Kernel("it", text)
 
 
 def never():
@@ -106,18 +106,18 @@ def test_a_text_is_written_once_for_each_key(cache):
     assert len(list(cache.iterdir())) == 2
 
 
-@pytest.mark.parametrize("damage", ["", "{", "[]", '{"name": "it"}', '{"a": 1}'])
+@pytest.mark.parametrize("damage", [b"", b"\n", b"a" * 64 + b"\n{}"])
 def test_a_damaged_text_is_written_again(cache, damage):
     kernel.kept(b"key", write)
     (path,) = cache.iterdir()
-    path.write_text(damage)
+    path.write_bytes(damage)
     assert kernel.kept(b"key", write) == write()
     assert kernel.kept(b"key", never) == write()
 
 
 def test_another_way_of_writing_is_another_text(cache, monkeypatch):
     kernel.kept(b"key", write)
-    monkeypatch.setattr(kernel, "_own_source", lambda: b"another")
+    monkeypatch.setattr(kernel, "source_of", lambda *modules: b"another")
     assert kernel.kept(b"key", lambda: write("more")) == write("more")
 
 
@@ -134,29 +134,29 @@ def test_without_a_folder_it_is_written_every_time(tmp_path):
 
 @pytest.mark.skipif(jax.default_backend() == "gpu", reason="there is a GPU")
 def test_without_an_nvidia_gpu_there_is_none():
-    assert not kernel.is_available()
-    assert make_env(parse_config({})).physics.impl == "xla"
+    assert not gpu.is_available()
+    assert make_env(parse_config({})).physics.impl != "ptx"
     with pytest.raises(UserError, match=r"physics\.impl = ptx needs an NVIDIA GPU.* cpu"):
         make_env(parse_config({"physics": {"impl": "ptx"}}))
 
 
 @pytest.fixture
-def gpu(monkeypatch, launches):
-    monkeypatch.setattr(kernel, "is_available", lambda: True)
+def as_on_a_gpu(monkeypatch, launches):
+    monkeypatch.setattr(gpu, "is_available", lambda: True)
     return launches
 
 
-def test_the_environment_steps_by_the_kernel_where_there_is_one(gpu):
+def test_the_environment_steps_by_the_kernel_where_there_is_one(as_on_a_gpu):
     env = make_env(parse_config({}))
     assert env.physics.impl == "ptx"
     states = jax.vmap(env.reset)(jax.random.split(jax.random.PRNGKey(0), 3))
     ahead = jax.vmap(env.step)(states, jnp.ones((3, 2)))
-    assert gpu == [3]
+    assert as_on_a_gpu == [3]
     assert np.all(ahead.pipeline_state.qpos[:, 0] > 0)
     np.testing.assert_allclose(ahead.pipeline_state.time, 1 / 60, rtol=1e-5)
 
 
-def test_models_that_differ_from_robot_to_robot_go_into_the_kernel(gpu):
+def test_models_that_differ_from_robot_to_robot_go_into_the_kernel(as_on_a_gpu):
     env = make_env(parse_config({}))
     gains = jnp.float32([0.5, 1.0])
 
@@ -167,7 +167,7 @@ def test_models_that_differ_from_robot_to_robot_go_into_the_kernel(gpu):
         return here.step_physics(state, jnp.ones(2)).qvel
 
     ours = jax.vmap(drive)(gains)
-    assert gpu == [2]
+    assert as_on_a_gpu == [2]
     # The second robot has its preset's gain.
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
     np.testing.assert_allclose(ours[1], env.step_physics(state, jnp.ones(2)).qvel, atol=1e-5)
@@ -175,7 +175,7 @@ def test_models_that_differ_from_robot_to_robot_go_into_the_kernel(gpu):
 
 
 @pytest.mark.parametrize("impl", ["auto", "ptx"])
-def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(gpu, impl):
+def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(as_on_a_gpu, impl):
     # The library's Cholesky factor is a call, not arithmetic.
     env = make_env(parse_config({"physics": {"impl": impl, "cholesky": "library"}}))
     if impl == "auto":
@@ -185,34 +185,43 @@ def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(gp
         env.step_physics(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))
 
 
-def test_the_text_of_a_model_of_its_own_is_kept_and_of_another_is_not(gpu, cache, monkeypatch):
+def test_a_text_is_kept_for_each_model_and_for_what_varies_of_it(as_on_a_gpu, cache):
     def writes(env):
-        before = len(list(cache.glob("kernel-*.json")))
+        before = len(list(cache.glob("kernel-*")))
         assert env.physics.impl == "ptx"
-        return len(list(cache.glob("kernel-*.json"))) - before
+        return len(list(cache.glob("kernel-*"))) - before
 
     env = make_env(parse_config({}))
     assert writes(env) == 1
     assert writes(make_env(parse_config({}))) == 0
     assert writes(make_env(parse_config({"physics": {"iterations": 3}}))) == 1
     assert writes(make_env(parse_config({"robot": {"preset": "real"}}))) == 1
-    # What it holds is no part of the key.
-    slippery = env.mjx_model.replace(pair_friction=env.mjx_model.pair_friction * 0.5)
+    friction = env.mjx_model.pair_friction
+    slippery = env.mjx_model.replace(pair_friction=friction * 0.5)
+    assert writes(env.with_model(slippery)) == 1
     assert writes(env.with_model(slippery)) == 0
+
+    def varied(friction):
+        return writes(env.with_model(env.mjx_model.replace(pair_friction=friction)))
+
+    counts = []
+    jax.eval_shape(lambda friction: counts.append(varied(friction)), friction)
+    jax.eval_shape(lambda friction: counts.append(varied(friction)), friction)
+    assert counts == [1, 0]
 
 
 def test_a_program_is_the_same_whether_its_kernel_is_written_or_found(cache, monkeypatch):
     def launch(written, leaves, results):
         return [x + len(written.text) for x in results]
 
-    monkeypatch.setattr(kernel, "is_available", lambda: True)
-    monkeypatch.setattr(kernel, "_launch", launch)
+    monkeypatch.setattr(gpu, "is_available", lambda: True)
+    monkeypatch.setattr(gpu, "launch", launch)
     programs = []
     for _ in range(2):
         env = make_env(parse_config({}))
         states = env.reset(jax.random.PRNGKey(0)).pipeline_state
         programs.append(jax.jit(env.step_physics).lower(states, jnp.zeros(2)).as_text())
-    assert len(list(cache.glob("kernel-*.json"))) == 1
+    assert len(list(cache.glob("kernel-*"))) == 1
     assert programs[0] == programs[1]
 
 

@@ -39,7 +39,7 @@ def run(program, arguments, steps=1, carried=1):
     robots = len(arguments[0])
     kernel = ptx.make_kernel(program, carried=carried, steps=steps, name="it")
     outputs = [np.full_like(x, np.nan) for x in arguments[:carried]]
-    ptx_machine.run(kernel.source(robots), -(-robots // ptx.THREADS), arguments, outputs)
+    ptx_machine.run(ptx.source(kernel, robots), -(-robots // ptx.THREADS), arguments, outputs)
     return outputs
 
 
