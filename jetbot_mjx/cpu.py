@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jetbot_mjx import kernel, llvm, xla_ffi
-from jetbot_mjx.kernel import Kernel
+from jetbot_mjx import llvm, xla_ffi
+from jetbot_mjx.kernel import Kernel, kept_bytes, source_of
 from jetbot_mjx.scalarize import Program, scalarize
 
 IMPL = "llvm"
@@ -73,7 +73,7 @@ def is_available() -> bool:
 def depends_on() -> bytes:
     """All that a kernel's text depends on, beside its program."""
     host = _host()
-    return kernel.source_of(llvm, xla_ffi) + f"{host.machine} {host.lanes}".encode()
+    return source_of(llvm, xla_ffi) + f"{xla_ffi.TEXT} {host.machine} {host.lanes}".encode()
 
 
 def write(program: Program, *, carried: int, steps: int) -> Kernel:
@@ -97,20 +97,28 @@ def launch(kernel: Kernel, leaves: Sequence[Array], results: Sequence[Array]) ->
     return list(jax.ffi.ffi_call(_registered(kernel), shapes)(*leaves))
 
 
-def _registered(written: Kernel) -> str:
+def _registered(kernel: Kernel) -> str:
     """The name by which XLA knows a kernel; compiles it when it is first asked for."""
-    host = _host()
-    key = "\n".join([host.version, host.name, host.features, str(_LEVEL), written.text]).encode()
-    name = f"jetbot_mjx_{hashlib.sha256(key).hexdigest()}"
+    name = f"jetbot_mjx_{hashlib.sha256(_key(kernel.text)).hexdigest()}"
     # Programs are traced in several threads.
     with _lock:
         if name not in _loaded:
-            code = kernel.kept_bytes("object", key, lambda: _compile(written.text))
-            engine = _load(code)
-            address = ctypes.c_void_p(engine.get_function_address(written.name))
+            engine = _load(_machine_code(kernel.text))
+            address = ctypes.c_void_p(engine.get_function_address(kernel.name))
             jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
             _loaded[name] = engine
     return name
+
+
+def _key(text: str) -> bytes:
+    """All that a kernel's machine code depends on."""
+    host = _host()
+    return "\n".join([host.version, host.name, host.features, str(_LEVEL), text]).encode()
+
+
+def _machine_code(text: str) -> bytes:
+    """An object file, from the folder of compiled programs if it was compiled before."""
+    return kept_bytes("object", _key(text), lambda: _compile(text))
 
 
 def _compile(text: str) -> bytes:

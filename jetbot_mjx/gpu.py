@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jetbot_mjx import kernel, ptx
-from jetbot_mjx.kernel import Kernel
+from jetbot_mjx import ptx
+from jetbot_mjx.kernel import Kernel, source_of
 from jetbot_mjx.scalarize import Program, scalarize
 
 IMPL = "ptx"
@@ -41,7 +41,7 @@ def is_available() -> bool:
 
 def depends_on() -> bytes:
     """All that a kernel's text depends on, beside its program."""
-    return kernel.source_of(ptx)
+    return source_of(ptx)
 
 
 def write(program: Program, *, carried: int, steps: int) -> Kernel:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jax.custom_batching import custom_vmap
 from jaxtyping import Array, PyTree
 
-from jetbot_mjx import scalars
+from jetbot_mjx import moving, scalars
 from jetbot_mjx import scalarize as scalarize_module
 from jetbot_mjx.scalarize import Program
 
@@ -144,7 +144,7 @@ def kept(key: bytes, write: Callable[[], Kernel]) -> Kernel:
     Returns:
       The kernel.
     """
-    key = key + source_of(scalars, scalarize_module)
+    key = key + source_of(scalars, moving, scalarize_module)
     content = kept_bytes("kernel", key, lambda: json.dumps(write()._asdict()).encode())
     return Kernel(**json.loads(content))
 

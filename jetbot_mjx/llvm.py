@@ -82,7 +82,11 @@ class _Text:
 
     def _function(self, name: str) -> str:
         suffix = f"v{self._lanes}f32"
-        return f"@llvm.{name}.v{self._lanes}i32.{suffix}" if "sat" in name else f"@llvm.{name}.{suffix}"
+        return (
+            f"@llvm.{name}.v{self._lanes}i32.{suffix}"
+            if "sat" in name
+            else f"@llvm.{name}.{suffix}"
+        )
 
     def _row(self, row: int) -> str:
         address = self._do(f"getelementptr {self._type('f')}, ptr %tile, i64 {row}")
@@ -112,12 +116,16 @@ class _Text:
 
     def _call(self, value: Value, operands: list[str]) -> str:
         (x,) = operands
-        return f"call {self._type('f')} {self._function(_INTRINSICS[value.op])}({self._type('f')} {x})"
+        return (
+            f"call {self._type('f')} {self._function(_INTRINSICS[value.op])}({self._type('f')} {x})"
+        )
 
     def _extreme(self, value: Value, operands: list[str]) -> str:
         # One instruction on x86, which takes the second where one is not a number.
         number = self._type("f")
-        ordered = sorted(zip(value.operands, operands, strict=True), key=lambda x: not is_known(x[0]))
+        ordered = sorted(
+            zip(value.operands, operands, strict=True), key=lambda x: not is_known(x[0])
+        )
         (first, a), (_, b) = ordered
         better = "ogt" if value.op == "max" else "olt"
         best = self._chosen(self._do(f"fcmp {better} {number} {a}, {b}"), "f", a, b)
@@ -142,7 +150,9 @@ class _Text:
         return self._chosen(self._do(f"icmp {better} {self._type('i')} {a}, {b}"), "i", a, b)
 
     def _chosen(self, which: str, kind: str, yes: str, no: str) -> str:
-        return f"select {self._type('b')} {which}, {self._type(kind)} {yes}, {self._type(kind)} {no}"
+        return (
+            f"select {self._type('b')} {which}, {self._type(kind)} {yes}, {self._type(kind)} {no}"
+        )
 
     def _select(self, value: Value, operands: list[str]) -> str:
         which, no, yes = operands
@@ -151,7 +161,8 @@ class _Text:
     def _convert(self, value: Value, operands: list[str]) -> str:
         source, to = value.operands[0].dtype.kind, value.dtype.kind
         if source == "f":
-            return f"call {self._type('i')} {self._function('fptosi.sat')}({self._type('f')} {operands[0]})"
+            function = self._function("fptosi.sat")
+            return f"call {self._type('i')} {function}({self._type('f')} {operands[0]})"
         how = "zext" if to == "i" else "uitofp" if source == "b" else "sitofp"
         return f"{how} {self._type(source)} {operands[0]} to {self._type(to)}"
 

@@ -47,7 +47,7 @@ class Physics:
         self._lock = threading.Lock()
         self._kernel: kernel.Step | UnsupportedError | None = None
         for backend in BACKENDS:
-            if backend.IMPL == config.impl and not backend.is_available():
+            if config.impl == backend.IMPL and not backend.is_available():
                 raise UserError(
                     f"physics.impl = {config.impl} needs {backend.NEEDS}; this is"
                     f" {jax.default_backend()}: choose xla or auto"

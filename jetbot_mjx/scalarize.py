@@ -11,20 +11,27 @@ long as all numbers are finite.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
+from jetbot_mjx.moving import (
+    RULES,
+    Numbers,
+    filled,
+    known_array,
+    known_values,
+    numbers_of,
+    shape_of,
+    windows,
+)
 from jetbot_mjx.scalars import EVALUATE, Graph, Scalar, UnsupportedError, Value, in_order, is_known
 
 MOST_TRIPS = 64
 """Of a loop that is written out."""
-
-Numbers = np.ndarray
-"""An array of `Scalar`, dtype object."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,39 +96,11 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
     closed = jax.make_jaxpr(function)(*arguments)
     graph = Graph()
     inputs = [
-        _filled(leaf.shape, lambda dtype=leaf.dtype: graph.input(dtype))
+        filled(leaf.shape, lambda dtype=leaf.dtype: graph.input(dtype))
         for leaf in jax.tree.leaves(arguments)
     ]
     outputs = _Writer(graph).closed(closed, inputs)
     return Program(inputs, outputs, in_order(x for array in outputs for x in array.ravel()))
-
-
-def _filled(shape: Sequence[int], make: Callable[[], Scalar]) -> Numbers:
-    numbers = np.empty(shape, object)
-    for place in np.ndindex(*shape):
-        numbers[place] = make()
-    return numbers
-
-
-def _numbers(scalars: Iterable[Scalar], shape: Sequence[int]) -> Numbers:
-    numbers = iter(list(scalars))
-    return _filled(shape, lambda: next(numbers))
-
-
-def _known_array(array: Any) -> Numbers:
-    array = np.asarray(array)
-    return _numbers(array.ravel(), array.shape)
-
-
-def _values(numbers: Numbers, dtype: Any) -> np.ndarray:
-    """A plain array of numbers that are all known."""
-    if not all(map(is_known, numbers.ravel())):
-        raise UnsupportedError("an index that depends on the state")
-    return np.asarray(list(numbers.ravel()), dtype).reshape(numbers.shape)
-
-
-def _shape(variable: Any) -> tuple[int, ...]:
-    return tuple(variable.aval.shape)
 
 
 class _Writer:
@@ -131,7 +110,7 @@ class _Writer:
         self._graph = graph
 
     def closed(self, closed: ClosedJaxpr, arguments: Sequence[Numbers]) -> list[Numbers]:
-        constants = [_known_array(constant) for constant in closed.consts]
+        constants = [known_array(constant) for constant in closed.consts]
         return self._write(closed.jaxpr, constants, arguments)
 
     def _write(
@@ -143,7 +122,7 @@ class _Writer:
         def read(atom: Any) -> Numbers:
             if isinstance(atom, Literal):
                 aval: Any = atom.aval
-                return _known_array(np.asarray(atom.val, aval.dtype))
+                return known_array(np.asarray(atom.val, aval.dtype))
             return known[atom]
 
         for equation in jaxpr.eqns:
@@ -155,7 +134,7 @@ class _Writer:
         name = equation.primitive.name
         if name in EVALUATE:
             return [self._each(name, *operands)]
-        rule = getattr(self, f"_{name.replace('-', '_')}", None)
+        rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
         if rule is None:
             raise UnsupportedError(f"the operation {name}")
         result = rule(equation, equation.params, *operands)
@@ -164,11 +143,11 @@ class _Writer:
     def _each(self, op: str, *operands: Numbers) -> Numbers:
         arrays = np.broadcast_arrays(*operands)
         rows = zip(*(array.ravel() for array in arrays), strict=True)
-        return _numbers((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
+        return numbers_of((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
 
     def _choose(self, which: Scalar, no: Numbers, yes: Numbers) -> Numbers:
         pairs = zip(no.ravel(), yes.ravel(), strict=True)
-        return _numbers((self._graph.select(which, a, b) for a, b in pairs), no.shape)
+        return numbers_of((self._graph.select(which, a, b) for a, b in pairs), no.shape)
 
     # Functions within functions.
 
@@ -184,11 +163,11 @@ class _Writer:
         body = params["jaxpr"].jaxpr
         # Only what is scanned over has one axis less inside.
         scanned = sum(
-            len(_shape(outer)) != len(_shape(inner))
+            len(shape_of(outer)) != len(shape_of(inner))
             for outer, inner in zip(equation.invars, body.invars, strict=True)
         )
         stacked = sum(
-            len(_shape(outer)) != len(_shape(inner))
+            len(shape_of(outer)) != len(shape_of(inner))
             for outer, inner in zip(equation.outvars, body.outvars, strict=True)
         )
         carried = len(equation.outvars) - stacked
@@ -200,9 +179,9 @@ class _Writer:
             slices = [_at(sequence, i) for sequence in operands[first:]]
             results = self.closed(params["jaxpr"], [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
-        shapes = [_shape(variable) for variable in equation.outvars[carried:]]
+        shapes = [shape_of(variable) for variable in equation.outvars[carried:]]
         columns = [
-            _numbers((x for i in order for x in rows[i][k].ravel()), shape)
+            numbers_of((x for i in order for x in rows[i][k].ravel()), shape)
             for k, shape in enumerate(shapes)
         ]
         return [*carry, *columns]
@@ -238,86 +217,7 @@ class _Writer:
         which = self._graph.convert(which, np.dtype(bool))
         return [self._choose(which, *pair) for pair in zip(no, yes, strict=True)]
 
-    # What only moves numbers about.
-
-    def _copy(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return x
-
-    _stop_gradient = _copy
-
-    def _reshape(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return x.reshape(_shape(equation.outvars[0]))
-
-    _squeeze = _expand_dims = _reshape
-
-    def _slice(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        strides = params["strides"] or [1] * x.ndim
-        bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
-        return x[tuple(slice(*bound) for bound in bounds)]
-
-    def _broadcast_in_dim(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        shape = [1] * len(params["shape"])
-        for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
-            shape[axis] = size
-        return np.broadcast_to(x.reshape(shape), params["shape"])
-
-    def _transpose(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return x.transpose(params["permutation"])
-
-    def _rev(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return np.flip(x, params["dimensions"])
-
-    def _tile(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return np.tile(x, params["reps"])
-
-    def _concatenate(self, equation: Any, params: Any, *operands: Numbers) -> Numbers:
-        return np.concatenate(operands, params["dimension"])
-
-    def _stack(self, equation: Any, params: Any, *operands: Numbers) -> Numbers:
-        return np.stack(operands, params["axis"])
-
-    def _unstack(self, equation: Any, params: Any, x: Numbers) -> list[Numbers]:
-        parts = np.split(x, x.shape[params["axis"]], params["axis"])
-        return [part.reshape(_shape(equation.outvars[0])) for part in parts]
-
-    def _split(self, equation: Any, params: Any, x: Numbers) -> list[Numbers]:
-        return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
-
-    def _pad(self, equation: Any, params: Any, x: Numbers, padding: Numbers) -> Numbers:
-        if any(low < 0 or high < 0 or inside for low, high, inside in params["padding_config"]):
-            raise UnsupportedError("padding that is negative or between numbers")
-        widths = [(low, high) for low, high, _ in params["padding_config"]]
-        padded = _filled(_shape(equation.outvars[0]), padding.item)
-        padded[tuple(slice(low, low + n) for (low, _), n in zip(widths, x.shape, strict=True))] = x
-        return padded
-
-    def _iota(self, equation: Any, params: Any) -> Numbers:
-        shape, axis = params["shape"], params["dimension"]
-        counts = np.arange(shape[axis]).astype(params["dtype"])
-        counts = counts.reshape([-1 if i == axis else 1 for i in range(len(shape))])
-        return _known_array(np.broadcast_to(counts, shape))
-
-    def _empty(self, equation: Any, params: Any) -> Numbers:
-        variable = equation.outvars[0]
-        return _known_array(np.zeros(_shape(variable), variable.aval.dtype))
-
-    def _gather(self, equation: Any, params: Any, x: Numbers, indices: Numbers) -> Numbers:
-        numbers = params["dimension_numbers"]
-        places = _windows(
-            x.shape,
-            _values(indices, np.int64),
-            offset_dims=numbers.offset_dims,
-            collapsed=numbers.collapsed_slice_dims,
-            index_map=numbers.start_index_map,
-            batching=numbers.operand_batching_dims,
-            indices_batching=numbers.start_indices_batching_dims,
-            sizes=params["slice_sizes"],
-            clip="CLIP" in str(params["mode"]),
-        )
-        fill = equation.outvars[0].aval.dtype.type(_fill_value(equation))
-        flat = x.ravel()
-        numbers = (flat[place] if place >= 0 else fill for place in places.ravel())
-        return _numbers(numbers, _shape(equation.outvars[0]))
+    # What depends on how numbers are moved.
 
     def _dynamic_slice(self, equation: Any, params: Any, x: Numbers, *starts: Numbers) -> Numbers:
         for axis, (start, size) in enumerate(zip(starts, params["slice_sizes"], strict=True)):
@@ -345,9 +245,9 @@ class _Writer:
         numbers = params["dimension_numbers"]
         fixed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
         window = iter(updates.shape[axis] for axis in numbers.update_window_dims)
-        places = _windows(
+        places = windows(
             x.shape,
-            _values(indices, np.int64),
+            known_values(indices, np.int64),
             offset_dims=numbers.update_window_dims,
             collapsed=numbers.inserted_window_dims,
             index_map=numbers.scatter_dims_to_operand_dims,
@@ -373,14 +273,14 @@ class _Writer:
 
     def _convert_element_type(self, equation: Any, params: Any, x: Numbers) -> Numbers:
         dtype = np.dtype(params["new_dtype"])
-        return _numbers((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
+        return numbers_of((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
     def _select_n(self, equation: Any, params: Any, which: Numbers, *cases: Numbers) -> Numbers:
         if len(cases) != 2:
             raise UnsupportedError("a selection from more than two")
         which = np.broadcast_to(which, cases[0].shape)
         rows = zip(which.ravel(), cases[0].ravel(), cases[1].ravel(), strict=True)
-        return _numbers((self._graph.select(*row) for row in rows), cases[0].shape)
+        return numbers_of((self._graph.select(*row) for row in rows), cases[0].shape)
 
     def _clamp(
         self, equation: Any, params: Any, low: Numbers, x: Numbers, high: Numbers
@@ -391,20 +291,20 @@ class _Writer:
         return self._each("mul", x, x)
 
     def _integer_pow(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        one = _known_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
+        one = known_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
         result = one
         for _ in range(abs(params["y"])):
             result = self._each("mul", result, x)
         return result if params["y"] >= 0 else self._each("div", one, result)
 
     def _rsqrt(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return self._each("div", _known_array(np.float32(1)), self._each("sqrt", x))
+        return self._each("div", known_array(np.float32(1)), self._each("sqrt", x))
 
     def _reduce(self, op: str, start: Scalar, params: Any, x: Numbers) -> Numbers:
         axes = tuple(params["axes"])
         kept = [axis for axis in range(x.ndim) if axis not in axes]
         shape = [x.shape[axis] for axis in kept]
-        results = _filled(shape, lambda: start)
+        results = filled(shape, lambda: start)
         x = x.transpose(*kept, *axes)
         for place in np.ndindex(*shape):
             for number in x[place].ravel() if axes else [x[place]]:
@@ -445,7 +345,7 @@ class _Writer:
         (axis,) = params["axes"]
         kind = equation.outvars[0].aval.dtype.type
         x = np.moveaxis(x, axis, -1)
-        places = _filled(x.shape[:-1], lambda: kind(0))
+        places = filled(x.shape[:-1], lambda: kind(0))
         for row in np.ndindex(*x.shape[:-1]):
             best = x[row][0]
             for i, number in enumerate(x[row][1:], start=1):
@@ -468,14 +368,7 @@ class _Writer:
                         product = self._graph.apply("mul", x, y)
                         total = self._graph.apply("add", total, product)
                     sums.append(total)
-        return _numbers(sums, _shape(equation.outvars[0]))
-
-    def _sort(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
-        if params["num_keys"] != 1:
-            raise UnsupportedError("sorting by more than one key")
-        keys = _values(operands[0], equation.outvars[0].aval.dtype)
-        order = np.argsort(keys, params["dimension"], kind="stable")
-        return [np.take_along_axis(x, order, params["dimension"]) for x in operands]
+        return numbers_of(sums, shape_of(equation.outvars[0]))
 
 
 def _at(numbers: Numbers, i: int) -> Numbers:
@@ -497,49 +390,3 @@ def _grouped(x: Numbers, batch: Sequence[int], summed: Sequence[int]) -> Numbers
         int(np.prod([x.shape[axis] for axis in axes], dtype=int)) for axes in (batch, free, summed)
     ]
     return x.transpose(*batch, *free, *summed).reshape(sizes)
-
-
-def _fill_value(equation: Any) -> float:
-    given = equation.params.get("fill_value")
-    dtype = equation.outvars[0].aval.dtype
-    if given is not None:
-        return given
-    return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
-
-
-def _windows(
-    shape: Sequence[int],
-    indices: np.ndarray,
-    *,
-    offset_dims: Sequence[int],
-    collapsed: Sequence[int],
-    index_map: Sequence[int],
-    batching: Sequence[int],
-    indices_batching: Sequence[int],
-    sizes: Sequence[int],
-    clip: bool,
-) -> np.ndarray:
-    """Where in a flat operand a gather reads, or a scatter writes; -1: nowhere.
-
-    Source: the semantics of gather and scatter in the StableHLO specification.
-    """
-    places = np.arange(int(np.prod(shape, dtype=int))).reshape(shape)
-    fixed = (*collapsed, *batching)
-    window = [size for axis, size in enumerate(sizes) if axis not in fixed]
-    rank = indices.ndim - 1 + len(window)
-    batch_dims = [axis for axis in range(rank) if axis not in offset_dims]
-    result = np.empty((*indices.shape[:-1], *window), np.int64)
-    for at in np.ndindex(*indices.shape[:-1]):
-        start = np.zeros(len(shape), np.int64)
-        start[list(index_map)] = indices[at]
-        for axis, source in zip(batching, indices_batching, strict=True):
-            start[axis] = at[source]
-        most = np.asarray(shape) - np.asarray(sizes)
-        if clip:
-            start = np.clip(start, 0, most)
-        inside = bool(np.all((start >= 0) & (start <= most)))
-        cut = tuple(slice(a, a + n) for a, n in zip(start, sizes, strict=True))
-        result[at] = places[cut].reshape(window) if inside else -1
-    # Batch axes came first; put each axis where it belongs.
-    order = np.argsort([*batch_dims, *offset_dims])
-    return result.transpose(order)

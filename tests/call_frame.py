@@ -119,11 +119,9 @@ class Pool:
 
     def count(self, arguments):
         ctypes.c_int64.from_address(arguments.contents[3]).value = self.threads
-        return None
 
     def destroy(self, arguments):
         self.destroyed.append(arguments.contents[2])
-        return None
 
     def finish(self):
         for thread in self.started:

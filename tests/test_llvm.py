@@ -185,8 +185,8 @@ def test_of_another_interface_nothing_is_touched(plus_one, change):
 def test_what_is_not_written_for_a_cpu_is_named():
     with pytest.raises(UnsupportedError, match="tanh"):
         cpu.write(scalarize(lambda x: jnp.tanh(x), VECTOR), carried=1, steps=1)
+    program = scalarize(lambda i: i + 1, jax.ShapeDtypeStruct((1,), jnp.int32))
     with pytest.raises(UnsupportedError, match="not float32"):
-        program = scalarize(lambda i: i + 1, jax.ShapeDtypeStruct((1,), jnp.int32))
         cpu.write(program, carried=1, steps=1)
 
 
