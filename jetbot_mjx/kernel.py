@@ -7,7 +7,6 @@ the state back. In which language, and who launches it, is a back end's affair: 
 """
 
 import contextlib
-import functools
 import hashlib
 import json
 import tempfile
@@ -181,7 +180,6 @@ def _digest(content: bytes) -> bytes:
     return hashlib.sha256(content).hexdigest().encode()
 
 
-@functools.cache
 def source_of(*modules: types.ModuleType) -> bytes:
     """The source of modules: what they write depends on it."""
     return b"".join(Path(module.__file__ or "").read_bytes() for module in modules)
