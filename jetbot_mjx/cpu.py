@@ -9,8 +9,9 @@ import ctypes
 import functools
 import hashlib
 import importlib
+import re
 import threading
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -29,9 +30,19 @@ _NAME = "physics"
 _LEVEL = 2
 """Of code generation; there are no passes before it, for a program has nothing left to shorten."""
 
+_XLA_NAME = re.compile(r"jetbot_mjx_[0-9a-f]{64}")
+
+
+class _Loaded(NamedTuple):
+    """Machine code that XLA may call as long as the process lives."""
+
+    engine: Any
+    code: bytes
+
+
 _lock = threading.Lock()
-_loaded: dict[str, Any] = {}
-"""Machine code by its name in XLA, which may call it as long as the process lives."""
+_loaded: dict[str, _Loaded] = {}
+"""By the name that XLA knows it by."""
 
 
 class _Host(NamedTuple):
@@ -103,11 +114,39 @@ def _registered(kernel: Kernel) -> str:
     # Programs are traced in several threads.
     with _lock:
         if name not in _loaded:
-            engine = _load(_machine_code(kernel.text))
-            address = ctypes.c_void_p(engine.get_function_address(kernel.name))
-            jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
-            _loaded[name] = engine
+            _register(name, _machine_code(kernel.text))
     return name
+
+
+def _register(name: str, code: bytes) -> None:
+    engine = _load(code)
+    address = ctypes.c_void_p(engine.get_function_address(_NAME))
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
+    _loaded[name] = _Loaded(engine, code)
+
+
+def kernels_in(lowered: str) -> dict[str, bytes]:
+    """The kernels that a program calls.
+
+    Args:
+      lowered: the program's text.
+
+    Returns:
+      Their machine code by the names that XLA knows them by.
+    """
+    return {name: _loaded[name].code for name in sorted(set(_XLA_NAME.findall(lowered)))}
+
+
+def register(kernels: Mapping[str, bytes]) -> None:
+    """Makes kernels known to XLA, before it loads a program that calls them.
+
+    Args:
+      kernels: of `kernels_in`, from this processor and these versions of all libraries.
+    """
+    with _lock:
+        for name, code in kernels.items():
+            if name not in _loaded:
+                _register(name, code)
 
 
 def _key(text: str) -> bytes:

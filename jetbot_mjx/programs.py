@@ -27,16 +27,17 @@ from typing import Self
 import jax
 from jax.experimental import serialize_executable
 
+from jetbot_mjx import cpu
 from jetbot_mjx.compiling import Options, compiler_options
 from jetbot_mjx.config import Config
 
 TRUSTED = f"{__package__}."
 """How tasks begin whose source is part of the key."""
 
-SOURCES = {".py", ".xml"}
+SOURCES = {".ll", ".py", ".xml"}
 """Of what programs are made from, as files of this package end."""
 
-_LIBRARIES = ("jax", "jaxlib", "brax", "flax", "mujoco", "mujoco-mjx", "numpy", "optax")
+_LIBRARIES = ["brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx", "numpy", "optax"]
 _UNUSED_DAYS = 30
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
 _DIGEST_BYTES = hashlib.sha256().digest_size
@@ -95,10 +96,12 @@ class Programs:
             return program
         began = time.perf_counter()
         with _CacheHits() as hits:
-            program = trace().lower().compile(compiler_options=self._options)
+            lowered = trace().lower()
+            program = lowered.compile(compiler_options=self._options)
         # What XLA loaded for a CPU it cannot write again: some functions would be missing.
         if self._folder and not (hits.count and jax.default_backend() == "cpu"):
-            _keep(self._path(name), program, time.perf_counter() - began)
+            seconds = time.perf_counter() - began
+            _keep(self._path(name), program, cpu.kernels_in(lowered.as_text()), seconds)
         return program
 
     def _path(self, name: str) -> Path:
@@ -133,7 +136,7 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
         config.model_copy(update={"seed": 0}).model_dump(mode="json"),
         _own_source(),
         sys.version,
-        [importlib.metadata.version(name) for name in _LIBRARIES],
+        [_version(name) for name in _LIBRARIES],
         settings,
         os.environ.get("XLA_FLAGS"),
         processor(),
@@ -141,6 +144,13 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
         [device.device_kind for device in devices],
     ]
     return Programs(options, Path(folder), json.dumps(depends_on, sort_keys=True))
+
+
+def _version(library: str) -> str | None:
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def processor() -> str:
@@ -191,7 +201,8 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:
         return None
-    seconds, kept = pickle.loads(body)
+    seconds, kernels, kept = pickle.loads(body)
+    cpu.register(kernels)
     program = serialize_executable.deserialize_and_load(*kept)
     with contextlib.suppress(OSError):
         path.touch()
@@ -206,14 +217,19 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     return program
 
 
-def _keep(path: Path, program: jax.stages.Compiled, seconds: float) -> None:
-    """Writes a program and the time that it took; a folder without room costs time, no more."""
+def _keep(
+    path: Path, program: jax.stages.Compiled, kernels: dict[str, bytes], seconds: float
+) -> None:
+    """Writes a program, the kernels that it calls and the time that it took.
+
+    A folder without room costs time, no more.
+    """
     try:
         kept = serialize_executable.serialize(program)
     except (NotImplementedError, ValueError):
         # This kind of device cannot.
         return
-    body = pickle.dumps((seconds, kept))
+    body = pickle.dumps((seconds, kernels, kept))
     with contextlib.suppress(OSError):
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:

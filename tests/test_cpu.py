@@ -17,6 +17,7 @@ from jetbot_mjx import cpu, kernel, xla_ffi
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.programs import programs_of
 from jetbot_mjx.scalarize import scalarize
 
 DEVICES = 8
@@ -227,6 +228,25 @@ def test_another_kernel_has_another_name():
         for n, steps in ((1.0, 1), (2.0, 1), (1.0, 2))
     ]
     assert len({cpu._registered(text) for text in texts}) == 3
+
+
+@needs_it
+def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, monkeypatch):
+    shape = jax.ShapeDtypeStruct((2,), jnp.float32)
+    written = cpu.write(scalarize(lambda x: x * 2.5, shape), carried=1, steps=1)
+    x = np.ones((3, 2), np.float32)
+    config = parse_config({})
+    program = programs_of(config, keep=True).compile(
+        "test", lambda: jax.jit(lambda x: cpu.launch(written, [x], [x])[0]).trace(x)
+    )
+    (name,) = cpu.kernels_in(program.as_text())
+    # As in a new process, but that XLA knows the name already.
+    monkeypatch.setattr(cpu, "_loaded", {})
+    told = []
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: told.append(name))
+    found = programs_of(config, keep=True).find("test")
+    assert told == [name]
+    np.testing.assert_array_equal(found(x), np.full((3, 2), 2.5))
 
 
 @pytest.fixture
