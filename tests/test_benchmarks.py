@@ -27,6 +27,7 @@ from gliding import everywhere
 from measurements import Sizes
 from timing import make_row
 
+from jetbot_mjx import cpu
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.state import robot_state
@@ -188,7 +189,7 @@ def test_what_loops_do_is_counted_once_as_kernels_and_every_turn_as_launches(
 
 
 def test_physics_stays_within_its_number_of_kernels_and_operations():
-    config = parse_config({"ppo": {"num_envs": 64}})
+    config = parse_config({"ppo": {"num_envs": 64}, "physics": {"impl": "xla"}})
     count = kernels.count_kernels(kernels.compiled_text(config, "physics"))
     found = sum(count.kernels.values())
     print(f"\n{found} kernels, {count.launches} launches")
@@ -198,6 +199,14 @@ def test_physics_stays_within_its_number_of_kernels_and_operations():
     scalars = kernels.count_scalars(config)
     assert 5_000 < sum(scalars.values()) < 10_000
     assert scalars["mul"] < 4_700
+
+
+@pytest.mark.skipif(not cpu.is_available(), reason="llvmlite compiles nothing for XLA")
+def test_physics_through_llvm_is_one_call():
+    config = parse_config({"ppo": {"num_envs": 64}, "physics": {"impl": "llvm"}})
+    count = kernels.count_kernels(kernels.compiled_text(config, "physics"))
+    assert count.kernels["custom-call"] == 1
+    assert sum(count.kernels.values()) < 10
 
 
 def test_one_robot_in_c_mujoco_has_the_same_task(world_config, world_env):

@@ -97,7 +97,7 @@ def test_threads_take_turns():
 
 @pytest.mark.parametrize(("choice", "calls"), [("unrolled", False), ("library", True)])
 def test_the_choice_decides_whether_physics_calls_a_library(choice, calls):
-    env = make_env(parse_config({"physics": {"cholesky": choice}}))
+    env = make_env(parse_config({"physics": {"cholesky": choice, "impl": "xla"}}))
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
     text = jax.jit(env.step_physics).lower(state, jnp.zeros(2)).as_text()
     assert ("potrf" in text or "cholesky" in text) == calls
