@@ -160,7 +160,7 @@ def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
       The content.
     """
     cache = jax.config.values["jax_compilation_cache_dir"]
-    if cache is None or not jax.config.values["jax_enable_compilation_cache"]:
+    if not cache or not jax.config.values["jax_enable_compilation_cache"]:
         return make()
     path = Path(cache) / f"{kind}-{hashlib.sha256(key).hexdigest()}"
     with contextlib.suppress(OSError):
