@@ -26,6 +26,7 @@ _PACKAGES = (
     "jetbot_mjx",
     "jax",
     "jaxlib",
+    "llvmlite",
     "mujoco",
     "mujoco-mjx",
     "brax",
