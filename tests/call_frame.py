@@ -100,7 +100,10 @@ _ApiFunction = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.POINTER(ctypes.c_size_t 
 
 
 class Pool:
-    """Threads of XLA's; `refuses` answers a task with an error, `waits` runs it after the call."""
+    """Threads of XLA's; `refuses` answers a task with an error, `waits` runs it after the call.
+
+    `left` are the results as the call leaves them.
+    """
 
     def __init__(self, threads=1, refuses=False, waits=False):
         self.threads, self.refuses, self.waits = threads, refuses, waits
@@ -142,6 +145,7 @@ def call(handler, arguments, results, pool=None, change=None):
     if change is not None:
         change(frame)
     error = handler(ctypes.addressof(frame))
+    pool.left = [array.copy() for array in results]
     pool.finish()
     return error
 

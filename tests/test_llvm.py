@@ -146,6 +146,16 @@ def test_threads_help_and_nobody_waits_for_one_that_does_not_come(plus_one, pool
     np.testing.assert_array_equal(outputs[0], 2)
 
 
+def test_the_call_is_over_when_all_robots_are_done():
+    steps = 50_000  # a block takes so long that the last ones end one after the other
+    handler = compiled(scalarize(lambda x: x + 1, VECTOR), steps=steps)
+    x, _ = many(2 * xla_ffi._BLOCKS_PER_THREAD + 1)
+    pool = Pool(threads=2)
+    for _ in range(20):
+        call_frame.call(handler, [x], [np.zeros_like(x)], pool)
+        np.testing.assert_array_equal(pool.left[0], 1 + steps)
+
+
 def test_few_robots_wake_no_thread(plus_one):
     arguments = many(2 * xla_ffi._BLOCKS_PER_THREAD - 1)
     pool = Pool(threads=8)
