@@ -1,8 +1,8 @@
 """A JetBot that learns to drive to goals, thousands at a time: MuJoCo MJX and Brax's PPO.
 
 The modules in reading order, each knowing only those before it:
-`errors`, `config`, `compiling`, `programs`, `imports`, `mjx`, `cholesky`, `scalars`, `moving`,
-`scalarize`, `kernel`, `ptx`, `gpu`, `llvm`, `xla_ffi`, `cpu`, `kinematics`, `model`, `task`,
+`errors`, `config`, `compiling`, `imports`, `mjx`, `cholesky`, `scalars`, `moving`, `scalarize`,
+`kernel`, `ptx`, `gpu`, `llvm`, `xla_ffi`, `cpu`, `programs`, `kinematics`, `model`, `task`,
 `state`, `physics`, `env`, `variation`, `wrappers`, `policy`, `advantages`, `ppo`, `trainer`,
 `rollout`, `evaluation`, `robustness`, `report`, `estimates`, `comparison`, `tables`, `plots`,
 `curves`, `offscreen`, `film`, `store`, `checkpoint`, `resume`, `faults`, `run_folder`, `aliases`,
