@@ -24,8 +24,11 @@ SYMBOLS = ("malloc", "free", "sched_yield")
 _BLOCKS_PER_THREAD = 4
 """Fewer are done sooner than another thread wakes."""
 
+_PATIENCE = 1000
+"""Looks at what other threads have still to do, some 20 µs, before the core is given away."""
+
 # Subnormal numbers are zeros: on whichever thread, for XLA's own have it so and others may not.
-_SUBNORMALS = {
+_PROCESSORS = {
     "x86_64": """
 declare void @llvm.x86.sse.stmxcsr(ptr)
 declare void @llvm.x86.sse.ldmxcsr(ptr)
@@ -46,6 +49,11 @@ define internal void @end(i64 %before) {
   call void @llvm.x86.sse.ldmxcsr(ptr %place)
   ret void
 }
+declare void @llvm.x86.sse2.pause()
+define internal void @relax() {
+  call void @llvm.x86.sse2.pause()
+  ret void
+}
 """,
     "aarch64": """
 declare i64 @llvm.aarch64.get.fpcr()
@@ -60,9 +68,14 @@ define internal void @end(i64 %before) {
   call void @llvm.aarch64.set.fpcr(i64 %before)
   ret void
 }
+declare void @llvm.aarch64.hint(i32)
+define internal void @relax() {
+  call void @llvm.aarch64.hint(i32 1)
+  ret void
+}
 """,
 }
-MACHINES = tuple(_SUBNORMALS)
+MACHINES = tuple(_PROCESSORS)
 """Processors that a kernel can be written for."""
 
 TEXT = resources.files("jetbot_mjx").joinpath("assets/xla_call.ll").read_text("utf-8")
@@ -106,6 +119,7 @@ def kernel_text(
         "major": VERSION[0],
         "minor": VERSION[1],
         "name": name,
+        "patience": _PATIENCE,
         "pointers": "\n  ".join(_pointer(i, len(sizes)) for i in range(arrays)),
         "reads": "\n  ".join(_reads(sizes, lanes)),
         "rows": max(1, sum(sizes)),
@@ -113,7 +127,7 @@ def kernel_text(
         "steps": steps,
         "writes": "\n  ".join(_writes(sizes[:carried], len(sizes), lanes)),
     }
-    return _SUBNORMALS[machine] + step + Template(TEXT).substitute(values)
+    return _PROCESSORS[machine] + step + Template(TEXT).substitute(values)
 
 
 def _address(i: int) -> str:

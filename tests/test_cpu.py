@@ -230,8 +230,17 @@ def test_another_kernel_has_another_name():
     assert len({cpu._registered(text) for text in texts}) == 3
 
 
+@pytest.fixture
+def fresh():
+    """Where JAX keeps nothing: what it found in its own cache, a CPU could not write again."""
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
+
+
 @needs_it
-def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, monkeypatch):
+def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, monkeypatch):
     monkeypatch.setattr(programs, "TRUSTED", "jetbot_mjx.")
     shape = jax.ShapeDtypeStruct((2,), jnp.float32)
     written = cpu.write(scalarize(lambda x: x * 2.5, shape), carried=1, steps=1)

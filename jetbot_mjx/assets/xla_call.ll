@@ -245,6 +245,17 @@ check:
   %all = icmp eq i64 %ended, %blocks
   br i1 %all, label %done, label %wait
 wait:
+  ; A block takes microseconds: who gives the core away at once has it back later than that.
+  %round = phi i64 [0, %check], [%round.next, %relax]
+  %round.next = add i64 %round, 1
+  %long = icmp uge i64 %round, $patience
+  br i1 %long, label %yield, label %relax
+relax:
+  call void @relax()
+  %seen = load atomic i64, ptr %ended.at acquire, align 8
+  %over = icmp eq i64 %seen, %blocks
+  br i1 %over, label %done, label %wait
+yield:
   %ignored = call i32 @sched_yield()
   br label %check
 done:
