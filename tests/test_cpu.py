@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, PartitionSpec
 
 from jetbot_mjx import cpu, kernel, programs, xla_ffi
@@ -235,8 +236,10 @@ def fresh():
     """Where JAX keeps nothing: what it found in its own cache, a CPU could not write again."""
     before = jax.config.values["jax_enable_compilation_cache"]
     jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()  # or what an earlier test had asked for would hold
     yield
     jax.config.update("jax_enable_compilation_cache", before)
+    compilation_cache.reset_cache()
 
 
 @needs_it
