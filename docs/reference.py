@@ -59,6 +59,8 @@ _REFUSED = (
     ("ppo.learning_rate_schedule=ADAPTIVE_KL", "ppo.learning_rate=0.1"),
     ("task.success_radius=0.01",),
     ("task.options.pillar=[1, 2]",),
+    ("randomization.friction=[1.2, 0.4]",),
+    ("randomization.action_delay=[0, 1.5]",),
     ("trainer=brax", "ppo.learning_rate_schedule=NONE", "seeds=5"),
     ("trainer=brax", "ppo.learning_rate_schedule=NONE", "deterministic=true"),
     ("trainer=brax", "ppo.learning_rate_schedule=LINEAR"),
@@ -108,7 +110,7 @@ def _walk(
             below.append((path, field.annotation, inner, shared, defaults[key]))
         else:
             meaning = " ".join(value["description"].split())
-            kind = _kind(value, list(dict.fromkeys(_bounds(field))))
+            kind = _range(value) or _kind(value, list(dict.fromkeys(_bounds(field))))
             settings.append(Setting(path, kind, defaults[key], meaning))
     yield Section(name, " ".join(schema["description"].split()), settings)
     for arguments in below:
@@ -138,6 +140,14 @@ def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
             return ", ".join([words, *bounds])
         case other:
             raise ValueError(f"{other}: teach this page to say it")
+
+
+def _range(schema: Mapping[str, Any]) -> str | None:
+    """A range [low, high] in words; None where the setting is none."""
+    if not {"low", "high", "whole"} <= schema.keys():
+        return None
+    numbers = "whole numbers" if schema["whole"] else "numbers"
+    return f"[low, high], {numbers} from {schema['low']:g} to {schema['high']:g}, or `null`"
 
 
 def _bounds(annotated: Any) -> Iterator[str]:

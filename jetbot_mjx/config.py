@@ -22,9 +22,11 @@ from pydantic import (
     ConfigDict,
     Field,
     ValidationError,
+    ValidationInfo,
+    field_validator,
     model_validator,
 )
-from pydantic_core import ErrorDetails
+from pydantic_core import ErrorDetails, PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
@@ -59,6 +61,14 @@ Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
+
+
+Range = tuple[float, float] | None
+
+
+def _range(low: float, high: float, *, whole: bool = False) -> Any:
+    """A field that holds a range [low, high] within bounds, or null."""
+    return Field(None, json_schema_extra={"low": low, "high": high, "whole": whole})
 
 
 _MOST_SUBSTEPS = 10_000
@@ -143,6 +153,90 @@ class PhysicsConfig(_Section):
                 f" make the sub-steps whole, for example sim_dt = {nearest:.9g}"
             )
         return self
+
+
+class RandomizationConfig(_Section):
+    """What is drawn anew for every episode of a training, uniformly from [low, high].
+
+    Each quantity and each robot by itself. null: as the preset has it; all null: nothing is drawn.
+    """
+
+    friction: Range = _range(0.05, 5)
+    """Factor on the Coulomb coefficient of wheel on floor."""
+    mass: Range = _range(0.2, 5)
+    """Factor on mass and inertia of the chassis."""
+    com_x: Range = _range(-0.03, 0.03)
+    """[m] shift of the chassis's centre of mass, forward."""
+    com_y: Range = _range(-0.03, 0.03)
+    """[m] likewise, to the left."""
+    com_z: Range = _range(-0.03, 0.03)
+    """[m] likewise, up."""
+    wheel_radius: Range = _range(0.5, 2)
+    """Factor on the radius of both wheels."""
+    wheel_radius_mismatch: Range = _range(-0.5, 0.5)
+    """Radii, (left - right) / mean."""
+    wheel_separation: Range = _range(0.5, 2)
+    """Factor on the distance between the wheels; above 1 the robot turns less."""
+    motor_gain: Range = _range(0.1, 2)
+    """Factor on the wheel speeds that the motors make of a command."""
+    motor_gain_mismatch: Range = _range(-0.5, 0.5)
+    """Gains, (left - right) / mean."""
+    supply_voltage: Range = _range(0.5, 2)
+    """Factor on the motors' voltage."""
+    dead_band: Range = _range(0, 0.9)
+    """Fraction of full voltage below which a wheel stands still."""
+    motor_lag: Range = _range(0, 1)
+    """[s] time constant of a first-order lag, ahead of the motors' own run-up."""
+    action_delay: Range = _range(0, 60, whole=True)
+    """[control steps] from command to motor."""
+    position_noise: Range = _range(0, 0.5)
+    """[m] deviation of the position that the robot takes itself to be at, at every step anew."""
+    yaw_noise: Range = _range(0, 1)
+    """[rad] likewise of the heading."""
+    speed_noise: Range = _range(0, 1)
+    """[m/s] likewise of the velocity."""
+    yaw_rate_noise: Range = _range(0, 1)
+    """[rad/s] likewise of the yaw rate."""
+    observation_delay: Range = _range(0, 60, whole=True)
+    """[control steps] by which the robot sees itself late."""
+    start_x: Range = _range(-5, 5)
+    """[m] where an episode starts, forward of the origin."""
+    start_y: Range = _range(-5, 5)
+    """[m] likewise, to the left."""
+    start_yaw: Range = _range(-math.pi - 1e-3, math.pi + 1e-3)
+    """[rad] heading at the start, counter-clockwise."""
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _within_bounds(cls, value: Any, info: ValidationInfo) -> object:
+        if value is None:
+            return None
+        bounds: Any = cls.model_fields[str(info.field_name)].json_schema_extra
+        kinds = int if bounds["whole"] else (int, float)
+        fits = (
+            isinstance(value, list | tuple)
+            and len(value) == 2
+            and all(isinstance(_integral(end), kinds) for end in value)
+            and not any(isinstance(end, bool) for end in value)
+            and bounds["low"] <= value[0] <= value[1] <= bounds["high"]
+        )
+        if not fits:
+            raise PydanticCustomError(
+                "range",
+                "[low, high], {kind} from {low} to {high}, the smaller one first",
+                {
+                    "kind": "whole numbers" if bounds["whole"] else "numbers",
+                    "low": f"{bounds['low']:g}",
+                    "high": f"{bounds['high']:g}",
+                },
+            )
+        return tuple(float(end) for end in value)
+
+    @property
+    def drawn(self) -> dict[str, tuple[float, float]]:
+        """The ranges of what is drawn, by name."""
+        ranges = {name: getattr(self, name) for name in type(self).model_fields}
+        return {name: span for name, span in ranges.items() if span is not None}
 
 
 class NetworkConfig(_Section):
@@ -273,6 +367,7 @@ class Config(_Section):
     robot: RobotConfig = RobotConfig()
     task: TaskConfig = TaskConfig()
     physics: PhysicsConfig = PhysicsConfig()
+    randomization: RandomizationConfig = RandomizationConfig()
     ppo: PPOConfig = PPOConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
 

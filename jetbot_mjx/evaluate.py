@@ -14,7 +14,7 @@ import jax
 from jetbot_mjx import cli
 from jetbot_mjx.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.comparison import Comparison, check_comparable, compare
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import (
@@ -25,6 +25,7 @@ from jetbot_mjx.evaluation import (
     summarize,
 )
 from jetbot_mjx.metrics import read_history
+from jetbot_mjx.randomization import VariedEnv
 from jetbot_mjx.report import CurvePoint, Report, by_goal, find_failures, learning_curve
 from jetbot_mjx.report_files import write_comparison, write_report
 from jetbot_mjx.robustness import SWEEP_GOALS, SweepResult, sweep
@@ -41,6 +42,7 @@ def run(
     which: Which = "best",
     output: str | Path | None = None,
     robustness: bool = False,
+    ranges: str | Path | None = None,
 ) -> Report:
     """Judges one policy and writes its report.
 
@@ -50,6 +52,8 @@ def run(
       which: the checkpoint of a run folder.
       output: the folder to write; None: `evaluations/<env_steps>/` of the run folder.
       robustness: whether to judge it on robots that differ from the preset as well.
+      ranges: a configuration file by whose `randomization` a robot is drawn for each goal, beside
+        the preset's; None: the run's own, if it has any.
 
     Returns:
       The report, which knows its folder.
@@ -59,7 +63,8 @@ def run(
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     folder = _report_folder(checkpoint) if output is None else Path(output)
-    return next(_judge([(checkpoint, folder)], episodes, robustness=robustness))
+    drawn = _Ranges.read(ranges)
+    return next(_judge([(checkpoint, folder)], episodes, robustness=robustness, drawn=drawn))
 
 
 def run_comparison(
@@ -69,6 +74,7 @@ def run_comparison(
     which: Which = "best",
     output: str | Path | None = None,
     robustness: bool = False,
+    ranges: str | Path | None = None,
 ) -> Comparison:
     """Judges the policies of several runs or seeds, reports on each, and compares them.
 
@@ -78,6 +84,7 @@ def run_comparison(
       which: the checkpoint of a run folder, of each seed.
       output: the folder for the comparison; None: `evaluations/comparison/` of the first run.
       robustness: whether each report judges its policy on other robots as well.
+      ranges: as for `run`.
 
     Returns:
       The comparison, which knows its folder; each report knows its own.
@@ -90,7 +97,10 @@ def run_comparison(
     check_comparable({name: entrant.config for name, entrant in entrants.items()})
     checkpoints = [one for entrant in entrants.values() for one in entrant.seeds.values()]
     reports = _judge(
-        [(one, _report_folder(one)) for one in checkpoints], episodes, robustness=robustness
+        [(one, _report_folder(one)) for one in checkpoints],
+        episodes,
+        robustness=robustness,
+        drawn=_Ranges.read(ranges),
     )
     judged = {
         name: {seed: _without_paths(next(reports)) for seed in entrant.seeds}
@@ -101,6 +111,25 @@ def run_comparison(
     comparison = compare(folder.absolute(), judged)
     write_comparison(comparison)
     return comparison
+
+
+class _Ranges(NamedTuple):
+    """What robots are drawn from, for whatever run."""
+
+    file: Path
+    ranges: RandomizationConfig
+
+    @classmethod
+    def read(cls, path: str | Path | None) -> "_Ranges | None":
+        if path is None:
+            return None
+        ranges = load_config(path).randomization
+        if not ranges.drawn:
+            raise UserError(
+                f"--ranges {path}: it draws nothing; give a configuration with ranges below"
+                " `randomization`, such as configs/real_jetbot.yaml"
+            )
+        return cls(Path(path), ranges)
 
 
 class _Entrant(NamedTuple):
@@ -160,17 +189,24 @@ def _without_paths(report: Report) -> Report:
 
 
 def _judge(
-    checkpoints: Sequence[tuple[Checkpoint, Path]], episodes: int, *, robustness: bool
+    checkpoints: Sequence[tuple[Checkpoint, Path]],
+    episodes: int,
+    *,
+    robustness: bool,
+    drawn: _Ranges | None,
 ) -> Iterator[Report]:
     """Judges policies and writes their reports; what is compiled serves all it fits."""
     keys, about = report_keys(episodes), versions()
     # All of them first: what does not fit its task is refused before anything is written.
     envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
-    evaluator, baselines, fits = None, {}, None
+    evaluator, varied, baselines, fits = None, None, {}, None
     for (checkpoint, folder), env in zip(checkpoints, envs, strict=True):
-        if evaluator is None or _program(checkpoint.config) != fits:
+        ranges = drawn.ranges if drawn else checkpoint.config.randomization
+        if evaluator is None or (_program(checkpoint.config), ranges) != fits:
             evaluator = Evaluator(env, checkpoint.networks, baselines=True, record=True)
-            fits = _program(checkpoint.config)
+            if ranges.drawn:
+                varied = Evaluator(VariedEnv(env, ranges=ranges), checkpoint.networks)
+            fits = _program(checkpoint.config), ranges
             beside = evaluator.run_baselines(checkpoint.params, keys)
             baselines = {name: summarize(each, env.dt) for name, each in beside.items()}
         driven = jax.device_get(evaluator.run(checkpoint.params, keys))
@@ -189,6 +225,13 @@ def _judge(
             episodes=driven,
             versions=about,
             robustness=_sweep(checkpoint, env, min(episodes, SWEEP_GOALS)) if robustness else (),
+            randomized=(
+                summarize(varied.run(checkpoint.params, keys), env.dt)
+                if varied and ranges.drawn
+                else None
+            ),
+            ranges=ranges if ranges.drawn else None,
+            ranges_file=drawn.file if drawn else None,
         )
         write_report(report)
         yield report
@@ -250,6 +293,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="judge on robots that differ from the preset too: friction, mass, motors, delay",
     )
     parser.add_argument(
+        "--ranges",
+        type=Path,
+        metavar="FILE",
+        help="configuration by whose randomization a robot is drawn for each goal, beside the"
+        " preset's (default: the run's own, if it has any)",
+    )
+    parser.add_argument(
         "--min-success", type=cli.fraction, help="exit with 1 below this success rate"
     )
     options = parser.parse_args(arguments)
@@ -263,6 +313,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         which=options.checkpoint,
         output=options.output,
         robustness=options.sweep,
+        ranges=options.ranges,
     )
     print(
         f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
@@ -281,6 +332,7 @@ def _main_comparison(options: argparse.Namespace) -> int:
         which=options.checkpoint,
         output=options.output,
         robustness=options.sweep,
+        ranges=options.ranges,
     )
     runs = comparison.runs
     policies = {

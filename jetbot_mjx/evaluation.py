@@ -18,6 +18,7 @@ from jetbot_mjx import kinematics
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.policy import PolicyParams, make_policy
 from jetbot_mjx.programs import Programs, programs_of
+from jetbot_mjx.randomization import VariedEnv
 from jetbot_mjx.rollout import Controller, Episodes, rollout_fn
 from jetbot_mjx.state import State, robot_state
 
@@ -162,7 +163,7 @@ class Evaluator:
 
     def __init__(
         self,
-        env: JetBotEnv,
+        env: JetBotEnv | VariedEnv,
         networks: ppo_networks.PPONetworks,
         *,
         baselines: bool = False,
@@ -172,7 +173,7 @@ class Evaluator:
         """Prepares the program; it compiles at its first use.
 
         Args:
-          env: one environment, unwrapped.
+          env: one environment, unwrapped, or one whose robots differ.
           networks: of the policies to judge.
           baselines: whether `run_baselines` will be wanted.
           record: whether to keep trajectories.
@@ -185,7 +186,8 @@ class Evaluator:
             controllers += [make(env) for make in BASELINES.values()]
         length = env.config.task.episode_length
         self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
-        self._name = f"episodes of {self._names}{', recorded' if record else ''}"
+        drawn = ", drawn" if isinstance(env, VariedEnv) else ""
+        self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
         self._programs = programs or programs_of(env.config, keep=False)
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
@@ -231,7 +233,7 @@ class Evaluator:
         return self._compiled[count](*arguments)
 
 
-def _random(env: JetBotEnv) -> Controller:
+def _random(env: JetBotEnv | VariedEnv) -> Controller:
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
         del params, state
         return jax.random.uniform(key, (env.action_size,), minval=-1.0, maxval=1.0)
@@ -239,7 +241,7 @@ def _random(env: JetBotEnv) -> Controller:
     return act
 
 
-def _constant(env: JetBotEnv) -> Controller:
+def _constant(env: JetBotEnv | VariedEnv) -> Controller:
     """The middle of the action range: half speed straight ahead."""
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
@@ -249,7 +251,7 @@ def _constant(env: JetBotEnv) -> Controller:
     return act
 
 
-def _turn_then_go(env: JetBotEnv) -> Controller:
+def _turn_then_go(env: JetBotEnv | VariedEnv) -> Controller:
     """Turns until the goal lies ahead, and drives the faster the better it is aligned."""
     steering = 4.0  # [1/s] yaw rate per heading error
     damping = 0.3  # yaw rate taken back per yaw rate: the motors lag, and it would swing

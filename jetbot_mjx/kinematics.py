@@ -122,6 +122,23 @@ def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
     return jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
+def turned(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"]:
+    """A body turned about the world's z axis.
+
+        q' = (cos α/2, 0, 0, sin α/2) ⊗ q
+
+    Args:
+      quat: (w, x, y, z) of the body in the world.
+      angle: α, counter-clockwise [rad].
+
+    Returns:
+      Its attitude afterwards, (w, x, y, z).
+    """
+    c, s = jnp.cos(0.5 * angle), jnp.sin(0.5 * angle)
+    w, x, y, z = quat
+    return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
+
+
 def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
     """Angle between a body's z axis and the world's.
 

@@ -276,7 +276,7 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
         for summary in (*result.policy, *result.scripted)
     ]
     ink = matplotlib.rcParams["text.color"]
-    columns = min(3, len(results))
+    columns = min(3 if len(results) <= 9 else 4, len(results))
     lines = -(-len(results) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.6 * lines), layout="constrained")
     grid = figure.add_gridspec(2 * lines, columns, height_ratios=[3, 2] * lines)

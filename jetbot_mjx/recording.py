@@ -33,6 +33,7 @@ from jetbot_mjx.offscreen import find_backend
 from jetbot_mjx.policy import PolicyParams, make_networks
 from jetbot_mjx.ppo import Fault
 from jetbot_mjx.programs import Programs, programs_of
+from jetbot_mjx.randomization import as_trained
 from jetbot_mjx.resume import Resumption, to_trees
 from jetbot_mjx.run_folder import make_folder, versions, writing_to
 from jetbot_mjx.store import Store, checkpoint_path, digest
@@ -106,7 +107,7 @@ class RunRecorder(Recorder):
         )
         self._config = config
         programs = programs or programs_of(config, keep=False)
-        self._evaluator = Evaluator(env, networks, programs=programs)
+        self._evaluator = Evaluator(as_trained(env), networks, programs=programs)
         # As one program: operation by operation it would be half a dozen.
         keys = jax.jit(training_keys, static_argnums=0)
         episodes = config.evaluation.episodes
@@ -208,7 +209,7 @@ class RunRecorder(Recorder):
         return not self.complete
 
     def judge(self, params: PolicyParams) -> Summary:
-        """Figures of a policy on the goals that every report uses."""
+        """Figures of a policy on the fixed goals of training, with robots as it is trained on."""
         episodes = self._evaluator.run(params, self._keys)
         return summarize(episodes, self._config.physics.ctrl_dt)
 

@@ -13,6 +13,7 @@ from jetbot_mjx import cli
 from jetbot_mjx.env import JetBotEnv, make_env
 from jetbot_mjx.faults import StoredFault, load_fault
 from jetbot_mjx.kinematics import yaw
+from jetbot_mjx.randomization import as_trained
 from jetbot_mjx.state import State, robot_state
 from jetbot_mjx.store import flatten
 from jetbot_mjx.wrappers import wrap_for_training
@@ -41,7 +42,7 @@ def run(stored: StoredFault, env: JetBotEnv) -> Iterator[Moment]:
       Every step up to the one that blew up.
     """
     wrapped = wrap_for_training(env, stored.config.task.episode_length)
-    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(env.step))
+    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(as_trained(env).step))
     state: Any = jax.tree.map(lambda x: jnp.asarray(x)[None], stored.fault.env_state)
     for action in stored.fault.actions[: int(stored.fault.step) + 1]:
         after = jax.device_get(jax.tree.map(lambda x: x[0], raw_step(state, action[None])))

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, RandomizationConfig
 from jetbot_mjx.evaluation import (
     GOAL_SET_VERSION,
     REPORT_GOALS,
@@ -113,6 +113,12 @@ class Report(NamedTuple):
     versions: Mapping[str, Any]
     robustness: tuple[SweepResult, ...] = ()
     """On robots that differ from the preset; empty where none were asked for."""
+    randomized: Summary | None = None
+    """On the same goals, with a robot drawn for each; None without ranges to draw from."""
+    ranges: RandomizationConfig | None = None
+    """What those robots were drawn from."""
+    ranges_file: Path | None = None
+    """Where the ranges stand; None: in the run's own configuration."""
 
     @property
     def name(self) -> str:
@@ -127,6 +133,7 @@ class Report(NamedTuple):
             f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
             f"{' --sweep' if self.robustness else ''}"
+            f"{f' --ranges {shlex.quote(str(self.ranges_file))}' if self.ranges_file else ''}"
         )
 
     def to_json(self) -> dict[str, Any]:
@@ -147,6 +154,8 @@ class Report(NamedTuple):
             "failures": [failure._asdict() for failure in self.failures],
             "learning_curve": [point._asdict() for point in self.learning_curve],
             "robustness": as_json(self.robustness) if self.robustness else None,
+            "randomized": self.randomized._asdict() if self.randomized else None,
+            "ranges": self.ranges.drawn if self.ranges else None,
             "versions": dict(self.versions),
         }
 

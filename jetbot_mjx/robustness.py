@@ -4,21 +4,22 @@ One quantity at a time leaves the preset's value; goals, rules and figures are t
 report. One compiled program serves all robots, and beside the policy the scripted controller.
 
 Sources, by tag; BOM and EST as in `model.py`:
+  CAD         the room that the battery has, and the clearance of the casters; see `model.py`.
   CSE276A     gassajor000/cse276a_jetbot: a JetBot's motors, calibrated.
   DUCKIETOWN  gym-duckietown: the simulator of a robot with the same motors.
   ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: how that randomises Isaac's JetBot.
   PICOBOT     uni-obuda picobot: a robot with the same motors, identified.
+  TT          measurements of the same motors: newscrewdriver.com, SunFounder's data.
   WHEELEDLAB  WheeledLab: how that randomises a drifting car.
 """
 
-import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from brax.training.agents.ppo import networks as ppo_networks
-from jaxtyping import Array, Int, UInt32
+from jaxtyping import Array, Float, Int, UInt32
 
 from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.env import JetBotEnv
@@ -30,8 +31,9 @@ from jetbot_mjx.evaluation import (
     summarize,
 )
 from jetbot_mjx.policy import PolicyParams
+from jetbot_mjx.randomization import VariedEnv
 from jetbot_mjx.rollout import Episodes, rollout_fn
-from jetbot_mjx.variation import Variation, VariedEnv
+from jetbot_mjx.variation import Variation
 
 SWEEP_GOALS = 128
 """How many of the report's fixed goals a sweep takes for each robot."""
@@ -61,6 +63,11 @@ class Sweep(NamedTuple):
         """The preset's value."""
         return getattr(Variation(), self.name)
 
+    @property
+    def robots(self) -> list[Variation]:
+        """The robot of each value."""
+        return [Variation()._replace(**{self.name: value}) for value in self.values]
+
 
 SWEEPS = (
     Sweep(
@@ -78,18 +85,69 @@ SWEEPS = (
         "EST 0.60 to 0.85 kg in all, from the BOM's parts; ISAACRL ±15 %",
     ),
     Sweep(
-        "motor_gain",
-        "motor gain",
+        "com_x",
+        "centre of mass, forward",
+        "m",
+        (-0.03, -0.015, 0.0, 0.015),
+        "CAD ±15 mm; further forward the robot tips over its wheels",
+    ),
+    Sweep("com_y", "centre of mass, left", "m", (-0.01, -0.005, 0.0, 0.005, 0.01), "CAD ±5 mm"),
+    Sweep("com_z", "centre of mass, up", "m", (-0.01, 0.0, 0.01, 0.02), "EST ±10 mm"),
+    Sweep(
+        "wheel_radius",
+        "radius of the wheels",
         "× preset",
-        (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15),
-        "BOM 9.6 to 12.6 V of three cells; ISAACRL ±10 %",
+        (0.92, 0.96, 1.0, 1.04, 1.08),
+        "BOM wheels of 60 and 65 mm, worn or new; measured to 68 mm",
     ),
     Sweep(
         "wheel_radius_mismatch",
         "unequal wheels",
         "(left - right) / mean",
         (-0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1),
-        "EST radius ±2 %; CSE276A motors 3 % apart; DUCKIETOWN deviation 2 %, to 5 % EST",
+        "EST radius ±2 %",
+    ),
+    Sweep(
+        "wheel_separation",
+        "wheel separation",
+        "× preset",
+        (0.9, 0.95, 1.0, 1.05, 1.25, 1.6),
+        "CAD ±5 %; CSE276A turns as if 1.4 to 1.8 times as wide",
+    ),
+    Sweep(
+        "motor_gain",
+        "motor gain",
+        "× preset",
+        (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15),
+        "ISAACRL ±10 %",
+    ),
+    Sweep(
+        "motor_gain_mismatch",
+        "unequal motors",
+        "(left - right) / mean",
+        (-0.2, -0.1, 0.0, 0.1, 0.2),
+        "CSE276A 3 % apart; DUCKIETOWN deviation 2 %, to 5 % EST",
+    ),
+    Sweep(
+        "supply_voltage",
+        "supply voltage",
+        "× nominal",
+        (0.8, 0.9, 1.0, 1.05, 1.15),
+        "BOM 5 V bank 0.9 to 1.05; three cells 9.6 to 12.6 V",
+    ),
+    Sweep(
+        "dead_band",
+        "dead-band of the motors",
+        "of full voltage",
+        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3),
+        "CSE276A 1 %, PICOBOT 11 %, TT 11 to 25 %",
+    ),
+    Sweep(
+        "motor_lag",
+        "further lag of the motors",
+        "s",
+        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25),
+        "PICOBOT 0.085 s, DUCKIETOWN 0.20 to 0.25 s, motors and all",
     ),
     Sweep(
         "action_delay",
@@ -99,11 +157,42 @@ SWEEPS = (
         "ISAACRL 0 to 3 steps; DUCKIETOWN 0.15 s",
     ),
     Sweep(
-        "motor_lag",
-        "further lag of the motors",
-        "s",
-        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25),
-        "PICOBOT 0.085 s, DUCKIETOWN 0.20 to 0.25 s, motors and all",
+        "position_noise",
+        "noise of the position",
+        "m",
+        (0.0, 0.01, 0.02, 0.03, 0.06),
+        "ISAACRL 0.01 to 0.03 m",
+    ),
+    Sweep(
+        "yaw_noise",
+        "noise of the heading",
+        "rad",
+        (0.0, 0.01, 0.03, 0.1),
+        "ISAACRL 0.01 to 0.03 rad",
+    ),
+    Sweep("speed_noise", "noise of the velocity", "m/s", (0.0, 0.01, 0.03), "ISAACRL 0.01 m/s"),
+    Sweep(
+        "yaw_rate_noise",
+        "noise of the yaw rate",
+        "rad/s",
+        (0.0, 0.03, 0.1),
+        "ISAACRL 0.03 rad/s",
+    ),
+    Sweep(
+        "observation_delay",
+        "delay of observations",
+        "control steps",
+        (0.0, 1.0, 2.0, 3.0, 6.0),
+        "EST 30 to 60 ms of a camera of 30 pictures a second",
+    ),
+    Sweep("start_x", "start, forward", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
+    Sweep("start_y", "start, left", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
+    Sweep(
+        "start_yaw",
+        "heading at the start",
+        "rad",
+        (-3.14, -1.57, 0.0, 1.57, 3.14),
+        "EST any heading",
     ),
 )
 
@@ -117,6 +206,78 @@ class SweepResult(NamedTuple):
     scripted: tuple[Summary, ...]
 
 
+class Sweeper:
+    """Judges policies over quantities, all of them in one compiled program."""
+
+    def __init__(
+        self,
+        env: JetBotEnv,
+        networks: ppo_networks.PPONetworks,
+        keys: UInt32[Array, "n 2"],
+        sweeps: Sequence[Sweep] = SWEEPS,
+    ) -> None:
+        """Prepares the program; it compiles at its first use.
+
+        Args:
+          env: one environment, unwrapped, with its preset's robot.
+          networks: of the policies.
+          keys: one reset key an episode, such as `report_keys(128)`.
+          sweeps: the quantities.
+        """
+        env = _with_enough_iterations(env)
+        self._env, self._keys, self._sweeps = env, keys, tuple(sweeps)
+        # The preset's robot occurs in every sweep, and drives once.
+        self._robots = list(dict.fromkeys(robot for one in sweeps for robot in one.robots))
+        # A CPU takes robots one after the other: the solver iterates until the last of a batch is
+        # done, and those that slide would hold up the rest. A GPU would have nothing to do.
+        at_once = 1 if jax.default_backend() == "cpu" else len(self._robots)
+        controllers = [policy_controller(networks), BASELINES["scripted"](env)]
+        length = env.config.task.episode_length
+
+        def drive(
+            index: int | Int[Array, ""],
+            params: PolicyParams,
+            keys: UInt32[Array, "n 2"],
+            variations: Float[Array, "robots quantities"],
+        ) -> Episodes:
+            def one(variation: Float[Array, " quantities"]) -> Episodes:
+                varied = VariedEnv(env, Variation(*variation))
+                return rollout_fn(varied, controllers, length)(index, params, keys)
+
+            return jax.lax.map(one, variations, batch_size=at_once)
+
+        self._drive = jax.jit(drive, compiler_options=compiler_options(env.config))
+        self._scripted: dict[Variation, Summary] = {}
+
+    def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
+        """Judges a policy at every value of every quantity, on the same goals.
+
+        Args:
+          params: the policy's.
+
+        Returns:
+          One result for each quantity.
+        """
+        host = jax.device_get(params)
+        policy = self._judged(0, host)
+        self._scripted = self._scripted or self._judged(1, host)
+        return tuple(
+            SweepResult(
+                one,
+                tuple(policy[robot] for robot in one.robots),
+                tuple(self._scripted[robot] for robot in one.robots),
+            )
+            for one in self._sweeps
+        )
+
+    def _judged(self, controller: int, params: PolicyParams) -> dict[Variation, Summary]:
+        variations = jnp.asarray(self._robots, jnp.float32)
+        driven = jax.device_get(self._drive(controller, params, self._keys, variations))
+        each = (jax.tree.map(lambda x, i=i: x[i], driven) for i in range(len(self._robots)))
+        summaries = (summarize(one, self._env.dt) for one in each)
+        return dict(zip(self._robots, summaries, strict=True))
+
+
 def sweep(
     env: JetBotEnv,
     networks: ppo_networks.PPONetworks,
@@ -124,7 +285,7 @@ def sweep(
     keys: UInt32[Array, "n 2"],
     sweeps: Sequence[Sweep] = SWEEPS,
 ) -> tuple[SweepResult, ...]:
-    """Judges a policy at every value of every quantity, on the same goals.
+    """Judges one policy, as `Sweeper` does several.
 
     Args:
       env: one environment, unwrapped, with its preset's robot.
@@ -136,34 +297,7 @@ def sweep(
     Returns:
       One result for each quantity.
     """
-    env = _with_enough_iterations(env)
-    controllers = [policy_controller(networks), BASELINES["scripted"](env)]
-    length = env.config.task.episode_length
-
-    def drive(
-        index: int | Int[Array, ""],
-        params: PolicyParams,
-        keys: UInt32[Array, "n 2"],
-        variation: Variation,
-    ) -> Episodes:
-        return rollout_fn(VariedEnv(env, variation), controllers, length)(index, params, keys)
-
-    # Robots one after the other: the solver iterates until the last of a batch is done, and
-    # those that slide would hold up the rest.
-    drive = jax.jit(drive, compiler_options=compiler_options(env.config))
-    host = jax.device_get(params)
-
-    @functools.cache  # the preset's robot occurs in every sweep, and drives once
-    def judged(robot: Variation, controller: int) -> Summary:
-        variation = jax.tree.map(jnp.float32, robot)
-        return summarize(drive(controller, host, keys, variation), env.dt)
-
-    results = []
-    for one in sweeps:
-        robots = [Variation()._replace(**{one.name: value}) for value in one.values]
-        policy, scripted = (tuple(judged(robot, i) for robot in robots) for i in range(2))
-        results.append(SweepResult(one, policy, scripted))
-    return tuple(results)
+    return Sweeper(env, networks, keys, sweeps).run(params)
 
 
 def _with_enough_iterations(env: JetBotEnv) -> JetBotEnv:

@@ -42,6 +42,9 @@ class State(struct.PyTreeNode):
     """What the task drew for this episode."""
     key: UInt32[Array, "2"]
     """Random key from which the next episode is drawn."""
+    hardware: Any = None
+    """How this episode's robot differs from its preset, and what its motors and sensors remember;
+    None: it is its preset."""
 
 
 def robot_state(physics: PhysicsState) -> RobotState:

@@ -12,7 +12,12 @@ from jetbot_mjx.robustness import CARRIES_AT, carries
 def policies_table(policies: Mapping[str, Report]) -> str:
     """Policies by name, and the baselines below them, as a table for the terminal."""
     baselines = next(iter(policies.values())).baselines
-    rows = [*((name, report.policy) for name, report in policies.items()), *baselines.items()]
+    rows: list[tuple[str, Summary]] = []
+    for name, report in policies.items():
+        rows.append((name, report.policy))
+        if report.randomized:
+            rows.append((f"{name}, randomised robots", report.randomized))
+    rows += baselines.items()
     width = max(10, *(len(name) for name, _ in rows))
     head = (
         f"{'':{width}}  {'success':>8}  {'95 % interval':>16}  {'to goal':>8}  {'p95':>7}"

@@ -1,8 +1,8 @@
-"""Robots that differ from their preset: friction, mass, motors, wheels, delay and lag.
+"""Robots that differ from their preset, and the physics model of each.
 
 A `Variation` is data, not structure: one compiled program serves every value, traced or not,
-and `jax.vmap` gives each robot its own. Most of it enters physics through the model. Delay and
-lag stand between command and motor; what they remember travels with the episode, in `info`.
+and `jax.vmap` gives each robot its own. Floor and masses enter physics through the model; wheels,
+motors and what the robot sees of itself stand before and behind it, in `motors` and `sensors`.
 """
 
 from typing import NamedTuple
@@ -10,78 +10,85 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-import scipy.linalg
-from brax.envs import Wrapper
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Bool, Float
 
 from jetbot_mjx import mjx
-from jetbot_mjx.env import JetBotEnv
-from jetbot_mjx.state import State
 
 MAX_ACTION_DELAY = 9
-"""Longest `action_delay` [control steps]: 150 ms at the default `ctrl_dt`."""
+"""Longest `action_delay` [control steps] of a robot whose delay is not known when its program is
+compiled: 150 ms at the default `ctrl_dt`."""
+
+MAX_OBSERVATION_DELAY = 6
+"""Longest `observation_delay` likewise: 100 ms."""
 
 _CHASSIS = "jetbot"
-_BODIES = (_CHASSIS, "left_wheel", "right_wheel")
 _SIDES = ("left", "right")
+
+Quantity = Float[ArrayLike, ""]
 
 
 class Variation(NamedTuple):
-    """How one robot differs from its preset. `Variation()` does not differ at all."""
+    """How one robot differs from its preset. `Variation()` does not differ at all.
 
-    friction: Float[ArrayLike, ""] = 1.0
-    """Factor on the Coulomb coefficient of wheel on floor."""
-    mass: Float[ArrayLike, ""] = 1.0
-    """Factor on mass and inertia of the chassis; the wheels keep theirs."""
-    motor_gain: Float[ArrayLike, ""] = 1.0
-    """Factor on the wheel speeds that the motors make of a command, and on their limit."""
-    wheel_radius_mismatch: Float[ArrayLike, ""] = 0.0
-    """(left - right) / mean radius. Entered as wheel speeds, which is the same as long as the
-    wheels roll; it stands for motors of unequal speed as well."""
-    action_delay: Float[ArrayLike, ""] = 0.0
-    """From command to motor [control steps], rounded, 0 to `MAX_ACTION_DELAY`; until the first
-    command arrives the motors hold the robot still."""
-    motor_lag: Float[ArrayLike, ""] = 0.0
-    """Time constant of a first-order lag [s], ahead of the motors' own run-up."""
-
-
-class Motors(NamedTuple):
-    """What stands between command and motor remembers. Wheel speeds (left, right) [rad/s]."""
-
-    commands: Float[Array, "delay 2"]
-    """The last commands, the newest first."""
-    targets: Float[Array, "2"]
-    """What the motors were asked for in the last step."""
-
-
-def motors_at_rest() -> Motors:
-    """Motors that no command has reached yet."""
-    return Motors(jnp.zeros((MAX_ACTION_DELAY, 2)), jnp.zeros(2))
-
-
-def drive_motors(
-    motors: Motors, command: Float[Array, "2"], variation: Variation, ctrl_dt: float
-) -> Motors:
-    """Passes one command through delay and lag.
-
-        u = command of `action_delay` steps ago        d = exp(-ctrl_dt / motor_lag)
-        target' = d target + (1 - d) u
-
-    Args:
-      motors: before.
-      command: wheel speeds (left, right) [rad/s], within the motors' limits.
-      variation: its `action_delay` and `motor_lag`.
-      ctrl_dt: duration of one control step [s].
-
-    Returns:
-      The motors after it; their `targets` are what they aim at during this step.
+    What is left at its default costs nothing: no program contains it.
     """
-    commands = jnp.concatenate([command[None], motors.commands])
-    delayed = commands[jnp.round(variation.action_delay).astype(jnp.int32)]
-    # Without a lag exp(-∞) is exactly zero, and the command passes bit for bit.
-    decay = jnp.exp(-ctrl_dt / jnp.asarray(variation.motor_lag))
-    return Motors(commands[:-1], decay * motors.targets + (1.0 - decay) * delayed)
+
+    friction: Quantity = 1.0
+    """Factor on the Coulomb coefficient of wheel on floor."""
+    mass: Quantity = 1.0
+    """Factor on mass and inertia of the chassis; the wheels keep theirs."""
+    com_x: Quantity = 0.0
+    """Shift of the chassis's centre of mass [m], body frame: forward."""
+    com_y: Quantity = 0.0
+    """To the left."""
+    com_z: Quantity = 0.0
+    """Up."""
+    wheel_radius: Quantity = 1.0
+    """Factor on the radius of both wheels."""
+    wheel_radius_mismatch: Quantity = 0.0
+    """(left - right) / mean radius."""
+    wheel_separation: Quantity = 1.0
+    """Factor on the distance between the wheels."""
+    motor_gain: Quantity = 1.0
+    """Factor on the wheel speeds that the motors make of a command, and on their limit."""
+    motor_gain_mismatch: Quantity = 0.0
+    """(left - right) / mean gain."""
+    supply_voltage: Quantity = 1.0
+    """Factor on the voltage at the motors, and so on their speed. A low one also widens the
+    dead-band."""
+    dead_band: Quantity = 0.0
+    """Fraction of full voltage below which a wheel stands still."""
+    motor_lag: Quantity = 0.0
+    """Time constant of a first-order lag [s], ahead of the motors' own run-up."""
+    action_delay: Quantity = 0.0
+    """From command to motor [control steps], rounded; until the first command arrives the motors
+    hold the robot still."""
+    position_noise: Quantity = 0.0
+    """Deviation of the position (x, y) that the robot takes itself to be at [m]."""
+    yaw_noise: Quantity = 0.0
+    """Of its heading [rad]."""
+    speed_noise: Quantity = 0.0
+    """Of its velocity (x, y) [m/s]."""
+    yaw_rate_noise: Quantity = 0.0
+    """Of its yaw rate [rad/s]."""
+    observation_delay: Quantity = 0.0
+    """By how much the robot sees itself late [control steps], rounded; the goal it knows."""
+    start_x: Quantity = 0.0
+    """Where the episode starts [m], world frame: forward of the origin."""
+    start_y: Quantity = 0.0
+    """To the left."""
+    start_yaw: Quantity = 0.0
+    """Heading at the start [rad], counter-clockwise."""
+
+    def differs(self, *names: str) -> bool:
+        """Whether any of some quantities may differ from the preset's; a traced one may."""
+        presets = type(self)._field_defaults
+        values = {name: getattr(self, name) for name in names}
+        return any(
+            not (isinstance(value, int | float) and value == presets[name])
+            for name, value in values.items()
+        )
 
 
 def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation) -> mjx.Model:
@@ -90,101 +97,98 @@ def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation)
     Args:
       model: the preset's.
       mj_model: the same robot for C, with or without what only shows.
-      variation: its friction, mass, motor gain and mismatch of the wheels.
+      variation: its friction, mass and centre of mass.
 
     Returns:
       A model of the same structure. The constants that MuJoCo derives from the masses when it
       compiles, and its contacts read, follow exactly; those that no part of this robot reads
       stay as they were.
     """
-    wheels = np.zeros(mj_model.npair, bool)
-    wheels[[mj_model.pair(f"{side}_wheel").id for side in _SIDES]] = True
+    changed = {}
+    if variation.differs("friction"):
+        wheels = np.zeros(mj_model.npair, bool)
+        wheels[[mj_model.pair(f"{side}_wheel").id for side in _SIDES]] = True
+        # Tangential only: torsion and rolling take no part in a contact of three dimensions.
+        tangential = wheels[:, None] & (np.arange(5) < 2)
+        factor = jnp.where(tangential, variation.friction, 1.0)
+        changed["pair_friction"] = model.pair_friction * factor
     chassis = np.arange(model.nbody) == mj_model.body(_CHASSIS).id
-    mass = jnp.where(chassis, variation.mass, 1.0)
-    half = 0.5 * jnp.asarray(variation.wheel_radius_mismatch)
-    gain = jnp.ones(mj_model.nu)
-    for side, mismatch in zip(_SIDES, (half, -half), strict=True):
-        factor = variation.motor_gain * (1.0 + mismatch)
-        gain = gain.at[mj_model.actuator(side).id].set(factor)
-    # Tangential only: torsion and rolling take no part in a contact of three dimensions.
-    friction = jnp.where(wheels[:, None] & (np.arange(5) < 2), variation.friction, 1.0)
-    return model.replace(
-        pair_friction=model.pair_friction * friction,
-        body_mass=model.body_mass * mass,
-        body_inertia=model.body_inertia * mass[:, None],
-        body_invweight0=model.body_invweight0 + _invweight_change(model, mj_model, variation.mass),
-        # Torque = gain (ctrl - wheel speed): with more gain on `ctrl` alone a motor aims
-        # higher, its limit included.
-        actuator_gainprm=model.actuator_gainprm * gain[:, None],
-    )
+    if variation.differs("mass"):
+        mass = jnp.where(chassis, variation.mass, 1.0)
+        changed["body_mass"] = model.body_mass * mass
+        changed["body_inertia"] = model.body_inertia * mass[:, None]
+    if variation.differs("com_x", "com_y", "com_z"):
+        shift = jnp.where(chassis[:, None], _com_shift(variation), 0.0)
+        changed["body_ipos"] = model.body_ipos + shift
+    if variation.differs("mass", "com_x", "com_y", "com_z"):
+        changed["body_invweight0"] = _invweights(model, mj_model, variation)
+    return model.replace(**changed)
 
 
-def _invweight_change(
-    model: mjx.Model, mj_model: mujoco.MjModel, mass: Float[ArrayLike, ""]
+def _com_shift(variation: Variation) -> Float[Array, "3"]:
+    return jnp.stack([jnp.asarray(x) for x in (variation.com_x, variation.com_y, variation.com_z)])
+
+
+def _invweights(
+    model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation
 ) -> Float[Array, "bodies 2"]:
-    """How `body_invweight0`, the softness of contacts, follows the chassis's mass.
+    """`body_invweight0`, the softness of contacts, which follows chassis mass and centre of mass.
 
     MuJoCo takes it from the diagonal of J M⁻¹ Jᵀ in the initial pose, averaged over the three
-    translations and the three rotations of each body. The inertia is M + (f - 1) C, with C the
-    chassis's share of it. In modes V with VᵀMV = 1 and VᵀCV = diag(λ) its inverse is
-    V diag(1 / (1 + (f - 1) λ)) Vᵀ, at every f.
+    translations and the three rotations of each body. A wheel is as heavy however it is turned,
+    and of its spin s the rest of the robot feels only what the rotor's a lets through,
+    s a / (s + a). So all is one rigid body of mass m, centre c and inertia J about it, and with
+    A = J⁻¹, d = p - c, e = a / (s + a):
+
+        a point p     1/m + (|d|² tr A - dᵀ A d) / 3
+        the chassis   tr A / 3
+        a wheel       (A_xx + A_zz + 1/(s + a) + e² A_yy) / 3
     """
-    data = mujoco.MjData(mj_model)
-    mujoco.mj_forward(mj_model, data)
-    inertia = np.zeros((mj_model.nv, mj_model.nv))
-    mujoco.mj_fullM(mj_model, data, inertia)
-    jacobians = {name: np.zeros((6, mj_model.nv)) for name in _BODIES}
-    for name, jacobian in jacobians.items():
-        body = mj_model.body(name).id
-        mujoco.mj_jacBodyCom(mj_model, data, jacobian[:3], jacobian[3:], body)
-    chassis = mj_model.body(_CHASSIS).id
-    axes = data.ximat[chassis].reshape(3, 3)
-    own_inertia = np.zeros((6, 6))
-    own_inertia[:3, :3] = mj_model.body_mass[chassis] * np.eye(3)
-    own_inertia[3:, 3:] = axes @ np.diag(mj_model.body_inertia[chassis]) @ axes.T
-    share = jacobians[_CHASSIS].T @ own_inertia @ jacobians[_CHASSIS]
-    rates, modes = scipy.linalg.eigh(share, inertia)
-    weights = np.zeros((model.nbody, 2, mj_model.nv))
-    for name, jacobian in jacobians.items():
-        squares = np.square(jacobian @ modes).reshape(2, 3, -1)
-        weights[mj_model.body(name).id] = squares.mean(axis=1)
-    # As a difference, so that the preset's mass leaves every bit as it was.
-    change = 1.0 / (1.0 + (jnp.asarray(mass) - 1.0) * rates) - 1.0
-    return (weights * change).sum(axis=-1)
+    bodies = [mj_model.body(name).id for name in (_CHASSIS, "left_wheel", "right_wheel")]
+    chassis, *wheels = bodies
+    masses, inertias = mj_model.body_mass, mj_model.body_inertia
+    rotor = mj_model.dof_armature[mj_model.joint("left_wheel_joint").dofadr[0]]
+    spin = inertias[wheels[0], 1]
+    felt = inertias[wheels[0]].copy()
+    felt[1] = spin * rotor / (spin + rotor)
+
+    def weights(
+        mass: Float[ArrayLike, ""], shift: Float[ArrayLike, "3"]
+    ) -> Float[Array, "bodies 2"]:
+        parts = [
+            (
+                mass * masses[chassis],
+                mj_model.body_ipos[chassis] + jnp.asarray(shift),
+                mass * inertias[chassis],
+            ),
+            *((masses[wheel], mj_model.body_pos[wheel], felt) for wheel in wheels),
+        ]
+        total = sum(part for part, _, _ in parts)
+        centre = sum(part * place for part, place, _ in parts) / total
+        arms = jnp.stack([place - centre for _, place, _ in parts])
+        about = jnp.zeros((3, 3))
+        for (part, _, moments), arm in zip(parts, arms, strict=True):
+            about += jnp.diag(jnp.asarray(moments))
+            about += part * (arm @ arm * jnp.eye(3) - jnp.outer(arm, arm))
+        loose = _inverse(about)
+        trace = jnp.trace(loose)
+        swing = (arms**2).sum(axis=1) * trace - (arms * (arms @ loose)).sum(axis=1)
+        through = rotor / (spin + rotor)
+        wheel = trace + (through**2 - 1.0) * loose[1, 1] + 1.0 / (spin + rotor)
+        rotation = jnp.stack([trace, wheel, wheel]) / 3.0
+        return jnp.stack([1.0 / total + swing / 3.0, rotation], axis=1)
+
+    shift = _com_shift(variation)
+    varied = model.body_invweight0.at[np.asarray(bodies)].set(weights(variation.mass, shift))
+    # Where it is the preset's robot, to the bit.
+    return jnp.where(_is_preset(variation, shift), model.body_invweight0, varied)
 
 
-class VariedEnv(Wrapper):
-    """An environment whose robot differs from its preset.
+def _is_preset(variation: Variation, shift: Float[Array, "3"]) -> Bool[Array, ""]:
+    return (jnp.asarray(variation.mass) == 1.0) & (shift == 0.0).all()
 
-    One robot, like the environment itself; the variation may be traced. `info["motors"]` holds
-    the commands on their way. For single episodes, such as those of `rollout`:
-    `NewEpisodeWrapper` would let commands of one episode arrive in the next.
-    """
 
-    env: JetBotEnv
-
-    def __init__(self, env: JetBotEnv, variation: Variation) -> None:
-        """Wraps one environment.
-
-        Args:
-          env: unbatched, with its preset's model.
-          variation: how its robot differs.
-        """
-        super().__init__(env.with_model(vary_model(env.mjx_model, env.mj_model, variation)))
-        self.variation = variation
-
-    def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begins an episode with no command on its way."""
-        state = self.env.reset(rng)
-        return state.replace(info={**state.info, "motors": motors_at_rest()})
-
-    def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Gives a command, and drives by those that have arrived."""
-        command = self.env.wheel_targets(action)
-        limit = self.env.robot.max_wheel_speed
-        if limit is not None:
-            # Ahead of the lag: an electronic limit, towards which the motors then run up.
-            command = jnp.clip(command, -limit, limit)
-        motors = drive_motors(state.info["motors"], command, self.variation, self.env.dt)
-        state = state.replace(info={**state.info, "motors": motors})
-        return self.env.step_towards(state, action, motors.targets)
+def _inverse(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """Of a symmetric matrix, without a call of LAPACK or cuSOLVER."""
+    rows = [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])]
+    return jnp.stack(rows, axis=1) / (a[0] * rows[0]).sum()

@@ -24,6 +24,7 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx import mjx
 from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.randomization import as_trained
 from jetbot_mjx.state import State
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
@@ -44,7 +45,7 @@ def wrap_for_training(
     action_repeat: int = 1,
     randomization_fn: RandomizationFn | None = None,
 ) -> Env:
-    """Wraps an environment as trainers need it, batched.
+    """Wraps an environment as trainers need it, batched, with what its configuration draws.
 
     The signature is that of Brax's `wrap_env_fn`: pass this function to `ppo.train`.
 
@@ -60,7 +61,8 @@ def wrap_for_training(
     """
 
     def chain(env: JetBotEnv) -> NewEpisodeWrapper:
-        return NewEpisodeWrapper(EpisodeWrapper(env, episode_length, action_repeat))
+        varied = as_trained(env)
+        return NewEpisodeWrapper(EpisodeWrapper(varied, episode_length, action_repeat))
 
     if randomization_fn is None:
         return VmapWrapper(chain(env))
@@ -164,7 +166,7 @@ class NewEpisodeWrapper(Wrapper):
     """Where an episode ends, the next one begins, with everything about it drawn anew.
 
     `reward`, `done`, `metrics` and `info` still tell of the step that ended the old episode;
-    physics, goal and `obs` are already the new one's.
+    physics, goal, `obs` and the robot's `hardware` are already the new one's.
     """
 
     env: _Env
@@ -174,8 +176,8 @@ class NewEpisodeWrapper(Wrapper):
         state = self.env.step(state, action)
         fresh = self.env.reset(state.key)
         begun = _select(state.done > 0, _episode(fresh), _episode(state))
-        physics, obs, goal, key = begun
-        return state.replace(pipeline_state=physics, obs=obs, goal=goal, key=key)
+        physics, obs, goal, key, hardware = begun
+        return state.replace(pipeline_state=physics, obs=obs, goal=goal, key=key, hardware=hardware)
 
 
 class RandomizedVmapWrapper(Wrapper):
@@ -219,7 +221,7 @@ class RandomizedVmapWrapper(Wrapper):
 
 def _episode(state: State) -> tuple[PyTree, ...]:
     """What belongs to an episode, as against the step that led here."""
-    return state.pipeline_state, state.obs, state.goal, state.key
+    return state.pipeline_state, state.obs, state.goal, state.key, state.hardware
 
 
 def _discarded(state: State) -> State:

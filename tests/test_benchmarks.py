@@ -18,6 +18,8 @@ import compare
 import contenders
 import kernels
 import one_robot
+import randomization
+import randomization_cost
 import rate_plots
 import readme_table
 import regressions
@@ -354,3 +356,36 @@ def test_every_adapter_is_timed_in_turn(world_config, monkeypatch, tmp_path, cap
     ]
     assert all(row["env_steps_per_second"] > 0 and len(row["repeats"]) == 2 for row in rows)
     assert capsys.readouterr().out.count("| sb3") == 3
+
+
+def test_the_cost_of_randomisation_is_told_round_by_round():
+    rates = {"off": [100.0, 50.0, 90.0], "on": [80.0, 40.0, 90.0]}
+    assert randomization_cost.cost(rates) == pytest.approx(0.25)
+
+
+def judged(way, seed, rates):
+    sweep = [
+        {
+            "label": "friction",
+            "unit": "1",
+            "values": [0.4, 1.0],
+            "nominal": 1.0,
+            "policy": [{"success_rate": rate} for rate in rates],
+            "scripted": [{"success_rate": 1.0}] * 2,
+        }
+    ]
+    one = {"success_rate": rates[-1]}
+    return {"way": way, "seed": seed, "preset": one, "ranges": one, "sweep": sweep}
+
+
+def test_both_ways_stand_side_by_side_with_mean_and_worst_seed():
+    rows = [judged("nominal", "0", (0.5, 1.0)), judged("nominal", "1", (0.7, 1.0))]
+    table = randomization.table(rows)
+    assert "| the full ranges | 100.00% (100.00%) | - |" in table
+    assert "| friction, its hardest value | 60.00% (50.00%) at 0.4 | - |" in table
+    rows.append(judged("randomised", "0", (0.9, 1.0)))
+    assert "| 90.00% (90.00%) at 0.4 |" in randomization.table(rows)
+    (axes,) = randomization.plot(rows).axes
+    lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}
+    assert lines["nominal"] == pytest.approx([0.6, 1.0])
+    assert lines["randomised"] == pytest.approx([0.9, 1.0])

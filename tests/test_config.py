@@ -254,6 +254,42 @@ BAD_VALUES = {
         "ppo.learning_rate_schedule = 'cosine'",
         "'NONE', 'LINEAR' or 'ADAPTIVE_KL'",
     ),
+    # Ranges.
+    "range upside down": (
+        "randomization: {friction: [1.2, 0.4]}",
+        "randomization.friction = [1.2, 0.4]",
+        "[low, high], numbers from 0.05 to 5, the smaller one first",
+    ),
+    "one number for a range": (
+        "randomization: {mass: 1.0}",
+        "randomization.mass = 1.0",
+        "it should be [low, high]",
+    ),
+    "range of one end": (
+        "randomization: {com_x: [0.01]}",
+        "randomization.com_x = [0.01]",
+        "it should be [low, high]",
+    ),
+    "range out of bounds": (
+        "randomization: {dead_band: [0, 1.5]}",
+        "randomization.dead_band = [0, 1.5]",
+        "from 0 to 0.9",
+    ),
+    "range of words": (
+        "randomization: {motor_lag: [no, much]}",
+        "randomization.motor_lag = ['no', 'much']",
+        "numbers from 0 to 1",
+    ),
+    "half a step of delay": (
+        "randomization: {action_delay: [0, 1.5]}",
+        "randomization.action_delay = [0, 1.5]",
+        "whole numbers from 0 to 60",
+    ),
+    "range without end": (
+        "randomization: {yaw_noise: [0, .nan]}",
+        "randomization.yaw_noise = [0, nan]",
+        "numbers from 0 to 1",
+    ),
     # Combinations.
     "step size outside its schedule": (
         "ppo: {learning_rate_schedule: ADAPTIVE_KL, learning_rate: 0.5}",

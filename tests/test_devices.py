@@ -18,7 +18,7 @@ from test_ppo import OBS, SIZE, TINY, beginning, furthest, lines, made_up, with_
 
 from jetbot_mjx import train, training
 from jetbot_mjx.checkpoint import load_checkpoint
-from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.ppo import PPO
 from jetbot_mjx.resumable_ppo import Program
@@ -67,6 +67,7 @@ def tell(one, eight, answer):
     config = load_config(SMOKE)
     known = {"device_count": jax.device_count(), "averaging": averaging()}
     known |= trained_program(config)
+    known["robots"] = robots(config)
     known["restored"] = restored(one)
     known["went_on"] = said("--resume", one, "--set", f"ppo.num_timesteps={2 * SIZE}")
     said("--config", SMOKE, "--run-dir", eight, "--set", "checkpoint_interval=32768")
@@ -116,6 +117,18 @@ def trained_program(config):
     }
 
 
+def robots(config):
+    """What was drawn for the environments, and each one's key of noise."""
+    drawn = {"friction": (0.4, 1.2), "motor_gain": (0.9, 1.1), "yaw_noise": (0.0, 0.1)}
+    config = config.model_copy(update={"randomization": RandomizationConfig(**drawn)})
+    hardware = Program(config, make_env(config)).init().env_state.hardware
+    return {
+        "shards": [shard.data.shape for shard in hardware.drawn.addressable_shards],
+        "drawn": np.asarray(hardware.drawn)[0].tolist(),
+        "keys": np.asarray(hardware.sensors.key)[0].tolist(),
+    }
+
+
 def averaging():
     """Adam's first moment after one update: of the whole batch, of each half, and of two devices.
 
@@ -160,6 +173,15 @@ def restored(run_dir):
     (state,) = program.get(program.put(resumption.states))
     stored = read_about(checkpoint_path(run_dir, resumption.env_steps))["sha256"]
     return {name: [stored[name], digest(tree)] for name, tree in to_trees(state).items()}
+
+
+def test_every_device_draws_robots_and_noise_of_its_own(told):
+    robots = told["robots"]
+    envs = load_config(SMOKE).ppo.num_envs
+    assert robots["shards"] == [[1, envs // DEVICES, 3]] * DEVICES
+    for column in np.transpose(robots["drawn"]):
+        assert len(set(column.tolist())) == envs
+    assert len({tuple(key) for key in robots["keys"]}) == envs
 
 
 def test_the_environments_are_dealt_over_the_devices(told):

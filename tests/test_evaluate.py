@@ -196,6 +196,30 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
     assert json.loads(first["report.json"])["robustness"] is None
 
 
+def test_ranges_of_a_file_are_judged_beside_the_preset(judged, tmp_path):
+    run_dir, _, (first, _), _ = judged
+    ranges = tmp_path / "ranges.yaml"
+    ranges.write_text("randomization: {motor_gain: [0.1, 0.11]}")
+    code, said = judge(run_dir, "--ranges", ranges, "--output", tmp_path / "report")
+    assert code == 0
+    assert "policy, randomised robots" in said
+    values = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert values["ranges"] == {"motor_gain": [0.1, 0.11]}
+    assert values["policy"] == json.loads(first["report.json"])["policy"]
+    # A tenth of the speed is not enough for any of the ways.
+    assert values["randomized"]["success_rate"] == 0.0 < values["policy"]["success_rate"]
+    page = (tmp_path / "report" / "report.md").read_text()
+    assert "| randomised robots | 0.00% |" in page
+    assert f"--ranges {ranges}" in page
+    assert json.loads(first["report.json"])["randomized"] is None
+
+
+def test_a_file_without_ranges_is_refused(judged, root):
+    run_dir, _, _, _ = judged
+    with pytest.raises(UserError, match=r"smoke\.yaml: it draws nothing; give a configuration"):
+        evaluate.run(run_dir, ranges=root / "configs" / "smoke.yaml")
+
+
 def test_figures_are_drawn_for_light_and_dark_surroundings(judged):
     _, folder, _, _ = judged
     page = (folder / "report.html").read_text("utf-8")

@@ -12,8 +12,9 @@ from jetbot_mjx.env import make_env
 from jetbot_mjx.evaluation import Summary, report_keys, wilson_interval
 from jetbot_mjx.plots import plot_robustness
 from jetbot_mjx.policy import PolicyParams, make_networks
+from jetbot_mjx.randomization import VariedEnv
 from jetbot_mjx.robustness import SWEEPS, Sweep, SweepResult, as_json, carries, sweep
-from jetbot_mjx.variation import MAX_ACTION_DELAY, Variation, VariedEnv
+from jetbot_mjx.variation import MAX_ACTION_DELAY, MAX_OBSERVATION_DELAY, Variation
 
 EPISODES = 16
 
@@ -40,7 +41,9 @@ def test_every_difference_is_swept_around_the_presets_value():
         assert one.label
         assert one.unit
         assert one.source
-    assert max(SWEEPS[Variation._fields.index("action_delay")].values) == MAX_ACTION_DELAY
+    by_name = {one.name: max(one.values) for one in SWEEPS}
+    assert by_name["action_delay"] == MAX_ACTION_DELAY
+    assert by_name["observation_delay"] == MAX_OBSERVATION_DELAY
 
 
 @pytest.mark.parametrize("one", SWEEPS, ids=lambda one: one.name)
@@ -117,11 +120,8 @@ def swept():
     )
     key = jax.random.PRNGKey(0)
     params = PolicyParams(None, networks.policy_network.init(key), None)
-    sweeps = [
-        one._replace(values=values)
-        for one, values in zip(SWEEPS, ((), (), (0.2, 1.0), (), (0.0, 9.0), ()), strict=True)
-        if values
-    ]
+    values = {"motor_gain": (0.2, 1.0), "action_delay": (0.0, 9.0)}
+    sweeps = [one._replace(values=values[one.name]) for one in SWEEPS if one.name in values]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(robustness, "VariedEnv", Counted)
         results = sweep(env, networks, params, report_keys(EPISODES), sweeps)

@@ -9,23 +9,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx import kinematics, mjx
+from jetbot_mjx import kinematics, mjx, model
 from jetbot_mjx.compiling import compiler_options
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
-from jetbot_mjx.model import CONTROLLER_WHEEL_RADIUS, WHEEL_SEPARATION, make_mj_model
-from jetbot_mjx.variation import (
-    MAX_ACTION_DELAY,
-    Variation,
-    VariedEnv,
-    drive_motors,
-    motors_at_rest,
-    vary_model,
-)
+from jetbot_mjx.model import CONTROLLER_WHEEL_RADIUS, WHEEL_RADIUS, WHEEL_SEPARATION, make_mj_model
+from jetbot_mjx.randomization import VariedEnv
+from jetbot_mjx.variation import MAX_ACTION_DELAY, Variation, vary_model
 
 ROBOTS = 16
 STEPS = 256
 MASSES = (0.8, 1.25)
+CENTRES = ((0.01, -0.005, 0.005), (-0.015, 0.005, -0.01))
 FRICTIONS = (0.4, 0.7, 1.0, 1.2)
 POSITION_TOLERANCE = 1e-3  # [m] after 256 control steps
 YAW_TOLERANCE = math.radians(0.5)
@@ -59,8 +54,8 @@ def driver(request):
 
             def step(state, action):
                 state = robot.step(state, action)
-                motors = state.info.get("motors", motors_at_rest())
-                return state, (state.pipeline_state, motors.targets)
+                targets = jnp.zeros(2) if variation is None else state.hardware.motors.targets
+                return state, (state.pipeline_state, targets)
 
             return jax.lax.scan(step, robot.reset(jax.random.PRNGKey(0)), actions)[1]
 
@@ -76,20 +71,22 @@ def actions():
     return jnp.asarray(np.repeat(drawn, 16, axis=1), jnp.float32)
 
 
-def varied_robot(robot, mass, friction):
+def varied_robot(robot, mass, friction, shift=(0.0, 0.0, 0.0)):
     return dataclasses.replace(
         robot,
+        chassis_com=tuple(np.add(robot.chassis_com, shift)),
         chassis_mass=mass * robot.chassis_mass,
         chassis_inertia=tuple(mass * moment for moment in robot.chassis_inertia),
         friction=friction,
     )
 
 
-def drive_in_c(env, mj_model, actions):
+def drive_in_c(env, mj_model, actions, height=None):
     """From the preset's initial pose, with a converged solver: qpos (t, nq)."""
     mj_model.opt.iterations, mj_model.opt.ls_iterations, mj_model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(mj_model)
     data.qpos[:] = env.mj_model.qpos0
+    data.qpos[2] = data.qpos[2] if height is None else height
     trail = []
     for target in np.asarray(jax.vmap(env.wheel_targets)(actions)):
         data.ctrl[:] = target
@@ -106,13 +103,14 @@ def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver, actions
 
 def test_a_varied_robot_drives_as_one_compiled_with_its_numbers(driver, actions):
     env, drive = driver
-    pairs = [(mass, friction) for mass in MASSES for friction in FRICTIONS]
-    mass, friction = (np.resize(column, ROBOTS) for column in np.transpose(pairs))
-    qpos = np.asarray(drive(many(mass=mass, friction=friction), actions)[0].qpos)
+    triples = [(m, f, *shift) for m in MASSES for f in FRICTIONS for shift in CENTRES]
+    mass, friction, *shift = (np.resize(column, ROBOTS) for column in np.transpose(triples))
+    centre = dict(zip(("com_x", "com_y", "com_z"), shift, strict=True))
+    qpos = np.asarray(drive(many(mass=mass, friction=friction, **centre), actions)[0].qpos)
     preset = np.asarray(drive(many(), actions)[0].qpos)
     worst = {"position": 0.0, "yaw": 0.0, "difference": 0.0}
     for i in range(ROBOTS):
-        robot = varied_robot(env.robot, mass[i], friction[i])
+        robot = varied_robot(env.robot, mass[i], friction[i], np.transpose(shift)[i])
         expected = drive_in_c(env, make_mj_model(robot, env.config.physics), actions[i])
         distance = np.linalg.norm(expected[:, :3] - qpos[i, :, :3], axis=-1).max()
         turned = np.asarray(
@@ -132,14 +130,13 @@ def test_a_varied_robot_drives_as_one_compiled_with_its_numbers(driver, actions)
     assert worst["difference"] > 3 * POSITION_TOLERANCE
 
 
-@pytest.mark.parametrize("mass", MASSES)
-def test_a_varied_model_is_the_one_that_mujoco_compiles(preset_env, mass):
-    robot = varied_robot(preset_env.robot, mass, 0.4)
+@pytest.mark.parametrize(("mass", "shift"), [*zip(MASSES, CENTRES, strict=True)])
+def test_a_varied_model_is_the_one_that_mujoco_compiles(preset_env, mass, shift):
+    robot = varied_robot(preset_env.robot, mass, 0.4, shift)
     compiled = mjx.put_model(make_mj_model(robot, preset_env.config.physics, visual=False))
-    varied = vary_model(
-        preset_env.mjx_model, preset_env.mj_model, Variation(mass=mass, friction=0.4)
-    )
-    for name in ("body_mass", "body_inertia", "body_invweight0", "pair_friction"):
+    variation = Variation(0.4, mass, *shift)
+    varied = vary_model(preset_env.mjx_model, preset_env.mj_model, variation)
+    for name in ("body_mass", "body_ipos", "body_inertia", "body_invweight0", "pair_friction"):
         changed, preset = getattr(varied, name), getattr(preset_env.mjx_model, name)
         np.testing.assert_allclose(changed, getattr(compiled, name), rtol=1e-5, atol=1e-7)
         assert np.abs(changed - preset).max() > 1e-6
@@ -166,6 +163,34 @@ def test_unequal_wheels_drive_in_the_circle_that_kinematics_predicts(driver):
     radius = np.linalg.norm(speed, axis=-1).mean(axis=1) / yaw_rate
     # v / ω = b (ω_R + ω_L) / 2 (ω_R - ω_L): a larger left wheel drives to the right.
     np.testing.assert_allclose(radius, -WHEEL_SEPARATION / mismatch, rtol=0.02)
+
+
+def test_wheels_of_another_size_and_distance_drive_as_a_robot_built_so(driver, monkeypatch):
+    env, drive = driver
+    radius, separation = 1.04, 0.95
+    # Slow, as above.
+    actions = jnp.broadcast_to(jnp.array([-0.8, 0.2]), (ROBOTS, STEPS, 2))
+    entered, preset = (
+        np.asarray(drive(one, actions)[0].qpos)[0]
+        for one in (many(wheel_radius=radius, wheel_separation=separation), many())
+    )
+    monkeypatch.setattr(model, "WHEEL_RADIUS", radius * WHEEL_RADIUS)
+    monkeypatch.setattr(model, "WHEEL_SEPARATION", separation * WHEEL_SEPARATION)
+    # The casters keep their height over the floor.
+    casters = tuple(
+        dataclasses.replace(one, pos=(*one.pos[:2], one.pos[2] - (radius - 1.0) * WHEEL_RADIUS))
+        for one in env.robot.casters
+    )
+    built = make_mj_model(dataclasses.replace(env.robot, casters=casters), env.config.physics)
+    expected = drive_in_c(env, built, actions[0], height=built.qpos0[2])
+    away = np.linalg.norm(expected[:, :2] - entered[:, :2], axis=-1).max()
+    difference = np.linalg.norm(expected[:, :2] - preset[:, :2], axis=-1).max()
+    print(
+        f"\n{env.config.robot.preset}: entered as wheel speeds, {away * 1e3:.1f} mm from a robot"
+        f" built so; the preset is {difference * 1e3:.0f} mm away"
+    )
+    assert away < 5e-3
+    assert difference > 10 * away
 
 
 def test_a_delay_shifts_the_response_by_its_steps(driver, actions):
@@ -195,33 +220,3 @@ def test_one_program_serves_all_values(driver):
     before = drive._cache_size()
     drive(many(friction=0.5, mass=1.1, action_delay=3), straight(STEPS, 0.5))
     assert drive._cache_size() == before
-
-
-def run_motors(variation, commands):
-    motors, targets = motors_at_rest(), []
-    for command in commands:
-        motors = drive_motors(motors, jnp.asarray(command, jnp.float32), variation, 1 / 60)
-        targets.append(motors.targets)
-    return np.asarray(targets)
-
-
-@pytest.mark.parametrize("delay", [0, 1, 3, MAX_ACTION_DELAY])
-def test_until_the_first_command_arrives_the_motors_are_asked_to_stand(delay):
-    commands = np.arange(1.0, 25.0).reshape(12, 2)
-    targets = run_motors(Variation(action_delay=delay), commands)
-    np.testing.assert_array_equal(targets[:delay], 0.0)
-    np.testing.assert_array_equal(targets[delay:], commands[: 12 - delay])
-
-
-def test_a_delay_is_rounded_to_whole_steps():
-    commands = np.arange(1.0, 25.0).reshape(12, 2)
-    np.testing.assert_array_equal(
-        run_motors(Variation(action_delay=1.6), commands),
-        run_motors(Variation(action_delay=2.0), commands),
-    )
-
-
-def test_a_lag_is_of_first_order():
-    targets = run_motors(Variation(motor_lag=0.1), [(10.0, -5.0)] * 12)
-    expected = 1.0 - np.exp(-np.arange(1, 13) / 60 / 0.1)
-    np.testing.assert_allclose(targets, expected[:, None] * (10.0, -5.0), rtol=1e-5)
