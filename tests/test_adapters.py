@@ -379,6 +379,16 @@ def _check_same_infos(mine, wanted):
             np.testing.assert_array_equal(mine[name], value)
 
 
+def test_robots_that_are_drawn_are_a_batch():
+    drawn = {"randomization": {"friction": [0.5, 1.0], "mass": [0.9, 1.1]}}
+    with pytest.raises(UserError, match=r"randomization\.friction, mass: .*take JetBotVectorEnv"):
+        JetBotGymEnv(config=drawn)
+    with everywhere():
+        batch = JetBotVectorEnv(num_envs=3, config=drawn)
+        batch.reset(seed=0)
+        batch.step(np.zeros((3, 2)))
+
+
 def test_every_environment_draws_goals_of_its_own(gliding):
     seen = [gliding.reset(seed=0)[0][:, GOAL]]
     for _ in range(40):

@@ -95,10 +95,17 @@ def drive_in_c(env, mj_model, actions, height=None):
     return np.stack(trail)
 
 
-def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver, actions):
+def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver):
+    env, _ = driver
+    varied = jax.jit(lambda variation: vary_model(env.mjx_model, env.mj_model, variation))
+    jax.tree.map(np.testing.assert_array_equal, varied(Variation()), env.mjx_model)
+
+
+def test_without_a_difference_the_robot_drives_as_its_preset(driver, actions):
+    """Not to the bit: where a number is known, a kernel has done its arithmetic beforehand."""
     _, drive = driver
     varied, preset = drive(many(), actions)[0], drive(None, actions)[0]
-    jax.tree.map(np.testing.assert_array_equal, varied, preset)
+    np.testing.assert_allclose(varied.qpos[..., :7], preset.qpos[..., :7], atol=2e-5)
 
 
 def test_a_varied_robot_drives_as_one_compiled_with_its_numbers(driver, actions):

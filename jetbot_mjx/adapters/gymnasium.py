@@ -17,6 +17,7 @@ from jetbot_mjx.adapters.settings import (
     seeds_of,
 )
 from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
 
 with an_extra("gymnasium"):
     import gymnasium
@@ -65,7 +66,8 @@ class JetBotGymEnv(gymnasium.Env):
           config: a YAML file, nested settings or a `Config` for all else; default: the tutorial's.
 
         Raises:
-          UserError: an argument or setting is wrong, or there is no display for a window.
+          UserError: an argument or setting is wrong, robots are to be drawn for every episode, or
+            there is no display for a window.
         """
         given = Arguments(
             skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
@@ -73,6 +75,11 @@ class JetBotGymEnv(gymnasium.Env):
         settings = resolve(given, config)
         self.config: Config = settings.config
         """What the environment was built from."""
+        if drawn := ", ".join(self.config.randomization.drawn):
+            raise UserError(
+                f"randomization.{drawn}: the single robot is the preset's; take JetBotVectorEnv, of"
+                " one robot if need be"
+            )
         # Who comes from elsewhere has no reason to know that JAX would compile at every start.
         cli.use_compilation_cache()
         self.robot = RobotInC(settings.config)
