@@ -22,6 +22,7 @@ from jetbot_mjx.wrappers import wrap_for_training
 GIB = 2**30
 
 _MOST_ENVS = 2**24
+_KEY = jax.ShapeDtypeStruct((2,), np.uint32)
 _FLOAT = 4
 
 _LAYERS = 1.6
@@ -35,7 +36,7 @@ class Sizes(NamedTuple):
     environment: int
     """The state of an environment."""
     physics: int
-    """What MJX computes on the way to its next state."""
+    """What is computed on the way to its next state."""
     sample: int
     """An environment step as it is collected."""
     learnt: int
@@ -84,7 +85,7 @@ def sizes(config: Config, env: JetBotEnv) -> Sizes:
       What one of each takes.
     """
     ppo = PPO(config.ppo, wrap_for_training(env, config.task.episode_length))
-    state = jax.eval_shape(ppo.init, jax.ShapeDtypeStruct((2,), np.uint32))
+    state = jax.eval_shape(ppo.init, _KEY)
     _, data, _ = jax.eval_shape(ppo.collect, state, state.key)
     unrolls = config.ppo.batch_size * config.ppo.num_minibatches
     samples = unrolls * config.ppo.unroll_length
@@ -93,18 +94,25 @@ def sizes(config: Config, env: JetBotEnv) -> Sizes:
     everything = _bytes(data) - ends
     learnt = everything - books + _bytes(data.extras["state_extras"]["truncation"])
     environments = _bytes(state.env_state)
-    world = make_mj_model(env.robot, config.physics, build_scene=env.task.build_scene, visual=False)
     network = config.ppo.network
     units = sum(network.policy_hidden_layer_sizes) + sum(network.value_hidden_layer_sizes)
     return Sizes(
         environment=environments // config.ppo.num_envs,
-        physics=_bytes(mjx.make_data(world)),
+        physics=_physics(config, env),
         sample=everything // samples,
         learnt=learnt // samples,
         unroll=ends // unrolls,
         layers=_FLOAT * units,
         parameters=_bytes(state) - environments,
     )
+
+
+def _physics(config: Config, env: JetBotEnv) -> int:
+    if env.physics.impl != "xla":
+        # One kernel keeps what it computes to itself: what comes in and what goes out.
+        return 2 * _bytes(jax.eval_shape(env.reset, _KEY).pipeline_state)
+    world = make_mj_model(env.robot, config.physics, build_scene=env.task.build_scene, visual=False)
+    return _bytes(mjx.make_data(world))
 
 
 def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:

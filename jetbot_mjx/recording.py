@@ -166,6 +166,11 @@ class RunRecorder(Recorder):
         """Since the training began, in all processes [s]."""
         return self._earlier + time.perf_counter() - self._began
 
+    def say(self, *lines: str) -> None:
+        """Passes lines to the terminal."""
+        for line in lines:
+            self._terminal.say(line)
+
     def begin(self, headline: str) -> None:
         """Says what is trained, and that compiling has begun."""
         self._terminal.say(headline)

@@ -129,6 +129,7 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: Prog
             recorder = RunRecorder(config, env, run_dirs, clock, resumption, programs)
             opened.append((stack.enter_context(recorder), resumption))
             if recorder.complete:
+                recorder.say(*welcome)
                 return _COMPLETE
             recorder.begin("\n".join([*welcome, _headline(config, run_dir)]))
             return _RESUMES if resumption else _BEGINS

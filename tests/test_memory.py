@@ -28,11 +28,15 @@ def each(config, env):
     return sizes(config, env)
 
 
+MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
+
+
 @pytest.mark.parametrize(
     ("settings", "fullest"),
     [
         ([], "learning"),
-        (["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"], "collecting"),
+        (MANY, "learning"),
+        ([*MANY, "physics.impl=xla"], "collecting"),
     ],
 )
 def test_xla_sets_aside_what_was_told(root, settings, fullest):

@@ -75,7 +75,7 @@ def program(config, smoke_run):
     evaluator = Evaluator(env, networks)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(resumable_ppo, "Program", Program)
-        patch.setattr(recording, "Evaluator", lambda env, networks: evaluator)
+        patch.setattr(recording, "Evaluator", lambda env, networks, **_: evaluator)
         yield original
 
 
