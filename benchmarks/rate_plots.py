@@ -16,7 +16,10 @@ from jetbot_mjx.run_folder import write_bytes
 
 
 def plot_rates(values: Mapping[str, Any]) -> Figure:
-    """Steps per second, and the time of one step, against the number of environments.
+    """Steps per second, the time of one step, and memory, against the number of environments.
+
+    Memory is drawn where the device tells it; its peak is that of the process until then, so that
+    sizes are to be measured in ascending order.
 
     Args:
       values: content of a file that `steps_per_second.py` wrote.
@@ -25,8 +28,9 @@ def plot_rates(values: Mapping[str, Any]) -> Figure:
       The figure; its colours are those of the theme in which it is drawn.
     """
     rows = values["results"]
-    figure = Figure(figsize=(10.4, 4.2), layout="constrained")
-    rates, times = figure.subplots(1, 2)
+    remembered = any(row.get("peak_device_bytes") for row in rows)
+    figure = Figure(figsize=(15.0 if remembered else 10.4, 4.4), layout="constrained")
+    rates, times, *others = figure.subplots(1, 3 if remembered else 2)
     for index, rate in enumerate(dict.fromkeys(row["rate"] for row in rows)):
         points = sorted((row for row in rows if row["rate"] == rate), key=lambda x: x["num_envs"])
         num_envs = [row["num_envs"] for row in points]
@@ -44,7 +48,17 @@ def plot_rates(values: Mapping[str, Any]) -> Figure:
         times.plot(num_envs, [row["microseconds_per_step"] for row in points], **style)
     rates.set(title="environment steps per second", ylabel="steps/s")
     times.set(title="time in which all environments make one step", ylabel="µs")
-    for axes in (rates, times):
+    for memory in others:
+        peaks: dict[int, float] = {}
+        for row in rows:
+            peaks[row["num_envs"]] = max(
+                peaks.get(row["num_envs"], 0.0), row["peak_device_bytes"] / 2**30
+            )
+        memory.plot(
+            *zip(*sorted(peaks.items()), strict=True), color="0.4", marker="o", markersize=4
+        )
+        memory.set(title="peak of the device's memory so far", ylabel="GiB")
+    for axes in (rates, times, *others):
         _make_readable(axes, sorted({row["num_envs"] for row in rows}))
     rates.legend(loc="best", fontsize="small")
     cores = f", {values['cpu_cores']} cores" if values["platform"] == "cpu" else ""
@@ -71,7 +85,7 @@ def draw(path: Path, values: Mapping[str, Any]) -> Path:
 
 def _make_readable(axes: Axes, num_envs: Sequence[int]) -> None:
     axes.set(xlabel="environments", xscale="log", yscale="log")
-    axes.set_xticks(num_envs, [f"{count:,}" for count in num_envs])
+    axes.set_xticks(num_envs, [f"{count:,}" for count in num_envs], rotation=35, ha="right")
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_minor_locator(NullLocator())

@@ -90,14 +90,17 @@ def _seconds(times: Iterable[float]) -> str:
 
 def best_rates_table(results: Results) -> str:
     """The best of every rate, with the environments it takes: a row for each machine."""
-    rows = []
+    best: dict[str, dict[str, Any]] = {}
     for values in _holding(results, "results"):
-        best = {
-            row["rate"]: row
-            for row in sorted(values["results"], key=lambda row: row["env_steps_per_second"])
-        }
-        cells = [_best(best[rate]) if rate in best else "-" for rate in _RATES]
-        rows.append([_machine(values, values), *cells])
+        found = best.setdefault(_machine(values, values), {})
+        for row in values["results"]:
+            rival = found.setdefault(row["rate"], row)
+            if row["env_steps_per_second"] > rival["env_steps_per_second"]:
+                found[row["rate"]] = row
+    rows = [
+        [machine, *(_best(found[rate]) if rate in found else "-" for rate in _RATES)]
+        for machine, found in best.items()
+    ]
     return _table(["environment steps/s at the best batch", *_RATES], "l" + "r" * len(_RATES), rows)
 
 

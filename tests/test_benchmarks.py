@@ -111,6 +111,15 @@ def test_a_slower_rate_ends_in_one_and_a_figure_lies_beside_the_file(monkeypatch
     assert picture.read_bytes() == drawn
 
 
+def test_a_figure_shows_what_a_device_tells_of_its_memory():
+    values = json.loads((ROOT / "benchmarks" / "results" / "nvidia-h200-sweep.json").read_text())
+    _, _, memory = rate_plots.plot_rates(values).axes
+    (line,) = memory.lines
+    largest = max(row["num_envs"] for row in values["results"])
+    peak = max(row["peak_device_bytes"] for row in values["results"])
+    assert (line.get_xdata()[-1], line.get_ydata()[-1] * 2**30) == (largest, peak)
+
+
 def test_a_figure_has_a_line_for_every_rate():
     values = json.loads((ROOT / "benchmarks" / "results" / "nvidia-h200.json").read_text())
     steps, times = rate_plots.plot_rates(values).axes
