@@ -100,7 +100,12 @@ PROBE = {
 class Unicycle(JetBotEnv):
     """A robot whose wheels neither slip nor lag."""
 
-    def step_physics(self, physics: PhysicsState, ctrl: Float[Array, "2"]) -> PhysicsState:
+    def step_physics(
+        self,
+        physics: PhysicsState,
+        ctrl: Float[Array, "2"],
+        mocap_pos: Float[Array, "nmocap 3"] | None = None,
+    ) -> PhysicsState:
         """Integrates one environment step of what the wheels command."""
         left, right = CONTROLLER_WHEEL_RADIUS * ctrl
         speed, yaw_rate = 0.5 * (left + right), (right - left) / CONTROLLER_WHEEL_SEPARATION

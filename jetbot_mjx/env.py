@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx import kinematics, mjx
 from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
@@ -22,7 +23,7 @@ from jetbot_mjx.model import (
 )
 from jetbot_mjx.physics import Physics
 from jetbot_mjx.state import PhysicsState, State, robot_state
-from jetbot_mjx.task import Task, layout_size, make_task
+from jetbot_mjx.task import AdvancesGoal, Goal, Task, layout_size, make_task
 
 
 class JetBotEnv(brax.envs.Env):
@@ -130,20 +131,37 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           The next state.
         """
-        physics = self.step_physics(state.pipeline_state, ctrl)
+        goal = state.goal
+        physics = self.step_physics(state.pipeline_state, ctrl, self._solid_places(goal))
         before, after = robot_state(state.pipeline_state), robot_state(physics)
-        reward, terms = self.task.reward(before, after, state.goal, action)
-        terminated = self.task.terminated(after, state.goal).astype(jnp.float32)
-        success = self.task.success(after, state.goal).astype(jnp.float32)
+        reward, terms = self.task.reward(before, after, goal, action)
+        if isinstance(self.task, AdvancesGoal):
+            goal = self.task.advance(before, after, goal)
+        terminated = self.task.terminated(after, goal).astype(jnp.float32)
+        success = self.task.success(after, goal).astype(jnp.float32)
         rewards = {f"reward/{name}": term for name, term in terms.items()}
         return state.replace(
             pipeline_state=physics,
-            obs=self.task.observe(after, state.goal),
+            obs=self.task.observe(after, goal),
             reward=reward,
             done=terminated,
             metrics={**state.metrics, "success": success, **rewards},
             info={**state.info, "terminated": terminated},
+            goal=goal,
         )
+
+    def _solid_places(self, goal: Goal) -> Float[Array, "nmocap 3"] | None:
+        """Where this episode's solid bodies stand [m], in the order of physics."""
+        names = self.physics.mocap_names
+        if not names:
+            return None
+        markers = self.task.markers(goal)
+        if missing := [name for name in names if name not in markers]:
+            raise UserError(
+                f"task.name = {self.config.task.name!r}: markers does not say where"
+                f" {', '.join(missing)} stands, a solid mocap body of build_scene"
+            )
+        return jnp.stack([markers[name] for name in names])
 
     def wheel_targets(self, action: Float[Array, "2"]) -> Float[Array, "2"]:
         """Wheel speeds (left, right) [rad/s] that an action commands, before motor limits."""
@@ -158,17 +176,24 @@ class JetBotEnv(brax.envs.Env):
             wheel_separation=CONTROLLER_WHEEL_SEPARATION,
         )
 
-    def step_physics(self, physics: PhysicsState, ctrl: Float[Array, "2"]) -> PhysicsState:
+    def step_physics(
+        self,
+        physics: PhysicsState,
+        ctrl: Float[Array, "2"],
+        mocap_pos: Float[Array, "nmocap 3"] | None = None,
+    ) -> PhysicsState:
         """Integrates one environment step.
 
         Args:
           physics: where to start.
           ctrl: wheel speed targets (left, right) [rad/s], held throughout.
+          mocap_pos: where the task's solid bodies stand [m], world frame; None: where they were
+            built.
 
         Returns:
           The physics state one `ctrl_dt` later.
         """
-        return self.physics.step(physics, ctrl)
+        return self.physics.step(physics, ctrl, mocap_pos)
 
     @property
     def observation_size(self) -> int:

@@ -86,18 +86,36 @@ class Physics:
         backend = self._backend()
         return "xla" if backend is None or self._as_kernel() is None else backend.IMPL
 
-    def step(self, state: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
+    @functools.cached_property
+    def mocap_names(self) -> tuple[str, ...]:
+        """Solid bodies that stand where a task puts them, in MuJoCo's order."""
+        model = self._mj_model
+        bodies = [model.body(i) for i in range(model.nbody)]
+        placed = sorted((body for body in bodies if body.mocapid[0] >= 0), key=lambda b: b.mocapid)
+        return tuple(body.name for body in placed)
+
+    def step(
+        self,
+        state: PhysicsState,
+        ctrl: Float[Array, " nu"],
+        mocap_pos: Float[Array, "nmocap 3"] | None = None,
+    ) -> PhysicsState:
         """Integrates one environment step, `n_substeps` physics steps.
 
         Args:
           state: where to start.
           ctrl: wheel speed targets (left, right) [rad/s], held throughout.
+          mocap_pos: where the bodies of `mocap_names` stand [m], world frame; None: where the
+            model has them.
 
         Returns:
           The state one `ctrl_dt` later.
         """
         leaves = jax.tree.leaves(self.model)
-        held = ctrl, [leaves[place] for place in self._varied]
+        known_late = [leaves[place] for place in self._varied]
+        if self._mj_model.nmocap:
+            known_late.append(self._data.mocap_pos if mocap_pos is None else mocap_pos)
+        held = ctrl, known_late
         one_kernel = self._as_kernel()
         if one_kernel is not None:
             return one_kernel(state, held)
@@ -113,14 +131,16 @@ class Physics:
 
         Args:
           state: where to start.
-          held: wheel speed targets (left, right) [rad/s], and those leaves of the model that are
-            known only when a program runs.
+          held: wheel speed targets (left, right) [rad/s], and what else is known only when a
+            program runs: leaves of the model, then, where there are any, the places of solid mocap
+            bodies [m].
 
         Returns:
           The state one `sim_dt` later.
         """
-        ctrl, varied = held
+        ctrl, known_late = held
         leaves, treedef = jax.tree.flatten(self.model)
+        varied, places = known_late[: len(self._varied)], known_late[len(self._varied) :]
         for place, leaf in zip(self._varied, varied, strict=True):
             leaves[place] = leaf
         data = self._data.replace(
@@ -130,6 +150,8 @@ class Physics:
             time=state.time,
             ctrl=ctrl,
         )
+        if places:
+            data = data.replace(mocap_pos=places[0])
         factorise = (
             contextlib.nullcontext if self._config.cholesky == "library" else cholesky.unrolled
         )
@@ -188,9 +210,10 @@ class Physics:
         model = self._mj_model
         state = PhysicsState(numbers(model.nq), numbers(model.nv), numbers(model.nv), numbers())
         leaves = jax.tree.leaves(self.model)
-        varied = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied]
+        known_late = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied]
+        known_late += [numbers(model.nmocap, 3)] if model.nmocap else []
         return backend.write(
-            scalarize(self.substep, state, (numbers(model.nu), varied)),
+            scalarize(self.substep, state, (numbers(model.nu), known_late)),
             carried=len(jax.tree.leaves(state)),
             steps=self._config.n_substeps,
         )

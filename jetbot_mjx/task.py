@@ -91,7 +91,7 @@ def layout_table(layout: Layout) -> str:
 class Task(Protocol):
     """What the environment asks of a task. All methods are pure and see one robot.
 
-    Optional beside these: `move_goal`, of `MovesGoal`.
+    Optional beside these: `move_goal`, of `MovesGoal`, and `advance`, of `AdvancesGoal`.
     """
 
     layout: Layout
@@ -134,8 +134,8 @@ class Task(Protocol):
     def build_scene(self, spec: mujoco.MjSpec) -> None:
         """Adds the task's own bodies to the scene before it is compiled.
 
-        What only shows wants `contype=0, conaffinity=0`: geoms that can collide stay in the
-        physics model.
+        What only shows wants `contype=0, conaffinity=0`. What the robot can run into is given a
+        contact pair with a geom of the robot; as a mocap body it stands where `markers` says.
         """
         ...
 
@@ -150,6 +150,29 @@ class MovesGoal(Protocol):
         Args:
           goal: what `sample` drew; all of it that is not the place to go stays.
           position_w: where the robot is to go instead [m], world frame.
+
+        Returns:
+          A tree of the same structure, shapes and dtypes.
+        """
+        ...
+
+
+@runtime_checkable
+class AdvancesGoal(Protocol):
+    """What a task can offer beside the contract: a goal that changes as the robot drives.
+
+    What an episode has to remember, such as how many gates are passed, is part of the goal.
+    """
+
+    def advance(self, before: RobotState, after: RobotState, goal: Goal) -> Goal:
+        """The goal after a step.
+
+        `reward` sees the goal before it; `terminated`, `success` and `observe` the one after.
+
+        Args:
+          before: the robot before the step.
+          after: the robot after it.
+          goal: until then.
 
         Returns:
           A tree of the same structure, shapes and dtypes.
@@ -271,7 +294,7 @@ def make_task(config: TaskConfig) -> Task:
     task_class: Any = getattr(module, class_name, None)
     if task_class is None:
         raise UserError(f"task.name = {config.name!r}: {module_name} has no {class_name!r}")
-    _check_members(config.name, task_class, _TASK_METHODS)
+    _check_members(config.name, task_class, METHODS)
     if task_class is Task:
         raise UserError(f"task.name = {config.name!r} is the contract, not a task: derive from it")
     task = task_class(config)
@@ -285,7 +308,7 @@ def _check_members(name: str, thing: object, members: Sequence[str]) -> None:
         raise UserError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
 
 
-_TASK_METHODS = (
+METHODS = (
     "sample",
     "observe",
     "reward",

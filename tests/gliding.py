@@ -27,7 +27,7 @@ LAG = 0.1  # [s] of the motors, so that there is something to learn
 
 
 class Gliding(JetBotEnv):
-    def step_physics(self, physics, ctrl):
+    def step_physics(self, physics, ctrl, mocap_pos=None):
         wanted = kinematics.body_twist(
             ctrl,
             wheel_radius=CONTROLLER_WHEEL_RADIUS,

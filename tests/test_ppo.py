@@ -341,8 +341,8 @@ FUSE = 5  # environment steps that a brittle world lasts; too few to reach a goa
 
 
 class Brittle(Gliding):
-    def step_physics(self, physics, ctrl):
-        after = super().step_physics(physics, ctrl)
+    def step_physics(self, physics, ctrl, mocap_pos=None):
+        after = super().step_physics(physics, ctrl, mocap_pos)
         spent = after.time > (FUSE - 0.5) * self.dt
         return after.replace(qvel=jnp.where(spent, jnp.nan, after.qvel))
 
