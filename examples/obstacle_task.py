@@ -139,7 +139,7 @@ class ObstacleTask(GoalTask):
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
         """Progress towards the goal [m], less the penalty where the pillar is hit."""
         progress, terms = super().reward(before, after, goal, action)
-        collision = -self.options.collision_penalty * self.hit(after, goal)
+        collision = -self.options.collision_penalty * self.hit(after, goal).astype(jnp.float32)
         return progress + collision, {**terms, "collision": collision}
 
     def terminated(self, robot: RobotState, goal: ObstacleGoal) -> Bool[Array, ""]:
