@@ -479,11 +479,11 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
+def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Config:
     """Reads a YAML file, applies overrides, and checks the whole.
 
     Args:
-      path: the YAML file; it names only what differs from the defaults.
+      path: the YAML file; it names only what differs from the defaults. None: nothing does.
       overrides: `section.key=value`, the value read as YAML; the last one wins.
 
     Returns:
@@ -493,10 +493,12 @@ def load_config(path: str | Path, overrides: Sequence[str] = ()) -> Config:
       ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
         type, out of bounds or at odds with another.
     """
-    values = _read_yaml(Path(path))
+    values = {} if path is None else _read_yaml(Path(path))
     for override in overrides:
         _apply_override(values, override)
-    return parse_config(values, source=" ".join([str(path), *(f"--set {o}" for o in overrides)]))
+    return parse_config(
+        values, source=" ".join([str(path or "config"), *(f"--set {o}" for o in overrides)])
+    )
 
 
 def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:

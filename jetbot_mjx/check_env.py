@@ -1,0 +1,80 @@
+"""Checks a task before it is trained: `python -m jetbot_mjx.check_env my_task:MyTask`.
+
+Every fault in one line, with the remedy. A built-in task goes by its class alone, such as
+`GoalTask`; one with settings is checked as a run would have it, `--config my_task.yaml`.
+"""
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from jetbot_mjx import cli
+from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.task_checks import CHECKS, MEANINGS, Finding, check_task
+
+BROKEN = 1
+"""Exit code: something is wrong with the task."""
+
+_BUILT_IN = "jetbot_mjx.task"
+
+
+def run(config: Config) -> Iterator[tuple[str, list[Finding]]]:
+    """Checks the task of a configuration.
+
+    Args:
+      config: the run.
+
+    Returns:
+      Each check's name and what it found, as they come.
+
+    Raises:
+      UserError: there is no such task, or it refuses the configuration.
+    """
+    return check_task(config)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line and checks.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      0, or 1 where something is wrong with the task.
+    """
+    parser = cli.Parser(prog="python -m jetbot_mjx.check_env", description=__doc__)
+    parser.add_argument(
+        "task", nargs="?", metavar="package.module:Class", help="default: that of --config"
+    )
+    parser.add_argument("--config", type=Path, help="YAML file with the task's settings")
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="override one setting; may be given again",
+    )
+    options = parser.parse_args(arguments)
+    if options.task is None and options.config is None:
+        parser.error("name a task as package.module:Class, or a --config that does")
+    overrides = list(options.overrides)
+    if options.task is not None:
+        name = options.task if ":" in options.task else f"{_BUILT_IN}:{options.task}"
+        overrides.append(f"task.name={name}")
+    config = load_config(options.config, overrides)
+    cli.require_device()
+    cli.use_compilation_cache()
+    wrong, last = 0, ""
+    for last, findings in run(config):
+        wrong += len(findings)
+        print(f"{'wrong' if findings else 'ok':5}  {last:8}  {MEANINGS[last]}", flush=True)
+        for finding in findings:
+            print(f"{'':7}- {finding.message}", flush=True)
+    if left := list(CHECKS)[list(CHECKS).index(last) + 1 :]:
+        print(f"not checked until that is mended: {', '.join(left)}")
+    print(f"{config.task.name}: " + (f"{wrong} findings" if wrong else "nothing wrong"))
+    return BROKEN if wrong else 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
