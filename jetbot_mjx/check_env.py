@@ -64,15 +64,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = load_config(options.config, overrides)
     cli.require_device()
     cli.use_compilation_cache()
-    wrong, last = 0, ""
-    for last, findings in run(config):
+    wrong, left = 0, list(CHECKS)
+    for name, findings in run(config):
         wrong += len(findings)
-        print(f"{'wrong' if findings else 'ok':5}  {last:8}  {MEANINGS[last]}", flush=True)
+        left.remove(name)
+        print(f"{'wrong' if findings else 'ok':5}  {name:8}  {MEANINGS[name]}", flush=True)
         for finding in findings:
             print(f"{'':7}- {finding.message}", flush=True)
-    if left := list(CHECKS)[list(CHECKS).index(last) + 1 :]:
+    if wrong and left:
         print(f"not checked until that is mended: {', '.join(left)}")
-    print(f"{config.task.name}: " + (f"{wrong} findings" if wrong else "nothing wrong"))
+    print(
+        f"{config.task.name}: "
+        + (f"{wrong} fault{'s' * (wrong > 1)}" if wrong else "nothing wrong")
+    )
     return BROKEN if wrong else 0
 
 

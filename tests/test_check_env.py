@@ -1,0 +1,60 @@
+"""The command: what it prints, its exit codes, and what it says of a user's mistake."""
+
+import gliding
+import pytest
+
+from jetbot_mjx import check_env
+from jetbot_mjx.errors import UserError
+
+
+def test_a_sound_task_is_clean(capsys):
+    with gliding.everywhere():
+        assert check_env.main(["broken_tasks:Sound"]) == 0
+    printed = capsys.readouterr().out
+    assert printed.count("ok ") == 11
+    assert printed.splitlines()[-1] == "broken_tasks:Sound: nothing wrong"
+
+
+def test_a_fault_is_told_in_one_line_and_in_the_exit_code(capsys):
+    assert check_env.main(["broken_tasks:Raises"]) == 1
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[1].startswith("wrong  purity")
+    assert lines[2].startswith("       - observe raises KeyError: 'lidar' (broken_tasks.py:")
+    assert lines[3].startswith("not checked until that is mended: types, draws")
+    assert lines[4] == "broken_tasks:Raises: 1 fault"
+
+
+def test_a_built_in_task_goes_by_its_class(capsys, monkeypatch):
+    asked = []
+    monkeypatch.setattr(check_env, "run", lambda config: asked.append(config.task) or iter(()))
+    check_env.main(["GoalTask", "--set", "task.observation=egocentric"])
+    assert (asked[0].name, asked[0].observation) == ("jetbot_mjx.task:GoalTask", "egocentric")
+
+
+def test_a_configuration_names_its_task(root, monkeypatch):
+    asked = []
+    monkeypatch.setattr(check_env, "run", lambda config: asked.append(config.task) or iter(()))
+    check_env.main(["--config", str(root / "examples" / "gates.yaml")])
+    assert (asked[0].name, asked[0].episode_length) == ("gates_task:GatesTask", 360)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "told"),
+    [
+        (["nowhere.at_all:Task"], "no module named 'nowhere'"),
+        (["broken_tasks:Nobody"], "broken_tasks has no 'Nobody'"),
+        (["Nobody"], "jetbot_mjx.task has no 'Nobody'"),
+        (["GoalTask", "--set", "task.optoins.a=1"], "optoins"),
+        (["broken_tasks:Drawn"], "is no task: it lacks sample"),
+    ],
+)
+def test_a_users_mistake_is_one_line(arguments, told):
+    with pytest.raises(UserError, match=told):
+        check_env.main(arguments)
+
+
+def test_a_command_that_names_nothing_is_refused(capsys):
+    with pytest.raises(SystemExit) as left:
+        check_env.main([])
+    assert left.value.code == 2
+    assert "name a task as package.module:Class" in capsys.readouterr().err
