@@ -26,7 +26,7 @@ POST_HEIGHT = 0.2  # [m]
 
 LEG = (0.35, 0.55)  # [m] from one gate to the next
 FIRST_TURN = 1.5  # [rad] largest bearing of the first gate from the start, to either side
-TURN = 0.7  # [rad] largest turn from one leg to the next, to either side
+TURN = 1.1  # [rad] largest turn from one leg to the next, to either side
 BONUS = 0.2  # [m] what passing a gate is worth, in the unit of progress
 
 

@@ -120,7 +120,7 @@ def reader(checkout, monkeypatch):
     before = set(sys.modules)
     yield sit
     for name in set(sys.modules) - before:
-        if name in {"my_task", "obstacle_task"}:
+        if name in {"my_task", "obstacle_task", "pillars_task", "gates_task"}:
             del sys.modules[name]
 
 

@@ -18,10 +18,12 @@ import pytest
 from ruamel.yaml import YAML
 
 from jetbot_mjx import (
+    check_env,
     cli,
     evaluate,
     export,
     metrics,
+    new_task,
     plan,
     play,
     render,
@@ -365,6 +367,8 @@ VARIABLES = {
     *("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
 }
 COMMANDS = {
+    "new_task": new_task,
+    "check_env": check_env,
     "plan": plan,
     "train": train,
     "evaluate": evaluate,
@@ -432,7 +436,7 @@ def reader(tmp_path, monkeypatch):
     before = set(sys.modules)
     yield sit
     for name in set(sys.modules) - before:
-        if name in {"my_task", "obstacle_task"}:
+        if name in {"my_task", "obstacle_task", "pillars_task", "gates_task"}:
             del sys.modules[name]
 
 
@@ -589,7 +593,7 @@ def test_the_task_of_the_page_does_what_it_says(reader, monkeypatch):
 
 
 def test_every_part_of_the_contract_is_on_the_page(root):
-    from jetbot_mjx.task import _TASK_METHODS
+    from jetbot_mjx.task import METHODS
 
-    for name in (*_TASK_METHODS, "layout"):
+    for name in (*METHODS, "layout"):
         assert f"| `{name}" in PAGES["own-task.md"]

@@ -207,3 +207,11 @@ def test_training_and_judging_run_end_to_end(load, env, tmp_path):
     assert told
     assert all(distance == pytest.approx(distances[goal]) for goal, distance in told.items())
     assert (report.folder / "report.html").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pillars", "gates"])
+def test_the_larger_examples_reach_nine_tenths(name, root, tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(root / "examples"))
+    training.run(load_config(root / "examples" / f"{name}.yaml"), tmp_path / "run")
+    assert evaluate.run(tmp_path / "run").policy.success_rate >= 0.9

@@ -44,6 +44,8 @@ NOUNS = (
     "sensors",
     "randomization",
     "wrappers",
+    "task_trials",
+    "task_checks",
     "policy",
     "advantages",
     "ppo",
@@ -105,7 +107,18 @@ ADAPTERS = tuple(
         "stable_baselines3",
     )
 )
-VERBS = ("plan", "train", "evaluate", "render", "replay", "play", "export", "sim2real")
+VERBS = (
+    "new_task",
+    "check_env",
+    "plan",
+    "train",
+    "evaluate",
+    "render",
+    "replay",
+    "play",
+    "export",
+    "sim2real",
+)
 ORDER = (*NOUNS, *ADAPTERS, *VERBS)
 """A module knows only those before it, a verb no other verb, and none but adapters an adapter."""
 
