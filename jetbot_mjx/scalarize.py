@@ -358,13 +358,15 @@ class _Writer:
         (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
         rows = _grouped(a, batch_a, sum_a)
         columns = _grouped(b, batch_b, sum_b)
-        zero = equation.outvars[0].aval.dtype.type(0)
+        dtype = np.dtype(equation.outvars[0].aval.dtype)
         sums = []
         for block, other in zip(rows, columns, strict=True):
             for row in block:
                 for column in other:
-                    total: Scalar = zero
-                    for x, y in zip(row, column, strict=True):
+                    total: Scalar = dtype.type(0)
+                    for pair in zip(row, column, strict=True):
+                        # JAX multiplies whole numbers by others here.
+                        x, y = (self._graph.convert(number, dtype) for number in pair)
                         product = self._graph.apply("mul", x, y)
                         total = self._graph.apply("add", total, product)
                     sums.append(total)

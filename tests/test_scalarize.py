@@ -94,6 +94,16 @@ def test_a_program_does_what_the_function_does(name):
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-6)
 
 
+def test_a_product_of_two_dtypes_is_one_of_the_results():
+    # As in the frame of a contact that has friction.
+    program = scalarize(lambda x: jnp.dot(x, jnp.where(x[0] > 0, 1, 0)), MATRIX)
+    x = np.float32(np.random.default_rng(3).normal(size=MATRIX.shape))
+    np.testing.assert_allclose(program.evaluate([x])[0], x @ (x[0] > 0), rtol=1e-6)
+    for value in program.values:
+        if value.op == "mul":
+            assert {x.dtype for x in value.operands} == {value.dtype}
+
+
 @pytest.mark.parametrize(
     ("function", "reason"),
     [

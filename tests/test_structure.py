@@ -45,6 +45,7 @@ NOUNS = (
     "randomization",
     "wrappers",
     "task_trials",
+    "method_checks",
     "task_checks",
     "policy",
     "advantages",
