@@ -6,7 +6,11 @@ from typing import Any, Literal, get_args
 
 import mujoco
 import numpy as np
+import trimesh
 import viser
+from trimesh.exchange import gltf
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
 
 from jetbot_mjx.geoms import shown_geoms
 from jetbot_mjx.model import QPOS_XYZ
@@ -19,6 +23,11 @@ Camera = Literal["free", "looks at the robot", "behind the robot"]
 CAMERAS: tuple[Camera, ...] = get_args(Camera)
 
 _FLOOR_PER_REACH = 2.5  # half the floor's side over the distance of the farthest goal
+_CELL, _SECTION = 0.25, 0.5  # [m] between the floor's lines, thin and thick
+_LINES = (
+    ("thin", _CELL, 0.003, (165, 170, 176)),
+    ("thick", _SECTION, 0.006, (125, 131, 139)),
+)  # [m] from one to the next, and across
 _EYE_PER_REACH = (-0.43, -0.88, 1.0)  # where pages open, in the same measure
 _LOOK_AT_PER_REACH = (0.12, -0.08, 0.0)  # aside of the origin, which the panel would hide
 _BEHIND_B = (-0.65, 0.45)  # [m] camera behind and above the robot
@@ -87,21 +96,31 @@ class Scene:
             self._ask(self._player.move_goal, float(goal_w[0]), float(goal_w[1]))
 
     def cast_shadows(self, cast: bool) -> None:
-        """Lets the sun cast shadows, or not."""
-        self._sun.cast_shadow = cast
+        """Lets the sun cast shadows on a floor that takes them, or not."""
+        with self._server.atomic():
+            self._sun.cast_shadow = cast
+            self._plane.visible = cast
+            self._lines.visible = not cast
 
     def _add_floor(self) -> None:
-        self._server.scene.add_grid(
+        scene = self._server.scene
+        # Without a GPU, a plane that fills the page takes half of every picture's time: there the
+        # floor is the page's own white with lines on it, and the plane waits for its shadows.
+        self._plane = scene.add_grid(
             "/floor",
             width=2 * self._edge,
             height=2 * self._edge,
-            cell_size=0.1,
-            section_size=0.5,
+            cell_size=_CELL,
+            section_size=_SECTION,
             cell_color=(190, 195, 201),
             section_color=(140, 147, 155),
             plane_color=(214, 218, 223),
             plane_opacity=1.0,
             shadow_opacity=0.35,
+            visible=False,
+        )
+        self._lines = scene.add_glb(
+            "/lines", _lines(self._edge), cast_shadow=False, receive_shadow=False
         )
 
     def _add_lights(self) -> None:
@@ -157,3 +176,30 @@ class Scene:
                 client.camera.look_at = robot_w + _AHEAD_B * ahead
             else:
                 client.camera.look_at = robot_w
+
+
+def _lines(edge: float) -> bytes:
+    """A square's lattice [m] about the origin, flat on the floor, as binary glTF."""
+    scene = trimesh.Scene()
+    for name, spacing, width, color in _LINES:
+        count = int(edge / spacing)
+        middle = spacing * np.arange(-count, count + 1)
+        low, high, end = middle - width / 2, middle + width / 2, np.full_like(middle, edge)
+        boxes = np.stack(
+            [np.r_[low, -end], np.r_[-end, low], np.r_[high, end], np.r_[end, high]], axis=1
+        )
+        corners = boxes[:, [[0, 1], [2, 1], [2, 3], [0, 3]]].reshape(-1, 2)
+        first = 4 * np.arange(len(boxes))[:, None, None]
+        faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
+        mesh = trimesh.Trimesh(np.pad(corners, ((0, 0), (0, 1))), faces, process=False)
+        paint = PBRMaterial(name=name, baseColorFactor=(*color, 255))
+        mesh.visual = TextureVisuals(material=paint)
+        scene.add_geometry(mesh, geom_name=name)
+    return gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
+
+
+def _unlit(tree: dict[str, Any]) -> None:
+    # Thin lines are many pixels' edges, and lighting each costs more than the robot does.
+    tree["extensionsUsed"] = ["KHR_materials_unlit"]
+    for material in tree["materials"]:
+        material["extensions"] = {"KHR_materials_unlit": {}}

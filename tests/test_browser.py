@@ -1,5 +1,6 @@
 """The page's server, scene and panel, without a browser: `test_page.py` has one."""
 
+import io
 import math
 import socket
 import types
@@ -9,6 +10,7 @@ import urllib.request
 import mujoco
 import numpy as np
 import pytest
+import trimesh
 import websockets.sync.client
 
 from jetbot_mjx.errors import UserError
@@ -152,6 +154,18 @@ def test_the_goal_is_red_and_has_its_size(browser):
     red, green, blue = cube.color
     assert red > 3 * max(green, blue)
     np.testing.assert_allclose(np.ptp(cube.vertices, axis=0), 0.1, rtol=1e-6)
+
+
+def test_only_shadows_need_a_floor_that_fills_the_page(browser):
+    plane, lines = map(browser.server.scene.get_handle_by_name, ("/floor", "/lines"))
+    assert (plane.visible, lines.visible) == (False, True)
+    floor = trimesh.load_scene(io.BytesIO(lines.glb_data), file_type="glb")
+    assert floor.area < 0.1 * plane.width * plane.height
+    np.testing.assert_allclose(floor.extents, (plane.width, plane.height, 0.0), atol=0.01)
+    browser.scene.cast_shadows(True)
+    assert (plane.visible, lines.visible) == (True, False)
+    browser.scene.cast_shadows(False)
+    assert (plane.visible, lines.visible) == (False, True)
 
 
 def test_a_ray_from_above_moves_the_goal_to_where_it_meets_the_floor(browser, player):
