@@ -63,4 +63,4 @@ def program(command):
 if __name__ == "__main__":
     command = importlib.import_module(f"jetbot_mjx.{sys.argv.pop(1)}")
     with everywhere():
-        cli.run_command(command.main)
+        cli.run_command(command.main, at_once=command.__name__.endswith(".train"))

@@ -54,13 +54,13 @@ def dwell_in_calls(seconds):
 
 {before_imports}
 import gliding
-from jetbot_mjx import cli, train
+from jetbot_mjx import cli, train, training
 from jetbot_mjx.evaluation import Evaluator
 from jetbot_mjx.resumable_ppo import Program
 from jetbot_mjx.store import Store
 {before_training}
 with gliding.everywhere():
-    cli.run_command(train.main)
+    cli.run_command(train.main, at_once=True)
 """
 
 
@@ -119,7 +119,7 @@ def test_while_importing_the_signal_ends_the_process_and_nothing_is_written(tmp_
 
 
 def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
-    with training(tmp_path / "run", f"dwell(train, 'make_env', {LONG})") as process:
+    with training(tmp_path / "run", f"dwell(training, 'make_env', {LONG})") as process:
         assert stop(process, "make_env") == -signal.SIGTERM
     assert not (tmp_path / "run").exists()
 
