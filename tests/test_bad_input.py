@@ -13,9 +13,7 @@ import pytest
 from test_cli import COMMANDS, SMOKE, damage_about, damaged, here, refused, trained
 from test_config import refusal, write
 from test_metrics import read_events
-from test_structure import ORDER
 
-import jetbot_mjx
 from jetbot_mjx import cli, evaluate, render, train
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
@@ -189,7 +187,3 @@ def test_tensorboard_can_be_read_while_training_runs(tmp_path):
     seen = len(read_events(tmp_path / "tensorboard"))
     sink.close()
     assert seen == 20
-
-
-def test_docstring():
-    assert re.findall(r"`(\w+)`", jetbot_mjx.__doc__) == list(ORDER)
