@@ -323,12 +323,36 @@ def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monk
     assert "mm at the end" in capsys.readouterr().out
 
 
+def test_documented_tasks_are_written_and_checked(tmp_path):
+    found = [
+        one.values
+        for name in ("new_task", "check_env")
+        for one in of_kind("python", "-m", f"jetbot_mjx.{name}")
+    ]
+    assert len(found) == 5
+    for page, words in found:
+        folder = tmp_path / page
+        folder.mkdir(exist_ok=True)
+        for name, text in own_files(page).items() if page in PAGES else ():
+            (folder / name).write_text(text, encoding="utf-8")
+        start = words.index("-m") + 1
+        name = words[start].removeprefix("jetbot_mjx.")
+        with pytest.MonkeyPatch.context() as patch:
+            patch.chdir(folder)
+            # As `python -m` does.
+            patch.syspath_prepend(str(folder))
+            patch.delitem(sys.modules, "my_task", raising=False)
+            assert run(name, words[start + 1 :]) == 0, words
+            sys.modules.pop("my_task", None)
+
+
 def test_no_kind_of_command_is_left_out():
     # Installing needs a network, Slurm a cluster, copying a robot; the tests that are named run
     # among these; Python is run as it is.
     elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",), ("srun",)}
     elsewhere |= {("scp",)}
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
+    covered |= {"new_task", "check_env"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":
