@@ -173,7 +173,7 @@ def test_the_source_is_all_python_and_all_models():
     """A file that is left out would let an old program be taken for a new one."""
     root = Path(programs.__file__).parent
     suffixes = {path.suffix for path in root.rglob("*") if path.is_file()}
-    assert suffixes - {".html", ".md", ".typed", ".pyc", ""} <= programs.SOURCES
+    assert suffixes - {".html", ".md", ".pyc", ".template", ".typed", ""} <= programs.SOURCES
 
 
 # A training.

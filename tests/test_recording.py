@@ -23,7 +23,7 @@ def recorder(root, tmp_path, monkeypatch):
     """Makes recorders that judge by heart."""
 
     class Evaluator:
-        def __init__(self, env, networks):
+        def __init__(self, env, networks, **_):
             pass
 
         def run(self, params, keys):
@@ -68,7 +68,7 @@ def events(monkeypatch, tmp_path):
         return len((run_dir / "metrics.jsonl").read_text().splitlines())
 
     class Film:
-        def __init__(self, env, networks):
+        def __init__(self, env, networks, **_):
             pass
 
         def write(self, path, params, env_steps):
