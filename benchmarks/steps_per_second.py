@@ -114,7 +114,7 @@ def _parser() -> argparse.ArgumentParser:
         "--compare",
         type=Path,
         metavar="OLD.json",
-        help=f"an earlier file; exit code 1 where a rate is {MOST_SLOWDOWN:.0%} slower than there",
+        help=f"an earlier file; exit code 1 where a rate is {MOST_SLOWDOWN:.0%}% slower than there",
     )
     return parser
 

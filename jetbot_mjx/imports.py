@@ -3,7 +3,8 @@
 MuJoCo loads GLFW before anyone asks for a window; MJX trimesh and SciPy's geometry for meshes that
 no robot here has, and it prints two lines when its optional Warp part is absent; Brax JAXopt for an
 engine that is not used here; tensorboardX a service that nobody logs to. On a slow machine that is
-the better part of two seconds, before anything has begun.
+the better part of two seconds, before anything has begun. And a training needs no OpenGL, so that
+MuJoCo has to do without what `MUJOCO_GL` asks for in vain.
 """
 
 import contextlib
@@ -112,10 +113,19 @@ def _mjx() -> Iterator[None]:
         yield
 
 
+@contextlib.contextmanager
+def _opengl() -> Iterator[None]:
+    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`; who needs pictures is told why by
+    # `offscreen.find_backend`. PyOpenGL fails by an AttributeError where the library is missing.
+    with contextlib.suppress(ImportError, AttributeError, OSError, RuntimeError):
+        yield
+
+
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", PutOff("jaxopt")),
     "mujoco.glfw": lambda: standing_in("glfw", PutOff("glfw")),
     "mujoco.mjx": _mjx,
+    "mujoco.rendering.classic.gl_context": _opengl,
     "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _Comet()),
 }
 """By the module that imports them."""

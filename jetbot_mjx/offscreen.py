@@ -28,6 +28,22 @@ from jetbot_mjx.errors import UserError
 
 _BACKENDS = ("egl", "osmesa", "glfw")
 
+_UNDECIDED = (
+    "",
+    "0",
+    "1",
+    "cgl",
+    "disable",
+    "disabled",
+    "enable",
+    "enabled",
+    "false",
+    "glx",
+    "off",
+)
+_UNDECIDED += ("on", "true", "wgl")
+"""What `MUJOCO_GL` may say besides, to MuJoCo; here it leaves the choice open."""
+
 _OVERSAMPLING = 2
 """Pixels drawn for one of the picture, along each axis. As smooth as OpenGL's own four samples a
 pixel, and where a CPU draws it takes two thirds of the time, of small pictures one third."""
@@ -185,15 +201,19 @@ def overview(
 
 @functools.cache
 def find_backend() -> str:
-    """The first OpenGL back end that works here; `MUJOCO_GL`, where set, is the only choice.
+    """The first OpenGL back end that works here; one that `MUJOCO_GL` names is the only choice.
 
     Returns:
       `egl`, `osmesa` or `glfw`.
 
     Raises:
-      UserError: none works; the message names what to install.
+      UserError: none works, and the message names what to install; or there is none of that name.
     """
-    wanted = os.environ.get("MUJOCO_GL", "").lower()
+    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
+    if wanted not in (*_BACKENDS, *_UNDECIDED):
+        raise UserError(
+            f"MUJOCO_GL = {wanted!r}: no such back end; unset it, or give egl or osmesa"
+        )
     candidates = (wanted,) if wanted in _BACKENDS else _BACKENDS
     for backend in candidates:
         # A display is what glfw needs; without one it fails slowly and loudly.

@@ -1,5 +1,6 @@
 """What the benchmarks say: of an earlier file, of a compiled program, of the files of results."""
 
+import importlib
 import json
 import sys
 from pathlib import Path
@@ -35,6 +36,21 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.state import robot_state
 
 SMALL = Sizes(repeats=2, unroll=4, training_steps=1)
+
+COMMANDS = sorted(
+    path.stem
+    for path in (ROOT / "benchmarks").glob("*.py")
+    if "def main(" in path.read_text("utf-8")
+)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_says_what_was_meant(capsys, name):
+    with pytest.raises(SystemExit) as caught:
+        importlib.import_module(name).main(["--help"])
+    out, err = capsys.readouterr()
+    assert (caught.value.code, err) == (0, "")
+    assert "option_strings" not in out  # what a lone percent sign turns into
 
 
 def rate(name, num_envs, steps_per_second):

@@ -1,6 +1,9 @@
 import functools
 import inspect
+import os
 import shutil
+import subprocess
+import sys
 
 import imageio.v3 as iio
 import jax
@@ -247,3 +250,25 @@ def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
             offscreen.find_backend()
     finally:
         offscreen.find_backend.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "said"),
+    [("osmesa", "'osmesa' does not work here"), ("software", "'software': no such back end")],
+)
+def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(tmp_path, wanted, said):
+    (tmp_path / "OpenGL.py").write_text("None.glGetError", "utf-8")  # what PyOpenGL does
+    environment = {**os.environ, "MUJOCO_GL": wanted, "PYTHONPATH": str(tmp_path)}
+    program = """
+import jetbot_mjx.physics
+from jetbot_mjx import errors, offscreen
+try:
+    offscreen.find_backend()
+except errors.UserError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], env=environment, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert said in done.stdout
