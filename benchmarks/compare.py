@@ -2,14 +2,15 @@
 
   physics     this project's `JetBotEnv.step_physics` under random actions
   mujoco      C MuJoCo's threaded `mujoco.rollout`: same model, sub-steps, actions held as long
+  warp        MJX-Warp on the same model, on an NVIDIA GPU
   env         this project's training environment under random actions
   playground  MuJoCo Playground's CartpoleBalance, which is smaller, as its trainers see it
   training    this project's PPO, rollouts and updates
   stock       Brax's own `ppo.train` with the same hyperparameters
   sb3         Stable-Baselines3's PPO with the tutorial's, on one robot in C MuJoCo
 
-All rates are environment steps per second. physics and mujoco take turns, so that what else the
-machine does meets both. What needs a package that is not installed is left out, in one line.
+All rates are environment steps per second. The first three take turns, so that what else the
+machine does meets all. What needs a package that is not installed is left out, in one line.
 """
 
 import argparse
@@ -21,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from contenders import Contender, MujocoRollout, Sb3, prepare_playground
+from contenders import Contender, MujocoRollout, Sb3, prepare_playground, prepare_warp
 from measurements import MEASUREMENTS, Sizes, prepare_env, prepare_physics, training_config
 from results import check_output, conditions, counts, default_output, write
 from timing import Row, available_cores
@@ -31,8 +32,9 @@ from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
 
 _CONFIG = Path(__file__).resolve().parents[1] / "configs" / "jetbot.yaml"
-_PAIR = ("physics", "mujoco")
-CONTENDERS = (*_PAIR, "env", "playground", "training", "stock", "sb3")
+_OTHERS = ("mujoco", "warp")
+"""Physics by other means."""
+CONTENDERS = ("physics", *_OTHERS, "env", "playground", "training", "stock", "sb3")
 _NEEDS = {
     "playground": (
         ("mujoco_playground", "lxml"),
@@ -43,6 +45,7 @@ _NEEDS = {
         ("torch", "stable_baselines3", "gymnasium"),
         "pip install -c constraints.txt '.[sb3]', best after torch's build for CPUs",
     ),
+    "warp": (("warp",), "pip install 'mujoco-mjx[warp]'"),
 }
 _BATCHES = {"cpu": (64, 128, 256, 512), "gpu": (4_096, 65_536)}
 _ROLLOUT_BATCHES = (16, 64, 256)
@@ -79,6 +82,8 @@ def run(
     if "mujoco" in contenders:
         batches = [count * available_cores() for count in _ROLLOUT_BATCHES]
         turns += [MujocoRollout(config, count, sizes) for count in batches]
+    if "warp" in contenders:
+        turns += [prepare_warp(config, count, sizes) for count in num_envs]
     measured = in_turns(turns, sizes.repeats)
     report(measured)
     best = _best([row for row, _ in measured])
@@ -91,33 +96,34 @@ def run(
     for name in contenders:
         if name in prepare:
             report(in_turns([prepare[name]()], sizes.repeats))
-        elif name not in _PAIR:
+        elif name not in ("physics", *_OTHERS):
             # The trainers' own reports are their clock.
             wall, cpu = time.perf_counter(), time.process_time()
             row = MEASUREMENTS[name](config, config.ppo.num_envs, sizes)
             report([(row, [(time.process_time() - cpu) / (time.perf_counter() - wall)])])
 
 
-def ratios(results: Sequence[Result], *, per_core: bool = False) -> list[float]:
-    """How `physics` compares with `mujoco`, each at its best number of environments.
+def ratios(results: Sequence[Result], other: str, *, per_core: bool = False) -> list[float]:
+    """How `physics` compares with another, each at its best number of environments.
 
     Args:
       results: what was measured.
+      other: `mujoco` or `warp`.
       per_core: compares steps per second of processor time, not of the clock on the wall.
 
     Returns:
       The ratio in each round; nothing where one of them was not measured.
     """
     best = _best([row for row, _ in results])
-    if not set(_PAIR) <= set(best):
+    if not {"physics", other} <= set(best):
         return []
     ours, theirs = (
         [rate / (busy if per_core else 1.0) for rate, busy in zip(row.repeats, cores, strict=True)]
-        for name in _PAIR
+        for name in ("physics", other)
         for row, cores in results
         if row is best[name]
     )
-    return [one / other for one, other in zip(ours, theirs, strict=True)]
+    return [one / another for one, another in zip(ours, theirs, strict=True)]
 
 
 def _best(rows: Sequence[Row]) -> dict[str, Row]:
@@ -142,6 +148,8 @@ def in_turns(contenders: Sequence[Contender], rounds: int) -> list[Result]:
 
 def missing(contender: str) -> str | None:
     """Why a contender has to be left out, in one line; None: nothing is missing."""
+    if contender == "warp" and jax.default_backend() != "gpu":
+        return "warp left out: MJX-Warp needs an NVIDIA GPU"
     packages, remedy = _NEEDS.get(contender, ((), ""))
     absent = [name for name in packages if importlib.util.find_spec(name) is None]
     return f"{contender} left out, no {', '.join(absent)}: {remedy}" if absent else None
@@ -167,18 +175,23 @@ def table_row(row: Row, busy: Sequence[float]) -> str:
 def _as_json(results: Sequence[Result]) -> dict[str, Any]:
     return {
         "comparison": [{**row._asdict(), "busy_cores": busy} for row, busy in results],
-        "physics_over_mujoco": ratios(results),
-        "physics_over_mujoco_per_core": ratios(results, per_core=True),
+        "physics_over_mujoco": ratios(results, "mujoco"),
+        "physics_over_mujoco_per_core": ratios(results, "mujoco", per_core=True),
+        "physics_over_warp": ratios(results, "warp"),
     }
 
 
 def ratio_lines(results: Sequence[Result]) -> list[str]:
-    """How `physics` compares with `mujoco`, for people; nothing where one was not measured."""
+    """How `physics` compares with others, for people; nothing where one was not measured."""
     lines = []
-    for per_core, unit in ((False, "second"), (True, "second of processor time")):
-        if found := ratios(results, per_core=per_core):
+    for other, per_core, unit in (
+        ("mujoco", False, "second"),
+        ("mujoco", True, "second of processor time"),
+        ("warp", False, "second"),
+    ):
+        if found := ratios(results, other, per_core=per_core):
             lines.append(
-                f"physics over mujoco, steps per {unit}: {statistics.median(found):.2f}"
+                f"physics over {other}, steps per {unit}: {statistics.median(found):.2f}"
                 f" ({min(found):.2f} .. {max(found):.2f} over {len(found)} rounds)"
             )
     return lines

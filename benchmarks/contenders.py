@@ -16,6 +16,7 @@ import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float
 from measurements import Sizes
+from mujoco import mjx
 from one_robot import OneRobot, make_physics_model, wheel_targets
 from timing import (
     REPEAT_SECONDS,
@@ -33,7 +34,9 @@ from timing import (
 )
 
 from jetbot_mjx.config import Config
+from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.state import PhysicsState
 
 PLAYGROUND_ENV = "CartpoleBalance"
 _PLAYGROUND_EPISODE = 1000
@@ -195,6 +198,36 @@ def as_gymnasium(robot: OneRobot) -> Any:
             return robot.step(action)
 
     return Env()
+
+
+def prepare_warp(config: Config, num_envs: int, sizes: Sizes) -> Timed:
+    """MJX-Warp on the same C model, under random actions.
+
+    Contacts of all robots share one buffer, which holds as many as MJX has.
+    """
+    env, model = make_env(config), make_physics_model(config)
+    n_substeps = config.physics.n_substeps
+    most = mjx.make_data(model)._impl
+    warp_model = mjx.put_model(model, impl="warp")
+    data = mjx.make_data(
+        model, impl="warp", naconmax=num_envs * int(most.ncon), njmax=int(most.nefc)
+    )
+
+    def step_robot(physics: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
+        world = data.replace(**vars(physics), ctrl=ctrl)
+        for _ in range(n_substeps):
+            world = mjx.step(warp_model, world)
+        return PhysicsState(*(getattr(world, name) for name in vars(physics)))
+
+    def step(carry: Carry) -> Carry:
+        key, actions = random_actions(carry.key, num_envs)
+        physics = jax.vmap(step_robot)(carry.state, jax.vmap(env.wheel_targets)(actions))
+        return Carry(
+            physics, key, carry.tally._replace(checksum=carry.tally.checksum + sums(physics))
+        )
+
+    first = jax.jit(jax.vmap(env.reset))(env_keys(num_envs)).pipeline_state
+    return Timed("warp", step, first, n_substeps=n_substeps, calls=sizes.unroll)
 
 
 def prepare_playground(num_envs: int, sizes: Sizes) -> Timed:

@@ -149,17 +149,19 @@ def _comparison(values: Mapping[str, Any]) -> str:
         for row in values["comparison"]
     ]
     table = _table(head, "lrrrr", rows)
-    told = []
-    for key, unit in (("", "second"), ("_per_core", "second of processor time")):
-        if ratios := values[f"physics_over_mujoco{key}"]:
-            ends = f"{min(ratios):.2f} .. {max(ratios):.2f}"
-            told.append(f"{statistics.median(ratios):.2f} ({ends}) per {unit}")
-    if not told:
-        return table
-    return (
-        f"{table}\n\n`physics` over `mujoco`, each at its best, median over rounds:"
-        f" {', '.join(told)}."
-    )
+    units = ("", "second"), ("_per_core", "second of processor time")
+    for other in ("mujoco", "warp"):
+        told = []
+        for key, unit in units:
+            if ratios := values.get(f"physics_over_{other}{key}"):
+                ends = f"{min(ratios):.2f} .. {max(ratios):.2f}"
+                told.append(f"{statistics.median(ratios):.2f} ({ends}) per {unit}")
+        if told:
+            table += (
+                f"\n\n`physics` over `{other}`, each at its best, median over rounds:"
+                f" {', '.join(told)}."
+            )
+    return table
 
 
 def adapters_table(results: Results) -> str:

@@ -342,21 +342,24 @@ def test_physics_and_mujoco_take_turns_and_are_compared_at_their_best(world_conf
         report=found.extend,
     )
     assert order[: len(order) // 3] * 3 == order
-    assert compare.ratios(found) == [1.5, 6.0, 2.0]
+    assert compare.ratios(found, "mujoco") == [1.5, 6.0, 2.0]
     assert "per second: 2.00 (1.50 .. 6.00 over 3 rounds)" in compare.ratio_lines(found)[0]
     # As if physics had had two cores and mujoco one.
     busy = [(row, [2.0 if row.rate == "physics" else 1.0] * 3) for row, _ in found]
-    assert compare.ratios(busy, per_core=True) == [0.75, 3.0, 1.0]
-    assert compare.ratios(found[:2]) == []
+    assert compare.ratios(busy, "mujoco", per_core=True) == [0.75, 3.0, 1.0]
+    assert compare.ratios(found[:2], "mujoco") == compare.ratios(found, "warp") == []
 
 
 def test_a_contender_without_its_package_is_left_out_in_one_line(monkeypatch):
     monkeypatch.setattr(compare.importlib.util, "find_spec", lambda name: None)
-    for name in ("sb3", "playground"):
+    monkeypatch.setattr(compare.jax, "default_backend", lambda: "gpu")
+    for name in ("sb3", "playground", "warp"):
         line = compare.missing(name)
         assert "pip install" in line
         assert "\n" not in line
     assert compare.missing("physics") is None
+    monkeypatch.setattr(compare.jax, "default_backend", lambda: "cpu")
+    assert compare.missing("warp") == "warp left out: MJX-Warp needs an NVIDIA GPU"
 
 
 def test_every_adapter_is_timed_in_turn(world_config, monkeypatch, tmp_path, capsys):
