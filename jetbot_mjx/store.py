@@ -129,11 +129,12 @@ class Store:
         """Waits until all is on disk."""
         with self._writing():
             self._manager.close()
-        self._clear_deleted()
+        shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
 
     def _clear_deleted(self) -> None:
-        # Orbax may be moving the next one in; what is left goes the next time.
-        shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
+        # The folder itself stays: Orbax may be about to move the next one in.
+        for path in (self._folder / _DELETED).glob("*"):
+            shutil.rmtree(path, ignore_errors=True)
 
     def _check_space(self, size: int) -> None:
         """Refuses before anything is begun that could not be finished."""

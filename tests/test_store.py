@@ -163,6 +163,17 @@ def test_the_latest_the_first_and_the_best_stay_and_of_equals_the_later(run_dir,
     assert checkpoint_steps(run_dir) == kept
 
 
+def test_where_old_ones_are_moved_to_is_not_taken_away_while_one_may_be_on_its_way(run_dir):
+    with Store(run_dir, keep=1) as store:
+        moved = run_dir / FOLDER / ".deleted"
+        (moved / "1").mkdir(parents=True)
+        before = moved.stat()
+        store.save(1, {"tree": TREE}, {}, None)
+        assert moved.stat().st_ino == before.st_ino
+        assert list(moved.iterdir()) == []
+    assert not moved.exists()
+
+
 def test_the_best_of_an_earlier_process_stays(run_dir):
     save(run_dir, *RATES[:4], keep=1)
     save(run_dir, *RATES[4:], keep=1)
