@@ -33,8 +33,8 @@ from jetbot_mjx.resume import to_trees
 from jetbot_mjx.store import FOLDER, checkpoint_path, checkpoint_steps, read_about, read_tree
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "smoke.yaml"
-INTERVAL = 8_192
-"""Environment steps between two checkpoints: two training steps."""
+INTERVAL = 65_536
+"""Environment steps between two checkpoints: half a second."""
 SETTINGS = ("evaluation.episodes=16", f"checkpoint_interval={INTERVAL}")
 
 BEFORE_FIRST = "before the first save"
@@ -253,14 +253,14 @@ class Kill(NamedTuple):
 def draw_aims(kills: int, rng: random.Random) -> list[Aim]:
     """Draws when to kill, such that every phase gets its share."""
     early = [
-        Aim("started", rng.uniform(0.2, 9.0)),
+        Aim("started", rng.uniform(0.2, 3.0)),
         Aim("saving", rng.uniform(0.0, 0.05)),
-        Aim("started", rng.uniform(3.0, 9.0)),
+        Aim("started", rng.uniform(2.0, 6.0)),
         Aim("saving", rng.uniform(0.0, 0.1)),
     ]
     kinds = [
-        lambda: Aim("started", rng.uniform(0.2, 7.0)),
-        lambda: Aim("trained", rng.uniform(0.0, 4.0)),
+        lambda: Aim("started", rng.uniform(0.2, 5.0)),
+        lambda: Aim("trained", rng.uniform(0.0, 2.0)),
         lambda: Aim("reported", rng.uniform(0.0, 0.7), rng.randint(1, 3)),
         lambda: Aim("saving", rng.uniform(0.0, 0.1), rng.randint(1, 3)),
         lambda: Aim("saved", rng.uniform(0.0, 0.02), rng.randint(1, 3)),
@@ -401,7 +401,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     jax.config.update("jax_platforms", "cpu")
     os.environ["JAX_PLATFORMS"] = "cpu"
     cli.use_compilation_cache()
-    timesteps = INTERVAL * (8 + 2 * options.kills)
+    timesteps = INTERVAL * (8 + 3 * options.kills)
     settings = [*SETTINGS, "checkpoints_to_keep=4", f"ppo.num_timesteps={timesteps}"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

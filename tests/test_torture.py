@@ -16,7 +16,7 @@ from torture import SETTINGS, Aim
 from jetbot_mjx.store import checkpoint_steps
 
 # A robot that glides needs more steps for the kills to fall into.
-LONGER = (*SETTINGS, "ppo.num_timesteps=131_072")
+LONGER = (*SETTINGS, "checkpoint_interval=8_192", "ppo.num_timesteps=131_072")
 TRAINER = gliding.program("train")
 
 
