@@ -192,7 +192,7 @@ def _own_source() -> str:
 
 
 def _load(path: Path) -> jax.stages.Compiled | None:
-    """The program in a file; None where there is none, or none that is whole."""
+    """The program in a file; None where there is none, or none that can be loaded."""
     began = time.perf_counter()
     try:
         content = path.read_bytes()
@@ -203,7 +203,11 @@ def _load(path: Path) -> jax.stages.Compiled | None:
         return None
     seconds, kernels, kept = pickle.loads(body)
     cpu.register(kernels)
-    program = serialize_executable.deserialize_and_load(*kept)
+    try:
+        program = serialize_executable.deserialize_and_load(*kept)
+    except jax.errors.JaxRuntimeError:
+        # A driver that knows it no longer, say: compiling says what is wrong, if anything is.
+        return None
     with contextlib.suppress(OSError):
         path.touch()
     # As JAX does when it finds a program in its own cache, for those who listen.

@@ -95,6 +95,16 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(kept, damage):
     assert twice(again.compile("double", never)) == [0.0, 2.0, 4.0]
 
 
+def test_one_that_the_device_no_longer_loads_is_compiled_anew(kept, monkeypatch):
+    def refuse(*kept):
+        raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: another driver")
+
+    monkeypatch.setattr(programs.serialize_executable, "deserialize_and_load", refuse)
+    again = Programs({}, kept.parent, KEY)
+    assert again.find("double") is None
+    assert twice(again.compile("double", double)) == [0.0, 2.0, 4.0]
+
+
 def test_a_folder_that_cannot_be_written_costs_nothing_but_time(folder):
     nowhere = Programs({}, folder / "missing", KEY)
     assert twice(nowhere.compile("double", double)) == [0.0, 2.0, 4.0]
