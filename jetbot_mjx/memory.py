@@ -30,6 +30,13 @@ _LAYERS = 1.6
 them on the way there, and on the way back some once more."""
 
 
+_TAKEN = 1.05
+"""What is taken for what is counted, as an H200 told of 65,536 environments and more."""
+
+_PROGRAMS = 112 * 2**20
+"""What programs and the libraries that they call take besides, as it told of 256 [bytes]."""
+
+
 class Sizes(NamedTuple):
     """What one of each takes [bytes]."""
 
@@ -68,10 +75,15 @@ class Footprint(NamedTuple):
     """The episodes of an evaluation, on the first device."""
 
     @property
-    def total(self) -> int:
-        """At the fullest moment."""
+    def counted(self) -> int:
+        """What its arrays take at the fullest moment."""
         most = max(self.collecting, self.learning, self.evaluation)
         return self.parameters + self.environments + most
+
+    @property
+    def total(self) -> int:
+        """What a device has to have for it: all that is counted, and what comes on top."""
+        return int(_TAKEN * self.counted) + _PROGRAMS
 
 
 def sizes(config: Config, env: JetBotEnv) -> Sizes:

@@ -63,7 +63,7 @@ def table(plan: Plan) -> str:
         f" which has {plan.limit / GIB:.1f}; > marks the configuration",
         f"  {'num_envs':>10}  {'batch_size':>10}  "
         + "  ".join(f"{one:>12}" for one in parts)
-        + f"  {'at once':>8}",
+        + f"  {'needed':>8}",
     ]
     for one in plan.footprints:
         mark = ">" if one.num_envs == plan.config.ppo.num_envs else " "

@@ -1,12 +1,14 @@
 """What a training takes is told from shapes, and is what XLA sets aside for it."""
 
+import json
+
 import jax
 import numpy as np
 import pytest
 
 from jetbot_mjx import memory, training
 from jetbot_mjx.compiling import compiler_options
-from jetbot_mjx.config import load_config
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.memory import GIB, footprint, ladder, next_that_fits, resized, sizes
@@ -53,8 +55,20 @@ def test_xla_sets_aside_what_was_told(root, settings, fullest):
     )
     trained = told._replace(evaluation=0)
     assert fullest == max(("collecting", "learning"), key=lambda part: getattr(told, part))
-    print(f"{fullest}: told {trained.total:,} bytes, taken {taken:,}")
-    assert 0.9 * taken <= trained.total <= 1.3 * taken
+    print(f"{fullest}: told {trained.counted:,} bytes, taken {taken:,}")
+    assert 0.9 * taken <= trained.counted <= 1.3 * taken
+
+
+def test_what_a_gpu_had_in_use_was_foretold(root):
+    measured = json.loads((root / "benchmarks/results/nvidia-h200-sweep.json").read_text("utf-8"))
+    config = parse_config(measured["config"])
+    each = sizes(config, make_env(config))
+    for row in measured["results"]:
+        if row["rate"] == "training":
+            size = resized(config, row["num_envs"] / config.ppo.num_envs)
+            told = footprint(size, each, 1).total / row["peak_device_bytes"]
+            print(f"{row['num_envs']} environments: {told:.2f} of what was in use")
+            assert 1.0 <= told <= 1.35
 
 
 def test_sizes_are_those_of_the_arrays(config, env, each):
@@ -84,7 +98,7 @@ def test_seeds_take_their_memory_each(config, each):
 
 
 def test_the_ladder_ends_with_the_first_that_does_not_fit(config, each):
-    limit = 3 * footprint(config, each, 1).total
+    limit = footprint(resized(config, 3.0), each, 1).total
     found = ladder(config, each, 1, limit)
     assert [one.num_envs for one in found[:4]] == [32, 64, 128, 256]
     assert [one.total <= limit for one in found] == [True] * (len(found) - 1) + [False]
