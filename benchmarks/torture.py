@@ -35,7 +35,7 @@ from jetbot_mjx.store import FOLDER, checkpoint_path, checkpoint_steps, read_abo
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "smoke.yaml"
 INTERVAL = 65_536
 """Environment steps between two checkpoints: half a second."""
-SETTINGS = ("evaluation.episodes=16", f"checkpoint_interval={INTERVAL}")
+SETTINGS = ("evaluation.episodes=16",)
 
 BEFORE_FIRST = "before the first save"
 STARTING = "starting again"
@@ -402,7 +402,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     os.environ["JAX_PLATFORMS"] = "cpu"
     cli.use_compilation_cache()
     timesteps = INTERVAL * (8 + 3 * options.kills)
-    settings = [*SETTINGS, "checkpoints_to_keep=4", f"ppo.num_timesteps={timesteps}"]
+    settings = [*SETTINGS, f"checkpoint_interval={INTERVAL}", "checkpoints_to_keep=4"]
+    settings += [f"ppo.num_timesteps={timesteps}"]
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         began = time.monotonic()

@@ -17,7 +17,6 @@ import pytest
 sys.path.append(str(Path(__file__).parents[1] / "benchmarks"))
 
 import torture
-from torture import INTERVAL, SETTINGS
 
 from jetbot_mjx import preemption
 from jetbot_mjx.preemption import STOPPED, Preemption
@@ -25,6 +24,10 @@ from jetbot_mjx.store import checkpoint_path, checkpoint_steps
 
 LONG = 3_600
 PATIENCE = 300
+
+INTERVAL = 8_192
+"""Environment steps between two checkpoints: two training steps."""
+SETTINGS = (*torture.SETTINGS, f"checkpoint_interval={INTERVAL}")
 
 TRAINER = gliding.program("train")
 
