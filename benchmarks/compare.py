@@ -175,21 +175,27 @@ def table_row(row: Row, busy: Sequence[float]) -> str:
 def _as_json(results: Sequence[Result]) -> dict[str, Any]:
     return {
         "comparison": [{**row._asdict(), "busy_cores": busy} for row, busy in results],
-        "physics_over_mujoco": ratios(results, "mujoco"),
-        "physics_over_mujoco_per_core": ratios(results, "mujoco", per_core=True),
-        "physics_over_warp": ratios(results, "warp"),
+        **{
+            f"physics_over_{other}{'_per_core' if per_core else ''}": ratios(
+                results, other, per_core=per_core
+            )
+            for other, per_core in _comparisons()
+        },
     }
+
+
+def _comparisons() -> list[tuple[str, bool]]:
+    """Others, and whether by processor time, of which physics on a GPU takes next to none."""
+    on_cpu = jax.default_backend() == "cpu"
+    return [("mujoco", False), *([("mujoco", True)] if on_cpu else []), ("warp", False)]
 
 
 def ratio_lines(results: Sequence[Result]) -> list[str]:
     """How `physics` compares with others, for people; nothing where one was not measured."""
     lines = []
-    for other, per_core, unit in (
-        ("mujoco", False, "second"),
-        ("mujoco", True, "second of processor time"),
-        ("warp", False, "second"),
-    ):
+    for other, per_core in _comparisons():
         if found := ratios(results, other, per_core=per_core):
+            unit = "second of processor time" if per_core else "second"
             lines.append(
                 f"physics over {other}, steps per {unit}: {statistics.median(found):.2f}"
                 f" ({min(found):.2f} .. {max(found):.2f} over {len(found)} rounds)"

@@ -205,10 +205,15 @@ def prepare_warp(config: Config, num_envs: int, sizes: Sizes) -> Timed:
 
     Contacts of all robots share one buffer, which holds as many as MJX has.
     """
+    warp = importlib.import_module("warp")
+    # It tells of every kernel that it loads.
+    warp.config.log_level = warp.LOG_WARNING
     env, model = make_env(config), make_physics_model(config)
     n_substeps = config.physics.n_substeps
     most = mjx.make_data(model)._impl
     warp_model = mjx.put_model(model, impl="warp")
+    # Otherwise a GPU prints a line for every robot whose solver used all iterations of the preset.
+    warp_model = warp_model.tree_replace({"opt._impl.warn_overflow": 0})
     data = mjx.make_data(
         model, impl="warp", naconmax=num_envs * int(most.ncon), njmax=int(most.nefc)
     )

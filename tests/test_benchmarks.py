@@ -347,6 +347,13 @@ def test_physics_and_mujoco_take_turns_and_are_compared_at_their_best(world_conf
     # As if physics had had two cores and mujoco one.
     busy = [(row, [2.0 if row.rate == "physics" else 1.0] * 3) for row, _ in found]
     assert compare.ratios(busy, "mujoco", per_core=True) == [0.75, 3.0, 1.0]
+    assert [line.split(":")[0] for line in compare.ratio_lines(found)] == [
+        "physics over mujoco, steps per second",
+        "physics over mujoco, steps per second of processor time",
+    ]
+    # A GPU's steps take next to no processor time.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert len(compare.ratio_lines(found)) == 1
     assert compare.ratios(found[:2], "mujoco") == compare.ratios(found, "warp") == []
 
 
