@@ -30,8 +30,9 @@ _LAYERS = 1.6
 them on the way there, and on the way back some once more."""
 
 
-_TAKEN = 1.05
-"""What is taken for what is counted, as an H200 told of 65,536 environments and more."""
+_TAKEN = 1.18
+"""What is taken for what is counted, at the most: for one size, programs that XLA compiled on two
+occasions took 15 and 17 GiB of an H200."""
 
 _PROGRAMS = 112 * 2**20
 """What programs and the libraries that they call take besides, as it told of 256 [bytes]."""
