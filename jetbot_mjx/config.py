@@ -559,7 +559,14 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
         section = section.setdefault(part, {})
         if not isinstance(section, dict):
             raise ConfigError(f"--set {override}: {part} is a value, not a section")
-    section[parts[-1]] = _parse_yaml(text, f"--set {override}")
+    value = _parse_yaml(text, f"--set {override}")
+    if isinstance(value, dict):
+        # Else what the file says of the other keys would be lost without a word.
+        inner = next(iter(value.items()), ("key", "value"))
+        raise ConfigError(
+            f"--set {override}: set single keys, as in --set {key.strip()}.{inner[0]}={inner[1]}"
+        )
+    section[parts[-1]] = value
 
 
 def _explain(error: ErrorDetails) -> str:

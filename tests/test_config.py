@@ -362,6 +362,8 @@ def test_a_path_that_is_no_text_file_is_refused(tmp_path, name, remedy):
         ("ppo..num_envs=3", "--set ppo..num_envs=3: write section.key=value"),
         ("ppo.num_envs: 3", "--set ppo.num_envs: 3: write section.key=value"),
         ("seed.x=1", "--set seed.x=1: seed is a value, not a section"),
+        ("ppo={num_envs: 8}", "num_envs: 8}: set single keys, as in --set ppo.num_envs=8"),
+        ("ppo.network={}", "--set ppo.network={}: set single keys, as in --set ppo.network.key=va"),
         ("ppo.gae_lambda.x=1", "ppo.gae_lambda.x=1: gae_lambda is a value, not a section"),
         ("seed=[", "--set seed=[, line 1 is not valid YAML"),
         ("ppo.num_env=3", "ppo.num_env = 3 is unknown: did you mean num_envs?"),
