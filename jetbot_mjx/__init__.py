@@ -11,7 +11,7 @@ The modules in reading order, each knowing only those before it:
 `processes`, `memory`, `resumable_ppo`, `brax_ppo`, `training`, `portable`, `contract`, `formats`,
 `stand_in`, `drive_log`, `clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`,
 `cli`, and the commands `new_task`, `check_env`, `plan`, `train`, `evaluate`, `render`, `replay`,
-`play`, `export`, `sim2real`. Commands meet only in the run folder.
+`play`, `export`, `sim2real`, `pretrained`. Commands meet only in the run folder.
 Beside them stand the adapters, for programs of Gymnasium and Stable-Baselines3; none but they
 import those, and no other module imports an adapter.
 
@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 from jetbot_mjx.imports import lighten as _lighten
 
 if TYPE_CHECKING:
+    from jetbot_mjx.checkpoint import PRETRAINED as PRETRAINED
     from jetbot_mjx.checkpoint import load_policy as load_policy
     from jetbot_mjx.config import load_config as load_config
     from jetbot_mjx.env import JetBotEnv as JetBotEnv
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
     from jetbot_mjx.wrappers import wrap_for_training as wrap_for_training
 
 _HOMES = {
+    "PRETRAINED": "checkpoint",
     "JetBotEnv": "env",
     "State": "state",
     "Task": "task",

@@ -24,6 +24,9 @@ from jetbot_mjx.store import (
 Which = Literal["best", "last"] | int
 """A checkpoint of a run: the best, the last, or the one at that many environment steps."""
 
+PRETRAINED = Path(__file__).parent / "assets" / "pretrained"
+"""Runs that come with the package, each named after its configuration."""
+
 POLICY = "policy"
 """The tree that holds a policy's parameters."""
 

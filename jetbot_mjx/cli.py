@@ -188,16 +188,22 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 
 
-def add_checkpoint_arguments(parser: argparse.ArgumentParser, *, several: bool = False) -> None:
+def add_checkpoint_arguments(
+    parser: argparse.ArgumentParser, *, several: bool = False, default: str | None = None
+) -> None:
     """Adds `run` and `--checkpoint`, by which a command finds its policy.
 
     Args:
       parser: of the command.
       several: whether it takes more than one run; `run` is then a list.
+      default: what is taken where no run is named, in words; `run` is then None. None: one has to
+        be named.
     """
     what = "a run folder, or one checkpoint folder of it"
     if several:
         parser.add_argument("run", nargs="+", help=f"{what}; several are compared")
+    elif default is not None:
+        parser.add_argument("run", nargs="?", help=f"{what} (default: {default})")
     else:
         parser.add_argument("run", help=what)
     parser.add_argument(

@@ -1,4 +1,7 @@
-"""Lets a policy drive live: `python -m jetbot_mjx.play RUN` serves it to the browser."""
+"""Lets a policy drive live: `python -m jetbot_mjx.play RUN` serves it to the browser.
+
+Without a run it is one that comes with the package.
+"""
 
 import getpass
 import socket
@@ -8,12 +11,13 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jetbot_mjx import cli, native
-from jetbot_mjx.checkpoint import Which
+from jetbot_mjx.checkpoint import PRETRAINED, Which
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.live import AGENTS
 from jetbot_mjx.player import Player
 
 _LARGEST_PORT = 65_535
+_SHOWN = "jetbot_egocentric"
 
 
 class Played(NamedTuple):
@@ -118,7 +122,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       The exit code.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.play", description=__doc__)
-    cli.add_checkpoint_arguments(parser)
+    cli.add_checkpoint_arguments(parser, default=f"of {_SHOWN}.yaml, comes with the package")
     parser.add_argument("--viewer", choices=("browser", "native"), default="browser")
     parser.add_argument("--agent", choices=AGENTS, default="policy", help="who drives at first")
     parser.add_argument("--seed", type=cli.whole_number(0), default=0, help="of the goals")
@@ -133,8 +137,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     cli.require_device()
     cli.use_compilation_cache()
+    if options.run is None:
+        print(f"no run is named: this policy comes with the package, trained by {_SHOWN}.yaml")
     played = run(
-        options.run,
+        PRETRAINED / _SHOWN if options.run is None else options.run,
         viewer=options.viewer,
         agent=options.agent,
         which=options.checkpoint,

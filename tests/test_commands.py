@@ -99,6 +99,7 @@ def checkout(tmp_path_factory):
             assert f"python -m jetbot_mjx.train {arguments}" in DOCUMENTED
             assert run("train", arguments.split()) == 0
         shutil.copytree("runs/mine", "runs/other")
+        assert run("pretrained", []) == 0
     return folder
 
 
@@ -355,7 +356,7 @@ def test_no_kind_of_command_is_left_out():
     elsewhere = {("pip", "install"), ("apt-get", "install"), ("[", "$?"), ("break",), ("srun",)}
     elsewhere |= {("scp",)}
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
-    covered |= {"new_task", "check_env"}
+    covered |= {"new_task", "check_env", "pretrained"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":

@@ -26,6 +26,7 @@ from jetbot_mjx import (
     new_task,
     plan,
     play,
+    pretrained,
     render,
     replay,
     sim2real,
@@ -377,6 +378,7 @@ COMMANDS = {
     "play": play,
     "export": export,
     "sim2real": sim2real,
+    "pretrained": pretrained,
 }
 
 
