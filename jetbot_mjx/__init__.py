@@ -11,7 +11,7 @@ The modules in reading order, each knowing only those before it:
 `processes`, `memory`, `resumable_ppo`, `brax_ppo`, `training`, `portable`, `contract`, `formats`,
 `stand_in`, `drive_log`, `clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`,
 `cli`, and the commands `new_task`, `check_env`, `plan`, `train`, `evaluate`, `render`, `replay`,
-`play`, `export`, `sim2real`, `pretrained`. Commands meet only in the run folder.
+`play`, `export`, `sim2real`, `pretrained`, `__main__`. Commands meet only in the run folder.
 Beside them stand the adapters, for programs of Gymnasium and Stable-Baselines3; none but they
 import those, and no other module imports an adapter.
 

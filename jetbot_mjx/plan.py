@@ -1,7 +1,7 @@
-"""Tells what fits: `python -m jetbot_mjx.plan --config configs/gpu.yaml`.
+"""Tells what memory a training takes: `python -m jetbot_mjx.plan --config configs/gpu.yaml`.
 
-The memory that a training takes on each device, for more and for fewer environments, from shapes
-alone: nothing is compiled and nothing trained.
+On each device, for more and for fewer environments, from shapes alone: nothing is compiled and
+nothing trained.
 """
 
 from collections.abc import Sequence

@@ -120,6 +120,7 @@ VERBS = (
     "export",
     "sim2real",
     "pretrained",
+    "__main__",
 )
 ORDER = (*NOUNS, *ADAPTERS, *VERBS)
 """A module knows only those before it, a verb no other verb, and none but adapters an adapter."""

@@ -1,0 +1,68 @@
+"""Lists the commands: `python -m jetbot_mjx`."""
+
+import ast
+import difflib
+import re
+import sys
+from collections.abc import Sequence
+from importlib import resources
+
+COMMANDS = (
+    "pretrained",
+    "train",
+    "plan",
+    "evaluate",
+    "render",
+    "play",
+    "export",
+    "sim2real",
+    "replay",
+    "new_task",
+    "check_env",
+)
+"""In the order in which a user comes to them."""
+
+_ALONE = "python -m jetbot_mjx"
+_WHAT_AND_HOW = re.compile(r"(?P<what>.+?): `(?P<how>python -m jetbot_mjx\.[^`]+)`")
+
+
+def run() -> dict[str, str]:
+    """What each command does, from its own first line; none of them is imported.
+
+    Returns:
+      Sentences by what is to be typed, in the order of `COMMANDS`.
+    """
+    found = {}
+    for name in COMMANDS:
+        source = resources.files("jetbot_mjx").joinpath(f"{name}.py").read_text("utf-8")
+        told = _WHAT_AND_HOW.match(ast.get_docstring(ast.parse(source)) or "")
+        assert told is not None, name
+        found[told["how"]] = told["what"]
+    return found
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Prints the list.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      0, or 2 where something was asked for that stands here only as a name.
+    """
+    asked = (sys.argv[1:] if arguments is None else list(arguments))[:1]
+    if asked and asked not in (["-h"], ["--help"]):
+        close = difflib.get_close_matches(asked[0], COMMANDS, n=1)
+        remedy = f"write python -m jetbot_mjx.{close[0]}" if close else f"say {_ALONE} for a list"
+        print(f"error: {_ALONE} {asked[0]}: {remedy}", file=sys.stderr)
+        return 2
+    listed = run()
+    width = max(map(len, listed))
+    print("Each tells of its arguments with --help:")
+    for how, what in listed.items():
+        print(f"  {how:{width}}  {what[0].lower()}{what[1:]}")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
