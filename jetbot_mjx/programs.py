@@ -201,10 +201,15 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:
         return None
-    seconds, kernels, kept = pickle.loads(body)
+    seconds, kernels, ids, kept = pickle.loads(body)
     cpu.register(kernels)
+    devices = {device.id: device for device in jax.devices()}
     try:
-        program = serialize_executable.deserialize_and_load(*kept)
+        program = serialize_executable.deserialize_and_load(
+            # Else it would be one program for all devices, whatever it was.
+            *kept,
+            execution_devices=[devices[number] for number in ids],
+        )
     except jax.errors.JaxRuntimeError:
         # A driver that knows it no longer, say: compiling says what is wrong, if anything is.
         return None
@@ -230,10 +235,11 @@ def _keep(
     """
     try:
         kept = serialize_executable.serialize(program)
+        ids = [device.id for device in program.runtime_executable().local_devices()]
     except (NotImplementedError, ValueError):
         # This kind of device cannot.
         return
-    body = pickle.dumps((seconds, kernels, kept))
+    body = pickle.dumps((seconds, kernels, ids, kept))
     with contextlib.suppress(OSError):
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
