@@ -257,3 +257,24 @@ def test_a_second_process_traces_nothing_and_trains_to_the_same_bits(root, tmp_p
     other, traced = trained(1)
     assert not traced
     assert other != first
+
+
+def test_a_program_for_one_of_several_devices_is_kept_for_that_one(tmp_path):
+    code = f"""
+import sys
+import jax, jax.numpy as jnp
+from pathlib import Path
+from jetbot_mjx.programs import Programs
+step = jax.jit(lambda x: 3 * x + 1)
+found = Programs({{}}, Path({str(tmp_path)!r}), "key")
+kept = found.find("it") is not None
+program = found.compile("it", lambda: step.trace(jnp.ones(4)))
+print(jax.device_count(), kept, float(program(jnp.ones(4)).sum()))
+"""
+    flags = "--xla_force_host_platform_device_count=2"
+    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    for kept in (False, True):
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.split() == ["2", str(kept), "16.0"]
