@@ -22,7 +22,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 
 import jax
 from jax.experimental import serialize_executable
@@ -235,7 +235,8 @@ def _keep(
     """
     try:
         kept = serialize_executable.serialize(program)
-        ids = [device.id for device in program.runtime_executable().local_devices()]
+        loaded: Any = program.runtime_executable()
+        ids = [device.id for device in loaded.local_devices()]
     except (NotImplementedError, ValueError):
         # This kind of device cannot.
         return

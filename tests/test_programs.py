@@ -97,7 +97,7 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(kept, damage):
 
 
 def test_one_that_the_device_no_longer_loads_is_compiled_anew(kept, monkeypatch):
-    def refuse(*kept):
+    def refuse(*kept, **devices):
         raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: another driver")
 
     monkeypatch.setattr(programs.serialize_executable, "deserialize_and_load", refuse)
