@@ -114,16 +114,20 @@ class TaskConfig(_Section):
 
 
 class PhysicsConfig(_Section):
-    """Time steps and solver effort. Integrator: Euler, without implicit joint damping."""
+    """Time steps and the solver's accuracy. Integrator: Euler, without implicit joint damping."""
 
     ctrl_dt: Positive = 1 / 60
     """[s] one environment step: how long an action is held."""
     sim_dt: Annotated[float, Field(ge=1e-5, allow_inf_nan=False)] = 1 / 120
     """[s] one physics step; `ctrl_dt` is a whole multiple of it."""
-    iterations: Count | None = None
-    """Newton iterations per physics step; null: as many as the robot needs, 2 or 3."""
-    ls_iterations: Count = 2
-    """Line-search steps per Newton iteration."""
+    tolerance: Annotated[float, Field(ge=0, le=1e-3, allow_inf_nan=False)] = 1e-6
+    """The contact solver stops when an iteration improves its cost by less than this, or its
+    gradient is smaller, both relative to the trace of the inertia matrix; MuJoCo's default of 1e-8 is
+    beyond float32's reach."""
+    iterations: Count = 20
+    """Newton iterations per physics step at most; one or two are the rule."""
+    ls_iterations: Count = 4
+    """Line-search steps per Newton iteration at most."""
     cholesky: Literal["unrolled", "library"] = "unrolled"
     """How MJX factorises its matrices: `unrolled` into scalar arithmetic, or by a call of LAPACK or
     cuSOLVER, which keeps a GPU from running a step as one kernel or CUDA graph."""

@@ -20,10 +20,11 @@ import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx import llvm, xla_ffi
-from jetbot_mjx.kernel import Kernel, kept_bytes, source_of
-from jetbot_mjx.scalarize import Program, scalarize
+from jetbot_mjx.kernel import Kernel, kept_bytes
+from jetbot_mjx.scalarize import scalarize
 
 IMPL = "llvm"
+PLATFORM = "cpu"
 NEEDS = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
 
 _NAME = "physics"
@@ -59,62 +60,71 @@ class _Host(NamedTuple):
 
 @functools.cache
 def is_available() -> bool:
-    """Whether JAX runs on a CPU, llvmlite is here, and XLA calls a kernel of it."""
-    if jax.default_backend() != "cpu":
-        return False
+    """Whether llvmlite is here, and XLA calls a kernel of it on CPUs."""
     try:
+        device = jax.local_devices(backend=PLATFORM)[0]
         host = _host()
     except (ImportError, OSError, RuntimeError, AttributeError, TypeError):
-        # No llvmlite, one that knows this processor not, or a C library that lacks a function.
+        # No llvmlite, one that knows this processor not, a C library that lacks a function, or
+        # JAX_PLATFORMS without cpu.
         return False
     if host.machine not in xla_ffi.MACHINES:
         return False
-    probe = write(scalarize(lambda x: 2.0 * x + 1.0, jnp.zeros(2)), carried=1, steps=2)
+    probe = Kernel(
+        scalarize(lambda x: 2.0 * x + 1.0, jax.ShapeDtypeStruct((2,), jnp.float32)),
+        carried=1,
+        steps=2,
+        fallback=lambda x: [4.0 * x + 3.0],
+    )
     numbers = np.arange(4 * host.lanes + 2, dtype=np.float32).reshape(-1, 2)
     # Whoever asks may be in the middle of tracing something else.
-    with jax.ensure_compile_time_eval():
-        leaves = [jnp.asarray(numbers)]
+    with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
-            (result,) = launch(probe, leaves, leaves)
+            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(numbers))
         except jax.errors.JaxRuntimeError:
             return False
         return bool((np.asarray(result) == 4 * numbers + 3).all())
 
 
-def depends_on() -> bytes:
-    """All that a kernel's text depends on, beside its program."""
-    host = _host()
-    return source_of(llvm, xla_ffi) + f"{xla_ffi.TEXT} {host.machine} {host.lanes}".encode()
+def kernel_text(kernel: Kernel) -> str:
+    """Write a kernel in LLVM's representation, for this processor.
 
+    Args:
+      kernel: the kernel.
 
-def write(program: Program, *, carried: int, steps: int) -> Kernel:
-    """Writes a kernel, as `jetbot_mjx.kernel.Backend` has it."""
+    Returns:
+      The text of a module.
+
+    Raises:
+      UnsupportedError: the program has an operation that is not written in LLVM.
+    """
     host = _host()
-    text = xla_ffi.kernel_text(
-        llvm.step_text(program, carried=carried, lanes=host.lanes),
-        [numbers.size for numbers in program.inputs],
-        carried=carried,
+    return xla_ffi.kernel_text(
+        llvm.step_text(kernel.program, carried=kernel.carried, lanes=host.lanes),
+        [numbers.size for numbers in kernel.program.inputs],
+        carried=kernel.carried,
         lanes=host.lanes,
-        steps=steps,
+        steps=kernel.steps,
         name=_NAME,
         machine=host.machine,
     )
-    return Kernel(_NAME, text)
 
 
-def launch(kernel: Kernel, leaves: Sequence[Array], results: Sequence[Array]) -> list[Array]:
-    """Runs a kernel, as `jetbot_mjx.kernel.Backend` has it."""
+def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
+    """Run a kernel, as `jetbot_mjx.kernel.Backend` has it."""
+    text = kernel.text(IMPL, lambda: kernel_text(kernel))
+    results = leaves[: kernel.carried]
     shapes = [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
-    return list(jax.ffi.ffi_call(_registered(kernel), shapes)(*leaves))
+    return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves))
 
 
-def _registered(kernel: Kernel) -> str:
+def _registered(text: str) -> str:
     """The name by which XLA knows a kernel; compiles it when it is first asked for."""
-    name = f"jetbot_mjx_{hashlib.sha256(_key(kernel.text)).hexdigest()}"
+    name = f"jetbot_mjx_{hashlib.sha256(_key(text)).hexdigest()}"
     # Programs are traced in several threads.
     with _lock:
         if name not in _loaded:
-            _register(name, _machine_code(kernel.text))
+            _register(name, _machine_code(text))
     return name
 
 

@@ -69,8 +69,6 @@ class Robot:
     """Rotor inertia seen at the wheel [kg m²]."""
     max_wheel_speed: float | None
     """Largest wheel speed a motor is asked for [rad/s]; None: not limited."""
-    solver_iterations: int
-    """Newton iterations per physics step: the fewest that pass `test_physics.py`. SIM."""
     friction: float = 1.0
     """Coulomb coefficient of wheel on floor. USD: 1.0 wheel, combined by maximum."""
 
@@ -107,7 +105,6 @@ ISAAC = Robot(
     motor_gain=0.05,  # SIM: Isaac's 1e4 is unstable at any useful time step
     armature=3e-4,  # EST: rotor 1.4e-7 kg m² through the 1:48 gear
     max_wheel_speed=None,  # the tutorial's 1 m/s needs 31 rad/s; USD would stop at 12.56
-    solver_iterations=2,
 )
 
 REAL = Robot(
@@ -124,14 +121,13 @@ REAL = Robot(
     motor_gain=0.05,  # SIM, as above
     armature=3e-4,  # EST, as above
     max_wheel_speed=12.56,  # [rad/s] USD, maxJointVelocity 719.635 °/s: 0.41 m/s
-    solver_iterations=3,  # two leave it 10 mm off the converged solution after 4 s
 )
 
 ROBOTS = {"isaac": ISAAC, "real": REAL}
 
 # Contact of every pair, softer than MuJoCo's default. In a pyramidal cone the friction of a
 # wheel that slides also pushes it off the floor, the harder the contact the more: at μ = 0.4
-# and (0.02, 1), (0.95, 0.99) the robot hops and tilts by 5° even with six Newton iterations.
+# and (0.02, 1), (0.95, 0.99) the robot hops and tilts by 5° even with a converged solver.
 _SOLREF = (0.04, 1.0)  # time constant [s], damping ratio; SIM
 _SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)  # SIM
 
@@ -180,14 +176,14 @@ def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
 def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig, robot: Robot) -> None:
     option = spec.option
     option.timestep = physics.ctrl_dt / physics.n_substeps
-    # Explicit Euler is the cheapest, and stable with two or three Newton iterations as long as
-    # `_check_stable` holds.
+    # Explicit Euler is the cheapest, and stable as long as `_check_stable` holds.
     option.integrator = mujoco.mjtIntegrator.mjINT_EULER
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     option.solver = mujoco.mjtSolver.mjSOL_NEWTON
     option.cone = mujoco.mjtCone.mjCONE_PYRAMIDAL
-    option.iterations = physics.iterations or robot.solver_iterations
+    option.iterations = physics.iterations
     option.ls_iterations = physics.ls_iterations
+    option.tolerance = physics.tolerance
 
 
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
@@ -263,7 +259,7 @@ def _settle(spec: mujoco.MjSpec) -> None:
     model = spec.compile()
     # To the solver's full accuracy, and through implicit damping, which dies out sooner.
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
-    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)
     for _ in range(int(2.0 / model.opt.timestep)):
         mujoco.mj_step(model, data)

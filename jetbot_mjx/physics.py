@@ -3,20 +3,16 @@
 import contextlib
 import copy
 import functools
-import importlib.metadata
-import inspect
-import json
 import threading
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import mujoco
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jetbot_mjx import cholesky, cpu, gpu, kernel, mjx
+from jetbot_mjx import cholesky, cpu, gpu, kernel, llvm, mjx
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.scalarize import scalarize
@@ -25,6 +21,11 @@ from jetbot_mjx.state import PhysicsState
 
 BACKENDS: tuple[kernel.Backend, ...] = (gpu, cpu)
 """Who can make a step as one kernel."""
+
+kernel.register(*BACKENDS)
+
+_PLATFORMS = {"gpu": "cuda"}
+"""What JAX's devices call a platform that its programs are compiled for under another name."""
 
 
 class Physics:
@@ -82,9 +83,10 @@ class Physics:
 
     @property
     def impl(self) -> str:
-        """Who makes a step, as in `physics.impl`, but never `auto`."""
-        backend = self._backend()
-        return "xla" if backend is None or self._as_kernel() is None else backend.IMPL
+        """Who makes a step on JAX's default devices, as in `physics.impl`, but never `auto`."""
+        platform = jax.local_devices()[0].platform
+        here = [x.IMPL for x in self._backends() if _PLATFORMS.get(platform, platform) == x.PLATFORM]
+        return "xla" if not here or self._as_kernel() is None else here[0]
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
@@ -114,11 +116,13 @@ class Physics:
         leaves = jax.tree.leaves(self.model)
         known_late = [leaves[place] for place in self._varied]
         if self._mj_model.nmocap:
-            known_late.append(self._data.mocap_pos if mocap_pos is None else mocap_pos)
-        held = ctrl, known_late
-        one_kernel = self._as_kernel()
-        if one_kernel is not None:
-            return one_kernel(state, held)
+            places = self._data.mocap_pos if mocap_pos is None else mocap_pos
+            known_late.append(jnp.asarray(places, self._data.mocap_pos.dtype))
+        held = jnp.asarray(ctrl, state.qpos.dtype), known_late
+        return (self._as_kernel() or self._steps)(state, held)
+
+    def _steps(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
+        """All physics steps of an environment step, as XLA makes them."""
         state, _ = jax.lax.scan(
             lambda state, _: (self.substep(state, held), None),
             state,
@@ -161,48 +165,31 @@ class Physics:
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
-    def _backend(self) -> kernel.Backend | None:
-        """Who makes a step as one kernel, if it can be made so; None where XLA is to make it."""
-        fit = (x for x in BACKENDS if self._config.impl in ("auto", x.IMPL) and x.is_available())
-        return next(fit, None)
+    def _backends(self) -> list[kernel.Backend]:
+        """Who may make a step as one kernel in this process."""
+        return [x for x in BACKENDS if self._config.impl in ("auto", x.IMPL) and x.is_available()]
 
     def _as_kernel(self) -> kernel.Step | None:
-        """The step as one kernel; None where XLA makes it."""
-        backend = self._backend()
-        if backend is None:
+        """The step as one kernel; None where XLA makes it on all platforms."""
+        if not self._backends():
             return None
         # Programs are traced in several threads; one is enough to write the kernel.
         with self._lock:
             if self._kernel is None:
                 try:
-                    self._kernel = kernel.batched(backend, self._written(backend))
+                    self._kernel = kernel.as_step(self._written())
                 except UnsupportedError as error:
                     self._kernel = error
         if not isinstance(self._kernel, UnsupportedError):
             return self._kernel
-        if self._config.impl == backend.IMPL:
+        if self._config.impl != "auto":
             raise UserError(
-                f"physics.impl = {backend.IMPL}: one kernel cannot do {self._kernel};"
+                f"physics.impl = {self._config.impl}: one kernel cannot do {self._kernel};"
                 " choose xla or auto"
             )
         return None
 
-    def _written(self, backend: kernel.Backend) -> kernel.Kernel:
-        # All that MJX's arithmetic depends on. What a task computes is no part of it.
-        model = np.zeros(mujoco.mj_sizeModel(self._mj_model), np.uint8)
-        mujoco.mj_saveModel(self._mj_model, None, model)
-        versions = [importlib.metadata.version(name) for name in ("jax", "mujoco", "mujoco-mjx")]
-        settings = json.dumps([versions, self._config.model_dump(mode="json"), self._varied])
-        known = b"".join(
-            np.asarray(leaf).tobytes()
-            for place, leaf in enumerate(jax.tree.leaves(self.model))
-            if place not in self._varied
-        )
-        own = settings.encode() + inspect.getsource(Physics).encode()
-        key = model.tobytes() + known + own + backend.depends_on()
-        return kernel.kept(key, lambda: self._write(backend))
-
-    def _write(self, backend: kernel.Backend) -> kernel.Kernel:
+    def _written(self) -> kernel.Kernel:
         # Shapes alone: arrays made here would become part of the program that is being traced.
         def numbers(*shape: int) -> Any:
             return jax.ShapeDtypeStruct(shape, jnp.float32)
@@ -212,8 +199,16 @@ class Physics:
         leaves = jax.tree.leaves(self.model)
         known_late = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied]
         known_late += [numbers(model.nmocap, 3)] if model.nmocap else []
-        return backend.write(
-            scalarize(self.substep, state, (numbers(model.nu), known_late)),
+        arguments = state, (numbers(model.nu), known_late)
+        program = scalarize(self.substep, *arguments)
+        llvm.require(program)
+        structure = jax.tree.structure(arguments)
+        return kernel.Kernel(
+            program,
             carried=len(jax.tree.leaves(state)),
             steps=self._config.n_substeps,
+            fallback=lambda *leaves: jax.tree.leaves(
+                self._steps(*jax.tree.unflatten(structure, leaves))
+            ),
+            impl=self._config.impl,
         )

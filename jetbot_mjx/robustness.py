@@ -41,10 +41,6 @@ SWEEP_GOALS = 128
 CARRIES_AT = 0.95
 """Success rate down to which a policy is said to carry."""
 
-# On a slippery floor the presets' two or three iterations are wrong by decimetres after 4 s;
-# these follow the converged solver to a millimetre (median of 16 robots at μ = 0.3). SIM.
-_ITERATIONS, _LS_ITERATIONS = 6, 4
-
 
 class Sweep(NamedTuple):
     """One quantity, and the values at which a policy is judged."""
@@ -224,7 +220,6 @@ class Sweeper:
           keys: one reset key an episode, such as `report_keys(128)`.
           sweeps: the quantities.
         """
-        env = _with_enough_iterations(env)
         self._env, self._keys, self._sweeps = env, keys, tuple(sweeps)
         # The preset's robot occurs in every sweep, and drives once.
         self._robots = list(dict.fromkeys(robot for one in sweeps for robot in one.robots))
@@ -298,15 +293,6 @@ def sweep(
       One result for each quantity.
     """
     return Sweeper(env, networks, keys, sweeps).run(params)
-
-
-def _with_enough_iterations(env: JetBotEnv) -> JetBotEnv:
-    option = env.mjx_model.opt
-    option = option.replace(
-        iterations=max(option.iterations, _ITERATIONS),
-        ls_iterations=max(option.ls_iterations, _LS_ITERATIONS),
-    )
-    return env.with_model(env.mjx_model.replace(opt=option))
 
 
 def carries(result: SweepResult) -> tuple[float, float] | None:

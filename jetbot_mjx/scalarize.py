@@ -1,10 +1,15 @@
-"""A JAX function of one robot as straight-line arithmetic on single numbers.
+"""A JAX function of one robot as arithmetic on single numbers.
 
 JAX describes a function by operations on arrays; here every array is taken apart into its numbers.
-Slices, gathers, transposes and the like then cost nothing, loops are written out, branches become
-selections, and what a model's constants decide is decided. What is left can be done for
-thousands of robots side by side, each by one thread of a GPU, without any number in between
-going through memory.
+Slices, gathers, transposes and the like then cost nothing, and what a model's constants decide is
+decided. What is left can be done for thousands of robots side by side, each by one thread of a GPU,
+without any number in between going through memory.
+
+Small loops of known length are written out, and small branches become selections. The others stay
+loops and branches. What a loop carries is first taken to be as constant as it begins, and only what
+proves otherwise is carried. And what is the same function of other carried numbers before the loop
+and after every trip is computed when a trip begins: of a solver that tests for convergence at the
+end of an iteration and prepares the next one there, the last preparation is then not made.
 
 The arithmetic is the function's own: results differ from JAX's by round-off alone, as
 long as all numbers are finite.
@@ -28,10 +33,26 @@ from jetbot_mjx.moving import (
     shape_of,
     windows,
 )
-from jetbot_mjx.scalars import EVALUATE, Graph, Scalar, UnsupportedError, Value, in_order, is_known
+from jetbot_mjx.schedule import Block, PlacedBranch, PlacedLoop, schedule
+from jetbot_mjx.scalars import (
+    EVALUATE,
+    Graph,
+    Loop,
+    Scalar,
+    UnsupportedError,
+    Value,
+    is_known,
+    is_same,
+)
 
 MOST_TRIPS = 64
 """Of a loop that is written out."""
+
+MOST_WRITTEN_OUT = 512
+"""Operations of a loop that is written out although it could stay one."""
+
+LEAST_IN_BRANCH = 24
+"""Operations for which a branch is better than computing both sides."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,11 +63,16 @@ class Program:
     """The numbers of each leaf of the arguments, in their shapes."""
     outputs: list[Numbers]
     """The numbers of each leaf of the result."""
-    values: list[Value]
-    """All that is computed, operands first."""
+    block: Block
+    """All that is computed."""
+
+    @property
+    def size(self) -> int:
+        """How many operations are written down."""
+        return sum(1 for _ in self.block.values())
 
     def evaluate(self, leaves: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Runs the program in NumPy.
+        """Run the program in NumPy.
 
         Args:
           leaves: of the arguments, each with the same leading batch axes.
@@ -55,33 +81,74 @@ class Program:
           The leaves of the result, with the same batch axes.
         """
         batch = leaves[0].shape[: leaves[0].ndim - self.inputs[0].ndim]
-        known: dict[int, np.ndarray] = {}
+        run = _Evaluation(batch)
         for numbers, leaf in zip(self.inputs, leaves, strict=True):
             columns = leaf.reshape(*batch, numbers.size)
-            known |= {x.index: columns[..., i] for i, x in enumerate(numbers.ravel())}
-
-        def look_up(x: Scalar) -> np.ndarray:
-            return np.broadcast_to(x, batch) if is_known(x) else known[x.index]
-
+            run.known |= {x.index: columns[..., i] for i, x in enumerate(numbers.ravel())}
         with np.errstate(all="ignore"):
-            for value in self.values:
-                if value.op == "input":
-                    continue
-                operands = [look_up(x) for x in value.operands]
-                if value.op == "select":
-                    known[value.index] = np.where(operands[0], operands[2], operands[1])
-                elif value.op == "convert":
-                    known[value.index] = operands[0].astype(value.dtype)
-                else:
-                    known[value.index] = EVALUATE[value.op](*operands)
+            run.block(self.block)
         return [
-            np.stack([look_up(x) for x in numbers.ravel()], -1).reshape(*batch, *numbers.shape)
+            np.stack([run.look_up(x) for x in numbers.ravel()], -1).reshape(*batch, *numbers.shape)
             for numbers in self.outputs
         ]
 
 
+class _Evaluation:
+    """The numbers of a program that runs in NumPy, of all robots."""
+
+    def __init__(self, batch: tuple[int, ...]) -> None:
+        self._batch = batch
+        self.known: dict[int, np.ndarray] = {}
+
+    def look_up(self, x: Scalar) -> np.ndarray:
+        return np.broadcast_to(x, self._batch) if is_known(x) else self.known[x.index]
+
+    def block(self, block: Block) -> None:
+        for item in block.items:
+            if isinstance(item, PlacedLoop):
+                self._loop(item)
+            elif isinstance(item, PlacedBranch):
+                self._branch(item)
+            else:
+                self.known[item.index] = self._operation(item)
+
+    def _operation(self, value: Value) -> np.ndarray:
+        operands = [self.look_up(x) for x in value.operands]
+        if value.op == "select":
+            return np.where(operands[0], operands[2], operands[1])
+        if value.op == "convert":
+            return operands[0].astype(value.dtype)
+        return EVALUATE[value.op](*operands)
+
+    def _loop(self, item: PlacedLoop) -> None:
+        loop = item.loop
+        state = [self.look_up(loop.first[place]) for place in item.places]
+        going = np.ones(self._batch, bool)
+        while True:
+            for place, numbers in zip(item.places, state, strict=True):
+                self.known[loop.carries[place].index] = numbers
+            self.block(item.head)
+            going = going & self.look_up(loop.going)
+            if not going.any():
+                break
+            self.block(item.body)
+            following = [self.look_up(loop.following[place]) for place in item.places]
+            state = [np.where(going, b, a) for a, b in zip(state, following, strict=True)]
+        for result in item.results:
+            self.known[result.index] = self.look_up(loop.outcomes[result.place])
+
+    def _branch(self, item: PlacedBranch) -> None:
+        for block in item.blocks:
+            self.block(block)
+        branch = item.branch
+        which = self.look_up(branch.which)
+        for result in item.results:
+            sides = [self.look_up(side[result.place]) for side in (branch.yes, branch.no)]
+            self.known[result.index] = np.where(which, *sides)
+
+
 def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
-    """Writes a function down as arithmetic on single numbers.
+    """Write a function down as arithmetic on single numbers.
 
     Args:
       function: what `jax.jit` takes; its shapes and indices must not depend on its arguments.
@@ -100,7 +167,7 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
         for leaf in jax.tree.leaves(arguments)
     ]
     outputs = _Writer(graph).closed(closed, inputs)
-    return Program(inputs, outputs, in_order(x for array in outputs for x in array.ravel()))
+    return Program(inputs, outputs, schedule(x for array in outputs for x in array.ravel()))
 
 
 class _Writer:
@@ -160,24 +227,28 @@ class _Writer:
         return self.closed(params["call_jaxpr"], operands)
 
     def _scan(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
-        body = params["jaxpr"].jaxpr
+        body, length = params["jaxpr"], params["length"]
         # Only what is scanned over has one axis less inside.
-        scanned = sum(
-            len(shape_of(outer)) != len(shape_of(inner))
-            for outer, inner in zip(equation.invars, body.invars, strict=True)
-        )
-        stacked = sum(
-            len(shape_of(outer)) != len(shape_of(inner))
-            for outer, inner in zip(equation.outvars, body.outvars, strict=True)
+        scanned, stacked = (
+            sum(len(shape_of(a)) != len(shape_of(b)) for a, b in zip(outer, inner, strict=True))
+            for outer, inner in (
+                (equation.invars, body.jaxpr.invars),
+                (equation.outvars, body.jaxpr.outvars),
+            )
         )
         carried = len(equation.outvars) - stacked
-        first = len(operands) - scanned
-        constants, carry = operands[: first - carried], list(operands[first - carried : first])
-        order = range(params["length"])
+        last = len(operands) - scanned
+        constants, carry = operands[: last - carried], list(operands[last - carried : last])
+        sequences = operands[last:]
+        if not scanned and not stacked:
+            rolled = self._counted_loop(body, length, constants, carry)
+            if rolled is not None:
+                return rolled
+        order = range(length)
         rows: dict[int, list[Numbers]] = {}
         for i in reversed(order) if params["reverse"] else order:
-            slices = [_at(sequence, i) for sequence in operands[first:]]
-            results = self.closed(params["jaxpr"], [*constants, *carry, *slices])
+            slices = [_at(sequence, i) for sequence in sequences]
+            results = self.closed(body, [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
         shapes = [shape_of(variable) for variable in equation.outvars[carried:]]
         columns = [
@@ -186,36 +257,120 @@ class _Writer:
         ]
         return [*carry, *columns]
 
+    def _counted_loop(
+        self, body: ClosedJaxpr, length: int, constants: Sequence[Numbers], carry: list[Numbers]
+    ) -> list[Numbers] | None:
+        """A scan over nothing as a loop; None where it is better written out, or must be."""
+        before = self._graph.count
+        self.closed(body, [*constants, *carry])
+        if (self._graph.count - before) * length <= MOST_WRITTEN_OUT:
+            return None
+
+        def going(state: list[Numbers]) -> Scalar:
+            return self._graph.apply("lt", state[0].item(), np.int32(length))
+
+        def trip(state: list[Numbers]) -> list[Numbers]:
+            counter = self._each("add", state[0], known_array(np.int32(1)))
+            return [counter, *self.closed(body, [*constants, *state[1:]])]
+
+        try:
+            return self._loop([known_array(np.int32(0)), *carry], going, trip)[1:]
+        except UnsupportedError:
+            # An index that counts the trips, say: written out it is known.
+            return None
+
     def _while(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
         first = params["cond_nconsts"]
         second = first + params["body_nconsts"]
         in_condition, in_body = operands[:first], operands[first:second]
-        state = result = list(operands[second:])
-        going: Scalar = np.bool_(True)
+
+        def going(state: list[Numbers]) -> Scalar:
+            return self.closed(params["cond_jaxpr"], [*in_condition, *state])[0].item()
+
+        def trip(state: list[Numbers]) -> list[Numbers]:
+            return self.closed(params["body_jaxpr"], [*in_body, *state])
+
+        state = list(operands[second:])
+        if not is_known(going(state)):
+            try:
+                return self._loop(state, going, trip)
+            except UnsupportedError:
+                # An index that counts the trips, say: written out it is known.
+                pass
+        return self._written_out(state, going, trip)
+
+    def _written_out(
+        self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
+    ) -> list[Numbers]:
+        result = state
+        still: Scalar = np.bool_(True)
         # The loop goes on past its end, on numbers that are then not taken: so a counter among
         # them stays known, and with it how often the loop is written out.
         for _ in range(MOST_TRIPS + 1):
-            (condition,) = self.closed(params["cond_jaxpr"], [*in_condition, *state])
-            going = self._graph.apply("and", going, condition.item())
-            if is_known(going) and not going:
+            still = self._graph.apply("and", still, going(state))
+            if is_known(still) and not still:
                 return result
-            state = self.closed(params["body_jaxpr"], [*in_body, *state])
-            result = [self._choose(going, *pair) for pair in zip(result, state, strict=True)]
+            state = trip(state)
+            result = [self._choose(still, *pair) for pair in zip(result, state, strict=True)]
         raise UnsupportedError(f"a loop that may run more than {MOST_TRIPS} times")
+
+    def _loop(
+        self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
+    ) -> list[Numbers]:
+        """A loop that stays one.
+
+        Args:
+          state: what the first trip begins with.
+          going: of a state: whether there is a trip.
+          trip: of a state: the next one.
+
+        Returns:
+          The state at the end.
+        """
+        first = _flat(state)
+        loop = self._graph.begin_loop(first)
+        carried: set[int] = set()
+        # Each round finds more that changes from trip to trip, until nothing else does.
+        while True:
+            begins = [loop.carries[k] if k in carried else x for k, x in enumerate(first)]
+            loop.following = _flat(trip(_like(state, begins)))
+            changed = [
+                k
+                for k, x in enumerate(first)
+                if k not in carried and not is_same(x, loop.following[k])
+            ]
+            if not changed:
+                break
+            carried.update(changed)
+        derived = _Derivation(self._graph, loop, carried).derived()
+        if derived:
+            begins = [derived.get(k, x) for k, x in enumerate(begins)]
+            loop.following = _flat(trip(_like(state, begins)))
+        loop.going = going(_like(state, begins))
+        loop.outcomes = begins
+        results = self._graph.end_loop(loop)
+        ends = [results[k] if k in carried else x for k, x in enumerate(first)]
+        return _like(state, ends)
 
     def _cond(
         self, equation: Any, params: Any, index: Numbers, *operands: Numbers
     ) -> list[Numbers]:
-        which = index.item()
-        branches = params["branches"]
+        branches, which = params["branches"], index.item()
         if is_known(which):
-            last = len(branches) - 1
-            return self.closed(branches[min(max(int(which), 0), last)], operands)
-        if len(branches) != 2:
-            raise UnsupportedError("a branch into more than two")
-        no, yes = (self.closed(branch, operands) for branch in branches)
-        which = self._graph.convert(which, np.dtype(bool))
-        return [self._choose(which, *pair) for pair in zip(no, yes, strict=True)]
+            return self.closed(branches[min(max(int(which), 0), len(branches) - 1)], operands)
+        before = self._graph.count
+        sides = [self.closed(branch, operands) for branch in branches]
+        is_branch = self._graph.count - before >= LEAST_IN_BRANCH
+        result = sides[-1]
+        for i in reversed(range(len(sides) - 1)):
+            later = self._graph.apply("gt", which, which.dtype.type(i))
+            if is_branch:
+                flat = self._graph.branch(later, _flat(sides[i]), _flat(result))
+                result = _like(result, flat)
+            else:
+                pairs = zip(sides[i], result, strict=True)
+                result = [self._choose(later, *pair) for pair in pairs]
+        return result
 
     # What depends on how numbers are moved.
 
@@ -276,11 +431,20 @@ class _Writer:
         return numbers_of((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
     def _select_n(self, equation: Any, params: Any, which: Numbers, *cases: Numbers) -> Numbers:
-        if len(cases) != 2:
-            raise UnsupportedError("a selection from more than two")
-        which = np.broadcast_to(which, cases[0].shape)
-        rows = zip(which.ravel(), cases[0].ravel(), cases[1].ravel(), strict=True)
-        return numbers_of((self._graph.select(*row) for row in rows), cases[0].shape)
+        shape = cases[0].shape
+        which = np.broadcast_to(which, shape)
+        result = cases[-1]
+        for i in reversed(range(len(cases) - 1)):
+            later = [self._is_after(number, i) for number in which.ravel()]
+            rows = zip(later, cases[i].ravel(), result.ravel(), strict=True)
+            result = numbers_of((self._graph.select(*row) for row in rows), shape)
+        return result
+
+    def _is_after(self, which: Scalar, case: int) -> Scalar:
+        """Whether a choice, bool or whole, is of a later case."""
+        if which.dtype == bool:
+            return which
+        return self._graph.apply("gt", which, which.dtype.type(case))
 
     def _clamp(
         self, equation: Any, params: Any, low: Numbers, x: Numbers, high: Numbers
@@ -371,6 +535,91 @@ class _Writer:
                         total = self._graph.apply("add", total, product)
                     sums.append(total)
         return numbers_of(sums, shape_of(equation.outvars[0]))
+
+
+class _Derivation:
+    """What a loop carries that follows from the other numbers that it carries.
+
+    A carried number follows from others if it is the same function of them before the first trip
+    and after every one. The two are compared operation by operation.
+    """
+
+    def __init__(self, graph: Graph, loop: Loop, carried: set[int]) -> None:
+        self._graph = graph
+        self._loop = loop
+        # What has fewer operations first: the others may follow from it.
+        self._places = sorted(carried, key=lambda k: _recorded(loop.following[k]))
+        self._known: dict[Any, Scalar] = {}
+
+    def derived(self) -> dict[int, Scalar]:
+        """Of those that follow: which, and how they are computed from the others."""
+        result: dict[int, Scalar] = {}
+        for place in self._places:
+            ends = self._loop.first[place], self._loop.following[place]
+            number = self._known.get(_names(ends))
+            if number is None:
+                number = self._matched(*ends)
+            if number is not None:
+                result[place] = number
+            self._known[_names(ends)] = self._loop.carries[place] if number is None else number
+        return result
+
+    def _matched(self, before: Scalar, after: Scalar) -> Scalar | None:
+        """What is `before` at first and `after` later, of carried numbers; None: nothing is."""
+        pending = [(before, after)]
+        found: dict[Any, Scalar | None] = {}
+        while pending:
+            ends = pending[-1]
+            names = _names(ends)
+            if names in self._known or names in found:
+                pending.pop()
+                continue
+            parts = _parts(*ends)
+            if parts is None:
+                # Nothing in common: then nothing above it has.
+                return None
+            missing = [
+                part
+                for part in parts
+                if not is_same(*part) and _names(part) not in self._known.keys() | found.keys()
+            ]
+            if missing:
+                pending += missing
+                continue
+            operands = [
+                a if is_same(a, b) else self._known.get(_names((a, b)), found.get(_names((a, b))))
+                for a, b in parts
+            ]
+            found[names] = self._graph.repeat(ends[1], operands)
+            pending.pop()
+        return found[_names((before, after))]
+
+
+def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
+    """The operands of two operations that are alike, in pairs."""
+    if is_known(before) or is_known(after) or not before.operands:
+        return None
+    if before.op != after.op or before.dtype != after.dtype or before.op == "input":
+        return None
+    return list(zip(before.operands, after.operands, strict=True))
+
+
+def _names(numbers: tuple[Scalar, Scalar]) -> tuple[Any, ...]:
+    return tuple((x.dtype.str, x.tobytes()) if is_known(x) else x.index for x in numbers)
+
+
+def _recorded(x: Scalar) -> int:
+    return -1 if is_known(x) else x.index
+
+
+def _flat(arrays: Sequence[Numbers]) -> list[Scalar]:
+    return [x for array in arrays for x in array.ravel()]
+
+
+def _like(arrays: Sequence[Numbers], flat: Sequence[Scalar]) -> list[Numbers]:
+    """Numbers in the shapes of arrays."""
+    numbers = iter(flat)
+    return [filled(array.shape, lambda: next(numbers)) for array in arrays]
 
 
 def _at(numbers: Numbers, i: int) -> Numbers:

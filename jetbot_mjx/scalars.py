@@ -2,12 +2,14 @@
 
 A `Graph` records operations on scalars. What is known when it is recorded is computed at once,
 what was recorded before is not recorded again, and what a zero multiplies is gone: of the matrices
-of a robot's physics most entries are zeros, and most of the arithmetic goes with them.
+of a robot's physics most entries are zeros, and most of the arithmetic goes with them. A `Loop` and
+a `Branch` are recorded as wholes; where each operation is done, `schedule` decides.
 
 Two rules hold for finite numbers only: 0·x is 0, and x - x is 0.
 """
 
-from collections.abc import Callable, Iterable
+import dataclasses
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -24,21 +26,64 @@ Scalar = Any
 class Value:
     """A number that is known only when the program runs."""
 
-    __slots__ = ("dtype", "index", "op", "operands")
+    __slots__ = ("dtype", "index", "op", "operands", "owner", "place")
 
-    def __init__(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype, index: int) -> None:
-        """Describes one operation.
+    def __init__(
+        self,
+        op: str,
+        operands: tuple[Scalar, ...],
+        dtype: np.dtype,
+        index: int,
+        owner: "Loop | Branch | None" = None,
+        place: int = 0,
+    ) -> None:
+        """Describe one operation.
 
         Args:
-          op: its name, as in `jax.lax`; `input` for what the program is given.
+          op: its name, as in `jax.lax`; `input` for what the program is given, `carry` for what a
+            loop hands from trip to trip, `result` for what a loop or a branch ends with.
           operands: numbers that it takes.
           dtype: of the result: float32, int32 or bool.
           index: place in the order of recording; operands have smaller ones.
+          owner: of a `carry` or a `result`: the loop or branch.
+          place: of a `carry` or a `result`: which of them it is.
         """
         self.op = op
         self.operands = operands
         self.dtype = dtype
         self.index = index
+        self.owner = owner
+        self.place = place
+
+
+@dataclasses.dataclass(eq=False)
+class Loop:
+    """Numbers that are computed anew as long as a condition on them holds."""
+
+    index: int
+    """Place in the order of recording, after all that a trip computes."""
+    carries: list[Value]
+    """What a trip begins with."""
+    first: list[Scalar]
+    """What the first trip begins with."""
+    following: list[Scalar] = dataclasses.field(default_factory=list)
+    """What the next trip begins with."""
+    going: Scalar = None
+    """Whether there is a trip, of `carries`."""
+    outcomes: list[Scalar] = dataclasses.field(default_factory=list)
+    """What the loop ends with, of the `carries` for which there is no trip."""
+
+
+@dataclasses.dataclass(eq=False)
+class Branch:
+    """Numbers of which only one of two kinds is computed."""
+
+    index: int
+    """Place in the order of recording, after all that either side computes."""
+    which: Scalar
+    """Which side."""
+    no: list[Scalar]
+    yes: list[Scalar]
 
 
 def is_known(x: Scalar) -> bool:
@@ -91,6 +136,9 @@ EVALUATE: dict[str, Callable[..., Any]] = {
 }
 """Every operation but `select` and `convert`, as NumPy does it."""
 
+MOST_VALUES = 200_000
+"""Operations of one program; what has more is no program to write out."""
+
 _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 
 
@@ -130,8 +178,6 @@ class Graph:
         shorter = _SHORTER.get(op, _unchanged)(self, kind, *operands)
         if shorter is not None:
             return shorter
-        if op in _COMMUTATIVE:
-            operands = tuple(sorted(operands, key=_place))
         dtype = _BOOL if op in COMPARISONS or op == "is_finite" else kind
         return self._record(op, operands, dtype)
 
@@ -164,40 +210,65 @@ class Graph:
             return self.apply("ne", x, x.dtype.type(0))
         return self._record("convert", (x,), dtype)
 
+    def repeat(self, value: Value, operands: Sequence[Scalar]) -> Value:
+        """An operation that was recorded, on other operands and as it stands."""
+        return self._record(value.op, tuple(operands), value.dtype)
+
+    def begin_loop(self, first: Sequence[Scalar]) -> Loop:
+        """Begin a loop: what its trips compute is recorded before `end_loop`."""
+        loop = Loop(-1, [], list(first))
+        for place, number in enumerate(first):
+            loop.carries.append(self._new("carry", (), number.dtype, loop, place))
+        return loop
+
+    def end_loop(self, loop: Loop) -> list[Value]:
+        """End a loop of which all attributes but `index` are known, and return its results."""
+        loop.index = self._next()
+        return [
+            self._new("result", (), number.dtype, loop, place)
+            for place, number in enumerate(loop.outcomes)
+        ]
+
+    def branch(self, which: Value, no: Sequence[Scalar], yes: Sequence[Scalar]) -> list[Scalar]:
+        """The numbers of one of two sides, of which only that one is computed."""
+        branch = Branch(self._next(), which, list(no), list(yes))
+        return [
+            b if is_same(a, b) else self._new("result", (), b.dtype, branch, place)
+            for place, (a, b) in enumerate(zip(no, yes, strict=True))
+        ]
+
+    @property
+    def count(self) -> int:
+        """How many operations have been recorded."""
+        return self._count
+
     def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Value:
-        key = (op, dtype, *map(_identity, operands))
+        names = [_identity(x) for x in operands]
+        # Found in whichever order, but kept as given: what is recorded twice in the same way looks
+        # the same.
+        key = (op, dtype, *(sorted(names, key=repr) if op in _COMMUTATIVE else names))
         if key not in self._values:
-            self._values[key] = Value(op, operands, dtype, self._count)
-            self._count += 1
+            self._values[key] = self._new(op, operands, dtype)
         return self._values[key]
 
+    def _new(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype, *owner: Any) -> Value:
+        return Value(op, operands, dtype, self._next(), *owner)
 
-def in_order(results: Iterable[Scalar]) -> list[Value]:
-    """All that results depend on, every operand before what takes it.
+    def _next(self) -> int:
+        if self._count >= MOST_VALUES:
+            raise UnsupportedError(f"more than {MOST_VALUES:,} operations")
+        self._count += 1
+        return self._count - 1
 
-    Args:
-      results: numbers; the known ones need nothing.
 
-    Returns:
-      The values, inputs included.
-    """
-    needed: dict[int, Value] = {}
-    pending = [x for x in results if not is_known(x)]
-    while pending:
-        value = pending.pop()
-        if value.index not in needed:
-            needed[value.index] = value
-            pending += [x for x in value.operands if not is_known(x)]
-    return [needed[index] for index in sorted(needed)]
+def is_same(x: Scalar, y: Scalar) -> bool:
+    """Whether two numbers are the same operation, or known and alike bit by bit."""
+    return x is y or (_known_and(x, y) and _identity(x) == _identity(y))
 
 
 def _identity(x: Scalar) -> Any:
     # By bits, or 0.0 would be -0.0, and NaN not itself.
     return x.index if isinstance(x, Value) else (x.dtype.str, x.tobytes())
-
-
-def _place(x: Scalar) -> int:
-    return x.index if isinstance(x, Value) else -1
 
 
 def _known_and(x: Scalar, *others: Scalar) -> bool:
