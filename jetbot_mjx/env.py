@@ -5,6 +5,8 @@ only what physics integrates and what the task drew; `mjx.Data` is rebuilt insid
 """
 
 import copy
+from collections.abc import Mapping
+from typing import NamedTuple
 
 import brax.envs
 import jax
@@ -23,7 +25,24 @@ from jetbot_mjx.model import (
 )
 from jetbot_mjx.physics import Physics
 from jetbot_mjx.state import PhysicsState, State, robot_state
-from jetbot_mjx.task import AdvancesGoal, Goal, Task, layout_size, make_task
+from jetbot_mjx.task import AdvancesGoal, Goal, RobotState, Task, layout_size, make_task
+
+
+class TaskStep(NamedTuple):
+    """What the task says of one step of the robot, whoever moved it."""
+
+    obs: Float[Array, " obs"]
+    """Observation after the step."""
+    reward: Float[Array, ""]
+    """Reward of the step."""
+    terms: Mapping[str, Float[Array, ""]]
+    """Named terms of the reward."""
+    terminated: Float[Array, ""]
+    """1 where the step ended the episode."""
+    success: Float[Array, ""]
+    """1 where the task is done."""
+    goal: Goal
+    """Goal after the step."""
 
 
 class JetBotEnv(brax.envs.Env):
@@ -131,27 +150,57 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           The next state.
         """
-        goal = state.goal
-        physics = self.step_physics(state.pipeline_state, ctrl, self._solid_places(goal))
+        mocap_pos = self.mocap_positions(state.goal)
+        physics = self.step_physics(state.pipeline_state, ctrl, mocap_pos)
         before, after = robot_state(state.pipeline_state), robot_state(physics)
+        task = self.task_step(before, after, state.goal, action)
+        rewards = {f"reward/{name}": term for name, term in task.terms.items()}
+        return state.replace(
+            pipeline_state=physics,
+            obs=task.obs,
+            reward=task.reward,
+            done=task.terminated,
+            metrics={**state.metrics, "success": task.success, **rewards},
+            info={**state.info, "terminated": task.terminated},
+            goal=task.goal,
+        )
+
+    def task_step(
+        self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, "2"]
+    ) -> TaskStep:
+        """Apply the task to one step of the robot.
+
+        `reward` is given the goal before the step, all else the goal after it.
+
+        Args:
+          before: the robot before the step.
+          after: the robot after it.
+          goal: the goal before the step.
+          action: the action of the step, as it was given.
+
+        Returns:
+          Observation, reward, end and the next goal.
+        """
         reward, terms = self.task.reward(before, after, goal, action)
         if isinstance(self.task, AdvancesGoal):
             goal = self.task.advance(before, after, goal)
         terminated = self.task.terminated(after, goal).astype(jnp.float32)
         success = self.task.success(after, goal).astype(jnp.float32)
-        rewards = {f"reward/{name}": term for name, term in terms.items()}
-        return state.replace(
-            pipeline_state=physics,
-            obs=self.task.observe(after, goal),
-            reward=reward,
-            done=terminated,
-            metrics={**state.metrics, "success": success, **rewards},
-            info={**state.info, "terminated": terminated},
-            goal=goal,
-        )
+        obs = self.task.observe(after, goal)
+        return TaskStep(obs, reward, terms, terminated, success, goal)
 
-    def _solid_places(self, goal: Goal) -> Float[Array, "nmocap 3"] | None:
-        """Where this episode's solid bodies stand [m], in the order of physics."""
+    def mocap_positions(self, goal: Goal) -> Float[Array, "nmocap 3"] | None:
+        """Return where the task's solid mocap bodies stand.
+
+        Args:
+          goal: the goal of the episode, before the step in which they stand there.
+
+        Returns:
+          Positions [m], world frame, in the order of `physics.mocap_names`; None: there are none.
+
+        Raises:
+          UserError: `markers` leaves one out.
+        """
         names = self.physics.mocap_names
         if not names:
             return None

@@ -10,7 +10,6 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from jaxtyping import Array, Float
 
@@ -18,9 +17,8 @@ from jetbot_mjx.checkpoint import Checkpoint
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.evaluation import report_keys
 from jetbot_mjx.model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
+from jetbot_mjx.mujoco_jetbot import MujocoJetBot
 from jetbot_mjx.policy import make_policy
-from jetbot_mjx.state import PhysicsState, robot_state
-from jetbot_mjx.task import Goal
 
 RECORDED = 10_000
 """How many observations an export is checked on."""
@@ -159,37 +157,21 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Rec
     Returns:
       The recording, the same for the same checkpoint on the same machine.
     """
-    model, data = env.mj_model, mujoco.MjData(env.mj_model)
-    act, task = as_jax(checkpoint, env), env.task
-
-    @jax.jit
-    def see(
-        qpos: Float[Array, " nq"], qvel: Float[Array, " nv"], goal: Goal
-    ) -> tuple[Array, Array, Array, Array]:
-        physics = PhysicsState(qpos, qvel, jnp.zeros_like(qvel), jnp.zeros(()))
-        robot = robot_state(physics)
-        obs = task.observe(robot, goal)
-        action, wheel_speeds = act(obs[None])
-        return obs, action[0], wheel_speeds[0], task.terminated(robot, goal)
-
-    sample = jax.jit(task.sample)
-    # The environment splits its key in two and gives the second to the task.
-    goals = (sample(jax.random.split(key)[1]) for key in report_keys(count))
+    robot = MujocoJetBot(checkpoint.config)
+    act = jax.jit(as_jax(checkpoint, env))
+    keys = iter(np.asarray(report_keys(count)))
     seen: list[np.ndarray] = []
     while len(seen) < count:
-        goal = next(goals)
-        mujoco.mj_resetData(model, data)
-        for _ in range(env.config.task.episode_length):
-            obs, _, ctrl, done = see(
-                np.asarray(data.qpos, np.float32), np.asarray(data.qvel, np.float32), goal
-            )
-            if done or len(seen) == count:
+        obs, _ = robot.reset(next(keys))
+        for _ in range(min(checkpoint.config.task.episode_length, count - len(seen))):
+            seen.append(obs)
+            (action,), _ = jax.device_get(act(obs[None]))
+            step = robot.step(action)
+            obs = step.obs
+            if step.terminated or not step.finite:
                 break
-            seen.append(np.asarray(obs))
-            data.ctrl[:] = ctrl
-            mujoco.mj_step(model, data, env.config.physics.n_substeps)
     obs = np.stack(seen)
-    action, wheel_speeds = jax.device_get(jax.jit(act)(obs))
+    action, wheel_speeds = jax.device_get(act(obs))
     return Recording(obs, action, wheel_speeds)
 
 

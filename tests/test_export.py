@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 from brax.training.acme import running_statistics, specs
 
-from jetbot_mjx import export, formats
+from jetbot_mjx import export, formats, portable
 from jetbot_mjx.checkpoint import Checkpoint, about_policy, load_checkpoint
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.contract import contract
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
@@ -200,6 +200,47 @@ def test_the_time_of_an_action_is_told_for_every_file(exported, monkeypatch, cap
     assert all(0 < float(row[1]) <= float(row[2]) <= float(row[3]) for row in rows)
     assert os.sched_getaffinity(0) == cores
     assert action_latency.main([str(exported / "nothing")]) == 2
+
+
+def towards(checkpoint, env):
+    """In place of a policy: it drives towards what the task shows first a direction of."""
+    del checkpoint
+
+    def act(obs):
+        bearing = jnp.arctan2(obs[:, 3], obs[:, 2])
+        drive = jnp.where(jnp.abs(bearing) < 0.5, 0.3, -1.0)
+        action = jnp.clip(jnp.stack([drive, bearing], axis=1), -1.0, 1.0)
+        return action, jax.vmap(env.wheel_targets)(action)
+
+    return act
+
+
+@pytest.fixture
+def record_example(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    monkeypatch.setattr(portable, "as_jax", towards)
+
+    def record_example(name, count):
+        settings = load_config(ROOT / "examples" / f"{name}.yaml").model_dump()
+        return record(*checkpoint_of(settings, tmp_path), count).obs
+
+    return record_example
+
+
+def test_a_recording_passes_gate_after_gate(record_example):
+    left = record_example("gates", 700)[:, 10]
+    passed = -np.diff(left)
+    assert set(left) == {3, 2, 1}  # the last gate ends the episode
+    assert set(passed) == {0, 1, -2}  # -2: the next episode
+    assert np.count_nonzero(passed == -2) >= 2
+
+
+def test_a_recording_runs_into_solid_pillars(record_example):
+    from pillars_task import BUMPER_POS, BUMPER_RADIUS, PILLAR_RADIUS
+
+    nearest = record_example("pillars", 300)[:, -3]
+    at_the_front = PILLAR_RADIUS + BUMPER_RADIUS + BUMPER_POS[0]
+    assert nearest.min() == pytest.approx(at_the_front, abs=0.01)
 
 
 # Without the package.

@@ -17,12 +17,13 @@ from stable_baselines3.common.env_checker import check_env
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMonitor
 
-from jetbot_mjx.adapters import JetBotGymEnv
+from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
 from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.offscreen import find_backend
 
 GOAL = slice(13, 16)
+BATCHES = (JetBotVecEnv, JetBotVectorEnv)
 ENDS = {"task": {"success_radius": 0.75}}  # near goals are reached within some steps
 GAMMA = 0.9
 
@@ -90,6 +91,23 @@ def test_its_ppo_learns_with_the_tutorials_hyperparameters(steps):
     after = list(ppo.policy.parameters())
     assert all(torch.isfinite(x).all() for x in after)
     assert any((x != y).any() for x, y in zip(before, after, strict=True))
+
+
+@pytest.mark.parametrize("task", ["gates", "pillars"])
+def test_a_batch_is_that_of_gymnasium(task, root, monkeypatch):
+    """Also where a goal advances, and where solid bodies stand."""
+    monkeypatch.syspath_prepend(str(root / "examples"))
+    config = root / "examples" / f"{task}.yaml"
+    ours, theirs = (make(4, max_episode_length=40, config=config) for make in BATCHES)
+    np.testing.assert_array_equal(ours.reset(), theirs.reset()[0])
+    for action in np.random.default_rng(0).uniform(-1, 1, (100, 4, 2)).astype(np.float32):
+        obs, reward, done, infos = ours.step(action)
+        wanted, rewards, terminated, truncated, _ = theirs.step(action)
+        np.testing.assert_array_equal(obs, wanted)
+        np.testing.assert_array_equal(reward, rewards)
+        np.testing.assert_array_equal(done, terminated | truncated)
+        for index in np.flatnonzero(done):
+            assert infos[index]["TimeLimit.truncated"] == truncated[index]
 
 
 class Recorder(VecEnvWrapper):

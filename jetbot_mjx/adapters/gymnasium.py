@@ -6,7 +6,6 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jetbot_mjx import cli
-from jetbot_mjx.adapters.robot_in_c import RobotInC
 from jetbot_mjx.adapters.settings import (
     RENDER_MODES,
     Arguments,
@@ -18,6 +17,7 @@ from jetbot_mjx.adapters.settings import (
 )
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.mujoco_jetbot import MujocoJetBot
 
 with an_extra("gymnasium"):
     import gymnasium
@@ -27,7 +27,7 @@ ENV_ID = "JetBot-v0"
 
 
 class JetBotGymEnv(gymnasium.Env):
-    """One robot, with the tutorial's constructor; physics is C MuJoCo's (`robot_in_c`).
+    """One robot, with the tutorial's constructor; physics is C MuJoCo's (`mujoco_jetbot`).
 
     Action, observation, reward and the end are those of `jetbot_mjx.JetBotEnv`. `terminated` is
     the task's end, `truncated` the time limit, which the environment keeps itself; `info` has
@@ -82,7 +82,7 @@ class JetBotGymEnv(gymnasium.Env):
             )
         # Who comes from elsewhere has no reason to know that JAX would compile at every start.
         cli.use_compilation_cache()
-        self.robot = RobotInC(settings.config)
+        self.robot = MujocoJetBot(settings.config)
         self.render_mode = settings.render_mode
         self._view = settings.view(self.robot.env)
         self.metadata = {**type(self).metadata, "render_fps": settings.frames_per_second}

@@ -1,17 +1,19 @@
-"""One robot in C MuJoCo, for who takes one step at a time: that of MJX takes several times as long.
+"""One robot in C MuJoCo and its task, one step at a time: MJX takes several times as long for one.
 
-The model is the one that MJX is given. All that is not physics, the draw of the goal, observation,
-reward and the end, is the environment's own code, compiled by JAX for the CPU.
+The model is the one that MJX is given. All that is not physics, the draw of the goal, where solid
+bodies stand, observation, reward, the end and the next goal, is the environment's own code,
+compiled by JAX for the CPU.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree, UInt32
+from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx.compiling import on_host
 from jetbot_mjx.config import Config
@@ -23,7 +25,14 @@ from jetbot_mjx.model import (
     make_mj_model,
 )
 from jetbot_mjx.state import PhysicsState, robot_state
-from jetbot_mjx.task import RobotState
+from jetbot_mjx.task import AdvancesGoal, Goal, RobotState
+
+# MuJoCo prints the first of each of these in an episode, and appends it to a file in the folder
+# that the program runs in. `Step.finite` tells them instead.
+_NONFINITE = [
+    int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}"))
+    for name in ("QPOS", "QVEL", "QACC", "CTRL")
+]
 
 
 class Step(NamedTuple):
@@ -34,7 +43,7 @@ class Step(NamedTuple):
     terminated: bool
     success: bool
     finite: bool
-    """Whether all of it is finite; where not, `obs` is the one before and nothing else counts."""
+    """Whether state, observation and reward are finite; where not, no step was taken."""
 
 
 class _Programs(NamedTuple):
@@ -43,28 +52,33 @@ class _Programs(NamedTuple):
     env: JetBotEnv
     model: mujoco.MjModel
     begin: Any
+    """From a key to the first pose, goal, solid bodies' places and observation, and a key."""
     judge: Any
+    """From poses, action and goal to the step's numbers; goal and places, if they can change."""
 
 
-class RobotInC:
+class MujocoJetBot:
     """A robot and its goal."""
 
     def __init__(self, config: Config) -> None:
         """Builds the model, and compiles what is not physics.
 
         Args:
-          config: robot, task and physics.
+          config: robot, task and physics; of `randomization` nothing is drawn.
 
         Raises:
           UserError: the task cannot be built.
         """
         self.env, self.model, self._begin, self._judge = _programs(config.model_dump_json())
         self.data = mujoco.MjData(self.model)
-        self.goal: PyTree = None
+        self.goal: Goal = None
+        """Goal of this episode, as it stands."""
         self._task = config.task
         self._n_substeps = config.physics.n_substeps
+        self._goal_advances = isinstance(self.env.task, AdvancesGoal)
         # Views, which stay true while MuJoCo steps.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
+        self._mocap_pos: Float[np.ndarray, "nmocap 3"] = self.data.mocap_pos.copy()
         self._before = self._pose()
         self._obs = np.zeros(self.env.observation_size, np.float32)
 
@@ -79,10 +93,11 @@ class RobotInC:
         Returns:
           The first observation, and the key of the next episode.
         """
-        qpos, qvel, self.goal, obs, next_key = self._begin(key)
-        mujoco.mj_resetData(self.model, self.data)
-        self._qpos[:], self._qvel[:] = qpos, qvel
-        self._before, self._obs = self._pose(), np.array(obs)
+        pose, self.goal, mocap_pos, obs, next_key = self._begin(key)
+        self._before, self._obs = np.array(pose), np.array(obs)
+        if mocap_pos is not None:
+            self._mocap_pos = np.asarray(mocap_pos)
+        self._place(time=0.0)
         return self._obs.copy(), np.asarray(next_key)
 
     def step(self, action: Float[np.ndarray, "2"]) -> Step:
@@ -94,15 +109,26 @@ class RobotInC:
         Returns:
           What came of it.
         """
-        self._ctrl[:] = self.wheel_targets(action)
+        time = self.data.time
+        ctrl = self.wheel_targets(action)
+        if not all(map(math.isfinite, ctrl)):
+            # MuJoCo would stop the motors instead.
+            return self._discarded(time)
+        self._ctrl[:] = ctrl
         mujoco.mj_step(self.model, self.data, self._n_substeps)
         # One array in and one out: every array more costs a third as much as physics.
         given = np.concatenate((self._before, self._qpos, self._qvel, action), dtype=np.float32)
-        judged = np.array(self._judge(given, self.goal))
+        judged, goal, mocap_pos = self._judge(given, self.goal)
+        judged = np.array(judged)
         reward, terminated, success, finite = judged[-4:].tolist()
         if not finite:
-            return Step(self._obs.copy(), 0.0, False, False, False)
+            return self._discarded(time)
         self._before, self._obs = given[len(self._before) : -len(action)], judged[:-4]
+        if self._goal_advances:
+            self.goal = goal
+            if mocap_pos is not None:
+                self._mocap_pos = np.asarray(mocap_pos)
+                self.data.mocap_pos[:] = self._mocap_pos
         return Step(self._obs.copy(), reward, terminated > 0, success > 0, True)
 
     def wheel_targets(self, action: Float[np.ndarray, "2"]) -> tuple[float, float]:
@@ -115,6 +141,19 @@ class RobotInC:
         speed = 0.5 * (drive + 1.0) * self._task.max_speed
         half = 0.5 * turn * self._task.max_yaw_rate * CONTROLLER_WHEEL_SEPARATION
         return (speed - half) / CONTROLLER_WHEEL_RADIUS, (speed + half) / CONTROLLER_WHEEL_RADIUS
+
+    def _discarded(self, time: float) -> Step:
+        """The step that is not taken, because it would not be finite."""
+        self._place(time)
+        return Step(self._obs.copy(), 0.0, False, False, False)
+
+    def _place(self, time: float) -> None:
+        """Puts robot and solid bodies where they were last known to be."""
+        mujoco.mj_resetData(self.model, self.data)
+        self._qpos[:], self._qvel[:] = np.split(self._before, [self.model.nq])
+        self.data.mocap_pos[:] = self._mocap_pos
+        self.data.time = time
+        self.data.warning.number[_NONFINITE] = 1
 
     def _pose(self) -> Float[np.ndarray, " nq+nv"]:
         return np.concatenate((self._qpos, self._qvel), dtype=np.float32)
@@ -131,32 +170,32 @@ def _programs(settings: str) -> _Programs:
         build_scene=env.task.build_scene,
         visual=False,
     )
-    # A world that blows up is ours to tell; MuJoCo would put the robot back without a word.
+    # A state that is not finite is ours to tell; MuJoCo would put the robot back without a word.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     nq, size = model.nq, model.nq + model.nv
 
     def begin(key: UInt32[Array, "2"]) -> tuple[Any, ...]:
         state = env.reset(key)
-        physics = state.pipeline_state
-        return physics.qpos, physics.qvel, state.goal, state.obs, state.key
+        pose = jnp.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel])
+        return pose, state.goal, env.mocap_positions(state.goal), state.obs, state.key
 
     def robot_of(pose: Float[Array, " n"]) -> RobotState:
         nothing = jnp.zeros(())
         return robot_state(PhysicsState(pose[:nq], pose[nq:], jnp.zeros(model.nv), nothing))
 
-    def judge(given: Float[Array, " n"], goal: PyTree) -> Float[Array, " m"]:
+    def judge(given: Float[Array, " n"], goal: Goal) -> tuple[Array, Goal, Array | None]:
         before, after, action = jnp.split(given, [size, 2 * size])
-        robot, moved = robot_of(before), robot_of(after)
-        reward, _ = env.task.reward(robot, moved, goal, action)
-        obs = env.task.observe(moved, goal)
-        flags = (env.task.terminated(moved, goal), env.task.success(moved, goal))
-        seen = jnp.concatenate([obs, jnp.stack([reward, *flags])])
-        finite: Bool[Array, ""] = jnp.isfinite(jnp.concatenate([seen, given])).all()
-        return jnp.append(seen, finite)
+        task = env.task_step(robot_of(before), robot_of(after), goal, action)
+        finite = jnp.isfinite(jnp.concatenate([after, task.obs, task.reward[None]])).all()
+        numbers = jnp.stack([task.reward, task.terminated, task.success, finite])
+        judged = jnp.concatenate([task.obs, numbers])
+        if not isinstance(env.task, AdvancesGoal):
+            return judged, None, None
+        return judged, task.goal, env.mocap_positions(task.goal)
 
     # On a GPU every call would wait for the device.
     with on_host():
         key, given = np.zeros(2, np.uint32), np.zeros(2 * size + env.action_size, np.float32)
         begin_program = jax.jit(begin).lower(key).compile()
-        judge_program = jax.jit(judge).lower(given, begin_program(key)[2]).compile()
+        judge_program = jax.jit(judge).lower(given, begin_program(key)[1]).compile()
     return _Programs(env, model, begin_program, judge_program)
