@@ -264,6 +264,27 @@ def test_a_longer_frame_is_made_of_more_physics_steps():
     assert env.robot.data.time == pytest.approx(12 / 60)
 
 
+@pytest.mark.parametrize(
+    ("physics_dt", "substeps"), [(1 / 240, 1), (1 / 120, 1), (1 / 100, 2), (1 / 60, 2)]
+)
+def test_a_frame_is_the_same_however_many_make_a_step(physics_dt, substeps):
+    one, three = JetBotGymEnv(1, physics_dt), JetBotGymEnv(3, physics_dt)
+    assert one.config.physics.n_substeps == substeps
+    assert three.config.physics.n_substeps == 3 * substeps
+    one.reset()
+    three.reset()
+    for action in np.random.default_rng(0).uniform(-1, 1, (8, 2)).astype(np.float32):
+        short = [one.step(action) for _ in range(3)]
+        obs, reward, *_ = three.step(action)
+        np.testing.assert_allclose(obs, short[-1][0], atol=1e-6)
+        assert reward == pytest.approx(sum(step[1] for step in short), abs=1e-6)
+
+
+def test_settings_that_round_are_left_as_they_are():
+    env = JetBotGymEnv(config={"physics": {"sim_dt": 0.008325}})  # 2.002 times into 1/60
+    assert env.config.physics.n_substeps == 2
+
+
 def test_the_same_seed_gives_the_same_episodes_and_each_has_a_goal_of_its_own():
     def goals(env, seed):
         return np.array([env.reset(seed=seed)[0][GOAL], *(env.reset()[0][GOAL] for _ in range(9))])

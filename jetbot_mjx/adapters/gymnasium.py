@@ -54,8 +54,8 @@ class JetBotGymEnv(gymnasium.Env):
 
         Args:
           skip_frame: `physics_dt` in one environment step.
-          physics_dt: [s] default: `physics.ctrl_dt`, 1/60; made in as many physics steps as
-            `physics.sim_dt` asks for.
+          physics_dt: [s] default: `physics.ctrl_dt`, 1/60; made in equal physics steps, none of
+            them longer than `physics.sim_dt`.
           rendering_dt: [s] of simulated time between two pictures in a window; default: one for
             every step.
           max_episode_length: environment steps after which an episode is truncated; default:

@@ -89,9 +89,8 @@ def resolve(given: Arguments, config: Source) -> Settings:
     """
     base = _read(config)
     physics_dt = base.physics.ctrl_dt if given.physics_dt is None else given.physics_dt
-    length = (
-        base.task.episode_length if given.max_episode_length is None else (given.max_episode_length)
-    )
+    length = given.max_episode_length
+    length = base.task.episode_length if length is None else length
     _check_count("skip_frame", given.skip_frame)
     _check_count("max_episode_length", length)
     _check_seconds("physics_dt", physics_dt)
@@ -102,8 +101,9 @@ def resolve(given: Arguments, config: Source) -> Settings:
     if mode not in (None, *RENDER_MODES):
         raise UserError(f"render_mode = {mode!r} is unknown: known are {', '.join(RENDER_MODES)}")
     values = base.model_dump()
-    # As many physics steps as it takes to make none longer than the configuration's.
-    substeps = max(1, math.ceil(ctrl_dt / base.physics.sim_dt - 1e-3))
+    # As many physics steps in every frame as it takes to make none longer than the configuration's,
+    # give or take what a configuration may round.
+    substeps = given.skip_frame * math.ceil(physics_dt / base.physics.sim_dt * (1 - 1e-3))
     values["physics"] |= {"ctrl_dt": float(ctrl_dt), "sim_dt": ctrl_dt / substeps}
     values["task"]["episode_length"] = int(length)
     return Settings(parse_config(values), mode, rendering_dt)
