@@ -99,9 +99,22 @@ def drive(env, actions):
 
 
 @pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
-def test_gymnasiums_checker_passes_with_every_render_mode(window, needs_opengl):
+def test_gymnasiums_checker_passes_with_every_render_mode(window, needs_opengl, monkeypatch):
+    monkeypatch.setenv("DISPLAY", ":0")
     check_env(gymnasium.make(ID).unwrapped)
     assert window.shown[-1] == "closed"
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
+def test_gymnasiums_checker_passes_without_a_display(needs_opengl, monkeypatch):
+    if sys.platform != "linux":
+        pytest.skip("a missing display is told on Linux only")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY"):
+        monkeypatch.delenv(name, raising=False)
+    env = gymnasium.make(ID).unwrapped
+    assert env.metadata["render_modes"] == ["rgb_array"]
+    assert JetBotVectorEnv(1).metadata["render_modes"] == ["rgb_array"]
+    check_env(env)
 
 
 def test_the_tutorials_arguments_are_taken_by_name_and_place():

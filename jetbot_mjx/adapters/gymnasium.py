@@ -7,7 +7,6 @@ from jaxtyping import Float, UInt8
 
 from jetbot_mjx import cli
 from jetbot_mjx.adapters.settings import (
-    RENDER_MODES,
     Arguments,
     Source,
     an_extra,
@@ -15,6 +14,7 @@ from jetbot_mjx.adapters.settings import (
     resolve,
     seeds_of,
 )
+from jetbot_mjx.adapters.view import RENDER_MODES
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.mujoco_jetbot import MujocoJetBot
@@ -85,7 +85,7 @@ class JetBotGymEnv(gymnasium.Env):
         self.robot = MujocoJetBot(settings.config)
         self.render_mode = settings.render_mode
         self._view = settings.view(self.robot.env)
-        self.metadata = {**type(self).metadata, "render_fps": settings.frames_per_second}
+        self.metadata = {**type(self).metadata, **settings.metadata}
         self.observation_space = spaces.Box(-np.inf, np.inf, (self.robot.env.observation_size,))
         self.action_space = spaces.Box(-1.0, 1.0, (self.robot.env.action_size,))
         (self._first_seed,) = seeds_of(seed, 1)

@@ -10,12 +10,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import UInt32
 
-from jetbot_mjx.adapters.view import View
+from jetbot_mjx.adapters.view import RENDER_MODES, View, shown_here
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.errors import UserError
-
-RENDER_MODES = ("human", "rgb_array")
 
 Seed = int | Sequence[int | None] | None
 Source = Config | Mapping[str, Any] | str | Path | None
@@ -61,9 +59,13 @@ class Settings(NamedTuple):
     """[s] between two pictures in a window."""
 
     @property
-    def frames_per_second(self) -> int:
-        """Pictures in a film with one for every step."""
-        return max(1, round(1 / self.config.physics.ctrl_dt))
+    def metadata(self) -> dict[str, Any]:
+        """What one environment declares: render modes that can be had here, pictures a second."""
+        modes = [mode for mode in RENDER_MODES if mode == self.render_mode or shown_here(mode)]
+        return {
+            "render_modes": modes,
+            "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
+        }
 
     def view(self, env: JetBotEnv) -> View | None:
         """What shows an environment; None where nothing is to be shown.

@@ -73,10 +73,7 @@ class JetBotVecEnv(VecEnv):
             spaces.Box(-np.inf, np.inf, (env.observation_size,)),
             spaces.Box(-1.0, 1.0, (env.action_size,)),
         )
-        self.metadata: dict[str, Any] = {
-            **self.metadata,
-            "render_fps": settings.frames_per_second,
-        }
+        self.metadata: dict[str, Any] = {**self.metadata, **settings.metadata}
 
     def reset(self) -> Float[np.ndarray, "n obs"]:
         """Begins an episode in every environment, with the seeds that `seed` was called with.

@@ -7,7 +7,6 @@ from jaxtyping import Bool, Float, UInt8
 
 from jetbot_mjx.adapters.batch import Batch
 from jetbot_mjx.adapters.settings import (
-    RENDER_MODES,
     Arguments,
     Seed,
     Source,
@@ -15,6 +14,7 @@ from jetbot_mjx.adapters.settings import (
     check_num_envs,
     resolve,
 )
+from jetbot_mjx.adapters.view import RENDER_MODES
 from jetbot_mjx.config import Config
 
 with an_extra("gymnasium"):
@@ -77,7 +77,7 @@ class JetBotVectorEnv(VectorEnv):
         self.batch = Batch(settings.config, self.num_envs, seed)
         self.render_mode = settings.render_mode
         self._view = settings.view(self.batch.env)
-        self.metadata = {**type(self).metadata, "render_fps": settings.frames_per_second}
+        self.metadata = {**type(self).metadata, **settings.metadata}
         env = self.batch.env
         self.single_observation_space = spaces.Box(-np.inf, np.inf, (env.observation_size,))
         self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_size,))

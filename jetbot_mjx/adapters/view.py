@@ -1,6 +1,8 @@
 """How an adapted environment shows itself: as pictures, or in MuJoCo's window."""
 
 import atexit
+import os
+import sys
 import time
 from typing import Any
 
@@ -14,8 +16,20 @@ from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import QPOS_XYZ
 from jetbot_mjx.offscreen import Renderer, overview
 
+RENDER_MODES = ("human", "rgb_array")
+
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 _REMEDY = "take render_mode='rgb_array', which needs none"
 _AROUND = np.array([0.15, 0.15, 0.0])  # [m] of a thing's middle, which belongs to it
+
+
+def shown_here(mode: str) -> bool:
+    """Return whether this machine is one to show a render mode, without opening anything.
+
+    Args:
+      mode: `human` needs a display, which on Linux an environment variable names.
+    """
+    return mode != "human" or sys.platform != "linux" or any(map(os.environ.get, _DISPLAYS))
 
 
 class View:
