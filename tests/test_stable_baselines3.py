@@ -11,6 +11,7 @@ import pytest
 sb3 = pytest.importorskip("stable_baselines3")
 torch = pytest.importorskip("torch")
 
+import gymnasium
 from gliding import everywhere
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_checker import check_env
@@ -91,6 +92,13 @@ def test_its_ppo_learns_with_the_tutorials_hyperparameters(steps):
     after = list(ppo.policy.parameters())
     assert all(torch.isfinite(x).all() for x in after)
     assert any((x != y).any() for x, y in zip(before, after, strict=True))
+
+
+def test_a_step_before_the_first_reset_is_refused():
+    env = JetBotVecEnv(2, render_mode="rgb_array")
+    for act in (lambda: env.step(np.zeros((2, 2))), env.render):
+        with pytest.raises(gymnasium.error.ResetNeeded, match=r"call reset\(\) before"):
+            act()
 
 
 @pytest.mark.parametrize("task", ["gates", "pillars"])

@@ -12,6 +12,7 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 
 with an_extra("sb3"):
+    import gymnasium
     from gymnasium import spaces
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
@@ -93,7 +94,11 @@ class JetBotVecEnv(VecEnv):
 
         Args:
           actions: in [-1, 1]²; values outside are clipped.
+
+        Raises:
+          ResetNeeded: there was no `reset` yet.
         """
+        self._require_reset("step")
         self.batch.start(actions)
 
     def step_wait(
@@ -132,8 +137,10 @@ class JetBotVecEnv(VecEnv):
         """A picture of every robot.
 
         Raises:
+          ResetNeeded: there was no `reset` yet.
           UserError: this machine has no OpenGL that works without a screen.
         """
+        self._require_reset("render")
         assert self._view is not None, "asked for pictures without a render_mode"
         return [self._view.frame(pose.qpos, pose.goal) for pose in self.batch.poses()]
 
@@ -204,6 +211,10 @@ class JetBotVecEnv(VecEnv):
         """No environment is wrapped; `VecMonitor` goes around all of them."""
         del wrapper_class
         return [False for _ in self._get_indices(indices)]
+
+    def _require_reset(self, method: str) -> None:
+        if not self.batch.is_begun:
+            raise gymnasium.error.ResetNeeded(f"call reset() before {method}()")
 
     def _shared(self, name: str) -> Any:
         if name in ("render_mode", "config"):
