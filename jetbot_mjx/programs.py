@@ -2,8 +2,8 @@
 
 JAX keeps what XLA compiled under the program that it was compiled from; to look there, a process
 must first trace and lower that program, which takes far longer than to load it. What is traced
-depends on the configuration, on this package's source and on what is installed: under these a
-command finds its programs at once. It does so only for tasks of this package, since nobody can say
+depends on the configuration, on the model, on this package's source and on what is installed: under
+these a command finds its programs at once. It does so only for tasks of this package, since nobody can say
 what a task of someone else's depends on.
 """
 
@@ -25,11 +25,15 @@ from pathlib import Path
 from typing import Any, Self
 
 import jax
+import mujoco
+import numpy as np
 from jax.experimental import serialize_executable
 
 from jetbot_mjx import cpu
 from jetbot_mjx.compiling import Options, compiler_options
 from jetbot_mjx.config import Config
+from jetbot_mjx.model import ROBOTS, make_mj_model
+from jetbot_mjx.task import make_task
 
 TRUSTED = f"{__package__}."
 """How tasks begin whose source is part of the key."""
@@ -135,6 +139,7 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
         # Seeds are arguments of programs.
         config.model_copy(update={"seed": 0}).model_dump(mode="json"),
         _own_source(),
+        _model(config),
         sys.version,
         [_version(name) for name in _LIBRARIES],
         settings,
@@ -178,6 +183,16 @@ class _CacheHits:
     def _listen(self, event: str, **kwargs: str | int) -> None:
         del kwargs
         self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
+
+
+def _model(config: Config) -> str:
+    """A name for the model of a configuration, with all options of its solver."""
+    scene = make_task(config.task).build_scene
+    robot = ROBOTS[config.robot.preset]
+    model = make_mj_model(robot, config.physics, build_scene=scene, visual=False)
+    content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
+    return hashlib.sha256(content.tobytes()).hexdigest()
 
 
 @functools.cache

@@ -1,5 +1,6 @@
 """Oracles: MJX against C MuJoCo and against closed form, and what must never happen."""
 
+import copy
 import dataclasses
 import math
 
@@ -13,15 +14,21 @@ from jetbot_mjx import kinematics, mjx, model
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.model import make_mj_model
+from jetbot_mjx.state import PhysicsState
 
 STEPS = 256
-POSITION_TOLERANCE = 5e-3  # [m] after 256 control steps
-YAW_TOLERANCE = math.radians(2.0)
-SOLVER_TOLERANCE = 2e-3  # [m] after 1 s, against the converged solution
+ROBOTS = 256  # under each kind of commands
+POSITION_TOLERANCE = 1.0  # [mm] of every robot with the preset's friction, over 256 control steps
+YAW_TOLERANCE = 0.5  # [°] likewise
+SLIPPERY_MEDIAN, SLIPPERY_P95 = 0.05, 0.5  # [mm] at μ = 0.4, where single robots are chaotic
+NOISE = 1e-6  # [m/s, rad/s] deviation after every control step: what float32 cannot tell
+ASTRAY = 1.0  # [mm] from where on a robot counts as led astray by noise
+STEP_TOLERANCE = 1e-5  # [m/s] of 999 in 1,000 single control steps
+STEP_OUTLIER = 1e-3  # [m/s] above which at most one in 10,000 may be
 CLOSED_FORM_TOLERANCE = 0.015
 WORST_TILT = 4.0  # [°]
 
-true_yaw = jax.jit(jax.vmap(kinematics.yaw))
+true_yaw = jax.jit(jax.vmap(jax.vmap(kinematics.yaw)))
 
 
 @pytest.fixture(scope="module", params=["isaac", "real"])
@@ -44,22 +51,43 @@ def driver(request):
     return env, drive
 
 
-def drive_in_c(env, mj_model, actions):
-    """The same actions in C MuJoCo: qpos (t, nq)."""
-    data = mujoco.MjData(mj_model)
-    targets = np.asarray(jax.vmap(env.wheel_targets)(actions))
-    trail = []
-    for target in targets:
-        data.ctrl[:] = target
-        mujoco.mj_step(mj_model, data, env.config.physics.n_substeps)
-        trail.append(data.qpos.copy())
-    return np.stack(trail)
+def drive_in_c(mj_model, first, ctrl, substeps, noise=0.0):
+    """The same targets (t, n, 2) in C MuJoCo: what follows each control step, (t, n, ...)."""
+    rng = np.random.default_rng(3)
+    steps, robots = ctrl.shape[:2]
+    trail = PhysicsState(
+        *(np.zeros((steps, robots, size)) for size in (mj_model.nq, mj_model.nv, mj_model.nv)),
+        time=np.zeros((steps, robots)),
+    )
+    for robot in range(robots):
+        data = mujoco.MjData(mj_model)
+        data.qpos[:] = first.qpos[robot]
+        for step in range(steps):
+            data.qvel += noise * rng.normal(size=mj_model.nv)
+            data.ctrl[:] = ctrl[step, robot]
+            mujoco.mj_step(mj_model, data, substeps)
+            trail.qpos[step, robot] = data.qpos
+            trail.qvel[step, robot] = data.qvel
+            trail.qacc_warmstart[step, robot] = data.qacc_warmstart
+    return trail
 
 
 def held(rng, draw, environments, hold):
     """Actions that are held for `hold` steps each."""
     actions = draw(rng, (environments, STEPS // hold, 2))
     return jnp.asarray(np.repeat(actions, hold, axis=1), jnp.float32)
+
+
+def switched(rng, draw, robots):
+    """Actions that each robot holds for 1 to 24 steps, as trained policies do."""
+    actions = np.zeros((robots, STEPS, 2))
+    for robot in range(robots):
+        step = 0
+        while step < STEPS:
+            hold = rng.integers(1, 25)
+            actions[robot, step : step + hold] = draw(rng, 2)
+            step += hold
+    return jnp.asarray(actions, jnp.float32)
 
 
 def uniform(rng, shape):
@@ -75,30 +103,76 @@ def converged(mj_model):
     return mj_model
 
 
-def test_mjx_follows_c_mujoco(driver):
+def apart(one, other):
+    """The largest distance of each of n robots [mm] and turn [°] between paths (t, n, nq)."""
+    distance = np.linalg.norm(one[..., :3] - other[..., :3], axis=-1).max(0)
+    turned = np.asarray(true_yaw(one[..., 3:7]) - true_yaw(np.float32(other[..., 3:7])))
+    turned = np.abs((turned + np.pi) % (2 * np.pi) - np.pi).max(0)
+    return 1e3 * distance, np.degrees(turned)
+
+
+@pytest.fixture(scope="module", params=[1.0, 0.4])
+def on_floor(request, driver):
+    """Physics on a floor of some friction, and the same in C MuJoCo, converged."""
     env, drive = driver
-    actions = held(np.random.default_rng(0), uniform, 16, hold=16)
-    qpos = np.asarray(drive(env.mjx_model, actions).qpos)
-    reference = converged(make_mj_model(env.robot, env.config.physics))
-    worst = {"after 1 s": 0.0, "position": 0.0, "yaw": 0.0}
-    for index in range(actions.shape[0]):
-        expected = drive_in_c(env, reference, actions[index])
-        distance = np.linalg.norm(expected[:, :3] - qpos[:, index, :3], axis=-1)
-        turned = np.asarray(
-            true_yaw(jnp.asarray(expected[:, 3:7], jnp.float32)) - true_yaw(qpos[:, index, 3:7])
-        )
-        turned = np.abs((turned + np.pi) % (2 * np.pi) - np.pi)
-        worst["after 1 s"] = max(worst["after 1 s"], distance[59])
-        worst["position"] = max(worst["position"], distance.max())
-        worst["yaw"] = max(worst["yaw"], turned.max())
+    robot = dataclasses.replace(env.robot, friction=request.param)
+    mj_model = make_mj_model(robot, env.config.physics, visual=False)
+    return request.param, mjx.put_model(mj_model), converged(copy.copy(mj_model))
+
+
+def test_mjx_follows_c_mujoco(driver, on_floor):
+    env, drive = driver
+    friction, mjx_model, reference = on_floor
+    rng = np.random.default_rng(0)
+    actions = jnp.concatenate([switched(rng, draw, ROBOTS) for draw in (uniform, bang_bang)])
+    ours = jax.device_get(drive(mjx_model, actions))
+    first = jax.device_get(jax.vmap(env.reset)(jnp.zeros((2 * ROBOTS, 2), jnp.uint32)))
+    first = first.pipeline_state
+    ctrl = np.asarray(jax.vmap(jax.vmap(env.wheel_targets))(actions)).swapaxes(0, 1)
+    substeps = env.config.physics.n_substeps
+    theirs = drive_in_c(reference, first, ctrl, substeps)
+    distance, turned = apart(ours.qpos, theirs.qpos)
+    median, p95 = np.percentile(distance, [50, 95])
+    case = f"{env.config.robot.preset}, μ = {friction}"
     print(
-        f"\n{env.config.robot.preset}: MJX is within {worst['position'] * 1e3:.2f} mm and"
-        f" {math.degrees(worst['yaw']):.2f}° of converged C MuJoCo over {STEPS} control steps,"
-        f" within {worst['after 1 s'] * 1e3:.2f} mm after 1 s"
+        f"\n{case}: MJX is within {distance.max():.3f} mm (median {median:.4f}, p95 {p95:.3f}) and"
+        f" {turned.max():.3f}° of converged C MuJoCo over {STEPS} control steps"
     )
-    assert worst["after 1 s"] < SOLVER_TOLERANCE
-    assert worst["position"] < POSITION_TOLERANCE
-    assert worst["yaw"] < YAW_TOLERANCE
+    if friction == 1.0:
+        assert distance.max() < POSITION_TOLERANCE
+        assert turned.max() < YAW_TOLERANCE
+    else:
+        # Some robots slide so that noise alone decides where they end: no more of ours may part.
+        noisy, _ = apart(drive_in_c(reference, first, ctrl, substeps, NOISE).qpos, theirs.qpos)
+        astray, allowed = (int((x > ASTRAY).sum()) for x in (distance, noisy))
+        print(
+            f"{case}: {astray} of {len(distance)} robots beyond {ASTRAY} mm; of C MuJoCo under"
+            f" noise of {NOISE} {allowed}, the worst at {noisy.max():.3f} mm"
+        )
+        assert median < SLIPPERY_MEDIAN
+        assert p95 < SLIPPERY_P95
+        # Two counts of rare events: their difference deviates by the root of their sum.
+        assert astray - allowed <= 3 * math.sqrt(astray + allowed)
+    single_steps_agree(case, env, mjx_model, theirs, ctrl)
+
+
+def single_steps_agree(case, env, mjx_model, theirs, ctrl):
+    """From every state of the converged path one control step ends where it does there."""
+    states = jax.tree.map(lambda x: jnp.float32(x[:-1].reshape(-1, *x.shape[2:])), theirs)
+    step = env.with_model(mjx_model).step_physics
+    ahead = jax.jit(jax.vmap(step))(states, ctrl[1:].reshape(-1, 2))
+    error = np.asarray(ahead.qvel) - theirs.qvel[1:].reshape(ahead.qvel.shape)
+    error = np.linalg.norm(error[:, :3], axis=-1)
+    outliers = np.flatnonzero(error > STEP_OUTLIER)
+    print(
+        f"{case}: one control step within {np.quantile(error, 0.999):.1e} m/s (p99.9);"
+        f" {len(outliers)} of {len(error):,} above {STEP_OUTLIER}"
+    )
+    for index in outliers:
+        before, robot = divmod(index, 2 * ROBOTS)
+        print(f"  robot {robot}, control step {before + 1}: {error[index]:.1e} m/s")
+    assert np.quantile(error, 0.999) < STEP_TOLERANCE
+    assert len(outliers) <= len(error) / 10_000
 
 
 def test_straight_driving_and_spinning_match_closed_form(driver):
