@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup sb3 train test test-slow check format benchmark docs clean
+.PHONY: setup sb3 train test test-gpu test-slow check format benchmark docs clean
 
 setup: $(STAMP)
 
@@ -39,6 +39,11 @@ train: setup
 test: setup
 	$(BIN)/python -m pytest -m 'not slow' --numprocesses logical --maxprocesses 8 --dist loadfile \
 		--no-loadscope-reorder
+
+# Every command and the tests, on this machine's NVIDIA GPU.
+test-gpu: setup
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cuda]'
+	$(BIN)/python tests/on_gpu.py
 
 test-slow: setup
 	$(BIN)/python -m pytest -m slow

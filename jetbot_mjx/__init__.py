@@ -1,8 +1,8 @@
 """A JetBot that learns to drive to goals, thousands at a time: MuJoCo MJX and Brax's PPO.
 
 The modules in reading order, each knowing only those before it:
-`errors`, `config`, `compiling`, `imports`, `mjx`, `cholesky`, `scalars`, `moving`, `scalarize`,
-`kernel`, `ptx`, `gpu`, `llvm`, `xla_ffi`, `cpu`, `programs`, `kinematics`, `model`, `task`,
+`errors`, `config`, `compiling`, `imports`, `mjx`, `cholesky`, `scalars`, `moving`, `schedule`,
+`scalarize`, `kernel`, `llvm`, `gpu`, `xla_ffi`, `cpu`, `kinematics`, `model`, `task`, `programs`,
 `state`, `physics`, `env`, `mujoco_jetbot`, `variation`, `motors`, `sensors`, `randomization`,
 `wrappers`, `task_trials`, `method_checks`, `task_checks`, `policy`, `advantages`, `ppo`, `trainer`,
 `rollout`, `evaluation`, `robustness`, `report`, `estimates`, `comparison`, `tables`, `plots`,

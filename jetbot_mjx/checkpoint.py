@@ -49,13 +49,13 @@ class Checkpoint(NamedTuple):
     about: Mapping[str, Any]
 
     def make_env(self) -> JetBotEnv:
-        """Builds the environment that the policy was trained in.
+        """Build the environment that the policy was trained in, for the devices that are here.
 
         Raises:
           UserError: the task cannot be built.
           CheckpointError: its observation is not the one that the policy knows.
         """
-        env = make_env(self.config)
+        env = make_env(self.config.for_any_device())
         layout = [field._asdict() for field in env.task.layout]
         if layout != self.about["layout"]:
             raise CheckpointError(

@@ -404,6 +404,15 @@ class Config(_Section):
             )
         return self
 
+    def for_any_device(self) -> "Config":
+        """The same with physics stepped by whoever can, if not by XLA.
+
+        A run that asked for a kernel on one kind of device is evaluated on others too.
+        """
+        if self.physics.impl == "xla":
+            return self
+        return self.model_copy(update={"physics": self.physics.model_copy(update={"impl": "auto"})})
+
     def of_each_seed(self) -> list["Config"]:
         """The configurations of single runs that this one stands for."""
         return [

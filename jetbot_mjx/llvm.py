@@ -308,9 +308,7 @@ class Writer:
         return self._chosen(self.do(f"icmp {better} {self.type('i')} {a}, {b}"), "i", a, b)
 
     def _chosen(self, which: str, kind: str, yes: str, no: str) -> str:
-        return (
-            f"select {self.type('b')} {which}, {self.type(kind)} {yes}, {self.type(kind)} {no}"
-        )
+        return f"select {self.type('b')} {which}, {self.type(kind)} {yes}, {self.type(kind)} {no}"
 
     def _select(self, value: Value, operands: list[str]) -> str:
         which, no, yes = operands

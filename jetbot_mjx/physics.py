@@ -85,7 +85,9 @@ class Physics:
     def impl(self) -> str:
         """Who makes a step on JAX's default devices, as in `physics.impl`, but never `auto`."""
         platform = jax.local_devices()[0].platform
-        here = [x.IMPL for x in self._backends() if _PLATFORMS.get(platform, platform) == x.PLATFORM]
+        here = [
+            x.IMPL for x in self._backends() if _PLATFORMS.get(platform, platform) == x.PLATFORM
+        ]
         return "xla" if not here or self._as_kernel() is None else here[0]
 
     @functools.cached_property

@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"  {'max |qvel|':>10}  not finite"
     )
     odd: list[str] = []
-    for index, moment in enumerate(run(stored, make_env(stored.config))):
+    for index, moment in enumerate(run(stored, make_env(stored.config.for_any_device()))):
         print(line(index, moment))
         odd = moment.odd
     if not odd:

@@ -79,7 +79,7 @@ def test_touching_costs_in_every_step_of_it(drives):
 
 def test_the_collision_is_that_of_c_mujoco(drives, env):
     model = copy.copy(env.mj_model)
-    model.opt.iterations, model.opt.ls_iterations = 100, 50
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     ctrl = np.asarray(env.wheel_targets(jnp.array([1.0, 0.0])))
     for places, qpos in zip(PLACES, drives[0], strict=True):
         data = mujoco.MjData(model)

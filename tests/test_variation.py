@@ -44,9 +44,7 @@ def driver(request):
 
     Without a variation it drives the environment itself.
     """
-    # Converged, as C MuJoCo is here: a robot that slides wants more than its preset's iterations.
-    solver = {"iterations": 10, "ls_iterations": 20}
-    env = make_env(parse_config({"robot": {"preset": request.param}, "physics": solver}))
+    env = make_env(parse_config({"robot": {"preset": request.param}}))
 
     def drive(variation, actions):
         def one(variation, actions):
