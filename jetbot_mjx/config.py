@@ -122,8 +122,8 @@ class PhysicsConfig(_Section):
     """[s] one physics step; `ctrl_dt` is a whole multiple of it."""
     tolerance: Annotated[float, Field(ge=0, le=1e-3, allow_inf_nan=False)] = 1e-6
     """The contact solver stops when an iteration improves its cost by less than this, or its
-    gradient is smaller, both relative to the trace of the inertia matrix; MuJoCo's default of 1e-8 is
-    beyond float32's reach."""
+    gradient is smaller, both relative to the trace of the inertia matrix; MuJoCo's default of 1e-8
+    is beyond float32's reach."""
     iterations: Count = 20
     """Newton iterations per physics step at most; one or two are the rule."""
     ls_iterations: Count = 4

@@ -39,7 +39,13 @@ class Kernel:
     """A step of one robot that a back end can run for many; compared by identity."""
 
     def __init__(
-        self, program: Program, *, carried: int, steps: int, fallback: Step, impl: str = "auto"
+        self,
+        program: Program,
+        *,
+        carried: int,
+        steps: int,
+        fallback: Callable[..., list[Array]],
+        impl: str = "auto",
     ) -> None:
         """Describe a kernel that repeats a program, its results becoming its first arguments.
 

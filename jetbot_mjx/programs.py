@@ -2,9 +2,9 @@
 
 JAX keeps what XLA compiled under the program that it was compiled from; to look there, a process
 must first trace and lower that program, which takes far longer than to load it. What is traced
-depends on the configuration, on the model, on this package's source and on what is installed: under
-these a command finds its programs at once. It does so only for tasks of this package, since nobody can say
-what a task of someone else's depends on.
+depends on the configuration, on the model, on this package's source and on what is installed:
+under these a command finds its programs at once. It does so only for tasks of this package, since
+nobody can say what a task of someone else's depends on.
 """
 
 import contextlib

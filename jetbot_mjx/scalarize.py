@@ -33,7 +33,6 @@ from jetbot_mjx.moving import (
     shape_of,
     windows,
 )
-from jetbot_mjx.schedule import Block, PlacedBranch, PlacedLoop, schedule
 from jetbot_mjx.scalars import (
     EVALUATE,
     Graph,
@@ -44,6 +43,7 @@ from jetbot_mjx.scalars import (
     is_known,
     is_same,
 )
+from jetbot_mjx.schedule import Block, PlacedBranch, PlacedLoop, schedule
 
 MOST_TRIPS = 64
 """Of a loop that is written out."""

@@ -10,7 +10,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx import kinematics, mjx, model
+from jetbot_mjx import cpu, kinematics, mjx, model
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.model import make_mj_model
@@ -114,7 +114,7 @@ def apart(one, other):
 @pytest.fixture(scope="module", params=[1.0, 0.4])
 def on_floor(request, driver):
     """Physics on a floor of some friction, and the same in C MuJoCo, converged."""
-    env, drive = driver
+    env, _ = driver
     robot = dataclasses.replace(env.robot, friction=request.param)
     mj_model = make_mj_model(robot, env.config.physics, visual=False)
     return request.param, mjx.put_model(mj_model), converged(copy.copy(mj_model))
@@ -215,6 +215,25 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     tilt = np.degrees(jax.vmap(jax.vmap(kinematics.tilt))(physics.qpos[:, :, 3:7]).max())
     print(f"\n{env.config.robot.preset}, friction {friction}: worst tilt {tilt:.2f}°")
     assert tilt < WORST_TILT
+
+
+@pytest.mark.skipif(not cpu.is_available(), reason="llvmlite compiles nothing for XLA")
+def test_another_solver_is_another_kernel():
+    # Iterations are no array of MJX's model: what only compares arrays takes them for the same.
+    env = make_env(parse_config({}))
+    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    option = env.mjx_model.opt
+
+    def kernels(**changed):
+        here = env.with_model(env.mjx_model.replace(opt=option.replace(**changed)))
+        lowered = jax.jit(here.step_physics).trace(state, jnp.zeros(2)).lower()
+        (name,) = cpu.kernels_in(lowered.as_text())
+        return name
+
+    plain = kernels()
+    assert kernels() == plain
+    others = [{"iterations": 3}, {"ls_iterations": 3}, {"tolerance": option.tolerance * 10}]
+    assert len({plain, *(kernels(**changed) for changed in others)}) == 4
 
 
 def test_physics_keeps_full_precision_in_its_matrix_products():

@@ -172,6 +172,19 @@ def test_changed_source_is_another_program(paths, monkeypatch):
     assert paths({}) != before
 
 
+def test_another_model_is_another_program(paths, monkeypatch):
+    before = paths({})
+    make = programs.make_mj_model
+
+    def with_another_solver(*arguments, **options):
+        model = make(*arguments, **options)
+        model.opt.iterations += 1
+        return model
+
+    monkeypatch.setattr(programs, "make_mj_model", with_another_solver)
+    assert paths({}) != before
+
+
 def test_a_task_of_someone_else_is_always_traced(paths):
     assert paths({"task": {"name": "someone.module:Task"}}) is None
 
