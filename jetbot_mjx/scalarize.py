@@ -51,6 +51,9 @@ MOST_TRIPS = 64
 MOST_WRITTEN_OUT = 512
 """Operations of a loop that is written out although it could stay one."""
 
+MOST_IN_PROGRAM = 100_000
+"""Operations of a program: a CPU's compiler takes 15 s for so many, and for more soon minutes."""
+
 LEAST_IN_BRANCH = 24
 """Operations for which a branch is better than computing both sides."""
 
@@ -167,7 +170,11 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
         for leaf in jax.tree.leaves(arguments)
     ]
     outputs = _Writer(graph).closed(closed, inputs)
-    return Program(inputs, outputs, schedule(x for array in outputs for x in array.ravel()))
+    block = schedule(x for array in outputs for x in array.ravel())
+    program = Program(inputs, outputs, block)
+    if program.size > MOST_IN_PROGRAM:
+        raise UnsupportedError(f"{program.size:,} operations, more than {MOST_IN_PROGRAM:,}")
+    return program
 
 
 class _Writer:

@@ -136,8 +136,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
 }
 """Every operation but `select` and `convert`, as NumPy does it."""
 
-MOST_VALUES = 200_000
-"""Operations of one program; what has more is no program to write out."""
+MOST_VALUES = 1_000_000
+"""Operations that are recorded at most, those that nothing needs included."""
 
 _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 
