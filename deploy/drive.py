@@ -2,7 +2,8 @@
 
 Runs on the robot with Python 3.6 or newer and NumPy, and there with NVIDIA's `jetbot`. POLICY is
 the folder that `python -m jetbot_mjx.export` wrote. X and Y are metres: ahead and to the left of
-the robot as it stands, or in the frame of a tracker (`--tracker PORT`, see poses.py).
+the robot as it stands, or in the frame of a tracker (`--tracker PORT`, see poses.py). A tracker on
+another machine needs `--tracker-host 0.0.0.0`, and a key that it shares with the robot.
 
 The motors are set to zero before the first command; while the newest pose is older than
 `--stale-after`; at the goal, at `--timeout`, after any error, on Ctrl-C, SIGTERM and SIGHUP.
@@ -21,6 +22,7 @@ import time
 import types
 from typing import Any, Callable, Iterator, NamedTuple, Optional
 
+from datagrams import Key
 from motors import (
     Calibration,
     DriveError,
@@ -32,12 +34,18 @@ from motors import (
     wheel_speed,
 )
 from observations import Observer
-from poses import Odometry, Pose, udp_tracker
+from poses import Odometry, Pose, Tracker, udp_tracker
 
 LOG_FORMAT = "jetbot_mjx-drive/1"
 
 STALE_AFTER = 0.08
 """[s] With the 17 ms of a control period the motors are at zero within 100 ms."""
+
+_NEEDED = (
+    *("files", "observation", "rest_quaternion", "rest_height", "goal_height", "success_radius"),
+    *("control_period", "wheel_speeds", "run", "env_steps", "task", "robot"),
+)
+"""What a drive takes from `policy.json`."""
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -118,6 +126,9 @@ def load_policy(folder: str) -> Policy:
         with open(os.path.join(folder, "policy.json"), encoding="utf-8") as file:
             contract = json.load(file)
         path = os.path.join(folder, "policy.py")
+        missing = [name for name in _NEEDED if name not in contract]
+        if missing:
+            raise DriveError(f"{folder} is no exported policy: policy.json lacks {missing[0]}")
         if "numpy" not in contract["files"] or not os.path.isfile(path):
             raise DriveError(f"{folder} holds no policy.py: export it with --format numpy")
         with open(path, encoding="utf-8") as file:
@@ -127,8 +138,10 @@ def load_policy(folder: str) -> Policy:
         return Policy(module.__dict__["act"], contract)
     except OSError as error:
         raise DriveError(f"{folder} is no exported policy: {error.strerror}")
-    except (ValueError, LookupError, TypeError, SyntaxError) as error:
+    except (ValueError, LookupError, TypeError, SyntaxError, RecursionError) as error:
         raise DriveError(f"{folder} is no exported policy: {error}")
+    except ImportError as error:
+        raise DriveError(f"{path} cannot be run here: {error}")
 
 
 def arrival_radius(contract: dict) -> float:
@@ -311,11 +324,27 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--calibration", metavar="FILE", help="of calibrate.py")
     parser.add_argument("--tracker", type=int, metavar="PORT", help="UDP; default: dead reckoning")
+    parser.add_argument(
+        "--tracker-host", metavar="HOST", help="address to listen at (default: this machine alone)"
+    )
+    parser.add_argument(
+        "--tracker-key", metavar="FILE", help="what the tracker signs with, see datagrams.py"
+    )
     parser.add_argument("--timeout", type=at_least(0.0), default=30.0, metavar="S")
     parser.add_argument("--stale-after", type=at_least(0.0), default=STALE_AFTER, metavar="S")
     parser.add_argument("--log", metavar="FILE", help="one JSON object for each control period")
     parser.add_argument("--dry-run", action="store_true", help="no robot: dead reckoning alone")
     return parser
+
+
+def _pose_source(options: argparse.Namespace, calibration: Calibration) -> Any:
+    host, key = options.tracker_host, options.tracker_key
+    if options.tracker is None:
+        for name, value in (("host", host), ("key", key)):
+            if value is not None:
+                raise DriveError(f"--tracker-{name} says how to listen: give --tracker PORT too")
+        return Odometry(calibration)
+    return udp_tracker(options.tracker, host or "127.0.0.1", None if key is None else Key(key))
 
 
 def main(arguments: Optional[list] = None, clock: Any = None) -> int:
@@ -341,9 +370,7 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
             arrival_radius(policy.contract),
         )
         robot = NoRobot() if options.dry_run else make_robot()
-        poses = Odometry(calibration)
-        if options.tracker is not None:
-            poses = udp_tracker(options.tracker)
+        poses = _pose_source(options, calibration)
         with contextlib.closing(poses), _log_file(options.log) as log, _leaving_by_signals():
             if log is not None:
                 log(log_header(policy, calibration, settings, poses.name))
@@ -351,6 +378,8 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
     except DriveError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
+    if isinstance(poses, Tracker) and poses.rejected:
+        print(f"{poses.rejected} datagrams were not believed, the last because {poses.reason}")
     nearest = "no pose came" if outcome.distance is None else f"{outcome.distance:.3f} m from it"
     print(
         f"{'reached' if outcome.reached else 'not reached'} after {outcome.seconds:.2f} s,"

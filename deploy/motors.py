@@ -112,7 +112,7 @@ def read_calibration(path: str) -> Calibration:
         raise DriveError(f"--calibration {path}: {error.strerror}")
     except KeyError as error:
         raise DriveError(f"--calibration {path} lacks {error}")
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise DriveError(f"--calibration {path} is no calibration: {error}")
     except DriveError as error:
         raise DriveError(f"--calibration {path}: {error}")

@@ -10,14 +10,16 @@ stale. Its frame is the robot's at the start.
 `Tracker` listens to whoever sees the robot from outside, such as a camera above the floor. One
 datagram is one JSON object, `{"time": 12.25, "x": 0.31, "y": -0.02, "yaw": 1.57}`: seconds of the
 sender's own clock, metres, and radians counter-clockwise from x. `time` must grow; what repeats
-is no news, so a tracker that hangs counts as one that is silent.
+is no news, so a tracker that hangs counts as one that is silent. From another machine datagrams
+are signed, see datagrams.py.
 """
 
-import json
+import ipaddress
 import math
 import socket
 from typing import Callable, NamedTuple, Optional
 
+from datagrams import LONGEST, Key, Refused, Sighting, parse
 from motors import Calibration, DriveError
 
 # [s] of a low-pass over the speeds: millimetres of noise are 0.1 m/s from picture to picture.
@@ -26,7 +28,11 @@ SMOOTHING = 0.03
 # [s] without news after which a tracker may begin a new count of time.
 _FORGET_AFTER = 0.5
 
-_LONGEST_DATAGRAM = 4096
+_LONGEST_DATAGRAM = 2 * LONGEST
+"""[bytes] Longer ones are cut off here, and are too long all the same."""
+
+_MOST_AT_ONCE = 256
+"""Datagrams; a flood of them must not keep the driver from its motors."""
 
 
 class Pose(NamedTuple):
@@ -109,59 +115,75 @@ class Tracker:
     name = "tracker"
 
     def __init__(
-        self, receive: Callable[[], list], close: Callable[[], None] = lambda: None
+        self,
+        receive: Callable[[], list],
+        close: Callable[[], None] = lambda: None,
+        key: Optional[Key] = None,
     ) -> None:
         """Begins without a pose.
 
         Args:
           receive: returns the datagrams that have come since it was last called.
           close: is called at the end.
+          key: that datagrams are signed with; None: they are not signed.
         """
-        self._receive, self.close = receive, close
+        self._receive, self._close, self._key = receive, close, key
         self._pose = None  # type: Optional[Pose]
         self._sent = 0.0
         self.rejected = 0
-        """Datagrams that were no pose."""
+        """Datagrams that were not believed."""
+        self.reason = ""
+        """Why the last of them was not."""
 
     def read(self, now: float) -> Optional[Pose]:
-        """The newest pose; None before the first."""
+        """Return the newest pose; None before the first. No datagram makes it raise."""
         for datagram in self._receive():
             try:
-                values = json.loads(datagram.decode("utf-8"))
-                sent, x, y, yaw = (float(values[name]) for name in ("time", "x", "y", "yaw"))
-            except (ValueError, TypeError, LookupError):
+                sighting = parse(datagram) if self._key is None else self._key.check(datagram)
+            except Refused as error:
                 self.rejected += 1
-                continue
-            if not all(math.isfinite(value) for value in (sent, x, y, yaw)):
-                self.rejected += 1
-                continue
-            self._update(now, sent, x, y, yaw)
+                self.reason = str(error)
+            else:
+                self._update(now, sighting)
         return self._pose
 
     def commanded(self, now: float, left: float, right: float) -> None:
         """Of no use here."""
 
-    def _update(self, now: float, sent: float, x: float, y: float, yaw: float) -> None:
+    def close(self) -> None:
+        """Stops listening, and keeps the newest time that was signed.
+
+        Raises:
+          DriveError: it cannot be kept.
+        """
+        self._close()
+        if self._key is not None:
+            self._key.close()
+
+    def _update(self, now: float, seen: Sighting) -> None:
         last = self._pose
+        # A key has seen to it already that time grows.
         if last is None or now - last.time > _FORGET_AFTER:
-            self._pose, self._sent = Pose(now, x, y, yaw, 0.0, 0.0), sent
+            self._pose, self._sent = Pose(now, seen.x, seen.y, seen.yaw, 0.0, 0.0), seen.time
             return
-        dt = sent - self._sent
+        dt = seen.time - self._sent
         if dt <= 0.0:
             return
-        turned = _nearest(yaw - last.yaw)
+        turned = _nearest(seen.yaw - last.yaw)
         heading = last.yaw + 0.5 * turned
-        moved = (x - last.x) * math.cos(heading) + (y - last.y) * math.sin(heading)
-        share = 1.0 - math.exp(-dt / SMOOTHING)
+        moved = (seen.x - last.x) * math.cos(heading) + (seen.y - last.y) * math.sin(heading)
+        # The share by its rate: finite however close two pictures were.
+        share = -math.expm1(-dt / SMOOTHING)
+        rate = share / dt
         self._pose = Pose(
             now,
-            x,
-            y,
+            seen.x,
+            seen.y,
             last.yaw + turned,
-            last.speed + share * (moved / dt - last.speed),
-            last.yaw_rate + share * (turned / dt - last.yaw_rate),
+            last.speed + rate * moved - share * last.speed,
+            last.yaw_rate + rate * turned - share * last.yaw_rate,
         )
-        self._sent = sent
+        self._sent = seen.time
 
 
 def _nearest(angle: float) -> float:
@@ -169,33 +191,46 @@ def _nearest(angle: float) -> float:
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
-def udp_tracker(port: int, host: str = "0.0.0.0") -> Tracker:
-    """A tracker that listens on a UDP port.
+def udp_tracker(port: int, host: str = "127.0.0.1", key: Optional[Key] = None) -> Tracker:
+    """Opens a UDP port for a tracker.
 
     Args:
       port: of this machine.
-      host: the address to listen at; by default every one.
+      host: the address to listen at; by default only programs of this machine reach it.
+      key: that the tracker signs with; None: it does not sign.
 
     Returns:
       The tracker.
 
     Raises:
-      DriveError: the port cannot be had.
+      DriveError: the port cannot be had, or others reach the address and there is no key.
     """
+    if not 0 < port < 65536:
+        raise DriveError(f"--tracker {port} is no port: give 1 to 65535")
+    try:
+        address = socket.gethostbyname(host)
+    except (OSError, ValueError) as error:
+        raise DriveError(f"--tracker-host {host}: {error}")
+    if key is None and not ipaddress.ip_address(address).is_loopback:
+        raise DriveError(
+            f"--tracker-host {host}: whoever reaches this address could steer the robot: share a"
+            " key with the tracker by --tracker-key FILE"
+        )
     listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        listener.bind((host, port))
-    except (OSError, OverflowError) as error:
+        listener.bind((address, port))
+    except OSError as error:
         listener.close()
-        raise DriveError(f"--tracker {port}: {error}")
+        raise DriveError(f"--tracker {port} at {host}: {error.strerror}")
     listener.setblocking(False)
 
     def receive() -> list:
         found = []
-        while True:
+        while len(found) < _MOST_AT_ONCE:
             try:
                 found.append(listener.recv(_LONGEST_DATAGRAM))
             except BlockingIOError:
-                return found
+                break
+        return found
 
-    return Tracker(receive, listener.close)
+    return Tracker(receive, listener.close, key)

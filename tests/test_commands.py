@@ -295,7 +295,7 @@ def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monk
     eye = Camera(robot, 60.0, 0.0, np.random.default_rng(0))
     distances = iter([0.14, 0.33])
     monkeypatch.setattr(drive, "make_robot", lambda: robot)
-    monkeypatch.setattr(drive, "udp_tracker", lambda port: Tracker(eye.receive))
+    monkeypatch.setattr(drive, "udp_tracker", lambda *where: Tracker(eye.receive))
     mains = {
         "calibrate": lambda words: calibrate.main(
             words, robot, robot, lambda: (next(distances), 0.0)

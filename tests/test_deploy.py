@@ -2,9 +2,11 @@
 
 import contextlib
 import functools
+import hmac
 import json
 import math
 import os
+import re
 import signal
 import socket
 import sys
@@ -27,6 +29,7 @@ ROOT = Path(__file__).parents[1]
 sys.path.append(str(ROOT / "deploy"))
 
 import calibrate
+import datagrams
 import drive
 import motors
 import observations
@@ -363,18 +366,244 @@ def test_a_tracker_takes_no_repeats_and_no_rubbish():
     assert tracker.read(0.7).x == 0.4
 
 
+NASTY = [
+    b"",
+    b"[" * 1000,
+    b"[" * 4000,
+    b'{"time":' * 120,
+    b"1" + b"0" * 400,
+    b'{"time": 9, "x": 1' + b"0" * 400 + b', "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": 1e308, "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": 0, "y": 0, "yaw": -1e308}',
+    b'{"time": 1e308, "x": 0, "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": NaN, "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": 0, "y": -Infinity, "yaw": 0}',
+    b'{"time": 9, "x": true, "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": "0.1", "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": [0], "y": 0, "yaw": 0}',
+    b'{"time": 9, "x": null, "y": 0, "yaw": 0}',
+    b'{"time": 9, "y": 0, "yaw": 0}',
+    b'"time"',
+    b"null",
+    b"\xef\xbb\xbf{}",
+    b'"\\ud800"',
+    b"\0" * 900,
+    json.dumps({"time": 9, "x": 0, "y": 0, "yaw": 0, "note": "x" * 1000}).encode(),
+]
+
+
+@pytest.mark.parametrize("content", NASTY, ids=range(len(NASTY)))
+def test_no_datagram_ends_a_drive(content, policy):
+    """The robot stops while nothing else comes, and goes on when the tracker is back."""
+    robot = StandIn()
+    eye = camera(robot)
+
+    def receive():
+        eye.blind = 0.5 <= robot.now() < 0.8
+        return [content] if eye.blind else eye.receive()
+
+    tracker = poses.Tracker(receive)
+    outcome = drive.drive(
+        robot, robot, tracker, policy, motors.default_calibration(), settings((0.6, 0.0))
+    )
+    assert outcome.reached
+    assert outcome.stale_ticks > 10
+    assert tracker.rejected > 10
+    assert tracker.reason
+
+
+def mutated(rng, time):
+    """Bytes that are nearly a pose, or nothing of the kind."""
+    if rng.random() < 0.2:
+        return rng.bytes(rng.integers(0, 1500))
+    numbers = [0, -1, 1.5, 1e-320, 1e17, 1e300, 10**30, 10**400, math.nan, -math.inf, True, None]
+    values = {"time": time, "x": 0.5, "y": 0.5, "yaw": 0.5}
+    for name in values:
+        others = [*numbers, "1", [], {}, values, rng.normal(), float(rng.integers(0, 100))]
+        if rng.random() < 0.5:
+            values = {**values, name: others[rng.integers(len(others))]}
+    content = bytearray(json.dumps(values).encode())
+    for _ in range(rng.integers(0, 3)):
+        place = rng.integers(len(content))
+        content[place : place + rng.integers(0, 2)] = rng.bytes(rng.integers(0, 2))
+    return bytes(content)
+
+
+@pytest.mark.parametrize("signs", [False, True])
+def test_whatever_comes_a_pose_stays_finite(signs, key):
+    """20,000 datagrams, of which some are poses."""
+    rng = np.random.default_rng(0)
+    inbox = []
+    tracker = poses.Tracker(lambda: [inbox.pop()], key=datagrams.Key(str(key)) if signs else None)
+    changes, last = 0, None
+    for index in range(20_000):
+        inbox.append(mutated(rng, index))
+        if signs and index % 2:
+            inbox[0] = signed(inbox[0])
+        # So long apart now and then that time is counted anew.
+        pose = tracker.read(0.02 * index + index // 50)
+        changes += pose is not last
+        last = pose
+        assert pose is None or all(map(math.isfinite, pose))
+    assert tracker.rejected > 5_000
+    assert changes > 20
+
+
+def test_pictures_close_together_make_no_infinite_speed():
+    inbox = []
+    tracker = poses.Tracker(lambda: [inbox.pop()])
+    for time, x in [(0.0, -1000.0), (5e-324, 1000.0), (1e-323, -1000.0), (1.0, 0.0), (1.1, 0.0)]:
+        inbox.append(datagram(time, x))
+        pose = tracker.read(0.0)
+    assert math.isfinite(pose.speed)
+
+
+def send(port, *contents):
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        for content in contents:
+            sender.sendto(content, ("127.0.0.1", port))
+
+
 def test_poses_come_by_udp(unused_port):
     port = unused_port()
-    tracker = poses.udp_tracker(port, "127.0.0.1")
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        for index in range(3):
-            sender.sendto(datagram(1.0 + index, x=index), ("127.0.0.1", port))
+    tracker = poses.udp_tracker(port)
+    send(port, b"[" * 4000, *(datagram(1.0 + index, x=index) for index in range(3)), b"0" * 60_000)
     assert tracker.read(1.0).x == 2
+    assert (tracker.rejected, tracker.reason) == (2, "it is longer than 1024 bytes")
     with (
         contextlib.closing(tracker),
-        pytest.raises(motors.DriveError, match=f"--tracker {port}: .*in use"),
+        pytest.raises(motors.DriveError, match=f"--tracker {port} at 127.0.0.1: .*in use"),
     ):
-        poses.udp_tracker(port, "127.0.0.1")
+        poses.udp_tracker(port)
+
+
+def test_a_flood_does_not_keep_the_driver_from_its_motors(monkeypatch, unused_port):
+    class Flood:
+        def __init__(self, *arguments):
+            self.bind = self.setblocking = self.close = lambda *value: None
+
+        def recv(self, size):
+            return b"x" * size
+
+    port = unused_port()
+    monkeypatch.setattr(poses.socket, "socket", Flood)
+    tracker = poses.udp_tracker(port)
+    assert tracker.read(0.0) is None
+    assert tracker.rejected == 256
+
+
+def test_other_machines_do_not_reach_a_tracker(unused_port):
+    port = unused_port()
+    with contextlib.closing(poses.udp_tracker(port)) as tracker:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            # Another address of the same loopback: reached only where all addresses are.
+            sender.sendto(datagram(1.0), ("127.0.0.2", port))
+        assert tracker.read(0.0) is None
+
+
+@pytest.mark.parametrize("host", ["0.0.0.0", "", "192.0.2.1"])
+def test_other_machines_are_let_in_with_a_key_only(host, unused_port):
+    with pytest.raises(motors.DriveError, match=r"could steer the robot: .* --tracker-key FILE"):
+        poses.udp_tracker(unused_port(), host)
+
+
+# Datagrams that are signed.
+
+SECRET = b"fb6a1c0e5f4b4ad0a2b1c3d4e5f60718"
+
+
+@pytest.fixture
+def key(tmp_path):
+    path = tmp_path / "tracker.key"
+    path.write_bytes(SECRET + b"\n")
+    path.chmod(0o600)
+    return path
+
+
+def signed(body, secret=SECRET):
+    return hmac.new(secret, body, "sha256").digest() + body
+
+
+def test_only_what_is_signed_and_new_is_believed(key):
+    inbox = []
+    tracker = poses.Tracker(lambda: [inbox.pop(0)] if inbox else [], key=datagrams.Key(str(key)))
+    first = signed(datagram(1000.0, x=0.1))
+
+    def read(content, now):
+        inbox.append(content)
+        return tracker.read(now)
+
+    assert read(first, 0.0).x == 0.1
+    last = tracker.read(0.0)
+    forged = [
+        datagram(1001.0, x=9.0),
+        signed(datagram(1001.0, x=9.0), b"another key of the same length.."),
+        signed(datagram(1001.0, x=9.0), b""),
+        bytes(32) + datagram(1001.0, x=9.0),
+        first[:32] + datagram(1001.0, x=9.0),
+        first[:-1],
+        b"",
+        first[:31],
+    ]
+    for content in forged:
+        assert read(content, 0.01) == last
+        assert tracker.reason == f"it is not signed with {key}"
+    assert tracker.rejected == len(forged)
+    # What was recorded does not count again, also not after a silence, or in another drive.
+    assert read(first, 5.0) == last
+    assert "not later than 1000.0" in tracker.reason
+    tracker.close()
+    tracker = poses.Tracker(lambda: [inbox.pop(0)] if inbox else [], key=datagrams.Key(str(key)))
+    assert read(first, 0.0) is None
+    assert f"a replay, or the tracker's clock was set back (then remove {key}.newest)" in (
+        tracker.reason
+    )
+    assert read(signed(datagram(1000.5, x=0.2)), 0.1).x == 0.2
+
+
+def test_a_signed_pose_of_the_page_is_believed(key, unused_port, monkeypatch):
+    text = (ROOT / "docs" / "deploy.md").read_text("utf-8")
+    (block,) = [one for one in re.findall(r"```python\n(.*?)```", text, re.DOTALL) if "hmac" in one]
+    port = unused_port()
+    monkeypatch.chdir(key.parent)
+    assert '("192.168.1.20", 9870)' in block
+    here = block.replace('("192.168.1.20", 9870)', f'("127.0.0.1", {port})')
+    for secret, seen in ((str(key), True), (None, False)):
+        given = None if secret is None else datagrams.Key(secret)
+        with contextlib.closing(poses.udp_tracker(port, key=given)) as tracker:
+            names = {}
+            exec(compile(here, "deploy.md", "exec"), names)
+            names["tracker"].close()
+            assert (tracker.read(0.0) is not None) == seen
+
+
+def test_a_key_is_made_that_nobody_else_reads(tmp_path, capsys):
+    path = tmp_path / "new.key"
+    assert datagrams.main([str(path)]) == 0
+    assert path.stat().st_mode & 0o777 == 0o600
+    assert len(path.read_text().strip()) == 64
+    datagrams.Key(str(path))
+    before = path.read_bytes()
+    assert datagrams.main([str(path)]) == 2
+    assert path.read_bytes() == before
+    assert capsys.readouterr().err == f"error: {path}: File exists\n"
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda key: key.chmod(0o644), "can be read by others: chmod 600 "),
+        (lambda key: key.write_text("secret"), "holds 6 bytes: make it at least 16"),
+        (lambda key: key.unlink(), "tracker.key: No such file"),
+        (lambda key: key.with_suffix(".key.newest").write_text("x"), "could not convert"),
+        (lambda key: key.with_suffix(".key.newest").mkdir(), "newest: Is a directory"),
+        (lambda key: key.with_suffix(".key.newest.unfinished").mkdir(), "newest: Is a directory"),
+    ],
+)
+def test_a_key_that_cannot_be_used_is_told(damage, message, key):
+    damage(key)
+    with pytest.raises(motors.DriveError, match=message):
+        datagrams.Key(str(key))
 
 
 # Calibration.
@@ -430,6 +659,9 @@ def test_a_wrong_calibration_is_told(change, message, tmp_path):
 # The command.
 
 
+DRY = ("{policy}", "--goal", "1", "0", "--dry-run")
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -440,6 +672,16 @@ def test_a_wrong_calibration_is_told(change, message, tmp_path):
             "--calibration c.json: No such",
         ),
         (["{policy}", "--goal", "1", "0", "--dry-run", "--tracker", "99999"], "--tracker 99999"),
+        (["{policy}", "--goal", "1", "0", "--dry-run", "--tracker", "0"], "give 1 to 65535"),
+        (
+            [*DRY, "--tracker", "9870", "--tracker-host", "nowhere.invalid"],
+            "--tracker-host nowhere.invalid: ",
+        ),
+        ([*DRY, "--tracker", "9870", "--tracker-host", "x" * 300], "--tracker-host xxx"),
+        ([*DRY, "--tracker", "9870", "--tracker-key", "no.key"], "--tracker-key no.key: No such"),
+        ([*DRY, "--tracker", "9870", "--tracker-key", ""], "--tracker-key : No such"),
+        ([*DRY, "--tracker-host", "0.0.0.0"], "give --tracker PORT too"),
+        ([*DRY, "--tracker-key", "no.key"], "give --tracker PORT too"),
         (["{policy}", "--goal", "1", "0", "--dry-run", "--log", "no/log"], "--log no/log: No such"),
     ],
 )
