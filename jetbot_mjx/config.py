@@ -203,6 +203,10 @@ class RandomizationConfig(_Section):
     """[rad/s] likewise of the yaw rate."""
     observation_delay: Range = _range(0, 60, whole=True)
     """[control steps] by which the robot sees itself late."""
+    height_offset: Range = _range(-0.05, 0.05)
+    """[m] by how much higher than it is the robot takes itself to be, in the whole episode."""
+    pitch_offset: Range = _range(-0.5, 0.5)
+    """[rad] likewise by how much its nose is lower."""
     start_x: Range = _range(-5, 5)
     """[m] where an episode starts, forward of the origin."""
     start_y: Range = _range(-5, 5)

@@ -139,6 +139,23 @@ def turned(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"
     return jnp.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w])
 
 
+def pitched(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"]:
+    """Return the attitude of a body turned about its own y axis.
+
+        q' = q ⊗ (cos α/2, 0, sin α/2, 0)
+
+    Args:
+      quat: (w, x, y, z) of the body in the world.
+      angle: α [rad]; positive lowers the nose.
+
+    Returns:
+      Its attitude afterwards, (w, x, y, z).
+    """
+    c, s = jnp.cos(0.5 * angle), jnp.sin(0.5 * angle)
+    w, x, y, z = quat
+    return jnp.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x])
+
+
 def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
     """Angle between a body's z axis and the world's.
 

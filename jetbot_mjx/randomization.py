@@ -19,7 +19,7 @@ from jetbot_mjx.config import RandomizationConfig
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.model import CONTROLLER_WHEEL_RADIUS, QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.motors import Motors, drive_motors, motors_at_rest
-from jetbot_mjx.sensors import Sensors, sense, sensors_at_start
+from jetbot_mjx.sensors import Sensors, sense, sensors_at_start, with_offsets
 from jetbot_mjx.state import PhysicsState, State, robot_state
 from jetbot_mjx.variation import (
     MAX_ACTION_DELAY,
@@ -122,7 +122,7 @@ class VariedEnv(Wrapper):
         motors = motors_at_rest(variation, self._action_delay)
         return state.replace(
             pipeline_state=physics,
-            obs=self.env.task.observe(robot, state.goal),
+            obs=self.env.task.observe(with_offsets(robot, variation), state.goal),
             hardware=Hardware(drawn, motors, sensors),
         )
 

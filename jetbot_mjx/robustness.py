@@ -3,7 +3,7 @@
 One quantity at a time leaves the preset's value; goals, rules and figures are those of the
 report. One compiled program serves all robots, and beside the policy the scripted controller.
 
-Sources, by tag; BOM and EST as in `model.py`:
+Sources, by tag; BOM, EST and SIM as in `model.py`:
   CAD         the room that the battery has, and the clearance of the casters; see `model.py`.
   CSE276A     gassajor000/cse276a_jetbot: a JetBot's motors, calibrated.
   DUCKIETOWN  gym-duckietown: the simulator of a robot with the same motors.
@@ -180,6 +180,20 @@ SWEEPS = (
         "control steps",
         (0.0, 1.0, 2.0, 3.0, 6.0),
         "EST 30 to 60 ms of a camera of 30 pictures a second",
+    ),
+    Sweep(
+        "height_offset",
+        "offset of the observed height",
+        "m",
+        (-0.003, -0.001, 0.0, 0.001, 0.003),
+        "SIM MuJoCo's default contact carries the robot 0.4 mm higher; EST 3 mm, a carpet",
+    ),
+    Sweep(
+        "pitch_offset",
+        "offset of the observed pitch",
+        "rad",
+        (-0.0175, 0.0, 0.0175),
+        "EST 1°, how straight a sensor is mounted",
     ),
     Sweep("start_x", "start, forward", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
     Sweep("start_y", "start, left", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),

@@ -1,7 +1,8 @@
 """What a robot knows of itself: its own state, late and inexact. A pure pipeline of one robot.
 
 It stands between physics and the task's `observe`, so any observation of any task has its share.
-The first one of an episode is exact: a robot that stands can take its time to look.
+The first one of an episode has no delay and no noise: a robot that stands can take its time to
+look. Offsets are in every one.
 Reward, success and the end of an episode follow the true state; the goal is known as it is.
 """
 
@@ -16,6 +17,7 @@ from jetbot_mjx.task import RobotState
 from jetbot_mjx.variation import Variation
 
 _NOISE = ("position_noise", "yaw_noise", "speed_noise", "yaw_rate_noise")
+_OFFSETS = ("height_offset", "pitch_offset")
 
 
 class Sensors(NamedTuple):
@@ -59,7 +61,7 @@ def sense(
       step: control steps since the episode began.
 
     Returns:
-      The sensors after it, and the state of `observation_delay` steps ago, with noise.
+      The sensors after it, and the state of `observation_delay` steps ago, with noise and offsets.
     """
     seen, key = sensors
     if seen is not None:
@@ -72,7 +74,25 @@ def sense(
         # Another key for every step, without drawing it: Threefry takes any.
         own = key ^ jnp.stack([jnp.uint32(0), step.astype(jnp.uint32)])
         robot = _noisy(robot, own, variation)
-    return Sensors(seen, key), robot
+    return Sensors(seen, key), with_offsets(robot, variation)
+
+
+def with_offsets(robot: RobotState, variation: Variation) -> RobotState:
+    """Return a robot's state with the errors that last a whole episode.
+
+    The attitude alone is turned: velocities in the world frame do not depend on it.
+
+    Args:
+      robot: its state.
+      variation: its offsets.
+    """
+    if not variation.differs(*_OFFSETS):
+        return robot
+    up = jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.asarray(variation.height_offset)])
+    return robot._replace(
+        position_w=robot.position_w + up,
+        quat=kinematics.pitched(robot.quat, jnp.asarray(variation.pitch_offset)),
+    )
 
 
 def _noisy(robot: RobotState, key: UInt32[Array, "2"], variation: Variation) -> RobotState:

@@ -74,6 +74,10 @@ class Variation(NamedTuple):
     """Of its yaw rate [rad/s]."""
     observation_delay: Quantity = 0.0
     """By how much the robot sees itself late [control steps], rounded; the goal it knows."""
+    height_offset: Quantity = 0.0
+    """By how much higher than it is the robot takes itself to be [m], in the whole episode."""
+    pitch_offset: Quantity = 0.0
+    """Likewise by how much its nose is lower [rad]."""
     start_x: Quantity = 0.0
     """Where the episode starts [m], world frame: forward of the origin."""
     start_y: Quantity = 0.0

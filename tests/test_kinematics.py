@@ -66,6 +66,16 @@ def test_rotations_match_scipy():
     np.testing.assert_allclose(jax.vmap(kinematics.tilt)(quats), np.arccos(z_axis[:, 2]), atol=2e-3)
 
 
+def test_pitching_turns_a_body_about_its_own_y_axis():
+    rotations = Rotation.random(64, random_state=1)
+    angles = np.linspace(-1.0, 1.0, 64)
+    expected = rotations * Rotation.from_euler("y", angles[:, None])
+    quats = jnp.asarray(rotations.as_quat(scalar_first=True), jnp.float32)
+    got = jax.vmap(kinematics.pitched)(quats, jnp.asarray(angles, jnp.float32))
+    apart = Rotation.from_quat(got, scalar_first=True) * expected.inv()
+    assert apart.magnitude().max() < 1e-6
+
+
 def test_yaw_ignores_the_sign_of_the_quaternion():
     quat = jnp.array([math.cos(0.4), 0.0, 0.0, math.sin(0.4)])
     np.testing.assert_allclose(kinematics.yaw(quat), 0.8, rtol=1e-6)

@@ -23,6 +23,7 @@ from jetbot_mjx.wrappers import wrap_for_training
 ENVS = 64
 EPISODES = 5
 EPISODE_LENGTH = 3
+NOT_OBSERVED = {"height_offset", "pitch_offset"}  # by an egocentric policy
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +40,8 @@ def test_what_can_be_drawn_is_what_can_differ():
     assert tuple(RandomizationConfig.model_fields) == Variation._fields
 
 
-def test_the_preset_draws_everything_around_the_presets_robot(ranges):
-    assert tuple(ranges.drawn) == Variation._fields
+def test_the_preset_draws_all_that_its_policy_can_tell_around_the_presets_robot(ranges):
+    assert tuple(ranges.drawn) == tuple(n for n in Variation._fields if n not in NOT_OBSERVED)
     for name, (low, high) in ranges.drawn.items():
         assert low < high, name
         if name not in {"dead_band", "motor_lag", "position_noise", "yaw_noise"}:
@@ -117,6 +118,19 @@ def test_the_first_observation_is_exact_and_the_others_are_not(config):
         state = varied.step(state, jnp.zeros(2))
     exact = env.task.observe(robot_state(state.pipeline_state), state.goal)
     assert np.abs(state.obs - exact)[:2].max() > 1e-3
+
+
+def test_an_offset_is_in_the_first_observation_and_not_in_physics(world_env):
+    state = world_env.reset(jax.random.PRNGKey(5))
+    offset = VariedEnv(world_env, Variation(height_offset=0.003, pitch_offset=0.02))
+    seen = offset.reset(jax.random.PRNGKey(5))
+    jax.tree.map(np.testing.assert_array_equal, seen.pipeline_state, state.pipeline_state)
+    assert float(seen.obs[2] - state.obs[2]) == pytest.approx(0.003, abs=1e-7)
+    assert float(seen.obs[5] - state.obs[5]) == pytest.approx(0.01, abs=1e-4)
+    with gliding.everywhere():
+        seen = offset.step(seen, jnp.zeros(2))
+    height = seen.pipeline_state.qpos[2]
+    assert float(seen.obs[2] - height) == pytest.approx(0.003, abs=1e-7)
 
 
 def test_an_episode_starts_where_and_as_the_robot_was_put(driven, ranges):
@@ -199,6 +213,9 @@ def test_a_training_resumes_to_the_bit_with_everything_drawn(config, tmp_path):
 def test_the_page_tells_what_the_preset_draws(root, ranges, name):
     page = (root / "docs" / "randomization.md").read_text("utf-8")
     (row,) = (line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
-    low, high = ranges.drawn[name]
-    shown = "-π, π" if name == "start_yaw" else f"{low:g}, {high:g}"
+    if name in NOT_OBSERVED:
+        shown = "-"
+    else:
+        low, high = ranges.drawn[name]
+        shown = "-π, π" if name == "start_yaw" else f"{low:g}, {high:g}"
     assert f"| {shown} |" in row

@@ -72,6 +72,19 @@ def test_noise_leaves_height_and_level_and_is_new_at_every_step(seen):
     assert len(np.unique(np.asarray(seen.position_w)[:, 0])) > 0.99 * SAMPLES
 
 
+def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_heading():
+    variation = Variation(observation_delay=1, height_offset=0.003, pitch_offset=0.02)
+    sensors = sensors_at_start(robot(), KEY, variation, 1)
+    sensors, _ = sense(sensors, robot(1.0, 0.7), variation, jnp.int32(0))
+    _, now = sense(sensors, robot(2.0, 0.9), variation, jnp.int32(1))
+    # Height and pitch differ, and nothing else; the delayed state has them once.
+    np.testing.assert_allclose(now.position_w, (1.0, 0.0, 0.033), atol=1e-7)
+    ahead = kinematics.rotate(now.quat, jnp.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(ahead[2], -np.sin(0.02), atol=1e-6)
+    assert float(kinematics.yaw(now.quat)) == pytest.approx(0.7, abs=1e-6)
+    assert float(kinematics.tilt(now.quat)) == pytest.approx(0.02, abs=1e-6)
+
+
 def test_an_exact_robot_sees_every_bit_and_remembers_nothing():
     sensors = sensors_at_start(robot(), KEY, Variation(), 0)
     assert sensors == (None, None)
