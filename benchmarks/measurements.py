@@ -216,9 +216,11 @@ def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -
         "batch_size": num_envs // minibatches,
         "num_timesteps": interval * (WARM_UP_INTERVALS + sizes.repeats),
     }
-    if trainer == "brax" and config.ppo.learning_rate_schedule == "LINEAR":
-        # It does not know this schedule, which costs nothing that could be timed.
-        values["ppo"]["learning_rate_schedule"] = "NONE"
+    if trainer == "brax":
+        # What it does not know, and costs nothing that could be timed.
+        values["ppo"]["normalizer"] = "brax"
+        if config.ppo.learning_rate_schedule == "LINEAR":
+            values["ppo"]["learning_rate_schedule"] = "NONE"
     adapted = parse_config(values, source=f"--num-envs {num_envs}")
     adapted.check_devices(jax.device_count())
     return adapted

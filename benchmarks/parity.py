@@ -4,7 +4,8 @@ The first training steps of both are equal to round-off, which `tests/test_ppo.p
 trainings are chaotic, and after an interval Brax draws another key: only how they learn can
 be compared. On two tasks, with N seeds:
   probe   the egocentric task with a robot that moves exactly as commanded: no physics
-  config  the given configuration; LINEAR, which Brax does not know, gives way to ADAPTIVE_KL
+  config  the given configuration; LINEAR and the physical normalizer, which Brax does not know,
+          give way to ADAPTIVE_KL and Brax's
 After every interval the deterministic policy drives to the same fixed goals, those of the final
 report. A training's figure is the area under its success curve over its length: its mean success
 while it learns. A seed's first networks decide most of that, so both trainers get the same seeds,
@@ -31,6 +32,8 @@ What differs between the trainers, on purpose:
 |                         |                               | device's index; one device: as is  |
 | total steps             | every interval rounded up to  | the whole rounded up to training   |
 |                         | training steps                | steps                              |
+| smallest deviation of   | 1e-6                          | by the observation's units, unless |
+| the normaliser          |                               | normalizer is brax, as it is here  |
 | learning rate           | NONE, ADAPTIVE_KL             | LINEAR as well, to zero at the end |
 | first reset             | on each device its own share  | all at once, then dealt out        |
 | several seeds           | no                            | in one program                     |
@@ -92,6 +95,7 @@ PROBE = {
         "num_timesteps": 262_144,
         "num_envs": 256,
         "batch_size": 64,
+        "normalizer": "brax",
         **STEERED,
     },
 }
@@ -324,9 +328,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.require_device()
     cli.use_compilation_cache()
     config, probe = load_config(options.config, options.overrides), parse_config(PROBE)
-    if config.ppo.learning_rate_schedule == "LINEAR":
-        values = config.model_dump(mode="json")
-        config = parse_config(values | {"ppo": values["ppo"] | STEERED})
+    values = config.model_dump(mode="json")
+    values["ppo"] |= STEERED if config.ppo.learning_rate_schedule == "LINEAR" else {}
+    values["ppo"]["normalizer"] = "brax"
+    config = parse_config(values)
     tasks = {"probe": (probe, Unicycle(probe)), options.config.name: (config, make_env(config))}
     for trainer in TRAINERS:
         _with_trainer(config, trainer, config.seed).check_devices(jax.device_count())

@@ -61,8 +61,14 @@ _REFUSED = (
     ("task.options.pillar=[1, 2]",),
     ("randomization.friction=[1.2, 0.4]",),
     ("randomization.action_delay=[0, 1.5]",),
-    ("trainer=brax", "ppo.learning_rate_schedule=NONE", "seeds=5"),
-    ("trainer=brax", "ppo.learning_rate_schedule=NONE", "deterministic=true"),
+    ("trainer=brax", "ppo.learning_rate_schedule=NONE", "ppo.normalizer=physical"),
+    ("trainer=brax", "ppo.learning_rate_schedule=NONE", "ppo.normalizer=brax", "seeds=5"),
+    (
+        "trainer=brax",
+        "ppo.learning_rate_schedule=NONE",
+        "ppo.normalizer=brax",
+        "deterministic=true",
+    ),
     ("trainer=brax", "ppo.learning_rate_schedule=LINEAR"),
 )
 """Settings that do not fit; each is tried while the page is written."""

@@ -35,7 +35,7 @@ def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
       env: the environment, unwrapped.
       recorder: hears before the first step and after every interval.
     """
-    ppo = config.ppo.model_dump(exclude={"network"})
+    ppo = config.ppo.model_dump(exclude={"network", "normalizer"})
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
     latest: dict[str, Any] = {}
     # Brax annotates it as a function of the environment alone, and calls it with all four.

@@ -20,6 +20,7 @@ from jetbot_mjx.store import (
     read_about,
     read_tree,
 )
+from jetbot_mjx.task import layout_data
 
 Which = Literal["best", "last"] | int
 """A checkpoint of a run: the best, the last, or the one at that many environment steps."""
@@ -56,7 +57,7 @@ class Checkpoint(NamedTuple):
           CheckpointError: its observation is not the one that the policy knows.
         """
         env = make_env(self.config.for_any_device())
-        layout = [field._asdict() for field in env.task.layout]
+        layout = layout_data(env.task.layout)
         if layout != self.about["layout"]:
             raise CheckpointError(
                 f"checkpoint {self.path} was trained on another observation than"
@@ -75,7 +76,7 @@ def about_policy(config: Config, env: JetBotEnv) -> dict[str, Any]:
     return {
         "format": FORMAT,
         "config": config.model_dump(mode="json"),
-        "layout": [field._asdict() for field in env.task.layout],
+        "layout": layout_data(env.task.layout),
         "observation_size": env.observation_size,
         "action_size": env.action_size,
         "ctrl_dt": env.dt,

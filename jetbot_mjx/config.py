@@ -303,6 +303,10 @@ class PPOConfig(_Section):
     """Factor on the reward inside the loss."""
     normalize_observations: bool = True
     """Normalise observations by running mean and deviation."""
+    normalizer: Literal["physical", "brax"] = "physical"
+    """Smallest deviation to normalise by. `physical`: by the units of the observation, 1 cm,
+    0.05 m/s, 0.05 rad, 0.1 rad/s, 0.05 of what has none, or a field's own `min_std`; `brax`: 1e-6
+    of anything, which ties a policy to the contact of the simulator that it was trained in."""
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
     network: NetworkConfig = NetworkConfig()
@@ -386,6 +390,11 @@ class Config(_Section):
                 raise ValueError(
                     "ppo.learning_rate_schedule = 'LINEAR' is not known to trainer = 'brax':"
                     " take trainer = 'resumable', or NONE or ADAPTIVE_KL"
+                )
+            if self.ppo.normalizer == "physical":
+                raise ValueError(
+                    "ppo.normalizer = 'physical' is not known to trainer = 'brax':"
+                    " take trainer = 'resumable', or ppo.normalizer = 'brax'"
                 )
             if self.deterministic:
                 raise ValueError(

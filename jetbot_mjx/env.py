@@ -12,6 +12,7 @@ import brax.envs
 import jax
 import jax.numpy as jnp
 import mujoco
+import numpy as np
 from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx import kinematics, mjx
@@ -25,7 +26,15 @@ from jetbot_mjx.model import (
 )
 from jetbot_mjx.physics import Physics
 from jetbot_mjx.state import PhysicsState, State, robot_state
-from jetbot_mjx.task import AdvancesGoal, Goal, RobotState, Task, layout_size, make_task
+from jetbot_mjx.task import (
+    AdvancesGoal,
+    Goal,
+    RobotState,
+    Task,
+    layout_size,
+    make_task,
+    min_std,
+)
 
 
 class TaskStep(NamedTuple):
@@ -248,6 +257,17 @@ class JetBotEnv(brax.envs.Env):
     def observation_size(self) -> int:
         """Length of the observation, from the task's layout."""
         return layout_size(self.task.layout)
+
+    @property
+    def observation_min_std(self) -> Float[np.ndarray, " obs"]:
+        """Smallest deviation by which training normalises each number of the observation.
+
+        Raises:
+          UserError: the task's layout does not tell it.
+        """
+        layout = self.task.layout
+        scales = [min_std(field) for field in layout]
+        return np.repeat(np.array(scales, np.float32), [field.size for field in layout])
 
     @property
     def action_size(self) -> int:

@@ -7,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jetbot_mjx.task import AdvancesGoal, Field, MovesGoal, Task, layout_size
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.task import AdvancesGoal, Field, MovesGoal, Task, layout_size, min_std
 from jetbot_mjx.task_trials import DRAWS, TERMS, Subject, ask_all, first_key
 
 
 def layout(subject: Subject) -> Iterator[str]:
-    """Names, sizes, units and frames of the observation."""
+    """Names, sizes, units, frames and smallest deviations of the observation."""
     fields = subject.task.layout
     if not isinstance(fields, tuple) or not all(isinstance(field, Field) for field in fields):
         yield "layout is no tuple of Field(name, size, unit, frame): make it one"
@@ -25,9 +26,18 @@ def layout(subject: Subject) -> Iterator[str]:
     for field in fields:
         if not isinstance(field.size, int) or field.size < 1:
             yield f"layout: {field.name!r} has the size {field.size!r}: it should be 1 or more"
-        for what in ("name", "unit", "frame"):
-            if not isinstance(getattr(field, what), str) or not getattr(field, what).strip():
-                yield f"layout: {field.name!r} has no {what}: say it, such as {_LIKE[what]}"
+        missing = [
+            what
+            for what in ("name", "unit", "frame")
+            if not isinstance(getattr(field, what), str) or not getattr(field, what).strip()
+        ]
+        for what in missing:
+            yield f"layout: {field.name!r} has no {what}: say it, such as {_LIKE[what]}"
+        if not missing and subject.config.ppo.normalizer == "physical":
+            try:
+                min_std(field)
+            except UserError as error:
+                yield str(error)
 
 
 _LIKE = {"name": "goal_distance", "unit": "m, or 1 for none", "frame": "world or body"}

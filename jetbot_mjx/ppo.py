@@ -1,9 +1,10 @@
 """Proximal policy optimisation as one pure step, put together from Brax's parts.
 
 Networks, action distribution, loss, running statistics, unrolls, gradients and the ADAPTIVE_KL
-rule are Brax's; so is the order of the random keys: on one device, step for step, this is
-`brax.training.agents.ppo.train`. What that function keeps in local variables is one value
-here, `TrainState`, that can be stored and put back; whatever is not finite is stopped and counted.
+rule are Brax's; so is the order of the random keys: on one device, step for step and with
+`normalizer: brax`, this is `brax.training.agents.ppo.train`. What that function keeps in local
+variables is one value here, `TrainState`, that can be stored and put back; whatever is not finite
+is stopped and counted.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`
 each device steps and shuffles its own environments; only gradients, the normaliser's sums and
@@ -137,6 +138,11 @@ class PPO:
             env.action_size,
             normalize=config.normalize_observations,
         )
+        self._min_std = (
+            self._env.observation_min_std
+            if config.normalize_observations and config.normalizer == "physical"
+            else None
+        )
         self._make_policy = ppo_networks.make_inference_fn(self.networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
@@ -166,8 +172,10 @@ class PPO:
         state = TrainState(
             params=params,
             optimizer_state=self._optimizer.init(params),
-            normalizer=running_statistics.init_state(
-                specs.Array((self._env.observation_size,), jnp.dtype("float32"))
+            normalizer=self._with_floor(
+                running_statistics.init_state(
+                    specs.Array((self._env.observation_size,), jnp.dtype("float32"))
+                )
             ),
             env_state=self._env.reset(jax.random.split(env_key, self.num_envs)),
             key=jax.random.split(epoch_key, 1)[0],
@@ -223,8 +231,8 @@ class PPO:
             update_key = jax.random.fold_in(update_key, index)
             rollout_key = jax.random.fold_in(rollout_key, index)
         env_state, data, fault = self.collect(state, rollout_key)
-        seen = running_statistics.update(
-            state.normalizer, data.observation, pmap_axis_name=self._axis
+        seen = self._with_floor(
+            running_statistics.update(state.normalizer, data.observation, pmap_axis_name=self._axis)
         )
         # As Brax does it: ADAPTIVE_KL compares with distributions under the old normaliser.
         adaptive = self.config.learning_rate_schedule == "ADAPTIVE_KL"
@@ -242,6 +250,19 @@ class PPO:
             env_steps=state.env_steps + self.config.steps_per_training_step,
         )
         return state, Metrics(figures, fault)
+
+    def _with_floor(
+        self, normalizer: running_statistics.RunningStatisticsState
+    ) -> running_statistics.RunningStatisticsState:
+        """Raise each deviation to the observation's physical scale.
+
+        A robot that never leaves its floor sees heights and tilts that differ by micrometres.
+        Divided by such a deviation, another simulator's contact is far outside of all that was
+        seen. The sums from which `std` is computed at the next update are left as they are.
+        """
+        if self._min_std is None:
+            return normalizer
+        return normalizer.replace(std=jnp.maximum(normalizer.std, self._min_std))
 
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]

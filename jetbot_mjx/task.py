@@ -45,7 +45,12 @@ class Field(NamedTuple):
     size: int
     unit: str
     frame: str
+    min_std: float | None = None
+    """[unit] smallest deviation by which training normalises it; None: that of its unit."""
 
+
+MIN_STD = {"m": 0.01, "m/s": 0.05, "rad": 0.05, "rad/s": 0.1, "1": 0.05}
+"""Smallest deviation of an observation by its unit: changes below it may be the simulator's own."""
 
 Layout = tuple[Field, ...]
 
@@ -73,6 +78,36 @@ LAYOUTS: dict[str, Layout] = {"world": WORLD, "egocentric": EGOCENTRIC}
 def layout_size(layout: Layout) -> int:
     """Length of the observation vector that a layout describes."""
     return sum(field.size for field in layout)
+
+
+def layout_data(layout: Layout) -> list[dict[str, Any]]:
+    """Return what a policy has to know of its observation, as JSON: all but `min_std`."""
+    return [
+        {name: value for name, value in field._asdict().items() if name != "min_std"}
+        for field in layout
+    ]
+
+
+def min_std(field: Field) -> float:
+    """Return the smallest deviation by which training normalises a field [its unit].
+
+    Raises:
+      UserError: it is no positive number, or not given and its unit has none in `MIN_STD`.
+    """
+    if field.min_std is None:
+        if field.unit not in MIN_STD:
+            raise UserError(
+                f"layout: {field.name!r} has the unit {field.unit!r}, for which no smallest"
+                " deviation is known: state one, Field(..., min_std=0.1), or set"
+                " ppo.normalizer=brax"
+            )
+        return MIN_STD[field.unit]
+    if not (isinstance(field.min_std, int | float) and 0 < field.min_std < math.inf):
+        raise UserError(
+            f"layout: {field.name!r} has min_std = {field.min_std!r}: it should be a positive"
+            f" number [{field.unit}]"
+        )
+    return field.min_std
 
 
 def layout_table(layout: Layout) -> str:

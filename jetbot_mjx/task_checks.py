@@ -197,7 +197,7 @@ CHECKS: Mapping[str, Callable[[Subject], Iterator[str]]] = {
 """The checks by name, in their order: each yields a line for everything that is wrong."""
 
 MEANINGS: Mapping[str, str] = {
-    "layout": "names, sizes, units and frames of the observation",
+    "layout": "names, sizes, units, frames and smallest deviations of the observation",
     "purity": "methods trace, twice into the same program, and leave self alone",
     "types": "shapes and dtypes as the contract has them, none of them weak",
     "draws": "a key gives one draw, and another key another",

@@ -26,6 +26,18 @@ class NoUnit(GoalTask):
         self.layout = (*self.layout[:-1], Field("goal_position", 3, "", "world"))
 
 
+class NoScale(GoalTask):
+    def __init__(self, config):
+        super().__init__(config)
+        self.layout = (*self.layout, Field("battery", 1, "V", "body"))
+
+
+class NegativeScale(GoalTask):
+    def __init__(self, config):
+        super().__init__(config)
+        self.layout = (*self.layout[:-1], self.layout[-1]._replace(min_std=-0.1))
+
+
 class LongerThanItsLayout(GoalTask):
     def observe(self, robot, goal):
         return jnp.append(super().observe(robot, goal), 0.0)

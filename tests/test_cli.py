@@ -21,7 +21,7 @@ from jetbot_mjx.checkpoint import FORMAT
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.policy import PolicyParams, make_networks
-from jetbot_mjx.task import WORLD
+from jetbot_mjx.task import WORLD, layout_data
 
 SMOKE = str(Path(__file__).parents[1] / "configs" / "smoke.yaml")
 COMMANDS = {
@@ -156,11 +156,13 @@ def test_train_refuses_a_bad_seed(refused):
     [
         ("seeds=2", "seeds = 2 is not known to trainer = 'brax'"),
         ("deterministic=true", "deterministic = true is not known to trainer = 'brax'"),
+        ("ppo.normalizer=physical", "ppo.normalizer = 'physical' is not known to trainer = 'brax'"),
         ("ppo.learning_rate_schedule=LINEAR", "'LINEAR' is not known to trainer = 'brax'"),
     ],
 )
 def test_train_refuses_what_the_stock_trainer_cannot_do(refused, setting, said):
-    assert said in refused(train, "--config", SMOKE, "--set", "trainer=brax", "--set", setting)
+    stock = ("--set", "trainer=brax", "--set", "ppo.normalizer=brax")
+    assert said in refused(train, "--config", SMOKE, *stock, "--set", setting)
 
 
 @pytest.mark.parametrize("run", ["nothing", "empty"])
@@ -216,7 +218,7 @@ def trained(tmp_path_factory):
     about = {
         "format": FORMAT,
         "config": config.model_dump(mode="json"),
-        "layout": [field._asdict() for field in WORLD],
+        "layout": layout_data(WORLD),
         "observation_size": 16,
         "action_size": 2,
     }

@@ -32,6 +32,7 @@ SETTINGS = [
     "--set",
     "evaluation.episodes=8",
 ]
+STOCK = ["--set", "trainer=brax", "--set", "ppo.normalizer=brax"]
 VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
@@ -269,7 +270,7 @@ def test_a_mistaken_variable_costs_one_line(monkeypatch, values, said):
     ("arguments", "said"),
     [
         (["--seeds", "2"], "--distributed trains one policy, not seeds = 2"),
-        (["--set", "trainer=brax"], "--distributed is not known to trainer = 'brax'"),
+        (STOCK, "--distributed is not known to trainer = 'brax'"),
     ],
 )
 def test_what_several_processes_cannot_do_is_refused_before_they_meet(arguments, said):

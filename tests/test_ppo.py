@@ -22,11 +22,12 @@ from jetbot_mjx import brax_ppo, evaluate, resumable_ppo, training
 from jetbot_mjx.checkpoint import load_checkpoint
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.faults import load_fault
 from jetbot_mjx.ppo import LOSSES, PPO, make_optimizer
 from jetbot_mjx.recording import RunRecorder
 from jetbot_mjx.store import flatten
-from jetbot_mjx.task import GoalTask
+from jetbot_mjx.task import EGOCENTRIC, LAYOUTS, Field, GoalTask
 from jetbot_mjx.wrappers import wrap_for_training
 
 STEPS = 4
@@ -122,7 +123,8 @@ def ours(smoke):
         # A KL so small that the schedule has something to do at every update.
         changes = {"learning_rate_schedule": schedule, "max_grad_norm": max_grad_norm}
         env = env_type(smoke)
-        return env, Jitted(with_ppo(smoke, **changes, desired_kl=0.003), env)
+        config = with_ppo(smoke, **changes, desired_kl=0.003, normalizer="brax")
+        return env, Jitted(config, env)
 
     return make
 
@@ -198,6 +200,78 @@ def test_the_keys_go_on_as_within_an_epoch_of_brax(smoke, ours):
     state, _ = one.advance(one.init(jax.random.PRNGKey(smoke.seed)), STEPS)
     assert furthest(state.policy_params[1:], reports.all[-1].params[1:]) < 5e-3
     assert int(jax.device_get(state.normalizer.count).to_numpy()) == STEPS * SIZE
+
+
+# The floor under the normaliser's deviations.
+
+
+@pytest.fixture(scope="module")
+def normalized(smoke):
+    """A function from the normaliser to the environment and the states after 0, 1, 2 steps."""
+    world = smoke.model_copy(update={"task": parse_config({}).task})
+
+    @functools.cache
+    def make(normalizer):
+        config = with_ppo(world, normalizer=normalizer)
+        env = Gliding(config)
+        one = Jitted(config, env)
+        states = [one.init(jax.random.PRNGKey(0))]
+        for _ in range(2):
+            states.append(one.advance(states[-1])[0])
+        return env, [state.normalizer for state in jax.device_get(states)]
+
+    return make
+
+
+def test_no_deviation_is_below_its_physical_scale(normalized):
+    env, statistics = normalized("physical")
+    floor = env.observation_min_std
+    expected = [*[0.01] * 3, *[0.05] * 4, *[0.05] * 3, *[0.1] * 3, *[0.01] * 3]
+    np.testing.assert_array_equal(floor, np.float32(expected))
+    seen = statistics[-1]
+    assert np.all(seen.std >= floor)
+    # A gliding robot stays on its floor: z, tilt, vertical speed and two of the rates are steady.
+    steady = np.flatnonzero(seen.summed_variance / (2 * SIZE) < (0.1 * floor) ** 2)
+    assert steady.tolist() == [2, 4, 5, 9, 10, 11, 15]
+    np.testing.assert_array_equal(seen.std[steady], floor[steady])
+
+
+def test_the_floor_changes_nothing_but_the_deviations(normalized):
+    env, (_, ours, later) = normalized("physical")
+    _, (_, stock, stock_later) = normalized("brax")
+    # Before the first update both see the same.
+    np.testing.assert_allclose(ours.mean, stock.mean, rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(ours.summed_variance, stock.summed_variance, rtol=1e-5, atol=1e-6)
+    floored = np.maximum(stock.std, env.observation_min_std)
+    np.testing.assert_allclose(ours.std, floored, rtol=1e-5)
+    assert np.min(stock_later.std) == np.float32(1e-6)
+    wide = later.std > 2 * env.observation_min_std
+    variance = later.summed_variance / (2 * SIZE)
+    np.testing.assert_allclose(later.std[wide] ** 2, variance[wide], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("settings", "expected"),
+    [({}, 5.0), ({"normalizer": "brax"}, 1.0), ({"normalize_observations": False}, 1.0)],
+)
+def test_a_field_states_its_own_scale(smoke, settings, expected):
+    config = with_ppo(smoke, num_envs=2, batch_size=2, **settings)
+    env = Gliding(config)
+    env.task.layout = (*env.task.layout[:-1], Field("yaw_rate", 1, "deg/s", "body", min_std=5.0))
+    ppo = PPO(config.ppo, wrap_for_training(env, config.task.episode_length))
+    std = jax.jit(ppo.init)(jax.random.PRNGKey(0)).normalizer.std
+    np.testing.assert_array_equal(std, [1.0] * 6 + [expected])
+
+
+def test_a_unit_without_a_scale_is_refused_before_anything_is_written(smoke, monkeypatch, tmp_path):
+    layout = (*EGOCENTRIC[:-1], Field("yaw_rate", 1, "deg/s", "body"))
+    monkeypatch.setitem(LAYOUTS, "egocentric", layout)
+    said = "'yaw_rate' has the unit 'deg/s', for which no smallest deviation is known"
+    with pytest.raises(UserError, match=said):
+        training.run(smoke, tmp_path / "run")
+    assert list(tmp_path.iterdir()) == []
+    config = with_ppo(smoke, normalizer="brax")
+    PPO(config.ppo, wrap_for_training(Gliding(config), config.task.episode_length))
 
 
 # Gradients that are not finite.

@@ -736,7 +736,8 @@ def test_resume_and_config_exclude_each_other(tmp_path, smoke, capsys):
 
 @pytest.mark.parametrize("stored", ["brax", "resumable"])
 def test_a_run_of_the_stock_trainer_is_not_continued(config, run_copy, stored):
-    brax = config.model_copy(update={"trainer": "brax"})
+    ppo = config.ppo.model_copy(update={"normalizer": "brax"})
+    brax = config.model_copy(update={"trainer": "brax", "ppo": ppo})
     if stored == "brax":
         (run_copy / "config.yaml").write_text(brax.to_yaml())
     before = contents(run_copy)

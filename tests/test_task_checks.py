@@ -27,6 +27,12 @@ def first_findings(config):
     [
         ("TwoOfAName", "layout", "'position' 2 times: give each"),
         ("NoUnit", "layout", "'goal_position' has no unit: say it"),
+        (
+            "NoScale",
+            "layout",
+            "'battery' has the unit 'V', for which no smallest deviation is known",
+        ),
+        ("NegativeScale", "layout", "'goal_position' has min_std = -0.1: it should be a positive"),
         ("CannotBeBuilt", "layout", "IndexError: tuple index out of range (broken_tasks.py:"),
         ("DecidesInPython", "purity", "success raises TracerBoolConversionError: Python cannot"),
         ("Raises", "purity", "observe raises KeyError: 'lidar' (broken_tasks.py:"),

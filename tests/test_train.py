@@ -109,6 +109,7 @@ def test_the_same_seed_trains_the_same_policy(smoke_run, tmp_path, root, capsys)
 
 def test_the_stock_trainer_leaves_the_same_kind_of_run(root, tmp_path, capsys):
     arguments = ["--config", str(root / "configs" / "smoke.yaml"), "--set", "trainer=brax"]
+    arguments += ["--set", "ppo.normalizer=brax"]
     arguments += ["--set", "ppo.num_timesteps=16384", "--run-dir", str(tmp_path / "run")]
     assert train.main(arguments) == 0
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
