@@ -14,7 +14,6 @@ import contextlib
 import functools
 import hashlib
 import math
-import tempfile
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from jaxtyping import Array, PyTree
 
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.scalarize import Program
+from jetbot_mjx.trusted_files import read_trusted, write_private
 
 Step = Callable[[PyTree, PyTree], PyTree]
 """Of (carry, consts): the carry, some steps later."""
@@ -242,16 +242,13 @@ def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     if not cache or not jax.config.values["jax_enable_compilation_cache"]:
         return make()
     path = Path(cache) / f"{kind}-{hashlib.sha256(key).hexdigest()}"
-    with contextlib.suppress(OSError):
-        digest, _, content = path.read_bytes().partition(b"\n")
-        if digest == _digest(content):
-            return content
+    digest, _, content = (read_trusted(path) or b"").partition(b"\n")
+    if digest == _digest(content):
+        return content
     content = make()
     # As with compiled programs: a folder that cannot be written costs time, nothing else.
-    with contextlib.suppress(OSError), tempfile.TemporaryDirectory(dir=cache) as folder:
-        written = Path(folder) / path.name
-        written.write_bytes(_digest(content) + b"\n" + content)
-        written.replace(path)
+    with contextlib.suppress(OSError):
+        write_private(path, _digest(content) + b"\n" + content)
     return content
 
 

@@ -16,7 +16,6 @@ import os
 import pickle
 import platform
 import sys
-import tempfile
 import threading
 import time
 from collections.abc import Callable
@@ -34,6 +33,7 @@ from jetbot_mjx.compiling import Options, compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.model import ROBOTS, make_mj_model
 from jetbot_mjx.task import make_task
+from jetbot_mjx.trusted_files import read_trusted, write_private
 
 TRUSTED = f"{__package__}."
 """How tasks begin whose source is part of the key."""
@@ -207,11 +207,10 @@ def _own_source() -> str:
 
 
 def _load(path: Path) -> jax.stages.Compiled | None:
-    """The program in a file; None where there is none, or none that can be loaded."""
+    """The program in a file; None where there is none, none that is trusted or can be loaded."""
     began = time.perf_counter()
-    try:
-        content = path.read_bytes()
-    except OSError:
+    content = read_trusted(path)
+    if content is None:
         return None
     digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:
@@ -260,7 +259,4 @@ def _keep(
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
                 other.unlink(missing_ok=True)
-        with tempfile.TemporaryDirectory(dir=path.parent) as folder:
-            written = Path(folder) / path.name
-            written.write_bytes(hashlib.sha256(body).digest() + body)
-            written.replace(path)
+        write_private(path, hashlib.sha256(body).digest() + body)

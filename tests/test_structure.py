@@ -19,6 +19,7 @@ PACKAGE = "jetbot_mjx"
 NOUNS = (
     "errors",
     "config",
+    "trusted_files",
     "compiling",
     "imports",
     "mjx",
