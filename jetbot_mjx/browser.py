@@ -6,19 +6,26 @@ back, not to interfere; MuJoCo in WebAssembly would run in the page, where the p
 
 viser calls back from threads of its own. What a callback asks for waits in a queue, and the loop
 that drives the player does it between two steps.
+
+Any page that a browser shows may open a connection to this machine, and viser takes them all. The
+header `Origin` says where a page is from, and only this player's own page is let in.
 """
 
 import contextlib
 import errno
+import http
+import ipaddress
 import queue
 import socket
 import time
-from collections.abc import Callable, Iterator
+import urllib.parse
+from collections.abc import Callable, Iterator, Sequence
 from types import TracebackType
 from typing import Any, Self
 
 import rich
 import viser
+import websockets.asyncio.server
 
 from jetbot_mjx.clock import Clock
 from jetbot_mjx.errors import UserError
@@ -29,6 +36,7 @@ from jetbot_mjx.scene import FPS, Scene
 FIRST_PORT = 8080
 _PORTS_TRIED = 100
 _FIGURES_PER_SECOND = 5
+_ORIGINS_TOLD = 10
 
 
 class _Server(viser.ViserServer):
@@ -42,19 +50,35 @@ class _Server(viser.ViserServer):
 class Browser:
     """Serves one player to any number of pages; a context manager that stops the server."""
 
-    def __init__(self, player: Player, *, host: str, port: int) -> None:
+    def __init__(
+        self,
+        player: Player,
+        *,
+        host: str,
+        port: int,
+        allow: Sequence[str] = (),
+        tell: Callable[[str], None],
+    ) -> None:
         """Opens the port and builds scene and panel.
 
         Args:
           player: what drives.
           host: the address to listen on; whoever reaches it can watch and interfere.
           port: to listen on, as `free_port` gave it.
+          allow: origins of other pages that may connect, such as `https://hub.example.org`.
+          tell: is given a line for each origin that was refused, the first few.
 
         Raises:
-          UserError: the port was taken meanwhile.
+          UserError: the port was taken meanwhile, or pages cannot be refused.
         """
-        with _quiet():
+        door = _Door(host, allow, tell)
+        with _quiet(), door.at_viser():
             self.server = _Server(host, port, label=player.run_dir.name, verbose=False)
+        if not door.stands:
+            self.close()
+            raise UserError(
+                f"viser {viser.__version__} lets in pages from anywhere: pip install viser==1.1.1"
+            )
         # Where a port is taken, viser goes on to the next.
         if self.server.get_port() != port:
             self.close()
@@ -102,6 +126,93 @@ class Browser:
 
     def _ask(self, do: Callable[..., Any], *given: Any) -> None:
         self._asked.put(lambda: do(*given))
+
+
+class _Door:
+    """Lets in this player's page and those that the user allows, and no other."""
+
+    def __init__(self, host: str, allow: Sequence[str], tell: Callable[[str], None]) -> None:
+        """Stands nowhere yet.
+
+        Args:
+          host: the address that is listened on.
+          allow: further origins.
+          tell: is given a line for each origin that was refused, the first few.
+        """
+        name = socket.gethostname().lower()
+        self._names = {host.lower(), "localhost", name, f"{name}.local"}
+        self._allow, self._tell = set(allow), tell
+        self._refused: set[str] = set()
+        self.stands = False
+        """Whether viser's server has it."""
+
+    @contextlib.contextmanager
+    def at_viser(self) -> Iterator[None]:
+        """Gives the door to the server that viser starts inside, for which viser has no option."""
+        module = websockets.asyncio.server
+        serve = module.serve
+
+        def serve_behind(*arguments: Any, process_request: Any, **options: Any) -> Any:
+            def look(connection: Any, request: Any) -> Any:
+                refusal = self._refuse(connection, request)
+                return process_request(connection, request) if refusal is None else refusal
+
+            self.stands = True
+            return serve(*arguments, process_request=look, **options)
+
+        module.serve = serve_behind
+        try:
+            yield
+        finally:
+            module.serve = serve
+
+    def _refuse(self, connection: Any, request: Any) -> Any:
+        """Return the answer to a request that is refused, or None."""
+        headers = request.headers
+        # The page itself is no secret, and a program that is no browser could send any header.
+        if not headers.get_all("Upgrade"):
+            return None
+        host = "".join(headers.get_all("Host"))
+        for origin in headers.get_all("Origin"):
+            if not self.lets_in(origin, host):
+                if origin not in self._refused and len(self._refused) < _ORIGINS_TOLD:
+                    self._refused.add(origin)
+                    self._tell(
+                        f"refused: a page from {origin[:200]!r} asked to connect; to let it in,"
+                        " --allow-origin names it"
+                    )
+                return connection.respond(http.HTTPStatus.FORBIDDEN, "another page's origin\n")
+        return None
+
+    def lets_in(self, origin: str, host: str) -> bool:
+        """Return whether a page may connect.
+
+        Args:
+          origin: where the page is from, as its browser says.
+          host: what the browser took this server for. It has to be the same, and no name that
+            someone else may point at this machine after he served a page of his own under it.
+
+        Returns:
+          Whether it may.
+        """
+        if origin in self._allow:
+            return True
+        try:
+            parts = urllib.parse.urlsplit(origin.lower())
+            name = parts.hostname or ""
+        except ValueError:
+            return False
+        if parts.scheme not in ("http", "https") or parts.netloc != host.lower():
+            return False
+        return name in self._names or _is_address(name)
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 def free_port(host: str, port: int | None) -> int:

@@ -3,9 +3,11 @@
 Without a run it is one that comes with the package.
 """
 
+import argparse
 import getpass
 import socket
 import types
+import urllib.parse
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
@@ -36,6 +38,7 @@ def run(
     seed: int = 0,
     host: str = "127.0.0.1",
     port: int | None = None,
+    allow: Sequence[str] = (),
     tell: Callable[[str], None] = print,
 ) -> Played:
     """Drives in real time until it is interrupted or the window is closed.
@@ -48,6 +51,7 @@ def run(
       seed: of goals and of the random agent.
       host: the address that the page is served at.
       port: the port of it; None: the first from 8080 on that is free.
+      allow: origins of other pages that may connect, such as `https://hub.example.org`.
       tell: is given what the user has to know, line by line.
 
     Returns:
@@ -66,7 +70,7 @@ def run(
     player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed)
     try:
         if viewer == "browser":
-            with browser.Browser(player, host=host, port=free) as page:
+            with browser.Browser(player, host=host, port=free, allow=allow, tell=tell) as page:
                 for line in addresses(host, free):
                     tell(line)
                 page.run()
@@ -112,6 +116,25 @@ def _browser() -> types.ModuleType:
     return browser
 
 
+def _origin(text: str) -> str:
+    """An argument that is a page's origin, as browsers write it."""
+    try:
+        parts = urllib.parse.urlsplit(text.lower())
+        port, name = parts.port, parts.hostname
+    except ValueError:
+        port = name = None
+    else:
+        if parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
+            name = None
+    if not name or parts.scheme not in ("http", "https"):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is no origin: write it as https://hub.example.org or http://localhost:3000"
+        )
+    default = {"http": 80, "https": 443}[parts.scheme]
+    host = f"[{name}]" if ":" in name else name
+    return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parses the command line and drives.
 
@@ -134,6 +157,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=cli.whole_number(1, _LARGEST_PORT),
         help="port to listen on (default: 8080, or the next free one)",
     )
+    parser.add_argument(
+        "--allow-origin",
+        type=_origin,
+        action="append",
+        default=[],
+        metavar="URL",
+        help="let in a page from elsewhere, as https://hub.example.org; may be given again",
+    )
     options = parser.parse_args(arguments)
     cli.require_device()
     cli.use_compilation_cache()
@@ -147,6 +178,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         seed=options.seed,
         host=options.host,
         port=options.port,
+        allow=options.allow_origin,
         tell=lambda line: print(line, flush=True),
     )
     print(f"{played.successes} of {played.episodes} goals reached")

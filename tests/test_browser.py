@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 import trimesh
+import websockets.exceptions
 import websockets.sync.client
 
 from jetbot_mjx.errors import UserError
@@ -34,7 +35,7 @@ def player(smoke_run):
 
 @pytest.fixture(scope="module")
 def browser(player, unused_port):
-    with Browser(player, host="127.0.0.1", port=unused_port()) as browser:
+    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
         yield browser
 
 
@@ -64,6 +65,91 @@ def test_the_page_and_its_data_come_from_one_port(browser):
         assert len(page.recv(timeout=10)) > 1000
 
 
+def knock(browser, origin, host=None):
+    """Whether a page from somewhere is sent anything, as a real client sees it."""
+    here = ("127.0.0.1", browser.server.get_port())
+    try:
+        with websockets.sync.client.connect(
+            f"ws://{host or f'127.0.0.1:{here[1]}'}",
+            sock=socket.create_connection(here),
+            origin=origin,
+            subprotocols=[f"viser-v{viser.__version__}"],
+        ) as page:
+            return len(page.recv(timeout=10)) > 1000
+    except websockets.exceptions.InvalidStatus as error:
+        return {403: False}[error.response.status_code]
+
+
+def test_a_page_from_elsewhere_is_refused_and_our_own_let_in(player, unused_port):
+    port = unused_port()
+    told = []
+    with Browser(
+        player,
+        host="127.0.0.1",
+        port=port,
+        allow=["https://hub.example.org"],
+        tell=told.append,
+    ) as browser:
+        for origin in (f"http://127.0.0.1:{port}", None, "https://hub.example.org"):
+            assert knock(browser, origin)
+        # Through a tunnel, from another port of another machine.
+        assert knock(browser, "http://localhost:9999", host="localhost:9999")
+        assert told == []
+        for origin in ("http://evil.example", "null", f"http://localhost:{port}"):
+            assert not knock(browser, origin)
+            assert not knock(browser, origin)
+        # A name that was pointed at this machine after the page had been served.
+        assert not knock(browser, f"http://evil.example:{port}", host=f"evil.example:{port}")
+        assert len(told) == 4
+        assert "'http://evil.example' asked to connect; to let it in, --allow-origin" in told[0]
+        for number in range(20):
+            assert not knock(browser, f"http://evil.example:{number + 1}")
+        assert len(told) == 10
+
+
+@pytest.mark.parametrize(
+    ("listening", "origin", "host", "lets_in"),
+    [
+        ("127.0.0.1", "http://[::1]:8080", "[::1]:8080", True),
+        ("0.0.0.0", "http://192.0.2.7:8080", "192.0.2.7:8080", True),
+        ("0.0.0.0", "http://this-machine:8080", "this-machine:8080", True),
+        ("0.0.0.0", "http://this-machine.local:8080", "This-Machine.local:8080", True),
+        ("0.0.0.0", "http://this-machine.evil.example", "this-machine.evil.example", False),
+        ("robots.example", "https://robots.example", "robots.example", True),
+        ("robots.example", "http://evil.example", "evil.example", False),
+        ("127.0.0.1", "http://127.0.0.1:3000", "127.0.0.1:8080", False),
+        ("127.0.0.1", "http://127.0.0.1:8080", "", False),
+        ("127.0.0.1", "http://", "", False),
+        ("127.0.0.1", "", "", False),
+        ("127.0.0.1", "http://[", "[", False),
+        ("127.0.0.1", "file://localhost", "localhost", False),
+        ("127.0.0.1", "http://localhost@evil.example", "evil.example", False),
+    ],
+)
+def test_a_page_is_let_in_from_where_the_player_is(listening, origin, host, lets_in, monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "This-Machine")
+    assert module._Door(listening, [], print).lets_in(origin, host) is lets_in
+
+
+def test_a_viser_that_lets_all_pages_in_is_refused(player, unused_port, monkeypatch):
+    elsewhere = types.SimpleNamespace(serve=None)
+    monkeypatch.setattr(module.websockets.asyncio, "server", elsewhere)
+    monkeypatch.setattr(module, "_Server", lambda host, port, **options: Served(port))
+    with pytest.raises(UserError, match="lets in pages from anywhere: pip install viser=="):
+        Browser(player, host="127.0.0.1", port=unused_port(), tell=print)
+    assert Served.stopped
+
+
+class Served:
+    stopped = False
+
+    def __init__(self, port):
+        self.get_port = lambda: port
+
+    def stop(self):
+        Served.stopped = True
+
+
 def test_only_this_machine_is_listened_to(browser):
     # Another address of the same loopback: served only where all addresses are.
     with pytest.raises(urllib.error.URLError, match="refused"):
@@ -75,7 +161,7 @@ def test_nothing_is_shared_through_other_machines(browser):
 
 
 def test_starting_and_stopping_say_nothing(player, capfd, unused_port):
-    with Browser(player, host="127.0.0.1", port=unused_port()):
+    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print):
         pass
     assert capfd.readouterr() == ("", "")
 
@@ -101,7 +187,7 @@ def test_a_port_that_is_taken_meanwhile_is_refused(player):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(UserError, match=f"--port {port} was taken meanwhile"):
-            Browser(player, host="127.0.0.1", port=port)
+            Browser(player, host="127.0.0.1", port=port, tell=print)
 
 
 @pytest.mark.parametrize("host", ["nowhere.invalid", "203.0.113.1"])

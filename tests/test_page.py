@@ -35,7 +35,7 @@ def served(smoke_run, unused_port):
     player = Player(smoke_run, agent="scripted", seed=3)
     player.paused = True
     over = threading.Event()
-    with Browser(player, host="127.0.0.1", port=unused_port()) as browser:
+    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
 
         def loop():
             while not over.is_set():

@@ -118,8 +118,26 @@ class FakePlayer:
 
 
 @pytest.mark.parametrize(
+    ("text", "origin"),
+    [
+        ("https://Hub.Example.org/", "https://hub.example.org"),
+        ("http://localhost:3000", "http://localhost:3000"),
+        ("https://hub.example.org:443", "https://hub.example.org"),
+        ("http://[::1]:3000", "http://[::1]:3000"),
+    ],
+)
+def test_origins_are_read_as_browsers_write_them(text, origin):
+    assert play._origin(text) == origin
+
+
+@pytest.mark.parametrize(
     ("arguments", "message"),
     [
+        (["--allow-origin", "hub.example.org"], "'hub.example.org' is no origin: write it as"),
+        (["--allow-origin", "https://hub/user"], "is no origin"),
+        (["--allow-origin", "http://hub:port"], "is no origin"),
+        (["--allow-origin", "http://["], "is no origin"),
+        (["--allow-origin", "*"], "is no origin"),
         (["--agent", "nobody"], "invalid choice: 'nobody'"),
         (["--viewer", "vnc"], "invalid choice: 'vnc'"),
         (["--port", "0"], "0 is too small: give at least 1"),
