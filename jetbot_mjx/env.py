@@ -98,8 +98,19 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           A copy; `self` stays as it is.
         """
+        return self.with_physics(self.physics.with_model(mjx_model))
+
+    def with_physics(self, physics: Physics) -> "JetBotEnv":
+        """Return this environment with something else to step its physics, as a new object.
+
+        Args:
+          physics: of the same robot and scene.
+
+        Returns:
+          A copy; `self` stays as it is.
+        """
         env = copy.copy(self)
-        env.physics = self.physics.with_model(mjx_model)
+        env.physics = physics
         return env
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:

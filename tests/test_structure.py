@@ -45,6 +45,7 @@ NOUNS = (
     "motors",
     "sensors",
     "randomization",
+    "mujoco_simulator",
     "wrappers",
     "task_trials",
     "method_checks",
