@@ -31,10 +31,12 @@ if TYPE_CHECKING:
     from jetbot_mjx.env import JetBotEnv as JetBotEnv
     from jetbot_mjx.env import make_env as make_env
     from jetbot_mjx.state import State as State
+    from jetbot_mjx.task import GoalTask as GoalTask
     from jetbot_mjx.task import Task as Task
     from jetbot_mjx.wrappers import wrap_for_training as wrap_for_training
 
 _HOMES = {
+    "GoalTask": "task",
     "PRETRAINED": "checkpoint",
     "JetBotEnv": "env",
     "State": "state",
@@ -44,7 +46,7 @@ _HOMES = {
     "make_env": "env",
     "wrap_for_training": "wrappers",
 }
-"""Public names, and the modules they live in."""
+"""Public names, and the modules they live in: configurations name tasks by the former alone."""
 
 _lighten()
 

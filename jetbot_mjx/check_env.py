@@ -14,7 +14,7 @@ from jetbot_mjx.task_checks import CHECKS, MEANINGS, Finding, check_task
 BROKEN = 1
 """Exit code: something is wrong with the task."""
 
-_BUILT_IN = "jetbot_mjx.task"
+_BUILT_IN = "jetbot_mjx"
 
 
 def run(config: Config) -> Iterator[tuple[str, list[Finding]]]:

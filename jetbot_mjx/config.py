@@ -92,8 +92,9 @@ class RobotConfig(_Section):
 class TaskConfig(_Section):
     """What is to be done, and what the policy sees and commands."""
 
-    name: str = "jetbot_mjx.task:GoalTask"
-    """The task class, as `package.module:Class`; it is built as `Class(task_config)`."""
+    name: str = "jetbot_mjx:GoalTask"
+    """The task class, as `package.module:Class`, built as `Class(task_config)`; this package's own
+    is named by the package alone."""
     observation: Literal["world", "egocentric"] = "world"
     """`world`: the tutorial's 16 numbers; `egocentric`: the goal as the robot sees it."""
     episode_length: Count = 256

@@ -262,7 +262,8 @@ class PPO:
         """
         if self._min_std is None:
             return normalizer
-        return normalizer.replace(std=jnp.maximum(normalizer.std, self._min_std))
+        raised: Any = normalizer
+        return raised.replace(std=jnp.maximum(raised.std, self._min_std))
 
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]

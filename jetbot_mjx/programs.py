@@ -35,8 +35,8 @@ from jetbot_mjx.model import ROBOTS, make_mj_model
 from jetbot_mjx.task import make_task
 from jetbot_mjx.trusted_files import read_trusted, write_private
 
-TRUSTED = f"{__package__}."
-"""How tasks begin whose source is part of the key."""
+TRUSTED = frozenset({f"{__package__}:GoalTask"})
+"""Tasks whose source is part of the key."""
 
 SOURCES = {".ll", ".py", ".xml"}
 """Of what programs are made from, as files of this package end."""
@@ -126,7 +126,7 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
     """
     options = compiler_options(config)
     folder = jax.config.values["jax_compilation_cache_dir"]
-    own_task = not config.task.name.startswith(TRUSTED)
+    own_task = config.task.name not in TRUSTED
     if not keep or folder is None or own_task or jax.process_count() > 1:
         return Programs(options)
     devices = jax.devices()

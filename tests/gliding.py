@@ -50,7 +50,7 @@ def everywhere():
     """A context within which every robot of this process glides, and no program is kept."""
     with (
         mock.patch.object(JetBotEnv, "step_physics", Gliding.step_physics),
-        mock.patch.object(programs, "TRUSTED", "no task at all"),
+        mock.patch.object(programs, "TRUSTED", frozenset()),
     ):
         yield
 

@@ -28,7 +28,7 @@ def test_a_built_in_task_goes_by_its_class(capsys, monkeypatch):
     asked = []
     monkeypatch.setattr(check_env, "run", lambda config: asked.append(config.task) or iter(()))
     check_env.main(["GoalTask", "--set", "task.observation=egocentric"])
-    assert (asked[0].name, asked[0].observation) == ("jetbot_mjx.task:GoalTask", "egocentric")
+    assert (asked[0].name, asked[0].observation) == ("jetbot_mjx:GoalTask", "egocentric")
 
 
 def test_a_configuration_names_its_task(root, monkeypatch):
@@ -43,7 +43,7 @@ def test_a_configuration_names_its_task(root, monkeypatch):
     [
         (["nowhere.at_all:Task"], "no module named 'nowhere'"),
         (["broken_tasks:Nobody"], "broken_tasks has no 'Nobody'"),
-        (["Nobody"], "jetbot_mjx.task has no 'Nobody'"),
+        (["Nobody"], "jetbot_mjx has no 'Nobody'"),
         (["GoalTask", "--set", "task.optoins.a=1"], "optoins"),
         (["broken_tasks:Drawn"], "is no task: it lacks sample"),
     ],

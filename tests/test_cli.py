@@ -137,7 +137,7 @@ def test_train_refuses_a_path_without_a_file(refused, path, said):
         ("ppo.learning_rate_schedule=COSINE", "it should be 'NONE', 'LINEAR' or 'ADAPTIVE_KL'"),
         ("task.name=GoalTask", "task.name = 'GoalTask' is wrong: write package.module:Class"),
         ("task.name=nowhere:Task", "no module named 'nowhere' can be imported"),
-        ("task.name=jetbot_mjx.task:GaolTask", "jetbot_mjx.task has no 'GaolTask'"),
+        ("task.name=jetbot_mjx:GaolTask", "jetbot_mjx has no 'GaolTask'"),
         ("task.name=builtins:str", "is no task: it lacks "),
     ],
 )

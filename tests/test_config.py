@@ -459,7 +459,7 @@ def test_environments_that_devices_cannot_share_are_refused(num_envs, batch_size
         ("jetbot_mjx.task:", "is wrong: write package.module:Class"),
         ("no_such_package.task:Task", "no module named 'no_such_package' can be imported"),
         ("jetbot_mjx.no_such:Task", "no module named 'jetbot_mjx.no_such' can be imported"),
-        ("jetbot_mjx.task:GaolTask", "jetbot_mjx.task has no 'GaolTask'"),
+        ("jetbot_mjx:GaolTask", "jetbot_mjx has no 'GaolTask'"),
         ("builtins:str", "is no task: it lacks "),
     ],
 )

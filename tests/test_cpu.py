@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import OWN_TASKS
 from jax.experimental.compilation_cache import compilation_cache
 from jax.sharding import Mesh, PartitionSpec
 
@@ -244,7 +245,7 @@ def fresh():
 
 @needs_it
 def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, monkeypatch):
-    monkeypatch.setattr(programs, "TRUSTED", "jetbot_mjx.")
+    monkeypatch.setattr(programs, "TRUSTED", OWN_TASKS)
     shape = jax.ShapeDtypeStruct((2,), jnp.float32)
     written = cpu.write(scalarize(lambda x: x * 2.5, shape), carried=1, steps=1)
     x = np.ones((3, 2), np.float32)

@@ -274,7 +274,7 @@ def test_a_training_on_a_terminal_has_the_dashboard(screen, watch, root, tmp_pat
     assert sys.stdout is screen.stream
     screen.until("tensorboard --logdir")
     text = screen.text
-    for part in ("training jetbot_mjx.task:GoalTask", "run folder: ", "first training step done"):
+    for part in ("training jetbot_mjx:GoalTask", "run folder: ", "first training step done"):
         assert part in text
     assert text.index("run folder: ") < text.index("compiling 0:00")
     end = on_screen(text)

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import OWN_TASKS
 from jax.experimental.compilation_cache import compilation_cache
 
 from jetbot_mjx import programs
@@ -18,6 +19,7 @@ from jetbot_mjx.checkpoint import PRETRAINED
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.programs import Programs, programs_of
 from jetbot_mjx.resumable_ppo import Program
+from jetbot_mjx.task import GoalTask, make_task
 
 KEY = "all that it depends on"
 
@@ -144,7 +146,7 @@ def test_what_nobody_used_for_long_makes_room(kept):
 @pytest.fixture
 def paths(tmp_path, monkeypatch):
     """Where a configuration's program would lie; None where it would not be kept."""
-    monkeypatch.setattr(programs, "TRUSTED", "jetbot_mjx.")
+    monkeypatch.setattr(programs, "TRUSTED", OWN_TASKS)
     monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", str(tmp_path))
 
     def paths(settings, *, keep=True):
@@ -185,8 +187,21 @@ def test_another_model_is_another_program(paths, monkeypatch):
     assert paths({}) != before
 
 
-def test_a_task_of_someone_else_is_always_traced(paths):
-    assert paths({"task": {"name": "someone.module:Task"}}) is None
+@pytest.mark.parametrize(
+    "name",
+    ["someone.module:Task", "jetbot_mjx_tasks:GoalTask", "jetbot_mjx.mine:Task", "jetbot_mjx:Mine"],
+)
+def test_a_task_of_someone_else_is_always_traced(paths, name):
+    assert paths({"task": {"name": name}}) is None
+
+
+def test_the_packages_own_tasks_are_named_by_the_package_alone(paths):
+    """So that no module's name is in a configuration or in a run."""
+    assert {parse_config({}).task.name} == OWN_TASKS
+    for name in OWN_TASKS:
+        config = parse_config({"task": {"name": name}})
+        assert isinstance(make_task(config.task), GoalTask)
+        assert paths({"task": {"name": name}}) is not None
 
 
 def test_programs_are_kept_only_where_that_is_asked_for(paths):

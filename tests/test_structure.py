@@ -150,6 +150,7 @@ PUBLIC = {
     "load_policy": "checkpoint",
     "PRETRAINED": "checkpoint",
     "JetBotEnv": "env",
+    "GoalTask": "task",
     "Task": "task",
     "State": "state",
 }

@@ -79,9 +79,9 @@ def test_a_world_that_blows_up_is_found_in_the_drive(monkeypatch):
 @pytest.mark.parametrize(
     "config",
     [
-        pytest.param(lambda root: config_of("jetbot_mjx.task:GoalTask"), id="world"),
+        pytest.param(lambda root: config_of("jetbot_mjx:GoalTask"), id="world"),
         pytest.param(
-            lambda root: config_of("jetbot_mjx.task:GoalTask", observation="egocentric"),
+            lambda root: config_of("jetbot_mjx:GoalTask", observation="egocentric"),
             id="egocentric",
         ),
         *[
