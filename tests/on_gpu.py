@@ -102,7 +102,9 @@ def main() -> int:
         environment |= {"JAX_PLATFORMS": "cuda,cpu"}
         workers = min(8, os.cpu_count() or 1)
         commands.append(
-            Command(f"python -m pytest -m 'not slow' -q -n {workers} --dist loadfile --durations=0")
+            Command(
+                f"python -m pytest -m 'not slow' -q -p no:benchmark -n {workers} --dist loadfile --durations=0"
+            )
         )
     failed = 0
     for index, command in enumerate(commands):
