@@ -19,6 +19,9 @@ from jetbot_mjx.state import State
 from jetbot_mjx.task import Goal
 from jetbot_mjx.wrappers import EpisodeWrapper
 
+# Apart from what the first reset, the robot and later episodes draw from the same key.
+_ACTION_DRAWS = 0x61637473
+
 Controller = Callable[[Any, State, UInt32[Array, "2"]], Float[Array, "2"]]
 
 
@@ -113,6 +116,9 @@ def rollout_fn(
         nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
         return nstate, added
 
+    # `fold_in(key, 1)` alone is `split(key)[1]`, from which the goal is drawn.
+    fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
+
     def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = jax.vmap(episode_env.reset)(keys)
         zero = jnp.zeros(keys.shape[0])
@@ -127,8 +133,7 @@ def rollout_fn(
             return (carry.time < episode_length) & (carry.tally.alive > 0).any()
 
         def body(carry: _Carry) -> _Carry:
-            # Reset keys with the step folded in: apart from those of later episodes.
-            step_keys = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys, carry.time)
+            step_keys = fold_in(fold_in(keys, _ACTION_DRAWS), carry.time)
             actions = jax.vmap(act)(carry.state, step_keys)
             state, tally = jax.vmap(one_step)(carry.state, carry.tally, actions)
             qpos = carry.qpos

@@ -2,6 +2,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from gliding import Gliding
 from scipy import stats
 
 from jetbot_mjx.config import parse_config
@@ -79,6 +80,23 @@ def test_the_reports_goals_are_those_of_version_1(world_env):
     expected = [[-0.9417, 0.1728], [0.4117, 0.9321], [-0.7720, -0.8731]]
     np.testing.assert_allclose(goals[:3, :2], expected, atol=1e-3)
     np.testing.assert_allclose(np.asarray(goals[:, :2]).mean(axis=0), [0.0039, -0.0186], atol=1e-3)
+
+
+def test_no_key_of_a_controller_is_one_that_a_reset_draws_from():
+    told = set()
+
+    def act(params, state, key):
+        del params, state
+        jax.debug.callback(lambda key: told.add(tuple(key.tolist())), key)
+        return jnp.zeros(2)
+
+    keys, steps = report_keys(2), 3
+    jax.block_until_ready(rollout_fn(Gliding(parse_config({})), [act], steps)(0, None, keys))
+    jax.effects_barrier()
+    assert len(told) == 2 * steps
+    # The episode's own, the goal's, and those of the episodes that would follow.
+    drawn = {tuple(key.tolist()) for one in keys for key in (one, *jax.random.split(one, 8))}
+    assert not told & drawn
 
 
 @pytest.fixture(scope="module", params=["isaac", "real"])
