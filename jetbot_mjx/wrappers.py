@@ -8,7 +8,8 @@ What `info` holds from `reset` on, all float32 (Brax's trainer reads the first f
   steps            environment steps of this episode so far, the last one's at its end
   truncation       1 where the episode was cut off (time limit, non-finite world): bootstraps
   episode_done     1 where an episode ended in this step
-  episode_metrics  sums over the episode: every metric, `sum_reward` and `length`
+  episode_metrics  sums over the episode: every metric, `sum_reward` and `length`; with
+                   `action_repeat` reward and metrics of a step are sums already
   terminated       1 where the task ended it: success or failure, does not bootstrap
   final_obs        what the policy would have seen next in the episode that ended
 """
@@ -113,12 +114,12 @@ class EpisodeWrapper(Wrapper):
     def step(self, state: State, action: Float[Array, "2"]) -> State:
         """One step, `action_repeat` environment steps unless the episode ends before."""
         begins = state.info["episode_done"] > 0
-        nstate, reward, length = self._repeat(state, action)
+        steps = jnp.where(begins, 0.0, state.info["steps"])
+        nstate, length = self._repeat(state, action, steps)
         finite = _all_finite((nstate.pipeline_state, nstate.obs, nstate.reward))
         nstate = _select(finite, nstate, _discarded(state))
-        nstate = nstate.replace(reward=jnp.where(finite, reward, 0.0))
 
-        steps = jnp.where(begins, 0.0, state.info["steps"]) + length
+        steps = steps + length
         out_of_time = steps >= self.episode_length
         terminated = nstate.info["terminated"]
         truncation = jnp.where(out_of_time | ~finite, 1.0 - terminated, 0.0)
@@ -141,25 +142,37 @@ class EpisodeWrapper(Wrapper):
         return nstate.replace(done=done, metrics=metrics, info=info)
 
     def _repeat(
-        self, state: State, action: Float[Array, "2"]
-    ) -> tuple[State, Float[Array, ""], Float[Array, ""]]:
-        """Steps until the action has been held long enough or the task has ended."""
+        self, state: State, action: Float[Array, "2"], steps: Float[Array, ""]
+    ) -> tuple[State, Float[Array, ""]]:
+        """Hold an action until it was held long enough, the task has ended or the time is out.
+
+        Args:
+          state: where to start.
+          action: in [-1, 1]².
+          steps: environment steps of this episode so far.
+
+        Returns:
+          The last state, its reward and metrics added up over the environment steps that were
+          made, and how many these were.
+        """
         nstate = self.env.step(state.replace(done=jnp.zeros(())), action)
-        reward, length = nstate.reward, jnp.ones(())
+        length = jnp.ones(())
         if self.action_repeat == 1:
-            return nstate, reward, length
+            return nstate, length
 
-        def again(
-            carry: tuple[State, Array, Array], _: None
-        ) -> tuple[tuple[State, Array, Array], None]:
-            state, reward, length = carry
-            going = state.done == 0
-            nstate = _select(going, self.env.step(state, action), state)
-            reward = reward + jnp.where(going, nstate.reward, 0.0)
-            return (nstate, reward, length + going), None
+        def again(carry: tuple[State, PyTree, Array], _: None) -> tuple[PyTree, None]:
+            state, sums, length = carry
+            going = (state.done == 0) & (steps + length < self.episode_length)
+            nstate = self.env.step(state, action)
+            added = jax.tree.map(jnp.add, sums, (nstate.reward, nstate.metrics))
+            carry = _select(going, (nstate, added), (state, sums))
+            return (*carry, length + going), None
 
-        carry, _ = jax.lax.scan(again, (nstate, reward, length), length=self.action_repeat - 1)
-        return carry
+        first = (nstate, (nstate.reward, nstate.metrics), length)
+        (nstate, (reward, metrics), length), _ = jax.lax.scan(
+            again, first, length=self.action_repeat - 1
+        )
+        return nstate.replace(reward=reward, metrics=metrics), length
 
 
 class NewEpisodeWrapper(Wrapper):

@@ -26,7 +26,8 @@ class Stub(brax.envs.Env):
         goal = jax.random.uniform(goal_key, (3,))
         zero = jnp.zeros(())
         physics = PhysicsState(jnp.zeros(9), jnp.zeros(8), jnp.zeros(8), zero)
-        return State(physics, goal, zero, zero, {"success": zero}, {"terminated": zero}, goal, key)
+        metrics = {"success": zero, "reward/given": zero}
+        return State(physics, goal, zero, zero, metrics, {"terminated": zero}, goal, key)
 
     def step(self, state, action):
         terminated = (action[1] > 0.5).astype(jnp.float32)
@@ -39,7 +40,7 @@ class Stub(brax.envs.Env):
             obs=state.goal + physics.qpos[:3],
             reward=action[0] + bad,
             done=terminated,
-            metrics={**state.metrics, "success": terminated},
+            metrics={**state.metrics, "success": terminated, "reward/given": action[0]},
             info={**state.info, "terminated": terminated},
         )
 
@@ -133,6 +134,34 @@ def test_action_repeat_adds_rewards_and_stops_at_the_end():
     assert (float(state.reward), float(state.info["steps"])) == (2, 2)
     ended = run(chain(action_repeat=3), [END])[-1]
     assert (float(ended.reward), float(ended.info["steps"])) == (1, 1)
+
+
+def test_action_repeat_adds_up_terms_as_it_does_rewards():
+    first, second = run(chain(action_repeat=3), [GO, 2 * GO])[1:]
+    assert float(first.metrics["reward/given"]) == float(first.reward) == 3
+    assert float(second.metrics["reward/given"]) == float(second.reward) == 2
+    sums = second.info["episode_metrics"]
+    assert float(sums["reward/given"]) == float(sums["sum_reward"]) == 5
+    assert float(sums["nonfinite_worlds"]) == 0
+    ended = run(chain(action_repeat=3), [END])[-1]
+    assert float(ended.metrics["success"]) == float(ended.info["episode_metrics"]["success"]) == 1
+
+
+def test_action_repeat_stops_at_the_time_limit():
+    first, last, begun = run(chain(action_repeat=3), [GO] * 3)[1:]
+    assert [float(s.info["steps"]) for s in (first, last, begun)] == [3, EPISODE_LENGTH, 3]
+    assert float(last.info["episode_metrics"]["length"]) == EPISODE_LENGTH
+    assert float(last.done) == float(last.info["truncation"]) == 1
+    # No step beyond the limit: the observation counts them.
+    np.testing.assert_allclose(last.info["final_obs"], first.goal + EPISODE_LENGTH)
+
+
+def test_a_world_that_blows_up_while_an_action_is_held_counts_for_nothing():
+    before, blown = run(chain(action_repeat=2), [GO, BLOW_UP])[1:]
+    assert float(blown.reward) == float(blown.metrics["reward/given"]) == 0
+    assert float(blown.info["episode_metrics"]["reward/given"]) == 2
+    assert float(blown.metrics["nonfinite_worlds"]) == 1
+    np.testing.assert_array_equal(blown.info["final_obs"], before.obs)
 
 
 def test_the_wrapped_state_keeps_its_tree_shapes_and_dtypes():
