@@ -133,6 +133,7 @@ def _run_json(run: Run) -> dict[str, Any]:
             "checkpoint": report.checkpoint.name,
             "env_steps": report.env_steps,
             "policy": report.policy._asdict(),
+            "mujoco": report.mujoco.to_json() if report.mujoco else None,
         }
         for name, report in run.seeds.items()
     ]

@@ -7,7 +7,7 @@ import argparse
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 
@@ -25,14 +25,18 @@ from jetbot_mjx.evaluation import (
     summarize,
 )
 from jetbot_mjx.metrics import read_history
+from jetbot_mjx.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.randomization import VariedEnv
 from jetbot_mjx.report import CurvePoint, Report, by_goal, find_failures, learning_curve
 from jetbot_mjx.report_files import write_comparison, write_report
-from jetbot_mjx.robustness import SWEEP_GOALS, SweepResult, sweep
+from jetbot_mjx.robustness import SWEEP_GOALS, InMujoco, MujocoEvaluator, SweepResult, sweep
 from jetbot_mjx.run_folder import seed_folders, versions
 from jetbot_mjx.tables import pairs_table, policies_table, robustness_table, runs_table
 
 BELOW_TARGET = 1
+
+Simulator = Literal["mujoco"]
+"""Another simulator than the one that policies are trained in."""
 
 
 def run(
@@ -43,6 +47,7 @@ def run(
     output: str | Path | None = None,
     robustness: bool = False,
     ranges: str | Path | None = None,
+    simulator: Simulator | None = None,
 ) -> Report:
     """Judges one policy and writes its report.
 
@@ -51,9 +56,11 @@ def run(
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder.
       output: the folder to write; None: `evaluations/<env_steps>/` of the run folder.
-      robustness: whether to judge it on robots that differ from the preset as well.
+      robustness: whether to judge it on robots that differ from the preset as well, and in C
+        MuJoCo.
       ranges: a configuration file by whose `randomization` a robot is drawn for each goal, beside
         the preset's; None: the run's own, if it has any.
+      simulator: in which to evaluate it beside the one that it was trained in.
 
     Returns:
       The report, which knows its folder.
@@ -64,7 +71,48 @@ def run(
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     folder = _report_folder(checkpoint) if output is None else Path(output)
     drawn = _Ranges.read(ranges)
-    return next(_judge([(checkpoint, folder)], episodes, robustness=robustness, drawn=drawn))
+    reports = _judge(
+        [(checkpoint, folder)],
+        episodes,
+        robustness=robustness,
+        elsewhere=robustness or simulator is not None,
+        drawn=drawn,
+    )
+    return next(reports)
+
+
+def run_in_mujoco(
+    run_or_checkpoint: str | Path,
+    *,
+    episodes: int = REPORT_GOALS,
+    which: Which = "best",
+    ranges: str | Path | None = None,
+    numerics: Numerics = OTHER_NUMERICS,
+) -> InMujoco:
+    """Evaluate one policy in C MuJoCo, and write nothing.
+
+    Args:
+      run_or_checkpoint: a run folder, or one checkpoint folder of it.
+      episodes: how many of the fixed goals, from the first on.
+      which: the checkpoint of a run folder.
+      ranges: as for `run`.
+      numerics: how C MuJoCo computes.
+
+    Returns:
+      The metrics.
+
+    Raises:
+      UserError: there is no usable checkpoint, or JAX was told to do without a CPU.
+    """
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    drawn = _Ranges.read(ranges)
+    evaluator = MujocoEvaluator(
+        checkpoint.make_env(),
+        checkpoint.networks,
+        drawn.ranges if drawn else checkpoint.config.randomization,
+        numerics,
+    )
+    return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
 def run_comparison(
@@ -75,6 +123,7 @@ def run_comparison(
     output: str | Path | None = None,
     robustness: bool = False,
     ranges: str | Path | None = None,
+    simulator: Simulator | None = None,
 ) -> Comparison:
     """Judges the policies of several runs or seeds, reports on each, and compares them.
 
@@ -83,8 +132,9 @@ def run_comparison(
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder, of each seed.
       output: the folder for the comparison; None: `evaluations/comparison/` of the first run.
-      robustness: whether each report judges its policy on other robots as well.
+      robustness: whether each report judges its policy on other robots, and in C MuJoCo, as well.
       ranges: as for `run`.
+      simulator: as for `run`.
 
     Returns:
       The comparison, which knows its folder; each report knows its own.
@@ -100,6 +150,7 @@ def run_comparison(
         [(one, _report_folder(one)) for one in checkpoints],
         episodes,
         robustness=robustness,
+        elsewhere=robustness or simulator is not None,
         drawn=_Ranges.read(ranges),
     )
     judged = {
@@ -193,19 +244,22 @@ def _judge(
     episodes: int,
     *,
     robustness: bool,
+    elsewhere: bool,
     drawn: _Ranges | None,
 ) -> Iterator[Report]:
     """Judges policies and writes their reports; what is compiled serves all it fits."""
     keys, about = report_keys(episodes), versions()
     # All of them first: what does not fit its task is refused before anything is written.
     envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
-    evaluator, varied, baselines, fits = None, None, {}, None
+    evaluator, varied, mujoco, baselines, fits = None, None, None, {}, None
     for (checkpoint, folder), env in zip(checkpoints, envs, strict=True):
         ranges = drawn.ranges if drawn else checkpoint.config.randomization
         if evaluator is None or (_program(checkpoint.config), ranges) != fits:
             evaluator = Evaluator(env, checkpoint.networks, baselines=True, record=True)
             if ranges.drawn:
                 varied = Evaluator(VariedEnv(env, ranges=ranges), checkpoint.networks)
+            if elsewhere:
+                mujoco = MujocoEvaluator(env, checkpoint.networks, ranges)
             fits = _program(checkpoint.config), ranges
             beside = evaluator.run_baselines(checkpoint.params, keys)
             baselines = {name: summarize(each, env.dt) for name, each in beside.items()}
@@ -232,6 +286,7 @@ def _judge(
             ),
             ranges=ranges if ranges.drawn else None,
             ranges_file=drawn.file if drawn else None,
+            mujoco=mujoco.run(checkpoint.params, keys) if mujoco else None,
         )
         write_report(report)
         yield report
@@ -290,7 +345,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--sweep",
         action="store_true",
-        help="judge on robots that differ from the preset too: friction, mass, motors, delay",
+        help="judge on robots that differ from the preset too: friction, mass, motors, delay; and"
+        " in C MuJoCo",
+    )
+    parser.add_argument(
+        "--simulator",
+        choices=get_args(Simulator),
+        help="evaluate in another simulator too: mujoco is C MuJoCo, with other numerics than in"
+        " training",
     )
     parser.add_argument(
         "--ranges",
@@ -314,6 +376,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         output=options.output,
         robustness=options.sweep,
         ranges=options.ranges,
+        simulator=options.simulator,
     )
     print(
         f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
@@ -333,6 +396,7 @@ def _main_comparison(options: argparse.Namespace) -> int:
         output=options.output,
         robustness=options.sweep,
         ranges=options.ranges,
+        simulator=options.simulator,
     )
     runs = comparison.runs
     policies = {

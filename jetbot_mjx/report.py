@@ -20,7 +20,7 @@ from jetbot_mjx.evaluation import (
     final_distances,
     wilson_interval,
 )
-from jetbot_mjx.robustness import SweepResult, as_json
+from jetbot_mjx.robustness import InMujoco, SweepResult, as_json
 from jetbot_mjx.rollout import Episodes
 
 TIME_LIMIT = "time limit"
@@ -119,6 +119,8 @@ class Report(NamedTuple):
     """What those robots were drawn from."""
     ranges_file: Path | None = None
     """Where the ranges stand; None: in the run's own configuration."""
+    mujoco: InMujoco | None = None
+    """On the same goals in C MuJoCo; None where it was not asked for."""
 
     @property
     def name(self) -> str:
@@ -132,7 +134,7 @@ class Report(NamedTuple):
         return (
             f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
-            f"{' --sweep' if self.robustness else ''}"
+            f"{' --sweep' if self.robustness else ' --simulator mujoco' if self.mujoco else ''}"
             f"{f' --ranges {shlex.quote(str(self.ranges_file))}' if self.ranges_file else ''}"
         )
 
@@ -156,6 +158,7 @@ class Report(NamedTuple):
             "robustness": as_json(self.robustness) if self.robustness else None,
             "randomized": self.randomized._asdict() if self.randomized else None,
             "ranges": self.ranges.drawn if self.ranges else None,
+            "mujoco": self.mujoco.to_json() if self.mujoco else None,
             "versions": dict(self.versions),
         }
 

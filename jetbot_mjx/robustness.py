@@ -2,6 +2,7 @@
 
 One quantity at a time leaves the preset's value; goals, rules and figures are those of the
 report. One compiled program serves all robots, and beside the policy the scripted controller.
+And on the same robot in another simulator: C MuJoCo, with numerics that no training uses.
 
 Sources, by tag; BOM, EST and SIM as in `model.py`:
   CAD         the room that the battery has, and the clearance of the casters; see `model.py`.
@@ -21,15 +22,18 @@ import jax.numpy as jnp
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, Int, UInt32
 
-from jetbot_mjx.compiling import compiler_options
+from jetbot_mjx.compiling import compiler_options, on_host
+from jetbot_mjx.config import RandomizationConfig
 from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.evaluation import (
     BASELINES,
     GOAL_SET_VERSION,
+    Evaluator,
     Summary,
     policy_controller,
     summarize,
 )
+from jetbot_mjx.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
 from jetbot_mjx.policy import PolicyParams
 from jetbot_mjx.randomization import VariedEnv
 from jetbot_mjx.rollout import Episodes, rollout_fn
@@ -183,14 +187,14 @@ SWEEPS = (
     ),
     Sweep(
         "height_offset",
-        "offset of the observed height",
+        "observed height, offset",
         "m",
         (-0.003, -0.001, 0.0, 0.001, 0.003),
         "SIM MuJoCo's default contact carries the robot 0.4 mm higher; EST 3 mm, a carpet",
     ),
     Sweep(
         "pitch_offset",
-        "offset of the observed pitch",
+        "observed pitch, offset",
         "rad",
         (-0.0175, 0.0, 0.0175),
         "EST 1°, how straight a sensor is mounted",
@@ -307,6 +311,67 @@ def sweep(
       One result for each quantity.
     """
     return Sweeper(env, networks, keys, sweeps).run(params)
+
+
+class InMujoco(NamedTuple):
+    """A policy in C MuJoCo, on the same goals as in the simulator that it was trained in."""
+
+    numerics: Numerics
+    policy: Summary
+    """On the preset's robot."""
+    randomized: Summary | None
+    """With a robot drawn for each goal; None without ranges to draw from."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it as plain values, for a report's file."""
+        numerics = self.numerics._asdict().items()
+        return {
+            "numerics": {k: list(v) if isinstance(v, tuple) else v for k, v in numerics},
+            "policy": self.policy._asdict(),
+            "randomized": self.randomized._asdict() if self.randomized else None,
+        }
+
+
+class MujocoEvaluator:
+    """Evaluates policies in C MuJoCo."""
+
+    def __init__(
+        self,
+        env: JetBotEnv,
+        networks: ppo_networks.PPONetworks,
+        ranges: RandomizationConfig | None = None,
+        numerics: Numerics = OTHER_NUMERICS,
+    ) -> None:
+        """Builds the simulator; its programs compile at their first use.
+
+        Args:
+          env: one environment, unwrapped, with its preset's robot.
+          networks: of the policies.
+          ranges: what a robot is drawn from for each goal, beside the preset's; None: nothing.
+          numerics: how C MuJoCo computes.
+
+        Raises:
+          UserError: JAX was told to do without a CPU.
+        """
+        self._numerics, self._dt = numerics, env.dt
+        simulator = in_mujoco(env, numerics)
+        self._preset = Evaluator(simulator, networks)
+        drawn = ranges is not None and ranges.drawn
+        self._drawn = Evaluator(VariedEnv(simulator, ranges=ranges), networks) if drawn else None
+
+    def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> InMujoco:
+        """Evaluate a policy.
+
+        Args:
+          params: the policy's.
+          keys: one reset key an episode, such as `report_keys(1024)`.
+        """
+        with on_host():
+            return InMujoco(
+                self._numerics,
+                summarize(self._preset.run(params, keys), self._dt),
+                summarize(self._drawn.run(params, keys), self._dt) if self._drawn else None,
+            )
 
 
 def carries(result: SweepResult) -> tuple[float, float] | None:

@@ -17,6 +17,11 @@ def policies_table(policies: Mapping[str, Report]) -> str:
         rows.append((name, report.policy))
         if report.randomized:
             rows.append((f"{name}, randomised robots", report.randomized))
+        if report.mujoco:
+            rows.append((f"{name} in C MuJoCo", report.mujoco.policy))
+            if report.mujoco.randomized:
+                drawn = report.mujoco.randomized
+                rows.append((f"{name} in C MuJoCo, randomised robots", drawn))
     rows += baselines.items()
     width = max(10, *(len(name) for name, _ in rows))
     head = (

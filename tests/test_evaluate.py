@@ -194,22 +194,63 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
     page = (tmp_path / "report.md").read_text()
     assert "| delay of actions | control steps | 0 | 0 to 0 | 0 to 9 | 25.00% |" in page
     assert json.loads(first["report.json"])["robustness"] is None
+    # The other simulator is part of it.
+    assert values["mujoco"]["policy"]["episodes"] == EPISODES
+
+
+def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_path):
+    run_dir, _, (first, _), _ = judged
+    code, said = judge(run_dir, "--simulator", "mujoco", "--output", tmp_path)
+    assert code == 0
+    assert "\npolicy in C MuJoCo " in said
+    values = json.loads((tmp_path / "report.json").read_text())
+    own = json.loads(first["report.json"])
+    assert own["mujoco"] is None
+    assert values["policy"] == own["policy"]
+    found = values["mujoco"]["policy"]
+    assert (found["episodes"], found["nonfinite_worlds"]) == (EPISODES, 0)
+    assert values["mujoco"]["randomized"] is None
+    numerics = values["mujoco"]["numerics"]
+    assert (numerics["substeps"], numerics["cone"]) == (8, "elliptic")
+    places = check_numbers(tmp_path / "report.html", values)
+    assert {"mujoco.policy.success_rate", "mujoco.numerics.solref.0"} <= places
+    page = (tmp_path / "report.md").read_text("utf-8")
+    assert f"| in C MuJoCo | {found['success_rate']:.2%} |" in page
+    assert "implicitfast with 8 steps per control step, elliptic friction cone" in page
+    assert f"--episodes {EPISODES} --simulator mujoco\n" in page
+    # And without a report, the same again.
+    again = evaluate.run_in_mujoco(run_dir, episodes=EPISODES)
+    assert json.loads(json.dumps(again.to_json())) == values["mujoco"]
+
+
+def test_another_simulator_that_there_is_not_is_refused(judged, capfd):
+    run_dir, _, _, _ = judged
+    with pytest.raises(SystemExit) as caught:
+        judge(run_dir, "--simulator", "isaac")
+    assert caught.value.code == 2
+    assert "argument --simulator: invalid choice: 'isaac'" in capfd.readouterr().err
 
 
 def test_ranges_of_a_file_are_judged_beside_the_preset(judged, tmp_path):
     run_dir, _, (first, _), _ = judged
     ranges = tmp_path / "ranges.yaml"
     ranges.write_text("randomization: {motor_gain: [0.1, 0.11]}")
-    code, said = judge(run_dir, "--ranges", ranges, "--output", tmp_path / "report")
+    elsewhere = "--simulator", "mujoco"
+    code, said = judge(run_dir, "--ranges", ranges, *elsewhere, "--output", tmp_path / "report")
     assert code == 0
     assert "policy, randomised robots" in said
+    assert "policy in C MuJoCo, randomised robots" in said
     values = json.loads((tmp_path / "report" / "report.json").read_text())
     assert values["ranges"] == {"motor_gain": [0.1, 0.11]}
     assert values["policy"] == json.loads(first["report.json"])["policy"]
     # A tenth of the speed is not enough for any of the ways.
     assert values["randomized"]["success_rate"] == 0.0 < values["policy"]["success_rate"]
+    there = values["mujoco"]
+    assert there["randomized"]["success_rate"] == 0.0 < there["policy"]["success_rate"]
+    check_numbers(tmp_path / "report" / "report.html", values)
     page = (tmp_path / "report" / "report.md").read_text()
     assert "| randomised robots | 0.00% |" in page
+    assert "| in C MuJoCo, randomised robots | 0.00% |" in page
     assert f"--ranges {ranges}" in page
     assert json.loads(first["report.json"])["randomized"] is None
 
@@ -300,7 +341,8 @@ def several(smoke_run, still, tmp_path_factory):
             if int(checkpoint.name) != steps:
                 shutil.rmtree(checkpoint)
     shutil.copytree(still, folder / "still")
-    return folder, *judge(folder / "five", folder / "still", "--min-success", "0.01")
+    runs = folder / "five", folder / "still"
+    return folder, *judge(*runs, "--min-success", "0.01", "--simulator", "mujoco")
 
 
 def test_runs_are_compared_beside_their_own_reports(several):
@@ -319,6 +361,11 @@ def test_runs_are_compared_beside_their_own_reports(several):
     assert success["mean"]["low"] == min(rates)
     assert values["runs"][1]["success_rate"]["over"] == "episodes"
     assert values["pairs"][0]["success_rate"]["losses"] == 0
+    elsewhere = [seed["mujoco"]["policy"] for run in values["runs"] for seed in run["seeds"]]
+    assert [one["episodes"] for one in elsewhere] == [EPISODES] * 3
+    assert elsewhere[2]["success_rate"] == 0.0 < elsewhere[0]["success_rate"]
+    for name in ("five seed-0", "five seed-1", "still"):
+        assert re.search(rf"^{name} in C MuJoCo +\d", said, re.MULTILINE)
     assert said.splitlines()[-2] == f"report: {home / 'comparison.html'}"
     # The still run is below the target; one is enough.
     assert code == 1
@@ -334,6 +381,7 @@ def test_the_comparison_tells_the_numbers_of_its_json_file(several):
         "runs.1.success_rate.mean.low",
         "pairs.0.success_rate.p",
         "runs.0.seeds.1.policy.success_rate",
+        "runs.0.seeds.1.mujoco.policy.success_rate",
         "baselines.scripted.success_rate",
     } <= places
     page = (home / "comparison.html").read_text("utf-8")
