@@ -7,6 +7,7 @@ command · 130 interrupted.
 
 import argparse
 import contextlib
+import io
 import os
 import sys
 import threading
@@ -17,6 +18,7 @@ from typing import Any, Literal, NoReturn
 import jax
 
 from jetbot_mjx.errors import UserError, ran_out
+from jetbot_mjx.interrupts import raise_again
 from jetbot_mjx.programs import processor
 from jetbot_mjx.trusted_files import distrust, tell_once
 
@@ -44,6 +46,11 @@ def run_command(
         opened: JAX takes a second to give a GPU back, and a compiler's thread, which cannot be
         interrupted, may abort the process.
     """
+    for stream in (sys.stdout, sys.stderr):
+        # What a terminal has no letters for must not end a command that has done its work.
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
+    raise_again()
     try:
         code = command(None)
     except UserError as error:
@@ -192,8 +199,8 @@ def positive_float(text: str) -> float:
         value = float(text)
     except ValueError:
         raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
-    if not 0 < value < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    if not 0 < value <= _LARGEST:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most {_LARGEST}")
     return value
 
 
@@ -203,7 +210,8 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
         return "best"
     if text == "last":
         return "last"
-    if text.isdecimal():
+    # More digits than any number of steps has, Python would refuse to read.
+    if text.isdecimal() and len(text) < 100:
         return int(text)
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 

@@ -18,6 +18,7 @@ PACKAGE = "jetbot_mjx"
 
 NOUNS = (
     "errors",
+    "interrupts",
     "config",
     "trusted_files",
     "compiling",

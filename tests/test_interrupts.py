@@ -1,0 +1,106 @@
+"""Ctrl-C before a command has begun, and where the exception is lost."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+STAND_IN = """
+import os, signal, time
+try:
+    os.kill(os.getpid(), signal.SIGINT)
+    time.sleep(20)
+except BaseException as error:
+    if {lost}:
+        raise ImportError("an extension could not be loaded")
+    raise
+"""
+"""For a library that is still loading when the signal comes."""
+
+
+def python(root, folder, *arguments, **options):
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{root}"},
+        capture_output=True,
+        text=True,
+        timeout=60,
+        **options,
+    )
+
+
+@pytest.mark.parametrize("lost", [False, True])
+@pytest.mark.parametrize("command", ["train", "evaluate"])
+def test_a_command_that_still_loads_leaves_quietly(command, lost, root, tmp_path):
+    (tmp_path / "jax").mkdir()
+    (tmp_path / "jax" / "__init__.py").write_text(STAND_IN.format(lost=lost))
+    done = python(root, tmp_path, "-m", f"jetbot_mjx.{command}", "--help")
+    # 130, to a shell.
+    assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
+
+
+def test_a_background_job_ignores_it_while_it_loads(root, tmp_path):
+    (tmp_path / "jax.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n1/0")
+    done = python(
+        root,
+        tmp_path,
+        *("-m", "jetbot_mjx.evaluate"),
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
+    )
+    assert done.returncode == 1
+    assert "ZeroDivisionError" in done.stderr
+
+
+@pytest.mark.parametrize("arguments", [("-c", "import program"), ("-m", "program")])
+def test_programs_that_import_the_package_keep_their_own_way(arguments, root, tmp_path):
+    (tmp_path / "program").mkdir()
+    (tmp_path / "program" / "__main__.py").touch()
+    (tmp_path / "program" / "__init__.py").write_text(
+        "import signal, jetbot_mjx\n"
+        "print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n"
+    )
+    done = python(root, tmp_path, *arguments)
+    assert (done.stdout, done.stderr) == ("True\n", "")
+
+
+COMMAND = """
+import signal, sys, time
+from jetbot_mjx import cli
+
+class Loses:
+    def __del__(self):
+        signal.raise_signal(signal.SIGINT)
+
+def command(_):
+    {what}
+    time.sleep(20)
+    return 0
+
+signal.signal(signal.SIGINT, signal.SIG_DFL)
+cli.run_command(command)
+"""
+
+
+@pytest.mark.parametrize(
+    ("what", "code", "said"),
+    [
+        ("signal.raise_signal(signal.SIGINT)", 130, "interrupted\n"),
+        # As in a callback of garbage collection: Python prints what is raised there, and goes on.
+        ("Loses()", 130, "interrupted\n"),
+        ("signal.signal(signal.SIGINT, signal.SIG_IGN); Loses(); sys.exit(3)", 3, ""),
+    ],
+)
+def test_a_command_at_work_is_interrupted_wherever_it_is(what, code, said, root, tmp_path):
+    done = python(root, tmp_path, "-c", COMMAND.format(what=what))
+    assert (done.returncode, done.stderr) == (code, said)
+
+
+def test_other_exceptions_that_are_lost_are_told(root, tmp_path):
+    source = COMMAND.format(what="Loses(); return 0")
+    source = source.replace("signal.raise_signal(signal.SIGINT)", "1 / 0")
+    done = python(root, tmp_path, "-c", source)
+    assert done.returncode == 0
+    assert "ZeroDivisionError" in done.stderr
