@@ -239,6 +239,8 @@ def free_port(host: str, port: int | None) -> int:
                     probe.bind(address[4])
         except socket.gaierror as error:
             raise UserError(f"--host {host!r} is no address: {error.strerror}") from None
+        except UnicodeError as error:
+            raise UserError(f"--host {host!r} is no address: {error}") from None
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise UserError(f"--host {host!r} is no address of this machine") from None

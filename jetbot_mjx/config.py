@@ -46,20 +46,36 @@ def _integral(value: object) -> object:
 
 def _wandb_project(name: str) -> str:
     """Refuses what Weights & Biases would refuse after the training has begun."""
-    if not 0 < len(name) <= 128 or set(name) & set("/\\#?%:"):
+    if not 0 < len(name) <= 128 or set(name) & set("/\\#?%:") or not name.isprintable():
         raise ValueError(
             f"{name!r} is no project's name: it should have 1 to 128 characters, none of /\\#?%:"
         )
     return name
 
 
-_Scalar = bool | int | float | str
+def _float32(value: float) -> float:
+    """Refuse what would be infinite where everything is computed."""
+    if value > _LARGEST_FLOAT32:
+        raise ValueError(f"{value:g} is too large: make it at most {_LARGEST_FLOAT32:.2g}")
+    return value
+
+
+def _utf8(text: str) -> str:
+    """Refuse what cannot be written to a file: half of a surrogate pair."""
+    text.encode()
+    return text
+
+
+_LARGEST_FLOAT32 = 3.4e38
+
+Text = Annotated[str, AfterValidator(_utf8)]
+_Scalar = bool | int | Annotated[float, Field(allow_inf_nan=False)] | Text
 
 Count = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**31)]
 Steps = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**53)]
 Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
-Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_float32)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_float32)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 
@@ -103,14 +119,14 @@ class TaskConfig(_Section):
     """[m/s] forward speed commanded by a₀ = 1."""
     max_yaw_rate: Positive = math.pi
     """[rad/s] yaw rate commanded by a₁ = 1."""
-    goal_distance_min: Positive = 0.2
+    goal_distance_min: Annotated[float, Field(gt=0, le=1000, allow_inf_nan=False)] = 0.2
     """[m] nearest goal."""
-    goal_distance_span: NonNegative = 1.0
+    goal_distance_span: Annotated[float, Field(ge=0, le=1000, allow_inf_nan=False)] = 1.0
     """[m] farthest goal minus nearest."""
     success_radius: Annotated[float, Field(ge=0.02, allow_inf_nan=False)] = 0.1
     """[m] 3-D distance of the axle midpoint to the goal below which it is reached. The cube's
     centre lies 18 mm above the axle: no smaller radius can be reached."""
-    options: dict[str, _Scalar] = Field(default_factory=dict)
+    options: dict[Text, _Scalar] = Field(default_factory=dict)
     """Free settings for a task of your own."""
 
 
@@ -385,6 +401,15 @@ class Config(_Section):
     evaluation: EvaluationConfig = EvaluationConfig()
 
     @model_validator(mode="after")
+    def _seeds_fit(self) -> Self:
+        if self.seed + self.seeds > 2**32:
+            raise ValueError(
+                f"seeds = {self.seeds} from seed = {self.seed} on go beyond {2**32 - 1}:"
+                f" make seed at most {2**32 - self.seeds}"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _trainer_can(self) -> Self:
         if self.trainer == "brax":
             if self.ppo.learning_rate_schedule == "LINEAR":
@@ -604,7 +629,7 @@ def _explain(error: ErrorDetails) -> str:
     value = error["input"]
     if location[:2] == ["task", "options"] and len(location) > 2:
         key = ".".join(location[:3])
-        return f"{key} = {value!r} is wrong: it should be true, false, a number or text"
+        return f"{key} = {value!r} is wrong: it should be true, false, a finite number or text"
     match error["type"]:
         case "invalid_key":
             return f"{key} = {value!r} is no key: keys should be strings"

@@ -98,11 +98,11 @@ def run(
 @contextlib.contextmanager
 def _written_whole(folder: Path) -> Iterator[Path]:
     """A folder under another name, which gets its own when all is in it."""
-    if folder.exists() and not (folder / FILE).is_file():
-        raise UserError(f"{folder} is there and no export: give --out a folder that is not")
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     earlier = folder.with_name(f".{folder.name}.earlier")
     with writing_to(folder):
+        if folder.exists() and not (folder / FILE).is_file():
+            raise UserError(f"{folder} is there and no export: give --out a folder that is not")
         for left in (unfinished, earlier):
             shutil.rmtree(left, ignore_errors=True)
         unfinished.mkdir(parents=True)

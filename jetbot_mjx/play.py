@@ -4,6 +4,7 @@ Without a run it is one that comes with the package.
 """
 
 import argparse
+import contextlib
 import getpass
 import socket
 import types
@@ -95,9 +96,12 @@ def addresses(host: str, port: int) -> list[str]:
     everywhere = host in ("0.0.0.0", "::")
     here = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(host, f"[{host}]" if ":" in host else host)
     name = socket.gethostname()
+    # In a container the user may have no name.
+    with contextlib.suppress(KeyError, OSError):
+        name = f"{getpass.getuser()}@{name}"
     lines = [
         f"it drives at http://{here}:{port} (Ctrl-C ends it)",
-        f"from elsewhere: ssh -N -L {port}:{here}:{port} {getpass.getuser()}@{name}, and open"
+        f"from elsewhere: ssh -N -L {port}:{here}:{port} {name}, and open"
         f" http://127.0.0.1:{port} there",
     ]
     if everywhere:

@@ -90,7 +90,7 @@ class Preemption:
             if not self._requested.is_set():
                 began = time.monotonic()
                 self._requested.set()
-                limit = _SHARE_OF_NOTICE * self._notice
+                limit = min(_SHARE_OF_NOTICE * self._notice, threading.TIMEOUT_MAX)
                 self._clock = threading.Timer(limit, _leave, [f"{limit:.0f} s after {name}"])
                 self._clock.daemon = True
                 self._clock.start()

@@ -15,7 +15,7 @@ from typing import Any
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Int
+from jaxtyping import Array, UInt32
 
 from jetbot_mjx import processes
 from jetbot_mjx.config import Config
@@ -46,7 +46,7 @@ class Program:
         devices = jax.devices()
         self._mesh = Mesh(np.array(devices), (_AXIS,))
         # On the host, from where every process's devices can take them.
-        self._seeds = np.arange(config.seed, config.seed + config.seeds, dtype=np.int32)
+        self._seeds = np.arange(config.seed, config.seed + config.seeds, dtype=np.uint32)
         self._ppo = PPO(
             config.ppo,
             wrap_for_training(env, config.task.episode_length),
@@ -80,7 +80,7 @@ class Program:
             program = self._programs.compile("init", lambda: jitted.trace(self._seeds))
         return program(self._seeds)
 
-    def _init(self, seeds: Int[Array, " seeds"]) -> TrainState:
+    def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
         return jax.vmap(lambda seed: self._ppo.init(jax.random.PRNGKey(seed)))(seeds)
 
     def put(self, states: Sequence[TrainState]) -> TrainState:

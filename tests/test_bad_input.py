@@ -14,8 +14,8 @@ from test_cli import COMMANDS, SMOKE, damage_about, damaged, here, refused, trai
 from test_config import refusal, write
 from test_metrics import read_events
 
-from jetbot_mjx import cli, evaluate, render, train
-from jetbot_mjx.config import parse_config
+from jetbot_mjx import cli, evaluate, render, resumable_ppo, train
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.metrics import TensorBoardSink
@@ -86,6 +86,34 @@ def test_unstable_time_steps(preset, dt):
 )
 def test_command_line(refused, command, arguments):
     refused(COMMANDS[command], *arguments)
+
+
+def test_a_checkpoint_of_more_digits_than_python_reads_is_refused(refused):
+    assert "is neither best, last nor a number" in refused(
+        evaluate, "run", "--checkpoint", "9" * 5000
+    )
+
+
+def test_a_seed_of_32_bits_trains(root):
+    config = load_config(root / "configs" / "smoke.yaml", ["seed=3000000000", "seeds=2"])
+    seeds = resumable_ppo.Program(config, make_env(config))._seeds
+    keys = [jax.random.PRNGKey(seed) for seed in (3_000_000_000, 3_000_000_001)]
+    assert jax.vmap(jax.random.PRNGKey)(seeds).tolist() == [key.tolist() for key in keys]
+
+
+def test_a_terminal_without_letters_is_told_all_the_same(root, tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from jetbot_mjx import cli\ncli.run_command(lambda _: print('r\\xfcn \\udcff') or 0)",
+        ],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(root), "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (0, "r\\xfcn \\udcff\n")
 
 
 def test_more_episodes_than_can_be_counted_are_refused(refused):

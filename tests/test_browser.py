@@ -2,6 +2,7 @@
 
 import io
 import math
+import re
 import socket
 import types
 import urllib.error
@@ -190,9 +191,11 @@ def test_a_port_that_is_taken_meanwhile_is_refused(player):
             Browser(player, host="127.0.0.1", port=port, tell=print)
 
 
-@pytest.mark.parametrize("host", ["nowhere.invalid", "203.0.113.1"])
+@pytest.mark.parametrize(
+    "host", ["nowhere.invalid", "203.0.113.1", "", "a..b", "x" * 300, "\udcff"]
+)
 def test_an_address_of_no_machine_or_another_is_refused(host):
-    with pytest.raises(UserError, match=f"--host '{host}' is no address"):
+    with pytest.raises(UserError, match=f"--host {re.escape(repr(host))} is no address"):
         free_port(host, None)
 
 

@@ -394,6 +394,12 @@ def test_a_folder_with_something_else_is_left_alone(run_dir, tmp_path):
     assert os.listdir(tmp_path) == ["thesis.txt"]
 
 
+def test_a_folder_that_cannot_be_is_told(run_dir, tmp_path):
+    with pytest.raises(UserError, match="cannot be written: File name too long"):
+        export.run(run_dir, output=tmp_path / ("x" * 300))
+    assert os.listdir(tmp_path) == []
+
+
 def test_an_unknown_format_is_told(run_dir, capsys):
     with pytest.raises(SystemExit) as left:
         export.main([str(run_dir), "--format", "torch"])

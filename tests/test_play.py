@@ -73,6 +73,17 @@ def test_the_address_is_one_to_open_and_a_warning_where_all_may(host, here, line
     assert ("everyone" in told[-1]) == (lines == 3)
 
 
+def test_a_user_without_a_name_is_left_out(monkeypatch):
+    def fail():
+        raise KeyError("getpwuid(): uid not found: 1234")
+
+    monkeypatch.setattr(play.getpass, "getuser", fail)
+    assert (
+        f"-L 8080:127.0.0.1:8080 {socket.gethostname()}, and open"
+        in (play.addresses("127.0.0.1", 8080)[1])
+    )
+
+
 def test_without_viser_one_line_says_what_to_install(smoke_run, monkeypatch, nothing_loads):
     monkeypatch.delitem(sys.modules, "jetbot_mjx.browser", raising=False)
     monkeypatch.delattr(jetbot_mjx, "browser", raising=False)

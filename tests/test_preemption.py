@@ -249,6 +249,15 @@ hashlib.pbkdf2_hmac('sha256', b'', b'salt', 2**31 - 1)""",
     assert "4 s after SIGTERM: leaving" in stderr
 
 
+def test_a_notice_of_ages_is_no_error():
+    code, _, stderr = listen(
+        "print('listening', flush=True)\nsend()\nasked.wait(60)\ntime.sleep(0.5)\nos._exit(3)",
+        notice=1e308,
+    )
+    assert code == 3
+    assert len(stderr.strip().splitlines()) == 1
+
+
 def test_another_signal_with_a_handler_is_no_wish_to_stop():
     code, _, stderr = listen(
         """\
