@@ -20,6 +20,7 @@ from motors import (
     Wheel,
     as_json,
     check_calibration,
+    default_calibration,
     stop,
 )
 
@@ -122,7 +123,7 @@ def main(
       measure: returns distance [m] and turn [rad] of one drive.
 
     Returns:
-      The exit code: 0, or 2 after a mistake.
+      The exit code: 0, 2 after a mistake, or 130 after Ctrl-C.
     """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -136,6 +137,10 @@ def main(
     if options.values[0] == options.values[1] or max(options.values) > 1:
         parser.error("--values wants two different ones, at most 1")
     try:
+        # What is wrong is told before the robot drives.
+        check_calibration(
+            default_calibration()._replace(separation=options.separation, lag=options.lag)
+        )
         robot, clock, trials = robot or make_robot(), clock or WallClock(), []
         for value in options.values:
             print(f"both motors at {value:g} for {options.seconds:g} s")
@@ -149,6 +154,9 @@ def main(
     except OSError as error:
         print(f"error: {options.output}: {error.strerror}", file=sys.stderr)
         return 2
+    except (KeyboardInterrupt, EOFError):
+        print("\ninterrupted", file=sys.stderr)
+        return 130
     print(f"{options.output}: {json.dumps(as_json(calibration))}")
     return 0
 

@@ -13,8 +13,8 @@ import sys
 import time
 
 import numpy as np
-from drive import Outcome, Policy, Settings, arrival_radius, drive, load_policy
-from motors import Calibration, DriveError, default_calibration
+from drive import Outcome, Policy, Settings, arrival_radius, at_least, drive, load_policy
+from motors import Calibration, DriveError, check_calibration, default_calibration
 from poses import Tracker
 
 from jetbot_mjx.stand_in import ROLLING_RADIUS, MotorModel, Pose, StandIn
@@ -124,22 +124,33 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("policy", help="the folder that jetbot_mjx.export wrote")
     parser.add_argument("--goals", type=int, default=100, help="how many (default: 100)")
-    parser.add_argument("--delay", type=float, default=nominal.delay, help="[s] (default: 0.05)")
-    parser.add_argument("--lag", type=float, default=nominal.lag, help="[s] (default: 0.1)")
+    parser.add_argument(
+        "--delay", type=at_least(0.0), default=nominal.delay, help="[s] (default: 0.05)"
+    )
+    parser.add_argument("--lag", type=at_least(0.0), default=nominal.lag, help="[s] (default: 0.1)")
     parser.add_argument(
         "--dead-band", type=float, default=nominal.dead_band[0], help="motor value (default: 0.12)"
     )
-    parser.add_argument("--rate", type=float, default=60.0, help="poses a second (default: 60)")
-    parser.add_argument("--noise", type=float, default=0.0, help="of a pose [m] (default: 0)")
-    parser.add_argument("--timeout", type=float, default=10.0, help="for a goal [s] (default: 10)")
-    parser.add_argument("--min-success", type=float, default=0.95, help="(default: 0.95)")
+    parser.add_argument(
+        "--rate", type=at_least(1.0), default=60.0, help="poses a second (default: 60)"
+    )
+    parser.add_argument(
+        "--noise", type=at_least(0.0), default=0.0, help="of a pose [m] (default: 0)"
+    )
+    parser.add_argument(
+        "--timeout", type=at_least(0.0), default=10.0, help="for a goal [s] (default: 10)"
+    )
+    parser.add_argument("--min-success", type=at_least(0.0), default=0.95, help="(default: 0.95)")
     options = parser.parse_args(arguments)
     try:
+        if options.goals < 1:
+            raise DriveError(f"--goals {options.goals}: give at least 1")
         policy = load_policy(options.policy)
         began = time.monotonic()
         motors = nominal._replace(
             delay=options.delay, lag=options.lag, dead_band=(options.dead_band,) * 2
         )
+        check_calibration(true_calibration(motors))
         outcomes = rehearse(
             policy,
             draw_goals(options.goals),

@@ -714,6 +714,77 @@ def test_a_dry_run_needs_numpy_alone(exported, tmp_path):
     assert read_log(log).outcome == "timed out"
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda contract: contract.pop("rest_height"), "policy.json lacks rest_height"),
+        (lambda contract: contract.pop("run"), "policy.json lacks run"),
+        (lambda contract: contract.update(files={}), "holds no policy.py"),
+    ],
+)
+def test_a_policy_that_lacks_something_is_told(change, message, exported, tmp_path, capsys):
+    contract = json.loads((exported / "policy.json").read_text())
+    change(contract)
+    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    (tmp_path / "policy.py").write_text("")
+    assert drive.main([str(tmp_path), "--goal", "1", "0", "--dry-run"]) == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("contract", "source", "message"),
+    [
+        ("[" * 100_000, "", "is no exported policy: "),
+        (None, "import no_such_package", "cannot be run here: No module named 'no_such_package'"),
+    ],
+)
+def test_a_policy_that_cannot_be_read_is_told(contract, source, message, exported, tmp_path):
+    contract = contract or (exported / "policy.json").read_text()
+    (tmp_path / "policy.json").write_text(contract)
+    (tmp_path / "policy.py").write_text(source)
+    with pytest.raises(motors.DriveError, match=message):
+        drive.load_policy(str(tmp_path))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--rate", "0"], "0 is not at least 1"),
+        (["--delay", "nan"], "nan is not at least 0"),
+        (["--noise", "-1"], "-1 is not at least 0"),
+        (["--goals", "-1"], "--goals -1: give at least 1"),
+        (["--dead-band", "1"], "left.dead_band = 1 is not between 0 and 0.6"),
+        (["--lag", "9"], "lag = 9 is not between 0 and 1"),
+    ],
+)
+def test_a_rehearsal_of_nonsense_is_refused(arguments, message, exported, capsys):
+    try:
+        code = rehearse.main([str(exported), *arguments])
+    except SystemExit as left:
+        code = left.code
+    assert code == 2
+    assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "error", "code", "message"),
+    [
+        (["--lag", "nan"], None, 2, "lag = nan is not between 0 and 1"),
+        (["--separation", "5"], None, 2, "separation = 5 is not between"),
+        ([], KeyboardInterrupt(), 130, "interrupted"),
+        ([], EOFError(), 130, "interrupted"),
+    ],
+)
+def test_a_calibration_that_does_not_end_is_told(arguments, error, code, message, tmp_path, capsys):
+    robot, path = Recorder(), tmp_path / "calibration.json"
+    arguments = ["--output", str(path), *arguments]
+    assert calibrate.main(arguments, robot, robot, failing(error)) == code
+    assert message in capsys.readouterr().err
+    assert not path.exists()
+    # What is wrong with the arguments is told before the robot drives.
+    assert robot.values[-1:] == ([(0.0, 0.0)] if error else [])
+
+
 def test_a_rehearsal_tells_how_many_goals_were_reached(exported, capsys):
     assert rehearse.main([str(exported), "--goals", "2", "--timeout", "0.2"]) == 1
     assert "0 of 2 goals reached; delay 0.05 s, lag 0.1 s" in capsys.readouterr().out
