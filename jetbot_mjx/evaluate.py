@@ -27,11 +27,24 @@ from jetbot_mjx.evaluation import (
 from jetbot_mjx.metrics import read_history
 from jetbot_mjx.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.randomization import VariedEnv
-from jetbot_mjx.report import CurvePoint, Report, by_goal, find_failures, learning_curve
+from jetbot_mjx.report import (
+    CurvePoint,
+    Report,
+    by_goal,
+    compare_with_best_known,
+    find_failures,
+    learning_curve,
+)
 from jetbot_mjx.report_files import write_comparison, write_report
 from jetbot_mjx.robustness import SWEEP_GOALS, InMujoco, MujocoEvaluator, SweepResult, sweep
 from jetbot_mjx.run_folder import seed_folders, versions
-from jetbot_mjx.tables import pairs_table, policies_table, robustness_table, runs_table
+from jetbot_mjx.tables import (
+    best_known_lines,
+    pairs_table,
+    policies_table,
+    robustness_table,
+    runs_table,
+)
 
 BELOW_TARGET = 1
 
@@ -265,6 +278,7 @@ def _judge(
             baselines = {name: summarize(each, env.dt) for name, each in beside.items()}
         driven = jax.device_get(evaluator.run(checkpoint.params, keys))
         run_dir = _shown(checkpoint.run_dir)
+        best_known, missing = compare_with_best_known(checkpoint.config, driven)
         report = Report(
             folder=folder,
             run=run_dir,
@@ -287,6 +301,8 @@ def _judge(
             ranges=ranges if ranges.drawn else None,
             ranges_file=drawn.file if drawn else None,
             mujoco=mujoco.run(checkpoint.params, keys) if mujoco else None,
+            best_known=best_known,
+            best_known_missing=missing,
         )
         write_report(report)
         yield report
@@ -381,7 +397,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(
         f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
-        f"{robustness_table(report)}report: {report.folder / 'report.html'}"
+        f"{best_known_lines(report)}{robustness_table(report)}"
+        f"report: {report.folder / 'report.html'}"
     )
     if report.policy.nonfinite_worlds:
         print(f"{report.policy.nonfinite_worlds} episodes ended in a world that blew up")

@@ -10,8 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
+from jetbot_mjx import best_known
 from jetbot_mjx.config import Config, RandomizationConfig
 from jetbot_mjx.evaluation import (
     GOAL_SET_VERSION,
@@ -92,6 +93,33 @@ class CurvePoint(NamedTuple):
     time_to_goal_median: float | None
 
 
+class Gap(NamedTuple):
+    """How much longer a policy takes than the best known, over the goals that it reached."""
+
+    bearing_low: float
+    """[°] of the goals, like `bearing_high`."""
+    bearing_high: float
+    reached: int
+    """Goals that the policy reached; without one the rest is None."""
+    policy_mean: float | None
+    """[s] mean time to these goals."""
+    best_mean: float | None
+    """[s] mean of the best-known times to the same goals."""
+    gap: float | None
+    """`policy_mean` / `best_mean` - 1."""
+
+
+class BestKnown(NamedTuple):
+    """The best-known times to the report's goals, and a policy's gap to them."""
+
+    time_to_goal_median: float
+    """[s] over all goals of the report, reached by the policy or not; so is the next."""
+    time_to_goal_p95: float
+    total: Gap
+    by_direction: tuple[Gap, ...]
+    """Of each sector of the bearing, from straight ahead to the left and round."""
+
+
 class Report(NamedTuple):
     """All that is told of one policy."""
 
@@ -121,6 +149,10 @@ class Report(NamedTuple):
     """Where the ranges stand; None: in the run's own configuration."""
     mujoco: InMujoco | None = None
     """On the same goals in C MuJoCo; None where it was not asked for."""
+    best_known: BestKnown | None = None
+    """None where nothing is known for these goals and settings."""
+    best_known_missing: str | None = None
+    """Why nothing is known."""
 
     @property
     def name(self) -> str:
@@ -152,6 +184,8 @@ class Report(NamedTuple):
             },
             "policy": self.policy._asdict(),
             "baselines": {name: one._asdict() for name, one in self.baselines.items()},
+            "best_known": _best_known_json(self.best_known),
+            "best_known_missing": self.best_known_missing,
             "cells": [cell._asdict() for cell in self.cells],
             "failures": [failure._asdict() for failure in self.failures],
             "learning_curve": [point._asdict() for point in self.learning_curve],
@@ -194,7 +228,7 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[Cell, ...]:
     edges = _ring_edges(distance)
     ring = np.clip(np.digitize(distance, edges) - 1, 0, len(edges) - 2)
     width = 360 / SECTORS
-    sector = np.floor((bearing + width / 2) / width).astype(int) % SECTORS
+    sector = _sectors(bearing)
     won = np.asarray(episodes.success) > 0
     seconds = np.asarray(episodes.steps) * ctrl_dt
     cells = []
@@ -204,6 +238,52 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[Cell, ...]:
             place = (edges[r], edges[r + 1], (s - 0.5) * width, (s + 0.5) * width)
             cells.append(_cell(place, won[here], seconds[here]))
     return tuple(cells)
+
+
+def _sectors(bearing: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return the sector that each bearing [°] lies in."""
+    width = 360 / SECTORS
+    return np.floor((bearing + width / 2) / width).astype(int) % SECTORS
+
+
+def compare_with_best_known(
+    config: Config, episodes: Episodes
+) -> tuple[BestKnown | None, str | None]:
+    """Compare a policy's times with the best known.
+
+    Args:
+      config: of its run.
+      episodes: on the host, to the first of the report's goals.
+
+    Returns:
+      The comparison, or None and why there is none.
+    """
+    known = best_known.find(config, episodes)
+    if known.steps is None:
+        return None, known.missing
+    best = known.steps * config.physics.ctrl_dt
+    seconds = np.asarray(episodes.steps, float) * config.physics.ctrl_dt
+    won, sector = np.asarray(episodes.success) > 0, _sectors(goal_places(episodes)[1])
+
+    def gap(low: float, high: float, here: np.ndarray) -> Gap:
+        if not here.any():
+            return Gap(low, high, 0, None, None, None)
+        ours, theirs = float(seconds[here].mean()), float(best[here].mean())
+        return Gap(low, high, int(here.sum()), ours, theirs, ours / theirs - 1)
+
+    width = 360 / SECTORS
+    by_direction = tuple(
+        gap((s - 0.5) * width, (s + 0.5) * width, won & (sector == s)) for s in range(SECTORS)
+    )
+    median, p95 = float(np.median(best)), float(np.percentile(best, 95))
+    return BestKnown(median, p95, gap(-180.0, 180.0, won), by_direction), None
+
+
+def _best_known_json(found: BestKnown | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    by_direction = [one._asdict() for one in found.by_direction]
+    return {**found._asdict(), "total": found.total._asdict(), "by_direction": by_direction}
 
 
 def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:

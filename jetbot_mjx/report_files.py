@@ -39,6 +39,7 @@ _FORMS = {
     "percent": "{:.2%}",
     "whole percent": "{:.0%}",
     "seconds": "{:.2f} s",
+    "milliseconds": "{:.3f} s",
     "metres": "{:.2f} m",
     "signed metres": "{:+.3f} m",
     "count": "{:,}",

@@ -28,7 +28,13 @@ def policies_table(policies: Mapping[str, Report]) -> str:
         f"{'':{width}}  {'success':>8}  {'95 % interval':>16}  {'to goal':>8}  {'p95':>7}"
         f"  {'path':>5}  {'return':>7}"
     )
-    return "\n".join([head, *(_row(name, row, width) for name, row in rows)])
+    lines = [head, *(_row(name, row, width) for name, row in rows)]
+    if best := next(iter(policies.values())).best_known:
+        lines.append(
+            f"{'best known':{width}}  {'-':>8}  {'-':>16}  {best.time_to_goal_median:6.2f} s"
+            f"  {best.time_to_goal_p95:5.2f} s  {'-':>5}  {'-':>7}"
+        )
+    return "\n".join(lines)
 
 
 def _row(name: str, summary: Summary, width: int) -> str:
@@ -38,6 +44,25 @@ def _row(name: str, summary: Summary, width: int) -> str:
         f"  {_value(summary.time_to_goal_median, '{:.2f} s'):>8}"
         f"  {_value(summary.time_to_goal_p95, '{:.2f} s'):>7}"
         f"  {_value(summary.path_efficiency, '{:.0%}'):>5}  {summary.episode_return:+7.3f}"
+    )
+
+
+def best_known_lines(report: Report) -> str:
+    """Return a policy's gap to the best-known times, or why none is told, as lines."""
+    best = report.best_known
+    if best is None:
+        return f"best known: not told, {report.best_known_missing}\n"
+    if best.total.gap is None:
+        return "best known: the policy reached no goal to be compared on\n"
+    directions = ", ".join(
+        f"{180 - (180 - (one.bearing_low + one.bearing_high) / 2) % 360:.0f}° {one.gap:+.1%}"
+        for one in best.by_direction
+        if one.gap is not None
+    )
+    return (
+        f"time to goal above the best known: {best.total.gap:+.2%} in the mean of"
+        f" {best.total.reached:,} goals reached ({best.total.policy_mean:.3f} s,"
+        f" {best.total.best_mean:.3f} s)\n  by the goal's bearing: {directions}\n"
     )
 
 

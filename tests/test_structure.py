@@ -58,6 +58,7 @@ NOUNS = (
     "rollout",
     "evaluation",
     "robustness",
+    "best_known",
     "report",
     "estimates",
     "comparison",

@@ -1,0 +1,296 @@
+"""Searches for the shortest time to each of the report's goals: `python benchmarks/best_known.py`.
+
+No policy: commands of one goal, found with the true model and driven without looking. A command
+is a polyline of --knots points over the time that the goal takes; the cross-entropy method draws
+--samples of them around a mean, keeps the best sixteenth, moves mean and deviation to those, and
+does so --rounds times, from --starts beginnings. Each begins anew, with its knots over the time
+of the best so far. A sample is driven by the report's own rollout from the goal's own reset key,
+so that its time is counted as a policy's is; what it is judged by are the environment steps until
+the end, and those that the rest of the way to the goal would take at full speed.
+
+What is found is an upper bound of the shortest time, and reports show it as "best known".
+
+Source: R. Y. Rubinstein, The Cross-Entropy Method for Combinatorial and Continuous Optimization,
+Methodology and Computing in Applied Probability 1 (1999), 127-190, doi:10.1023/A:1010091220143.
+"""
+
+# First, before Brax imports MJX and lets it print.
+import jetbot_mjx  # noqa: F401  isort: skip
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, UInt32
+from results import check_output
+
+from jetbot_mjx import cli
+from jetbot_mjx.best_known import FILE, FORMAT, settings_of
+from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import BASELINES, GOAL_SET_VERSION, REPORT_GOALS, report_keys
+from jetbot_mjx.rollout import Controller, Episodes, rollout_fn
+from jetbot_mjx.run_folder import versions, write_text, writing_to
+from jetbot_mjx.state import State
+
+_ROOT = Path(__file__).resolve().parents[1]
+_ELITE_SHARE = 16
+_FIRST_STD = 1.0
+_LEAST_STD = 0.02
+
+
+class Settings(NamedTuple):
+    """How thoroughly is searched."""
+
+    knots: int = 16
+    samples: int = 512
+    rounds: int = 40
+    starts: int = 3
+    seed: int = 0
+
+
+class Commands(NamedTuple):
+    """A polyline of actions, held beyond its end."""
+
+    knots: Float[Array, "*batch knots 2"]
+    """Actions, clipped to [-1, 1] only where the environment does."""
+    steps: Float[Array, "*batch"]
+    """Environment steps over which the knots are spread evenly."""
+
+
+class Found(NamedTuple):
+    """The best of all samples of one goal."""
+
+    rank: Float[Array, "*batch"]
+    """Environment steps to the goal, and a thousandth of what elites are chosen by."""
+    steps: Float[Array, "*batch"]
+    """Environment steps to the goal; not finite where it was never reached."""
+    commands: Commands
+
+
+def play(params: Commands, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
+    """The controller that plays commands."""
+    del key
+    count = params.knots.shape[-2]
+    place = jnp.minimum(state.info["steps"] / params.steps, 1.0) * (count - 1)
+    weights = jnp.maximum(1.0 - jnp.abs(place - jnp.arange(count)), 0.0)
+    return (weights[:, None] * params.knots).sum(axis=0)
+
+
+def drive_fn(env: JetBotEnv, longest: int) -> Callable[..., Episodes]:
+    """Make the report's rollout one of a command and a reset key each.
+
+    Args:
+      env: one environment, unwrapped.
+      longest: environment steps after which an episode is cut off.
+
+    Returns:
+      A function of (commands of n samples, reset keys (n, 2)) to their episodes.
+    """
+    rollout = rollout_fn(env, [play], longest)
+
+    def drive(commands: Commands, keys: UInt32[Array, "n 2"]) -> Episodes:
+        one = jax.vmap(lambda commands, key: rollout(0, commands, key[None]))(commands, keys)
+        return jax.tree.map(lambda x: x[:, 0], one)
+
+    return drive
+
+
+def search_fn(env: JetBotEnv, settings: Settings, longest: int) -> Callable[..., Found]:
+    """Make the search for one goal.
+
+    Args:
+      env: one environment, unwrapped.
+      settings: how thoroughly.
+      longest: environment steps after which a sample is given up.
+
+    Returns:
+      A function of (goal's number, its reset key, environment steps that it takes at most) to the
+      best commands; to be batched by `jax.vmap`.
+    """
+    drive = drive_fn(env, longest)
+    elites = max(2, settings.samples // _ELITE_SHARE)
+    full_speed = env.config.task.max_speed * env.dt  # [m] in a step
+
+    def one_round(
+        carry: tuple[Array, Array, Found], key: Array, reset_key: Array, spread: Array
+    ) -> tuple[tuple[Array, Array, Found], None]:
+        mean, std, best = carry
+        noise = jax.random.normal(key, (settings.samples, settings.knots, 2))
+        # The mean itself is among them.
+        knots = mean + std * noise.at[0].set(0.0)
+        commands = Commands(knots, jnp.broadcast_to(spread, settings.samples))
+        driven = drive(commands, jnp.broadcast_to(reset_key, (settings.samples, 2)))
+        rest = jnp.linalg.norm(driven.goal_w[:, :2] - driven.end_w, axis=-1)
+        cost = driven.steps + rest / full_speed
+        steps = jnp.where(driven.success > 0, driven.steps, jnp.inf)
+        rank = jnp.where(driven.success > 0, driven.steps, longest) + 1e-3 * cost
+        found = Found(rank, steps, commands)
+        found = jax.tree.map(lambda x: x[jnp.argmin(rank)], found)
+        best = jax.tree.map(lambda a, b: jnp.where(found.rank < best.rank, a, b), found, best)
+        chosen = knots[jax.lax.top_k(-cost, elites)[1]]
+        mean, std = chosen.mean(axis=0), jnp.maximum(chosen.std(axis=0), _LEAST_STD)
+        return (mean, std, best), None
+
+    def search(goal: Int[Array, ""], reset_key: UInt32[Array, "2"], most: Array) -> Found:
+        key = jax.random.fold_in(jax.random.PRNGKey(settings.seed), goal)
+        zeros = jnp.zeros((settings.knots, 2))
+        nothing = Found(jnp.float32(jnp.inf), jnp.float32(jnp.inf), Commands(zeros, most))
+
+        def one_start(best: Found, key: Array) -> tuple[Found, None]:
+            spread = jnp.minimum(best.steps, most)
+            carry = (zeros, jnp.full_like(zeros, _FIRST_STD), best)
+            carry, _ = jax.lax.scan(
+                lambda carry, key: one_round(carry, key, reset_key, spread),
+                carry,
+                jax.random.split(key, settings.rounds),
+            )
+            return carry[-1], None
+
+        return jax.lax.scan(one_start, nothing, jax.random.split(key, settings.starts))[0]
+
+    return search
+
+
+def run(env: JetBotEnv, settings: Settings, goals: int, chunk: int) -> tuple[Found, Episodes]:
+    """Search all goals, and print how far it is.
+
+    Args:
+      env: one environment, unwrapped.
+      settings: how thoroughly.
+      goals: how many of the report's, from the first on.
+      chunk: goals at once.
+
+    Returns:
+      The best of each goal, and the scripted baseline's episodes, all on the host.
+
+    Raises:
+      UserError: to a goal no way was found.
+    """
+    keys = report_keys(goals)
+    scripted: Controller = BASELINES["scripted"](env)
+    rollout = jax.jit(rollout_fn(env, [scripted], env.config.task.episode_length))
+    beside = jax.device_get(rollout(0, None, keys))
+    longest = int(beside.steps.max())
+    search = jax.jit(jax.vmap(search_fn(env, settings, longest)))
+    found, began = [], time.perf_counter()
+    for start in range(0, goals, chunk):
+        # The last chunk is as large as the others: one program serves all.
+        which = np.arange(start, start + chunk) % goals
+        one = search(which, np.asarray(keys)[which], beside.steps[which])
+        found.append(jax.device_get(one))
+        done = min(start + chunk, goals)
+        print(f"{done:>5} goals  {time.perf_counter() - began:7.1f} s", flush=True)
+    best: Found = jax.tree.map(lambda *parts: np.concatenate(parts)[:goals], *found)
+    if missed := np.flatnonzero(~np.isfinite(best.steps)).tolist():
+        raise UserError(
+            f"no way was found to {len(missed)} goals, such as {missed[0]}: more --samples,"
+            " --rounds or --starts may find one"
+        )
+    return best, beside
+
+
+def to_json(config: Config, settings: Settings, best: Found, beside: Episodes) -> dict[str, Any]:
+    """Return a search as it stands in the file."""
+    return {
+        "settings": settings_of(config),
+        "goal_set_version": GOAL_SET_VERSION,
+        "physics": config.physics.model_dump(mode="json"),
+        "search": settings._asdict(),
+        "versions": versions(),
+        # Whole millimetres on the floor.
+        "goals": np.rint(1e3 * beside.goal_w[:, :2].astype(float)).astype(int).tolist(),
+        "steps": best.steps.astype(int).tolist(),
+    }
+
+
+def read(path: Path) -> list[dict[str, Any]]:
+    """Return the searches in a file, none where there is no file.
+
+    Raises:
+      UserError: it is a file of something else.
+    """
+    if not path.exists():
+        return []
+    try:
+        values = json.loads(path.read_text(encoding="utf-8"))
+        if values["format"] != FORMAT:
+            raise ValueError(values["format"])
+        return list(values["searches"])
+    except (OSError, ValueError, LookupError, TypeError):
+        raise UserError(f"--output {path} is no file of best-known times: name another") from None
+
+
+def store(path: Path, search: dict[str, Any]) -> None:
+    """Write a search into the file, in the place of an earlier one for the same settings.
+
+    Raises:
+      UserError: the file cannot be written, or is one of something else.
+    """
+    kept = [one for one in read(path) if one["settings"] != search["settings"]]
+    searches = sorted([*kept, search], key=lambda one: json.dumps(one["settings"]))
+    # A line for each key: indented as other files are, these numbers would be thousands of lines.
+    texts = [
+        "{\n"
+        + ",\n".join(f'   "{key}": {json.dumps(value)}' for key, value in one.items())
+        + "\n  }"
+        for one in searches
+    ]
+    body = ",\n  ".join(texts)
+    with writing_to(path):
+        write_text(path, f'{{\n "format": "{FORMAT}",\n "searches": [\n  {body}\n ]\n}}\n')
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parses the command line, searches, prints what it found and writes the JSON file.
+
+    Args:
+      arguments: without the program's name; None: those of the process.
+
+    Returns:
+      The exit code.
+    """
+    defaults = Settings()
+    parser = cli.Parser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--config", type=Path, default=_ROOT / "configs" / "jetbot.yaml")
+    parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
+    parser.add_argument(
+        "--goals", type=cli.positive_int, default=REPORT_GOALS, help="of the report"
+    )
+    parser.add_argument("--chunk", type=cli.positive_int, help="goals at once")
+    for name in ("knots", "samples", "rounds", "starts"):
+        default = getattr(defaults, name)
+        parser.add_argument(f"--{name}", type=cli.positive_int, default=default)
+    parser.add_argument("--seed", type=int, default=defaults.seed)
+    parser.add_argument("--output", type=Path, default=FILE)
+    options = parser.parse_args(arguments)
+    if options.knots < 2 or options.samples < 2:
+        parser.error("--knots and --samples: at least 2")
+    cli.require_device()
+    cli.use_compilation_cache()
+    config = load_config(options.config, options.overrides)
+    check_output(options.output)
+    read(options.output)
+    settings = Settings(*(getattr(options, name) for name in Settings._fields))
+    chunk = options.chunk or (8 if jax.default_backend() == "cpu" else 1024)
+    env = make_env(config)
+    best, beside = run(env, settings, options.goals, min(chunk, options.goals))
+    for name, steps in (("best known", best.steps), ("scripted", beside.steps)):
+        seconds = steps * env.dt
+        print(
+            f"{name:>10}: median {np.median(seconds):.3f} s, mean {seconds.mean():.4f} s,"
+            f" p95 {np.percentile(seconds, 95):.3f} s"
+        )
+    store(options.output, to_json(config, settings, best, beside))
+    print(f"results: {options.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
