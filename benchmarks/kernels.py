@@ -3,7 +3,7 @@
 Counts the instructions of the compiled programs that become kernels (on a CPU: loops and calls of
 their own), for one environment step of physics, one of the training environment and one training
 step, and the arithmetic of one physics step written out number by number, which is what a kernel
-in PTX does. No clock: a regression shows on any machine, however busy.
+does. No clock: a regression shows on any machine, however busy.
 """
 
 import collections
@@ -135,7 +135,7 @@ def count_scalars(config: Config) -> dict[str, int]:
     env = make_env(parse_config(values))
     physics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
     program = scalarize(env.step_physics, physics, jnp.zeros(env.action_size))
-    return dict(collections.Counter(x.op for x in program.values if x.op != "input").most_common())
+    return dict(collections.Counter(x.op for x in program.block.values()).most_common())
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -6,15 +6,15 @@ The modules in reading order, each knowing only those before it:
 `kinematics`, `model`, `task`, `programs`, `state`, `physics`, `env`, `mujoco_jetbot`, `variation`,
 `motors`, `sensors`, `randomization`, `mujoco_simulator`, `wrappers`, `task_trials`,
 `method_checks`, `task_checks`, `policy`, `advantages`, `ppo`, `trainer`, `rollout`, `evaluation`,
-`robustness`, `report`, `estimates`, `comparison`, `tables`, `plots`, `curves`, `offscreen`, `film`,
-`store`, `checkpoint`, `resume`, `faults`, `run_folder`, `aliases`, `metrics`, `report_files`,
-`tracking`, `terminal`, `board`, `dashboard`, `recording`, `preemption`, `processes`, `memory`,
-`resumable_ppo`, `brax_ppo`, `training`, `portable`, `contract`, `formats`, `stand_in`, `drive_log`,
-`clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`, `cli`, and the commands
-`new_task`, `check_env`, `plan`, `train`, `evaluate`, `render`, `replay`, `play`, `export`,
-`sim2real`, `pretrained`, `__main__`. Commands meet only in the run folder. Beside them stand the
-adapters, for programs of Gymnasium and Stable-Baselines3; none but they import those, and no other
-module imports an adapter.
+`robustness`, `best_known`, `report`, `estimates`, `comparison`, `tables`, `plots`, `curves`,
+`offscreen`, `film`, `store`, `checkpoint`, `resume`, `faults`, `run_folder`, `aliases`, `metrics`,
+`report_files`, `tracking`, `terminal`, `board`, `dashboard`, `recording`, `preemption`,
+`processes`, `memory`, `resumable_ppo`, `brax_ppo`, `training`, `portable`, `contract`, `formats`,
+`stand_in`, `drive_log`, `clock`, `live`, `player`, `geoms`, `scene`, `panel`, `browser`, `native`,
+`cli`, and the commands `new_task`, `check_env`, `plan`, `train`, `evaluate`, `render`, `replay`,
+`play`, `export`, `sim2real`, `pretrained`, `__main__`. Commands meet only in the run folder. Beside
+them stand the adapters, for programs of Gymnasium and Stable-Baselines3; none but they import
+those, and no other module imports an adapter.
 
 What the package itself offers is imported at its first use: a command that is mistyped says so at
 once, and a GPU wakes while the rest loads.
