@@ -1,4 +1,4 @@
-"""What is measured: five programs, each held to the clock of `timing.py`.
+"""What is measured: six programs, each held to the clock of `timing.py`.
 
 Nothing here prints or parses; `steps_per_second.py` beside this file is the command.
 """
@@ -29,6 +29,7 @@ from jetbot_mjx.preemption import Preemption
 from jetbot_mjx.trainer import Progress, Recorder
 from jetbot_mjx.wrappers import wrap_for_training
 
+_LONGEST_HOLD = 24  # environment steps
 WARM_UP_INTERVALS = 2  # the first compiles; the second, the little that runs between intervals
 
 
@@ -65,6 +66,32 @@ def measure_physics(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times the physics alone."""
     row = _measure(prepare_physics(config, num_envs, sizes), sizes)
     # Here no wrapper ends episodes or mends worlds; only the last look tells of them.
+    return row._replace(episodes_per_env_step=None, nonfinite_worlds=None)
+
+
+def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
+    """Time the physics alone under commands of ±1, as trained policies give them.
+
+    Each robot holds its commands for as many steps as it has drawn, 1 to 24.
+    """
+    env = make_env(config)
+    robots = env_keys(num_envs)
+    holds = jax.vmap(lambda key: jax.random.randint(key, (), 1, _LONGEST_HOLD + 1))(robots)
+
+    def action(key: Array, hold: Array, time: Array) -> Array:
+        turn = jnp.round(time / env.dt).astype(int) // hold
+        return jax.random.rademacher(jax.random.fold_in(key, turn), (2,), jnp.float32)
+
+    def step(carry: Carry) -> Carry:
+        actions = jax.vmap(action)(robots, holds, carry.state.time)
+        physics = jax.vmap(env.step_physics)(carry.state, jax.vmap(env.wheel_targets)(actions))
+        checksum = carry.tally.checksum + sums(physics)
+        return Carry(physics, carry.key, carry.tally._replace(checksum=checksum))
+
+    first = jax.jit(jax.vmap(env.reset))(robots).pipeline_state
+    n_substeps = config.physics.n_substeps
+    timed = Timed("switched", step, first, n_substeps=n_substeps, calls=sizes.unroll)
+    row = _measure(timed, sizes)
     return row._replace(episodes_per_env_step=None, nonfinite_worlds=None)
 
 
@@ -175,6 +202,7 @@ def _time_trainer(rate: str, config: Config, train: Callable[[Listener], None]) 
 
 MEASUREMENTS: dict[str, Callable[[Config, int, Sizes], Row]] = {
     "physics": measure_physics,
+    "switched": measure_switched,
     "env": measure_env,
     "rollout": measure_rollout,
     "training": measure_training,

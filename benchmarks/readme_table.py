@@ -18,7 +18,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.run_folder import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
-_RATES = ("physics", "env", "rollout", "training", "stock")
+_RATES = ("physics", "switched", "env", "rollout", "training", "stock")
 
 Results = Mapping[str, Mapping[str, Any]]
 """Content of every file of results, by its name."""

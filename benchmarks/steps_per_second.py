@@ -1,7 +1,8 @@
 """Measures how fast robots step: `python benchmarks/steps_per_second.py --num-envs 256,1024`.
 
-Five rates, each of a program of its own, for each number of environments:
+Six rates, each of a program of its own, for each number of environments:
   physics   `JetBotEnv.step_physics` alone, under random actions
+  switched  the same under commands of ±1 that each robot holds for 1 to 24 steps
   env       the whole training environment: observation, reward, books, resets to new goals
   rollout   the same under the exploring policy, with the transitions that PPO stores
   training  PPO by the trainer of `python -m jetbot_mjx.train`: rollouts and updates
