@@ -121,10 +121,10 @@ def make_model(env: JetBotEnv, numerics: Numerics) -> mujoco.MjModel:
     def build_scene(spec: mujoco.MjSpec) -> None:
         env.task.build_scene(spec)
         # Textures are a hundred times as large as the rest, and every drawn robot is a copy.
-        for geom in spec.geoms:
-            geom.material = ""
-        for element in (*spec.materials, *spec.textures):
-            spec.delete(element)
+        for material in spec.materials:
+            material.textures = [""] * len(material.textures)
+        for texture in spec.textures:
+            spec.delete(texture)
 
     model = make_mj_model(env.robot, env.config.physics, build_scene=build_scene, visual=False)
     option = model.opt

@@ -167,6 +167,15 @@ def test_the_numerics_are_those_asked_for(root, monkeypatch):
     assert mujoco.mj_sizeModel(model) < 50_000
 
 
+def test_a_scene_may_use_materials_wherever_it_likes(world_env, monkeypatch):
+    def build_scene(spec):
+        tendon = spec.add_tendon(name="a tendon that shows", material="goal")
+        tendon.wrap_joint("left_wheel_joint", 1.0)
+
+    monkeypatch.setattr(world_env.task, "build_scene", build_scene)
+    assert make_model(world_env, mujoco_simulator.OTHER_NUMERICS).npair == 4
+
+
 def test_solid_bodies_stand_where_the_episode_has_them(root, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "examples"))
     import pillars_task
