@@ -27,14 +27,17 @@ DEVICES = 8
 needs_it = pytest.mark.skipif(not cpu.is_available(), reason="llvmlite compiles nothing for XLA")
 
 
+def kernel_of(function, *shapes, carried=1, steps=1):
+    program = scalarize(function, *shapes)
+    return kernel.Kernel(program, carried=carried, steps=steps, fallback=list, impl="llvm")
+
+
 def made_step():
     def once(changing, held):
         return {"x": changing["x"] * held, "n": changing["n"] + 1}
 
     shapes = {"x": jnp.zeros(3), "n": jnp.zeros(())}
-    return kernel.batched(
-        cpu, cpu.write(scalarize(once, shapes, jnp.zeros(())), carried=2, steps=2)
-    )
+    return kernel.as_step(kernel_of(once, shapes, jnp.zeros(()), carried=2, steps=2))
 
 
 @pytest.fixture(scope="module")
@@ -180,12 +183,12 @@ def test_threads_that_trace_at_once_compile_it_once(monkeypatch):
     original = cpu._compile
     monkeypatch.setattr(cpu, "_compile", lambda text: compiled.append(text) or original(text))
     shape = jax.ShapeDtypeStruct((2,), jnp.float32)
-    written = cpu.write(scalarize(lambda x: x - 41.5, shape), carried=1, steps=1)
+    written = kernel_of(lambda x: x - 41.5, shape)
     x = jnp.ones((3, 2))
     results = []
 
     def trace():
-        results.append(jax.jit(lambda x: cpu.launch(written, [x], [x])[0])(x))
+        results.append(jax.jit(lambda x: cpu.launch(written, [x])[0])(x))
 
     with_no_cache = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", None)
@@ -226,7 +229,7 @@ def test_machine_code_is_kept_for_its_text_and_its_processor(cache, monkeypatch)
 def test_another_kernel_has_another_name():
     shape = jax.ShapeDtypeStruct((2,), jnp.float32)
     texts = [
-        cpu.write(scalarize(lambda x, n=n: x + n, shape), carried=1, steps=steps)
+        cpu.kernel_text(kernel_of(lambda x, n=n: x + n, shape, steps=steps))
         for n, steps in ((1.0, 1), (2.0, 1), (1.0, 2))
     ]
     assert len({cpu._registered(text) for text in texts}) == 3
@@ -247,11 +250,11 @@ def fresh():
 def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, monkeypatch):
     monkeypatch.setattr(programs, "TRUSTED", OWN_TASKS)
     shape = jax.ShapeDtypeStruct((2,), jnp.float32)
-    written = cpu.write(scalarize(lambda x: x * 2.5, shape), carried=1, steps=1)
+    written = kernel_of(lambda x: x * 2.5, shape)
     x = np.ones((3, 2), np.float32)
     config = parse_config({})
     program = programs_of(config, keep=True).compile(
-        "test", lambda: jax.jit(lambda x: cpu.launch(written, [x], [x])[0]).trace(x)
+        "test", lambda: jax.jit(lambda x: cpu.launch(written, [x])[0]).trace(x)
     )
     (name,) = cpu.kernels_in(program.as_text())
     # As in a new process, but that XLA knows the name already.

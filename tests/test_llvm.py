@@ -8,9 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from call_frame import Pool
-from test_ptx import FUNCTIONS, VECTOR
+from kernel_cases import FUNCTIONS, LOOPS, VECTOR, robots
 
 from jetbot_mjx import cpu, xla_ffi
+from jetbot_mjx.kernel import Kernel
 from jetbot_mjx.scalarize import scalarize
 from jetbot_mjx.scalars import UnsupportedError
 
@@ -22,11 +23,14 @@ LANES = cpu._host().lanes
 _engines = []
 
 
+def text_of(program, carried=1, steps=1):
+    return cpu.kernel_text(Kernel(program, carried=carried, steps=steps, fallback=list))
+
+
 def compiled(program, carried=1, steps=1):
     """A kernel as a function of a call frame."""
-    kernel = cpu.write(program, carried=carried, steps=steps)
-    _engines.append(cpu._load(cpu._compile(kernel.text)))
-    return call_frame.Handler(_engines[-1].get_function_address(kernel.name))
+    _engines.append(cpu._load(cpu._compile(text_of(program, carried, steps))))
+    return call_frame.Handler(_engines[-1].get_function_address(cpu._NAME))
 
 
 def run(program, arguments, carried=1, steps=1):
@@ -35,26 +39,37 @@ def run(program, arguments, carried=1, steps=1):
     return outputs
 
 
-MORE_FUNCTIONS = {
-    "extremes of a constant": lambda x: jnp.maximum(0.5, x) - jnp.minimum(x, -0.5),
-    "extremes of whole numbers": lambda x: (
-        jnp.maximum((x * 9).astype(int), jnp.abs((x[::-1] * 9).astype(int)))
-        - jnp.minimum((x * 7).astype(int), 2)
-    ).astype(jnp.float32),
-    "whole numbers compared": lambda x: jnp.where(
-        ((x * 3).astype(int) < 1) == (-(x * 3).astype(int) != (x[::-1] * 3).astype(int)), x, 0.0
-    ),
-    "numbers too large": lambda x: (x * 1e20).astype(int).astype(jnp.float32),
-}
+@pytest.fixture(params=["as many lanes as there are", "one lane"])
+def lanes(request, monkeypatch):
+    """One lane is what a GPU's thread does."""
+    if request.param == "one lane":
+        host = cpu._host()._replace(lanes=1)
+        monkeypatch.setattr(cpu, "_host", lambda: host)
+    return cpu._host().lanes
 
 
-@pytest.mark.parametrize("name", [*FUNCTIONS, *MORE_FUNCTIONS])
-def test_a_kernel_does_what_the_function_does(name):
-    function = {**FUNCTIONS, **MORE_FUNCTIONS}[name]
-    x = np.float32(np.random.default_rng(5).normal(size=(2 * LANES + 3, 4)))
-    x[3, 2] = 0
-    (ours,) = run(scalarize(function, VECTOR), [x])
-    np.testing.assert_allclose(ours, jax.vmap(function)(x), rtol=2e-5, atol=2e-6)
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_kernel_does_what_the_function_does(name, lanes):
+    function, x = FUNCTIONS[name], robots(2 * LANES + 3)
+    program = scalarize(function, VECTOR)
+    theirs = jax.vmap(function)(x)
+    np.testing.assert_allclose(program.evaluate([x])[0], theirs, rtol=2e-5, atol=2e-6)
+    (ours,) = run(program, [x])
+    np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_lane_that_is_done_keeps_its_numbers(name):
+    # Alone each robot ends its loops by itself; in a register the slowest keeps all of them there.
+    x = robots(LANES)
+    program = scalarize(LOOPS[name], VECTOR)
+    handler = compiled(program)
+    together = np.zeros_like(x)
+    call_frame.call(handler, [x], [together])
+    for i in range(LANES):
+        alone = np.zeros((1, 4), np.float32)
+        call_frame.call(handler, [x[i : i + 1]], [alone])
+        np.testing.assert_array_equal(alone[0], together[i])
 
 
 def test_what_is_not_a_number_stays_so_in_an_extreme():
@@ -194,10 +209,10 @@ def test_of_another_interface_nothing_is_touched(plus_one, change):
 
 def test_what_is_not_written_for_a_cpu_is_named():
     with pytest.raises(UnsupportedError, match="tanh"):
-        cpu.write(scalarize(lambda x: jnp.tanh(x), VECTOR), carried=1, steps=1)
+        text_of(scalarize(lambda x: jnp.tanh(x), VECTOR))
     program = scalarize(lambda i: i + 1, jax.ShapeDtypeStruct((1,), jnp.int32))
     with pytest.raises(UnsupportedError, match="not float32"):
-        cpu.write(program, carried=1, steps=1)
+        text_of(program)
 
 
 @pytest.mark.parametrize("triple", ["x86_64-linux-gnu", "aarch64-linux-gnu", "arm64-apple-macosx"])
@@ -209,7 +224,7 @@ def test_the_text_is_good_for_every_machine(triple, monkeypatch):
     machine = "x86_64" if triple.startswith("x86") else "aarch64"
     host = cpu._host()._replace(machine=machine, lanes=4)
     monkeypatch.setattr(cpu, "_host", lambda: host)
-    text = cpu.write(scalarize(FUNCTIONS["extremes"], VECTOR), carried=1, steps=1).text
+    text = text_of(scalarize(FUNCTIONS["a loop of conditions"], VECTOR))
     module = binding.parse_assembly(text)
     module.triple = triple
     assert binding.Target.from_triple(triple).create_target_machine().emit_object(module)

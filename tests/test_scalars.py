@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from jetbot_mjx.scalars import EVALUATE, Graph, UnsupportedError, in_order, is_known
+from jetbot_mjx.scalars import EVALUATE, Graph, UnsupportedError, is_known
+from jetbot_mjx.schedule import schedule
 
 ONE, TWO, ZERO = (np.float32(x) for x in (1, 2, 0))
 YES, NO = np.bool_(True), np.bool_(False)
@@ -84,7 +85,7 @@ def test_selection_by_what_is_known_or_between_equals_needs_no_selection(graph, 
 def evaluate(result, inputs):
     """One number, its inputs given by their index."""
     values = dict(inputs)
-    for value in in_order([result]):
+    for value in schedule([result]).values():
         if value.op == "input":
             continue
         operands = [x if is_known(x) else values[x.index] for x in value.operands]
@@ -127,7 +128,7 @@ def test_operands_come_before_what_takes_them_and_the_unused_does_not_come(graph
     graph.apply("sqrt", x)
     square = graph.apply("mul", x, x)
     result = graph.apply("add", square, ONE)
-    assert in_order([result, ONE]) == [x, square, result]
+    assert list(schedule([result, ONE]).values()) == [square, result]
 
 
 def test_what_is_not_known_here_is_named(graph, x):
