@@ -220,15 +220,8 @@ class _Writer:
         return numbers_of((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
 
     def _choose(self, which: Scalar, no: Numbers, yes: Numbers) -> Numbers:
-        """One of two arrays, all numbers by the same choice."""
         pairs = zip(no.ravel(), yes.ravel(), strict=True)
         return numbers_of((self._graph.select(which, a, b) for a, b in pairs), no.shape)
-
-    def _choose_rows(self, which: Numbers, no: Numbers, yes: Numbers) -> Numbers:
-        """The same by a choice for each place of the leading axes."""
-        which = which.reshape(*which.shape, *[1] * (no.ndim - which.ndim))
-        rows = zip(np.broadcast_to(which, no.shape).ravel(), no.ravel(), yes.ravel(), strict=True)
-        return numbers_of((self._graph.select(*row) for row in rows), no.shape)
 
     # Functions within functions.
 
@@ -298,19 +291,11 @@ class _Writer:
         second = first + params["body_nconsts"]
         in_condition, in_body = operands[:first], operands[first:second]
 
-        def rows_going(state: list[Numbers]) -> Numbers:
-            return self.closed(params["cond_jaxpr"], [*in_condition, *state])[0]
-
         def going(state: list[Numbers]) -> Scalar:
-            # Several loops that `jax.vmap` made one go on as long as any of them does.
-            rows = rows_going(state)
-            return self._reduce("or", np.bool_(False), {"axes": range(rows.ndim)}, rows).item()
+            return self.closed(params["cond_jaxpr"], [*in_condition, *state])[0].item()
 
         def trip(state: list[Numbers]) -> list[Numbers]:
-            rows = rows_going(state)
-            following = self.closed(params["body_jaxpr"], [*in_body, *state])
-            pairs = zip(state, following, strict=True)
-            return [self._choose_rows(rows, *pair) for pair in pairs] if rows.ndim else following
+            return self.closed(params["body_jaxpr"], [*in_body, *state])
 
         state = list(operands[second:])
         if not is_known(going(state)):

@@ -99,10 +99,14 @@ def _derived(x):
         return y, _heavy(y) * 0.25
 
     def trip(state):
-        y, ahead = state
-        return prepared(y * 0.5 + ahead)
+        y, ahead, count = state
+        return *prepared(y * 0.5 + ahead), count + 1
 
-    return jax.lax.while_loop(lambda s: jnp.abs(s[0]).max() > 0.3, trip, prepared(x))[0]
+    def going(state):
+        y, _, count = state
+        return (jnp.abs(y).max() > 0.3) & (count < 9)
+
+    return jax.lax.while_loop(going, trip, (*prepared(x), 0))[0]
 
 
 LOOPS = {

@@ -107,7 +107,9 @@ def test_a_product_of_two_dtypes_is_one_of_the_results():
 def _row_after_row(x):
     """An index that counts, in a loop of which only the numbers tell how long it is."""
     return jax.lax.while_loop(
-        lambda s: s[1].sum() < 9, lambda s: (s[0] + 1, s[1] + x[s[0] % len(x)]), (0, x[0])
+        lambda s: s[1].sum() < 9,
+        lambda s: (s[0] + 1, s[1] + jnp.take(x, s[0] % len(x), axis=0)),
+        (0, x[0]),
     )[1]
 
 

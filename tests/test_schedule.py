@@ -56,8 +56,8 @@ def test_what_stays_as_it_begins_is_no_carry_and_stays_known():
 
 def test_what_follows_from_other_carries_is_computed_when_a_trip_begins():
     (loop,) = loops(LOOPS["what is prepared for the next trip"])
-    # The four numbers themselves, none of those prepared.
-    assert len(loop.places) == 4
+    # The four numbers themselves and the count, none of those prepared.
+    assert len(loop.places) == 5
     # The condition needs none of the preparation: it is made after the test, if there is a trip.
     assert "floor" in ops(loop.body)
     assert "floor" not in ops(loop.head)
