@@ -40,6 +40,7 @@ from jetbot_mjx.scalars import (
     Scalar,
     UnsupportedError,
     Value,
+    converted,
     is_known,
     is_same,
 )
@@ -120,7 +121,7 @@ class _Evaluation:
         if value.op == "select":
             return np.where(operands[0], operands[2], operands[1])
         if value.op == "convert":
-            return operands[0].astype(value.dtype)
+            return converted(operands[0], value.dtype)
         return EVALUATE[value.op](*operands)
 
     def _loop(self, item: PlacedLoop) -> None:

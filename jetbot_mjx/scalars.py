@@ -102,6 +102,14 @@ def _divide(a: Any, b: Any) -> Any:
     return np.trunc(np.divide(a, b)).astype(a.dtype)
 
 
+def converted(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Numbers in another dtype: what is beyond the whole numbers is the last of them, NaN is 0."""
+    if x.dtype.kind == "f" and np.dtype(dtype).kind in "iu":
+        ends = np.iinfo(dtype)
+        x = np.clip(np.nan_to_num(np.float64(x), posinf=np.inf, neginf=-np.inf), ends.min, ends.max)
+    return x.astype(dtype)
+
+
 EVALUATE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
     "add": np.add,
@@ -199,8 +207,7 @@ class Graph:
     def convert(self, x: Scalar, dtype: np.dtype) -> Scalar:
         """A number in another dtype."""
         if is_known(x):
-            with np.errstate(all="ignore"):
-                return np.asarray(x).astype(dtype)[()]
+            return converted(np.asarray(x), dtype)[()]
         # Without 64-bit types, as JAX has them by default, only these are met.
         if dtype not in (_FLOAT, _INT, _BOOL):
             raise UnsupportedError(f"a conversion to {dtype}")

@@ -3,7 +3,10 @@
 import numpy as np
 import pytest
 
-from jetbot_mjx.scalars import EVALUATE, Graph, UnsupportedError, is_known
+from jetbot_mjx import scalars
+from jetbot_mjx.moving import numbers_of
+from jetbot_mjx.scalarize import Program
+from jetbot_mjx.scalars import Graph, UnsupportedError, is_known, is_same
 from jetbot_mjx.schedule import schedule
 
 ONE, TWO, ZERO = (np.float32(x) for x in (1, 2, 0))
@@ -82,18 +85,12 @@ def test_selection_by_what_is_known_or_between_equals_needs_no_selection(graph, 
     assert graph.select(graph.apply("not", flag), x, y) is graph.select(flag, y, x)
 
 
-def evaluate(result, inputs):
-    """One number, its inputs given by their index."""
-    values = dict(inputs)
-    for value in schedule([result]).values():
-        if value.op == "input":
-            continue
-        operands = [x if is_known(x) else values[x.index] for x in value.operands]
-        if value.op == "select":
-            values[value.index] = np.where(operands[0], operands[2], operands[1])
-        else:
-            values[value.index] = EVALUATE[value.op](*operands)
-    return values[result.index]
+def evaluate(result, *inputs):
+    """A number for each robot; `inputs` are what it depends on, with an array of numbers each."""
+    values, columns = zip(*inputs, strict=True)
+    leaves = [numbers_of([value], ()) for value in values]
+    (ends,) = Program(leaves, [numbers_of([result], ())], schedule([result])).evaluate(columns)
+    return ends
 
 
 @pytest.mark.parametrize("which", [True, False])
@@ -102,33 +99,62 @@ def evaluate(result, inputs):
 def test_a_selection_between_truths_is_logic(graph, which, no, yes):
     flags = [graph.input(np.bool_) for _ in range(3)]
     result = graph.select(*flags)
-    given = zip((flag.index for flag in flags), map(np.bool_, (which, no, yes)), strict=True)
-    assert evaluate(result, given) == (yes if which else no)
+    given = zip(flags, np.array([[which], [no], [yes]]), strict=True)
+    assert evaluate(result, *given) == [yes if which else no]
 
 
 @pytest.mark.parametrize(("op", "reference"), [("sin", np.sin), ("cos", np.cos)])
 def test_sine_and_cosine_are_those_of_the_library(graph, x, op, reference):
     angles = np.float32(np.concatenate([np.linspace(-9, 9, 4001), np.linspace(-5e3, 5e3, 4001)]))
-    ours = evaluate(graph.apply(op, x), {x.index: angles})
+    ours = evaluate(graph.apply(op, x), (x, angles))
     np.testing.assert_allclose(ours, reference(np.float64(angles)), atol=3e-7)
 
 
 def test_the_sign_of_a_number_is_that_of_the_library(graph, x):
     numbers = np.float32([-3, -0.0, 0, 2, np.nan])
-    np.testing.assert_array_equal(
-        evaluate(graph.apply("sign", x), {x.index: numbers}), np.sign(numbers)
-    )
+    np.testing.assert_array_equal(evaluate(graph.apply("sign", x), (x, numbers)), np.sign(numbers))
 
 
 def test_whole_numbers_divide_towards_zero(graph):
     assert graph.apply("div", np.int32(-7), np.int32(2)) == -3
 
 
-def test_operands_come_before_what_takes_them_and_the_unused_does_not_come(graph, x):
-    graph.apply("sqrt", x)
-    square = graph.apply("mul", x, x)
-    result = graph.apply("add", square, ONE)
-    assert list(schedule([result, ONE]).values()) == [square, result]
+@pytest.mark.parametrize("known", [True, False])
+def test_a_float_becomes_the_nearest_whole_number_there_is_towards_zero(graph, x, known):
+    numbers = np.float32([-2.75, 2.75, 3e9, -3e9, np.inf, np.nan])
+    whole = np.dtype(np.int32)
+    if known:
+        ours = [graph.convert(number, whole) for number in numbers]
+    else:
+        ours = evaluate(graph.convert(x, whole), (x, numbers))
+    np.testing.assert_array_equal(ours, [-2, 2, 2**31 - 1, -(2**31), 2**31 - 1, 0])
+
+
+def test_numbers_are_the_same_by_what_they_are_and_not_by_what_they_equal(graph, x):
+    assert is_same(x, x)
+    assert is_same(np.float32(np.nan), np.float32(np.nan))
+    assert not is_same(x, graph.input(np.float32))
+    assert not is_same(x, ZERO)
+    assert not is_same(ZERO, -ZERO)
+    assert not is_same(ZERO, np.int32(0))
+
+
+def test_of_a_branch_what_both_sides_agree_on_is_no_choice(graph, x, flag):
+    y = graph.input(np.float32)
+    same, other, nan = graph.branch(
+        flag, [x, y, np.float32(np.nan)], [x, graph.apply("neg", y), np.float32(np.nan)]
+    )
+    assert same is x
+    assert np.isnan(nan)
+    assert (other.op, other.place) == ("result", 1)
+
+
+def test_too_many_operations_are_refused(graph, x, monkeypatch):
+    monkeypatch.setattr(scalars, "MOST_VALUES", 10)
+    for _ in range(9):
+        x = graph.apply("sqrt", x)
+    with pytest.raises(UnsupportedError, match="more than 10 operations"):
+        graph.apply("sqrt", x)
 
 
 def test_what_is_not_known_here_is_named(graph, x):
