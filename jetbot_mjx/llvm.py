@@ -3,7 +3,8 @@
 On a CPU every number is a vector register wide: each lane does the whole program for one robot. On
 a GPU each thread does. A loop ends when it has for all lanes, or for the thread: a lane that is
 done keeps its numbers, so that they are the same whoever its neighbours are. A side of a branch is
-skipped if no lane takes it.
+skipped if no lane takes it. Lanes that are done with a loop around, or that took the other side of
+a branch around, hold up neither.
 
 Source: LLVM Language Reference Manual.
 """
@@ -99,6 +100,8 @@ class Writer:
         self._lanes = lanes
         self._count = 0
         self._names: dict[int, str] = {}
+        # The lanes whose numbers matter here; none written: those of all.
+        self._mask = ""
 
     def step(self, arguments: Sequence[str]) -> list[str]:
         """Do the program once.
@@ -185,6 +188,14 @@ class Writer:
             else:
                 self._operation(item)
 
+    def _masked_block(self, block: Block, mask: str) -> None:
+        """A block in which only the numbers of some lanes matter, of those that did around it."""
+        around = self._mask
+        # The only lane is there, or the block is not.
+        self._mask = mask if self._lanes > 1 else ""
+        self._block(block)
+        self._mask = around
+
     def _loop(self, item: PlacedLoop) -> None:
         loop, before = item.loop, self.label
         head, body, end = self._labels("head", "body", "end")
@@ -204,7 +215,7 @@ class Writer:
         going = self.do(f"and {truth} {going_before}, {self._operand(loop.going)}")
         self.add(f"br i1 {self._any(going)}, label %{body}, label %{end}")
         self.begin(body)
-        self._block(item.body)
+        self._masked_block(item.body, going)
         following = [self._operand(loop.following[place]) for place in item.places]
         if self._lanes > 1:
             following = [
@@ -217,7 +228,7 @@ class Writer:
                 f"{self._names[carry.index]} = phi {kind} [{a}, %{before}], [{b}, %{self.label}]"
             )
         self.lines[start + len(carries)] = (
-            f"{going_before} = phi {truth} [{self._splat('b', 'true')}, %{before}],"
+            f"{going_before} = phi {truth} [{self._mask or self._splat('b', 'true')}, %{before}],"
             f" [{going}, %{self.label}]"
         )
         self.add(f"br label %{head}")
@@ -238,11 +249,13 @@ class Writer:
         """What a side of a branch computes, if any lane takes it; else anything."""
         if not block.items:
             return [self._operand(x) for x in numbers]
+        if self._mask:
+            which = self.do(f"and {self.type('b')} {which}, {self._mask}")
         before = self.label
         taken, end = self._labels("taken", "end")
         self.add(f"br i1 {self._any(which)}, label %{taken}, label %{end}")
         self.begin(taken)
-        self._block(block)
+        self._masked_block(block, which)
         names, after = [self._operand(x) for x in numbers], self.label
         self.add(f"br label %{end}")
         self.begin(end)

@@ -102,6 +102,8 @@ class _Evaluation:
 
     def __init__(self, batch: tuple[int, ...]) -> None:
         self._batch = batch
+        # Of which robots the numbers matter here.
+        self._mask = np.ones(batch, bool)
         self.known: dict[int, np.ndarray] = {}
 
     def look_up(self, x: Scalar) -> np.ndarray:
@@ -116,6 +118,11 @@ class _Evaluation:
             else:
                 self.known[item.index] = self._operation(item)
 
+    def _masked_block(self, block: Block, mask: np.ndarray) -> None:
+        around, self._mask = self._mask, mask
+        self.block(block)
+        self._mask = around
+
     def _operation(self, value: Value) -> np.ndarray:
         operands = [self.look_up(x) for x in value.operands]
         if value.op == "select":
@@ -127,7 +134,7 @@ class _Evaluation:
     def _loop(self, item: PlacedLoop) -> None:
         loop = item.loop
         state = [self.look_up(loop.first[place]) for place in item.places]
-        going = np.ones(self._batch, bool)
+        going = self._mask
         while True:
             for place, numbers in zip(item.places, state, strict=True):
                 self.known[loop.carries[place].index] = numbers
@@ -135,17 +142,17 @@ class _Evaluation:
             going = going & self.look_up(loop.going)
             if not going.any():
                 break
-            self.block(item.body)
+            self._masked_block(item.body, going)
             following = [self.look_up(loop.following[place]) for place in item.places]
             state = [np.where(going, b, a) for a, b in zip(state, following, strict=True)]
         for result in item.results:
             self.known[result.index] = self.look_up(loop.outcomes[result.place])
 
     def _branch(self, item: PlacedBranch) -> None:
-        for block in item.blocks:
-            self.block(block)
         branch = item.branch
         which = self.look_up(branch.which)
+        self._masked_block(item.no, ~which & self._mask)
+        self._masked_block(item.yes, which & self._mask)
         for result in item.results:
             sides = [self.look_up(side[result.place]) for side in (branch.yes, branch.no)]
             self.known[result.index] = np.where(which, *sides)
