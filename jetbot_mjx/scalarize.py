@@ -15,6 +15,7 @@ The arithmetic is the function's own: results differ from JAX's by round-off alo
 long as all numbers are finite.
 """
 
+import contextlib
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -228,8 +229,15 @@ class _Writer:
         return numbers_of((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
 
     def _choose(self, which: Scalar, no: Numbers, yes: Numbers) -> Numbers:
+        """One of two arrays, all numbers by the same choice."""
         pairs = zip(no.ravel(), yes.ravel(), strict=True)
         return numbers_of((self._graph.select(which, a, b) for a, b in pairs), no.shape)
+
+    def _choose_rows(self, which: Numbers, no: Numbers, yes: Numbers) -> Numbers:
+        """The same by a choice for each place of the leading axes."""
+        which = which.reshape(*which.shape, *[1] * (no.ndim - which.ndim))
+        rows = zip(np.broadcast_to(which, no.shape).ravel(), no.ravel(), yes.ravel(), strict=True)
+        return numbers_of((self._graph.select(*row) for row in rows), no.shape)
 
     # Functions within functions.
 
@@ -275,11 +283,7 @@ class _Writer:
     def _counted_loop(
         self, body: ClosedJaxpr, length: int, constants: Sequence[Numbers], carry: list[Numbers]
     ) -> list[Numbers] | None:
-        """A scan over nothing as a loop; None where it is better written out, or must be."""
-        before = self._graph.count
-        self.closed(body, [*constants, *carry])
-        if (self._graph.count - before) * length <= MOST_WRITTEN_OUT:
-            return None
+        """A scan over nothing; None where it must be written out, however long."""
 
         def going(state: list[Numbers]) -> Scalar:
             return self._graph.apply("lt", state[0].item(), np.int32(length))
@@ -288,35 +292,65 @@ class _Writer:
             counter = self._each("add", state[0], known_array(np.int32(1)))
             return [counter, *self.closed(body, [*constants, *state[1:]])]
 
-        try:
-            return self._loop([known_array(np.int32(0)), *carry], going, trip)[1:]
-        except UnsupportedError:
-            # An index that counts the trips, say: written out it is known.
-            return None
+        state = [known_array(np.int32(0)), *carry]
+        with contextlib.suppress(UnsupportedError):
+            return self._short_or_loop(state, going, trip)[1:]
+        # An index that counts the trips, say: written out it is known.
+        return None
 
     def _while(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
         first = params["cond_nconsts"]
         second = first + params["body_nconsts"]
         in_condition, in_body = operands[:first], operands[first:second]
 
+        def rows_going(state: list[Numbers]) -> Numbers:
+            return self.closed(params["cond_jaxpr"], [*in_condition, *state])[0]
+
         def going(state: list[Numbers]) -> Scalar:
-            return self.closed(params["cond_jaxpr"], [*in_condition, *state])[0].item()
+            # Several loops that `jax.vmap` made one go on as long as any of them does.
+            rows = rows_going(state)
+            return self._reduce("or", np.bool_(False), {"axes": range(rows.ndim)}, rows).item()
 
         def trip(state: list[Numbers]) -> list[Numbers]:
-            return self.closed(params["body_jaxpr"], [*in_body, *state])
+            rows = rows_going(state)
+            following = self.closed(params["body_jaxpr"], [*in_body, *state])
+            pairs = zip(state, following, strict=True)
+            return [self._choose_rows(rows, *pair) for pair in pairs] if rows.ndim else following
 
         state = list(operands[second:])
-        if not is_known(going(state)):
-            try:
-                return self._loop(state, going, trip)
-            except UnsupportedError:
-                # An index that counts the trips, say: written out it is known.
-                pass
+        with contextlib.suppress(UnsupportedError):
+            return self._short_or_loop(state, going, trip)
+        # An index that counts the trips, say: written out it is known.
         return self._written_out(state, going, trip)
 
-    def _written_out(
+    def _short_or_loop(
         self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
     ) -> list[Numbers]:
+        """A loop that is written out where it is small and of known length, and else stays one."""
+        with contextlib.suppress(UnsupportedError):
+            return self._written_out(state, going, trip, is_short=True)
+        return self._loop(state, going, trip)
+
+    def _written_out(
+        self,
+        state: list[Numbers],
+        going: Callable[..., Scalar],
+        trip: Callable[..., list[Numbers]],
+        is_short: bool = False,
+    ) -> list[Numbers]:
+        """A loop as all trips that it may make.
+
+        Args:
+          state: what the first trip begins with.
+          going: of a state: whether there is a trip.
+          trip: of a state: the next one.
+          is_short: refuses one that makes more operations than can be written out, or of which is
+            not known how often it runs.
+
+        Returns:
+          The state at the end.
+        """
+        before = self._graph.count
         result = state
         still: Scalar = np.bool_(True)
         # The loop goes on past its end, on numbers that are then not taken: so a counter among
@@ -325,6 +359,8 @@ class _Writer:
             still = self._graph.apply("and", still, going(state))
             if is_known(still) and not still:
                 return result
+            if is_short and (not is_known(still) or self._graph.count - before > MOST_WRITTEN_OUT):
+                raise UnsupportedError("a loop that is not short")
             state = trip(state)
             result = [self._choose(still, *pair) for pair in zip(result, state, strict=True)]
         raise UnsupportedError(f"a loop that may run more than {MOST_TRIPS} times")
