@@ -17,7 +17,11 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" /
 Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(mode=0o700, parents=True, exist_ok=True)
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
 os.environ.setdefault("MPLBACKEND", "agg")
+# This checkout first, and whatever else there was: the libraries may lie there.
+_PATHS = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+os.environ["PYTHONPATH"] = os.pathsep.join(_PATHS)
 
+import jax
 import pytest
 
 from jetbot_mjx import programs
@@ -44,6 +48,11 @@ def pytest_collection_modifyitems(items):
     """Begins with the files that take longest, so that no worker is left alone with one."""
     rank = {name: index for index, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONGEST)))
+
+
+def pytest_runtest_setup(item):
+    if item.get_closest_marker("cpu") and jax.default_backend() != "cpu":
+        pytest.skip(f"of programs for CPUs; the default device is a {jax.default_backend()}")
 
 
 @pytest.fixture(scope="session")

@@ -101,8 +101,12 @@ def main() -> int:
         # Tests take some CPU devices for several; the GPU is the default one.
         environment |= {"JAX_PLATFORMS": "cuda,cpu"}
         workers = min(8, os.cpu_count() or 1)
-        suite = f"-m 'not slow' -q -p no:benchmark -n {workers} --dist loadfile"
-        commands.append(Command(f"python -m pytest {suite}"))
+        commands.append(
+            Command(
+                f"python -m pytest -m 'not slow' -q -p no:benchmark -n {workers} --dist loadfile"
+                " --durations=0"
+            )
+        )
     failed = 0
     for index, command in enumerate(commands):
         failed += not _run(command, folder, output / f"{index:02}.txt", environment)

@@ -155,22 +155,21 @@ def test_a_stray_folder_among_the_checkpoints_does_not_matter(refused, damaged):
     refused(evaluate, damaged.parents[1], "--checkpoint", "123")
 
 
-def test_missing_parameters_cost_one_line(root, damaged):
+def test_missing_parameters_cost_one_line(damaged):
     shutil.rmtree(damaged / "policy" / "d")
     process = subprocess.run(
         [sys.executable, "-m", "jetbot_mjx.evaluate", str(damaged)],
-        env={**os.environ, "PYTHONPATH": str(root)},
         capture_output=True,
         text=True,
     )
     assert (process.returncode, len(process.stderr.splitlines())) == (2, 1)
 
 
-def test_a_platform_that_is_not_there_costs_one_line(root, tmp_path):
+def test_a_platform_that_is_not_there_costs_one_line(tmp_path):
     process = subprocess.run(
         [sys.executable, "-m", "jetbot_mjx.train", "--config", SMOKE],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(root), "JAX_PLATFORMS": "nowhere"},
+        env={**os.environ, "JAX_PLATFORMS": "nowhere"},
         capture_output=True,
         text=True,
     )

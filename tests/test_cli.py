@@ -1,7 +1,6 @@
 """The command line: a user's mistake costs one line and exit code 2, and leaves nothing behind."""
 
 import json
-import os
 import re
 import shutil
 import subprocess
@@ -492,12 +491,11 @@ def test_train_names_its_run_folder_after_the_configuration(asked):
         (["render", ".", "--episodes", "0"], "0 is too small: give at least 1"),
     ],
 )
-def test_a_mistake_costs_one_line(root, tmp_path, arguments, said):
+def test_a_mistake_costs_one_line(tmp_path, arguments, said):
     command, *rest = arguments
     process = subprocess.run(
         [sys.executable, "-m", f"jetbot_mjx.{command}", *rest],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(root)},
         capture_output=True,
         text=True,
     )

@@ -69,7 +69,7 @@ def start(arguments, *, interrupted=False, **variables):
     flag = "interrupted" if interrupted else "-"
     return subprocess.Popen(
         [sys.executable, __file__, flag, *map(str, arguments)],
-        env={**environment, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "cpu", **variables},
+        env={**environment, "JAX_PLATFORMS": "cpu", **variables},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -297,7 +297,6 @@ def test_processes_that_do_not_come_are_not_waited_for_without_end(tmp_path, unu
         cwd=tmp_path,
         env={
             **os.environ,
-            "PYTHONPATH": str(ROOT),
             **dict(zip(VARIABLES, (f"127.0.0.1:{unused_port()}", "2", "1"), strict=True)),
         },
         capture_output=True,

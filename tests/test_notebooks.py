@@ -1,6 +1,5 @@
 """The notebooks run from top to bottom, as a reader would, on the smallest configuration."""
 
-import os
 from pathlib import Path
 
 import nbformat
@@ -34,7 +33,6 @@ def execute(root, tmp_path_factory):
         patch.setenv("JETBOT_EPISODES", "4")
         patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
         patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
-        patch.setenv("PYTHONPATH", str(root), prepend=os.pathsep)
         # Nothing of the user's own Jupyter, and nothing left in it.
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
         patch.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))

@@ -575,9 +575,9 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
     assert stored.config.task.name == task.name
     found = replayed(Gliding(stored.config), stored.config, stored.fault)
     assert found.index(1.0) == int(stored.fault.step)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent), prepend=os.pathsep)
     again = subprocess.run(
         [sys.executable, *gliding.program("replay"), str(files[0])],
-        env={**os.environ, "PYTHONPATH": str(Path(__file__).parent)},
         capture_output=True,
         text=True,
     )

@@ -256,9 +256,12 @@ def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
     ("wanted", "said"),
     [("osmesa", "'osmesa' does not work here"), ("software", "'software': no such back end")],
 )
-def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(tmp_path, wanted, said):
+def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
+    tmp_path, monkeypatch, wanted, said
+):
     (tmp_path / "OpenGL.py").write_text("None.glGetError", "utf-8")  # what PyOpenGL does
-    environment = {**os.environ, "MUJOCO_GL": wanted, "PYTHONPATH": str(tmp_path)}
+    monkeypatch.setenv("MUJOCO_GL", wanted)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     program = """
 import jetbot_mjx.physics
 from jetbot_mjx import errors, offscreen
@@ -267,8 +270,6 @@ try:
 except errors.UserError as error:
     print(error)
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], env=environment, capture_output=True, text=True
-    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     assert said in done.stdout

@@ -317,7 +317,7 @@ def test_importing_prints_nothing_and_starts_no_device(tmp_path):
             " jetbot_mjx.replay, jetbot_mjx.play, jetbot_mjx.export, jetbot_mjx.sim2real",
         ],
         cwd=tmp_path,
-        env={**os.environ, "PYTHONPATH": str(ROOT), "JAX_PLATFORMS": "nowhere"},
+        env={**os.environ, "JAX_PLATFORMS": "nowhere"},
         capture_output=True,
         text=True,
     )
