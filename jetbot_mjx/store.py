@@ -12,6 +12,7 @@ import itertools
 import json
 import logging
 import os
+import re
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -34,6 +35,9 @@ _SUCCESS = "success_rate"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
 _DELETED = ".deleted"
+
+_PLACES = re.compile(r"\s*\[source locations='[^']*'\]")
+"""What some releases of TensorStore add to an error: file after file of its own source."""
 
 # Orbax tells of every step of its work at INFO, of what it would prefer at WARNING, and at ERROR,
 # by tracebacks from each of its threads, of what it raises as well.
@@ -338,7 +342,9 @@ def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
 
 
 def _reason(error: Exception) -> str:
-    lines = str(error).strip().splitlines() or [type(error).__name__]
+    """Return why, in one line of at most 305 characters, without places in another's source."""
+    text = _PLACES.sub("", str(error))
+    lines = text.strip().splitlines() or [type(error).__name__]
     # What TensorStore says begins with what it did, and ends with why it failed.
     return lines[0] if len(lines[0]) <= 300 else f"{lines[0][:150]} ... {lines[0][-150:]}"
 
