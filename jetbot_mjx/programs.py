@@ -24,15 +24,12 @@ from pathlib import Path
 from typing import Any, Self
 
 import jax
-import mujoco
 import numpy as np
 from jax.experimental import serialize_executable
 
 from jetbot_mjx import cpu
 from jetbot_mjx.compiling import Options, compiler_options
 from jetbot_mjx.config import Config
-from jetbot_mjx.model import ROBOTS, make_mj_model
-from jetbot_mjx.task import make_task
 from jetbot_mjx.trusted_files import read_trusted, write_private
 
 TRUSTED = frozenset({f"{__package__}:GoalTask"})
@@ -187,11 +184,16 @@ class _CacheHits:
 
 def _model(config: Config) -> str:
     """A name for the model of a configuration, with all options of its solver."""
-    scene = make_task(config.task).build_scene
-    robot = ROBOTS[config.robot.preset]
-    model = make_mj_model(robot, config.physics, build_scene=scene, visual=False)
-    content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
-    mujoco.mj_saveModel(model, None, content)
+    # A mistyped command says so before MuJoCo is loaded.
+    import mujoco
+
+    from jetbot_mjx import model, task
+
+    scene = task.make_task(config.task).build_scene
+    robot = model.ROBOTS[config.robot.preset]
+    made = model.make_mj_model(robot, config.physics, build_scene=scene, visual=False)
+    content = np.zeros(mujoco.mj_sizeModel(made), np.uint8)
+    mujoco.mj_saveModel(made, None, content)
     return hashlib.sha256(content.tobytes()).hexdigest()
 
 

@@ -14,7 +14,7 @@ import pytest
 from conftest import OWN_TASKS
 from jax.experimental.compilation_cache import compilation_cache
 
-from jetbot_mjx import programs
+from jetbot_mjx import model, programs
 from jetbot_mjx.checkpoint import PRETRAINED
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.programs import Programs, programs_of
@@ -119,7 +119,10 @@ def test_without_a_folder_nothing_is_kept(folder):
     assert Programs({}).find("double") is None
 
 
-def test_what_a_cpu_found_in_jax_s_cache_is_not_written_again(tmp_path, monkeypatch):
+@pytest.mark.parametrize(("platform", "written"), [("cpu", 0), ("gpu", 1)])
+def test_what_a_cpu_found_in_jax_s_cache_is_not_written_again(
+    folder, monkeypatch, platform, written
+):
     hits = programs._CacheHits.__exit__
 
     def found(self, *exception):
@@ -127,8 +130,9 @@ def test_what_a_cpu_found_in_jax_s_cache_is_not_written_again(tmp_path, monkeypa
         hits(self, *exception)
 
     monkeypatch.setattr(programs._CacheHits, "__exit__", found)
-    Programs({}, tmp_path, KEY).compile("double", double)
-    assert not list(tmp_path.iterdir())
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    Programs({}, folder, KEY).compile("double", double)
+    assert len(list(folder.iterdir())) == written
 
 
 def test_what_nobody_used_for_long_makes_room(kept):
@@ -176,14 +180,14 @@ def test_changed_source_is_another_program(paths, monkeypatch):
 
 def test_another_model_is_another_program(paths, monkeypatch):
     before = paths({})
-    make = programs.make_mj_model
+    make = model.make_mj_model
 
     def with_another_solver(*arguments, **options):
-        model = make(*arguments, **options)
-        model.opt.iterations += 1
-        return model
+        made = make(*arguments, **options)
+        made.opt.iterations += 1
+        return made
 
-    monkeypatch.setattr(programs, "make_mj_model", with_another_solver)
+    monkeypatch.setattr(model, "make_mj_model", with_another_solver)
     assert paths({}) != before
 
 
@@ -302,7 +306,12 @@ program = found.compile("it", lambda: step.trace(jnp.ones(4)))
 print(jax.device_count(), kept, float(program(jnp.ones(4)).sum()))
 """
     flags = "--xla_force_host_platform_device_count=2"
-    environment = {**os.environ, "XLA_FLAGS": flags, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": flags,
+        "JAX_ENABLE_COMPILATION_CACHE": "false",
+    }
     for kept in (False, True):
         command = [sys.executable, "-c", code]
         done = subprocess.run(command, env=environment, capture_output=True, text=True)
