@@ -8,6 +8,7 @@ from jetbot_mjx.config import parse_config
 
 
 def test_what_xla_knows_reaches_it_and_what_it_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setattr(
         compiling, "_QUICK", {"xla_backend_optimization_level": 2, "xla_no_such_thing": True}
     )

@@ -33,6 +33,8 @@ def each(config, env):
 MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
 
 
+# For so small a training the XLA of a GPU sets aside from half to nine eighths of what is told.
+@pytest.mark.cpu
 @pytest.mark.parametrize(
     ("settings", "fullest"),
     [

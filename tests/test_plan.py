@@ -2,6 +2,7 @@
 
 import re
 
+import jax
 import pytest
 
 from jetbot_mjx import plan
@@ -23,7 +24,8 @@ def test_the_table_tells_what_fits_and_marks_the_configuration(smoke, capsys):
     code, out = said(capsys, "--config", smoke, "--memory", "0.2")
     assert code == 0
     lines = out.splitlines()
-    assert re.match(r"GiB on each of 1 x cpu, which has 0\.2;", lines[0])
+    devices = rf"{jax.device_count()} x {re.escape(jax.devices()[0].device_kind)}"
+    assert re.match(rf"GiB on each of {devices}, which has 0\.2;", lines[0])
     assert [line.split()[1] for line in lines if line.startswith(">")] == ["128"]
     assert [line.endswith("does not fit") for line in lines[2:-1]][-2:] == [False, True]
     largest = int(lines[-3].split()[0].replace(",", ""))
