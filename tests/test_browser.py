@@ -11,9 +11,6 @@ import urllib.request
 import mujoco
 import numpy as np
 import pytest
-import trimesh
-import websockets.exceptions
-import websockets.sync.client
 
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.model import QPOS_QUAT, QPOS_XYZ
@@ -21,7 +18,10 @@ from jetbot_mjx.player import Player
 
 pytest.importorskip("viser")
 
+import trimesh
 import viser
+import websockets.exceptions
+import websockets.sync.client
 
 from jetbot_mjx import browser as module
 from jetbot_mjx.browser import FIRST_PORT, Browser, free_port

@@ -2,8 +2,12 @@
 
 from pathlib import Path
 
-import nbformat
 import pytest
+
+pytest.importorskip("ipykernel")
+pytest.importorskip("nbclient")
+
+import nbformat
 from ipykernel.kernelspec import write_kernel_spec
 from nbclient import NotebookClient
 
