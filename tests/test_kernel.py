@@ -38,7 +38,8 @@ def step():
 def launches(function, *arguments, platforms=None):
     """How many kernels a program calls on the platform that it is lowered for."""
     # A function of its own: what was lowered before would be taken again.
-    text = jax.jit(lambda *x: function(*x)).trace(*arguments).lower(lowering_platforms=platforms).as_text()
+    traced = jax.jit(lambda *x: function(*x)).trace(*arguments)
+    text = traced.lower(lowering_platforms=platforms).as_text()
     return text.count("custom_call @jetbot_mjx_") + text.count(f"custom_call @{gpu._TARGET}")
 
 
