@@ -159,7 +159,9 @@ def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
 
 @_kernel_p.def_impl
 def _run(*leaves: Any, kernel: Kernel) -> list[Array]:
-    return _compiled(*leaves, kernel=kernel)
+    # Also within `jax.disable_jit`, where this would otherwise call itself.
+    with jax.disable_jit(False):
+        return _compiled(*leaves, kernel=kernel)
 
 
 @functools.partial(jax.jit, static_argnames="kernel")

@@ -160,3 +160,9 @@ def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(im
         return
     with pytest.raises(UserError, match=r"physics\.impl = llvm: one kernel cannot do.*cholesky"):
         env.step_physics(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))
+
+
+def test_it_runs_where_nothing_is_to_be_compiled():
+    with jax.disable_jit():
+        result = made()({"x": jnp.arange(3.0), "n": jnp.zeros(())}, jnp.float32(3))
+    np.testing.assert_array_equal(result["x"], [0, 9, 18])
