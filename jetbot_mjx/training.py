@@ -24,6 +24,7 @@ from jetbot_mjx.run_folder import (
     stored_config,
     write_run,
 )
+from jetbot_mjx.store import checkpoint_steps
 from jetbot_mjx.tracking import check_tracking
 from jetbot_mjx.trainer import Recorder
 
@@ -100,7 +101,9 @@ def _check_folder(config: Config, run_dir: Path) -> None:
                 f"--run-dir {run_dir} is in use by a run of trainer = {stored.trainer!r}, which"
                 " cannot be continued: name a new folder"
             )
-        stored.check_resume(config)
+        # What ended before its first checkpoint, such as for lack of memory, may begin as another.
+        if stored.seeds != config.seeds or any(map(checkpoint_steps, seed_dirs(run_dir, stored))):
+            stored.check_resume(config)
 
 
 def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, programs: Programs) -> Result:

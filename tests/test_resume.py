@@ -28,6 +28,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import Evaluator
 from jetbot_mjx.policy import make_networks
 from jetbot_mjx.resume import TRAINING, resume, to_trees
+from jetbot_mjx.run_folder import write_run
 from jetbot_mjx.store import (
     FOLDER,
     CheckpointError,
@@ -687,6 +688,14 @@ def test_what_may_not_change_on_resume_is_refused_by_name(run_copy, setting, sai
 def test_the_same_command_with_another_configuration_is_refused(run_copy, smoke):
     arguments = ["--config", smoke, "--run-dir", str(run_copy), "--seed", "3"]
     assert "seed = 3 is not what the run began with, 0" in refused(train.main, arguments)
+
+
+def test_a_run_that_ended_before_its_first_checkpoint_begins_as_another(config, tmp_path):
+    write_run(tmp_path, config.model_copy(update={"seed": 3}))
+    (tmp_path / "metrics.jsonl").write_text("")
+    (tmp_path / "checkpoints").mkdir()
+    assert training.run(config, tmp_path).finished
+    assert load_config(tmp_path / "config.yaml") == config
 
 
 def test_a_changed_interval_moves_the_reports_and_nothing_else(
