@@ -39,8 +39,10 @@ class Physics:
           config: the physics of the run.
 
         Raises:
-          UserError: one kernel is asked for where there can be none.
+          UserError: one kernel is asked for where there can be none, or JAX computes in 64 bits.
         """
+        if jax.config.values["jax_enable_x64"]:
+            raise UserError("physics is float32, and JAX_ENABLE_X64 is set: unset it")
         self._mj_model = mj_model
         self._config = config
         self._varied: tuple[int, ...] = ()

@@ -9,6 +9,7 @@ import pytest
 
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.state import robot_state
 from jetbot_mjx.task import layout_size
 
@@ -175,3 +176,8 @@ def test_with_model_makes_a_new_environment_and_leaves_the_old(env):
     other = env.with_model(env.mjx_model.replace(pair_friction=env.mjx_model.pair_friction * 0.5))
     assert other is not env
     assert float(other.mjx_model.pair_friction.max()) < float(env.mjx_model.pair_friction.max())
+
+
+def test_64_bits_are_refused_with_the_remedy():
+    with jax.enable_x64(True), pytest.raises(UserError, match="unset it"):
+        make_env(parse_config({}))
