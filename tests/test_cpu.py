@@ -22,6 +22,8 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.programs import programs_of
 from jetbot_mjx.scalarize import scalarize
 
+pytestmark = pytest.mark.cpu
+
 DEVICES = 8
 
 needs_it = pytest.mark.skipif(not cpu.is_available(), reason="llvmlite compiles nothing for XLA")
