@@ -20,11 +20,11 @@ except BaseException as error:
 """For a library that is still loading when the signal comes."""
 
 
-def python(root, folder, *arguments, **options):
+def python(folder, *arguments, **options):
     return subprocess.run(
         [sys.executable, *arguments],
         cwd=folder,
-        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{root}"},
+        env={**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{os.environ['PYTHONPATH']}"},
         capture_output=True,
         text=True,
         timeout=60,
@@ -34,18 +34,17 @@ def python(root, folder, *arguments, **options):
 
 @pytest.mark.parametrize("lost", [False, True])
 @pytest.mark.parametrize("command", ["train", "evaluate"])
-def test_a_command_that_still_loads_leaves_quietly(command, lost, root, tmp_path):
+def test_a_command_that_still_loads_leaves_quietly(command, lost, tmp_path):
     (tmp_path / "jax").mkdir()
     (tmp_path / "jax" / "__init__.py").write_text(STAND_IN.format(lost=lost))
-    done = python(root, tmp_path, "-m", f"jetbot_mjx.{command}", "--help")
+    done = python(tmp_path, "-m", f"jetbot_mjx.{command}", "--help")
     # 130, to a shell.
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
 
 
-def test_a_background_job_ignores_it_while_it_loads(root, tmp_path):
+def test_a_background_job_ignores_it_while_it_loads(tmp_path):
     (tmp_path / "jax.py").write_text("import os, signal\nos.kill(os.getpid(), signal.SIGINT)\n1/0")
     done = python(
-        root,
         tmp_path,
         *("-m", "jetbot_mjx.evaluate"),
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_IGN),
@@ -55,14 +54,14 @@ def test_a_background_job_ignores_it_while_it_loads(root, tmp_path):
 
 
 @pytest.mark.parametrize("arguments", [("-c", "import program"), ("-m", "program")])
-def test_programs_that_import_the_package_keep_their_own_way(arguments, root, tmp_path):
+def test_programs_that_import_the_package_keep_their_own_way(arguments, tmp_path):
     (tmp_path / "program").mkdir()
     (tmp_path / "program" / "__main__.py").touch()
     (tmp_path / "program" / "__init__.py").write_text(
         "import signal, jetbot_mjx\n"
         "print(signal.getsignal(signal.SIGINT) is signal.default_int_handler)\n"
     )
-    done = python(root, tmp_path, *arguments)
+    done = python(tmp_path, *arguments)
     assert (done.stdout, done.stderr) == ("True\n", "")
 
 
@@ -93,14 +92,14 @@ cli.run_command(command)
         ("signal.signal(signal.SIGINT, signal.SIG_IGN); Loses(); sys.exit(3)", 3, ""),
     ],
 )
-def test_a_command_at_work_is_interrupted_wherever_it_is(what, code, said, root, tmp_path):
-    done = python(root, tmp_path, "-c", COMMAND.format(what=what))
+def test_a_command_at_work_is_interrupted_wherever_it_is(what, code, said, tmp_path):
+    done = python(tmp_path, "-c", COMMAND.format(what=what))
     assert (done.returncode, done.stderr) == (code, said)
 
 
-def test_other_exceptions_that_are_lost_are_told(root, tmp_path):
+def test_other_exceptions_that_are_lost_are_told(tmp_path):
     source = COMMAND.format(what="Loses(); return 0")
     source = source.replace("signal.raise_signal(signal.SIGINT)", "1 / 0")
-    done = python(root, tmp_path, "-c", source)
+    done = python(tmp_path, "-c", source)
     assert done.returncode == 0
     assert "ZeroDivisionError" in done.stderr
