@@ -151,13 +151,15 @@ def test_what_nobody_used_for_long_makes_room(kept):
 def paths(tmp_path, monkeypatch):
     """Where a configuration's program would lie; None where it would not be kept."""
     monkeypatch.setattr(programs, "TRUSTED", OWN_TASKS)
-    monkeypatch.setitem(jax.config.values, "jax_compilation_cache_dir", str(tmp_path))
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
 
     def paths(settings, *, keep=True):
         found = programs_of(parse_config(settings), keep=keep)
         return found._path("advance") if found._folder else None
 
-    return paths
+    yield paths
+    jax.config.update("jax_compilation_cache_dir", before)
 
 
 def test_a_configuration_finds_its_own_programs_whatever_its_seed(paths):
