@@ -106,7 +106,8 @@ def converted(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Numbers in another dtype: what is beyond the whole numbers is the last of them, NaN is 0."""
     if x.dtype.kind == "f" and np.dtype(dtype).kind in "iu":
         ends = np.iinfo(dtype)
-        x = np.clip(np.nan_to_num(np.float64(x), posinf=np.inf, neginf=-np.inf), ends.min, ends.max)
+        finite = np.nan_to_num(x.astype(np.float64), posinf=np.inf, neginf=-np.inf)
+        return np.clip(finite, ends.min, ends.max).astype(dtype)
     return x.astype(dtype)
 
 
