@@ -55,10 +55,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="override one setting; may be given again",
     )
     options = parser.parse_args(arguments)
-    if options.task is None and options.config is None:
+    if not options.task and options.config is None:
         parser.error("name a task as package.module:Class, or a --config that does")
     overrides = list(options.overrides)
-    if options.task is not None:
+    if options.task:
         name = options.task if ":" in options.task else f"{_BUILT_IN}:{options.task}"
         overrides.append(f"task.name={name}")
     config = load_config(options.config, overrides)

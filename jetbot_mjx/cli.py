@@ -83,8 +83,10 @@ def require_device() -> None:
     """Refuses to go on where JAX has no device to run on.
 
     Raises:
-      UserError: `JAX_PLATFORMS` names what is not there.
+      UserError: `JAX_PLATFORMS` names what is not there, or JAX computes in 64 bits.
     """
+    if jax.config.values["jax_enable_x64"]:
+        raise UserError("all is computed in float32, and JAX_ENABLE_X64 is set: unset it")
     try:
         jax.devices()
     # JAX fails by an assertion where the plugin for a platform is not installed.

@@ -29,6 +29,7 @@ from jetbot_mjx.state import PhysicsState, State, robot_state
 from jetbot_mjx.task import (
     AdvancesGoal,
     Goal,
+    GoalTask,
     RobotState,
     Task,
     layout_size,
@@ -76,13 +77,26 @@ class JetBotEnv(brax.envs.Env):
         self.config = config
         self.task: Task = make_task(config.task)
         self.robot = ROBOTS[config.robot.preset]
-        self.mj_model: mujoco.MjModel = make_mj_model(
-            self.robot, config.physics, build_scene=self.task.build_scene
-        )
-        physics_model = make_mj_model(
-            self.robot, config.physics, build_scene=self.task.build_scene, visual=False
-        )
-        self.physics = Physics(physics_model, config.physics)
+        try:
+            self.mj_model: mujoco.MjModel = make_mj_model(
+                self.robot, config.physics, build_scene=self.task.build_scene
+            )
+            physics_model = make_mj_model(
+                self.robot, config.physics, build_scene=self.task.build_scene, visual=False
+            )
+            self.physics = Physics(physics_model, config.physics)
+            # A scene of its own may be more than MJX can simulate: better said before a run begins.
+            # The model of a task that comes with the package is built when something is compiled.
+            if type(self.task).build_scene is not GoalTask.build_scene:
+                _ = self.physics.model
+        except (RuntimeError, ValueError) as error:
+            reason = " ".join(str(error).split())
+            if isinstance(error, NotImplementedError):
+                reason = f"MJX does not support {reason}"
+            raise UserError(
+                f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
+                f" (python -m jetbot_mjx.check_env {config.task.name} says more)"
+            ) from None
 
     @property
     def mjx_model(self) -> mjx.Model:

@@ -19,6 +19,7 @@ from jetbot_mjx.env import JetBotEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import (
     GOAL_SET_VERSION,
+    MOST_GOALS,
     REPORT_GOALS,
     Evaluator,
     report_keys,
@@ -351,7 +352,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.evaluate", description=__doc__)
     cli.add_checkpoint_arguments(parser, several=True)
-    parser.add_argument("--episodes", type=cli.positive_int, default=REPORT_GOALS)
+    parser.add_argument("--episodes", type=cli.whole_number(1, MOST_GOALS), default=REPORT_GOALS)
     parser.add_argument(
         "--output",
         type=Path,

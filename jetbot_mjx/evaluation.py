@@ -28,6 +28,9 @@ GOAL_SET_VERSION = 1
 REPORT_GOALS = 1024
 """How many of its fixed goals a report takes, unless told otherwise."""
 
+MOST_GOALS = 1_048_576
+"""As many can be asked for."""
+
 _REPORT_SEED = 20_251
 _TRAINING_SEED = 20_252
 

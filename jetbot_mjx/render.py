@@ -270,7 +270,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     which_goals = parser.add_mutually_exclusive_group()
     which_goals.add_argument(
         "--episodes",
-        type=cli.positive_int,
+        type=cli.whole_number(1, REPORT_GOALS),
         metavar="N",
         help="the first N of the fixed goals (default: 20, of a gallery 4)",
     )

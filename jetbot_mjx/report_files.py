@@ -35,6 +35,9 @@ LISTED_FAILURES = 50
 
 _REPLAYED = 8
 
+_NOT_ALWAYS = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
+"""Figures that a page may be without."""
+
 _FORMS = {
     "percent": "{:.2%}",
     "whole percent": "{:.0%}",
@@ -157,6 +160,9 @@ def _write(
     }
     make_folder(folder)
     with writing_to(folder):
+        # Of an earlier report that had more.
+        for figure in sorted(_NOT_ALWAYS[name] - drawn.keys()):
+            (folder / f"{figure}.png").unlink(missing_ok=True)
         for figure, (light, _) in drawn.items():
             write_bytes(folder / f"{figure}.png", light)
         write_json(folder / f"{name}.json", values)

@@ -176,6 +176,17 @@ class StandsOnTheRobot(GoalTask):
         spec.add_pair(geomname1="ball", geomname2="left_wheel", condim=1)
 
 
+class AsksForAnotherSolver(GoalTask):
+    def build_scene(self, spec):
+        spec.option.solver = mujoco.mjtSolver.mjSOL_PGS
+
+
+class NamesNoSite(GoalTask):
+    def build_scene(self, spec):
+        tendon = spec.add_tendon(name="rope")
+        tendon.wrap_site("nowhere")
+
+
 class PutsItOnTheRobot(GoalTask):
     def build_scene(self, spec):
         pillar = spec.worldbody.add_body(name="pillar", mocap=True, pos=(1.0, 0.0, 0.0))

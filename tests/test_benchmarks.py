@@ -112,7 +112,7 @@ def test_a_slower_rate_ends_in_one_and_a_figure_lies_beside_the_file(monkeypatch
             return rate("physics", num_envs, now * num_envs)
 
         monkeypatch.setitem(steps_per_second.MEASUREMENTS, "physics", physics)
-        skipped = [f"--skip={name}" for name in ("env", "rollout", "training", "stock")]
+        skipped = [f"--skip={name}" for name in steps_per_second.MEASUREMENTS if name != "physics"]
         output = tmp_path / f"{now}.json"
         compared = ["--compare", str(tmp_path / "1000.json")] if now != 1000 else []
         arguments = ["--num-envs", "8,64", "--output", str(output), *skipped, *compared]

@@ -1,18 +1,21 @@
 """The environment's contract: pure, one trace, one shape, the same under jit and vmap."""
 
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jetbot_mjx import cli, train
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.state import robot_state
 from jetbot_mjx.task import layout_size
 
+ROOT = Path(__file__).parents[1]
 ENVS = 4
 STEPS = 20
 
@@ -176,6 +179,27 @@ def test_with_model_makes_a_new_environment_and_leaves_the_old(env):
     other = env.with_model(env.mjx_model.replace(pair_friction=env.mjx_model.pair_friction * 0.5))
     assert other is not env
     assert float(other.mjx_model.pair_friction.max()) < float(env.mjx_model.pair_friction.max())
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("AsksForAnotherSolver", "MJX does not support mjtSolver.mjSOL_PGS"),
+        ("NamesNoSite", "Error: tendon 'rope'"),
+    ],
+)
+def test_a_scene_that_cannot_be_simulated_is_refused_before_a_run_begins(name, reason, tmp_path):
+    arguments = ["--config", str(ROOT / "configs" / "smoke.yaml"), "--run-dir", str(tmp_path / "x")]
+    with pytest.raises(UserError) as caught:
+        train.main([*arguments, "--set", f"task.name=broken_tasks:{name}"])
+    assert f"'broken_tasks:{name}': its scene cannot be simulated: {reason}" in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_64_bits_are_refused_by_commands_with_the_remedy():
+    with jax.enable_x64(True), pytest.raises(UserError, match="JAX_ENABLE_X64 is set: unset it"):
+        cli.require_device()
 
 
 def test_64_bits_are_refused_with_the_remedy():

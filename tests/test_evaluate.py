@@ -196,6 +196,9 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
     assert json.loads(first["report.json"])["robustness"] is None
     # The other simulator is part of it.
     assert values["mujoco"]["policy"]["episodes"] == EPISODES
+    # A report without it leaves none of an earlier one beside it.
+    assert judge(run_dir, "--output", tmp_path)[0] == 0
+    assert not (tmp_path / "robustness.png").exists()
 
 
 def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_path):

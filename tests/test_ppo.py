@@ -41,8 +41,8 @@ def smoke(root):
 
 @pytest.fixture
 def glide():
-    """What a training builds glides."""
-    with gliding.everywhere():
+    """What a training builds glides, in full precision."""
+    with gliding.everywhere(), jax.default_matmul_precision("highest"):
         yield
 
 
@@ -633,7 +633,7 @@ SEEDS = 3
 def several(smoke, tmp_path_factory):
     """Three seeds from 5 on, trained at once over two checkpoints, and their result."""
     config = with_ppo(smoke, num_timesteps=2 * SIZE, checkpoint_interval=SIZE, seed=5, seeds=SEEDS)
-    with gliding.everywhere():
+    with gliding.everywhere(), jax.default_matmul_precision("highest"):
         return config, training.run(config, tmp_path_factory.mktemp("seeds") / "run")
 
 

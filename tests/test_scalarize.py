@@ -15,6 +15,14 @@ from jetbot_mjx.state import PhysicsState
 
 MATRIX = jax.ShapeDtypeStruct((3, 4), jnp.float32)
 VECTOR = jax.ShapeDtypeStruct((4,), jnp.float32)
+
+
+def in_full_precision(function, x):
+    """What JAX makes of it for every robot, without a GPU's TF32."""
+    with jax.default_matmul_precision("highest"):
+        return jax.jit(jax.vmap(function))(x)
+
+
 INDICES = jnp.array([[2, 1], [0, 3], [2, 9]])
 
 
@@ -150,7 +158,7 @@ def test_a_program_does_what_the_function_does(name):
     x = np.float32(np.random.default_rng(3).normal(size=(20, *MATRIX.shape)))
     program = scalarize.scalarize(function, MATRIX)
     ours = program.evaluate([x])
-    theirs = jax.tree.leaves(jax.vmap(function)(x))
+    theirs = jax.tree.leaves(in_full_precision(function, x))
     for one, other in zip(ours, theirs, strict=True):
         assert one.shape == other.shape
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-6)
@@ -207,7 +215,7 @@ def check(function, robots=50, shape=VECTOR):
     program = scalarize.scalarize(function, shape)
     x = np.float32(np.random.default_rng(7).normal(size=(robots, *shape.shape)))
     ours = program.evaluate([x])
-    theirs = jax.tree.leaves(jax.jit(jax.vmap(function))(x))
+    theirs = jax.tree.leaves(in_full_precision(function, x))
     for one, other in zip(ours, theirs, strict=True):
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-6)
     return program
