@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jetbot_mjx.contract import FILE
+from jetbot_mjx.deployment.exporters import FORMATS, Act, require
+from jetbot_mjx.deployment.policy_spec import FILE
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.formats import FORMATS, Act, require
 
 CALLS = 2000
 _WARM_UP = 100

@@ -30,14 +30,15 @@ from jaxtyping import Array, Float, Int, UInt32
 from results import check_output
 
 from jetbot_mjx import cli
-from jetbot_mjx.best_known import FILE, FORMAT, settings_of
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.state import State
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import BASELINES, GOAL_SET_VERSION, REPORT_GOALS, report_keys
-from jetbot_mjx.rollout import Controller, Episodes, rollout_fn
-from jetbot_mjx.run_folder import versions, write_text, writing_to
-from jetbot_mjx.state import State
+from jetbot_mjx.evaluation.best_known import FILE, FORMAT, settings_of
+from jetbot_mjx.evaluation.evaluator import BASELINES, GOAL_SET_VERSION, REPORT_GOALS, report_keys
+from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
+from jetbot_mjx.runs.run_dir import versions, write_text, writing_to
 
 _ROOT = Path(__file__).resolve().parents[1]
 _ELITE_SHARE = 16
@@ -273,7 +274,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.knots < 2 or options.samples < 2:
         parser.error("--knots and --samples: at least 2")
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     config = load_config(options.config, options.overrides)
     check_output(options.output)
     read(options.output)

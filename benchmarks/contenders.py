@@ -34,9 +34,9 @@ from timing import (
 )
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.env import make_env
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.state import PhysicsState
 
 PLAYGROUND_ENV = "CartpoleBalance"
 _PLAYGROUND_EPISODE = 1000

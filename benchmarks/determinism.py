@@ -20,7 +20,7 @@ from typing import NamedTuple
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.run_folder import write_json
+from jetbot_mjx.runs.run_dir import write_json
 
 
 class Row(NamedTuple):

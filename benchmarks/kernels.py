@@ -17,12 +17,12 @@ import jax.numpy as jnp
 from timing import env_keys
 
 from jetbot_mjx import cli
-from jetbot_mjx.compiling import compiler_options
+from jetbot_mjx.agents.ppo import PPO
+from jetbot_mjx.compiler.lower_jaxpr import scalarize
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config, parse_config
-from jetbot_mjx.env import make_env
-from jetbot_mjx.ppo import PPO
-from jetbot_mjx.scalarize import scalarize
-from jetbot_mjx.wrappers import wrap_for_training
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.wrappers import wrap_for_training
 
 PROGRAMS = ("physics", "env", "training")
 

@@ -16,16 +16,17 @@ from typing import Any
 import jax
 from measurements import Listener
 
-from jetbot_mjx import cli, resumable_ppo
+from jetbot_mjx import cli
+from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.env import make_env
-from jetbot_mjx.evaluation import Summary
-from jetbot_mjx.metrics import CompileClock
-from jetbot_mjx.policy import PolicyParams
-from jetbot_mjx.preemption import Preemption
-from jetbot_mjx.recording import RunRecorder
-from jetbot_mjx.run_folder import write_json
-from jetbot_mjx.trainer import Progress, Recorder
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.runs.metrics import CompileClock
+from jetbot_mjx.runs.run_dir import write_json
+from jetbot_mjx.training import ppo_trainer
+from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.preemption import Preemption
+from jetbot_mjx.training.run_recorder import RunRecorder
 
 _UNJUDGED = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
 
@@ -79,7 +80,7 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
       Seconds of every training from its first report to its last, all of that on disk.
     """
     env = make_env(config)
-    program = resumable_ppo.Program(config, env)
+    program = ppo_trainer.Program(config, env)
     compiled = program.compile()
     program.compile = lambda: compiled
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
@@ -91,12 +92,12 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
     return seconds
 
 
-def _once(config: Config, env: Any, program: resumable_ppo.Program, way: str) -> float:
+def _once(config: Config, env: Any, program: ppo_trainer.Program, way: str) -> float:
     with tempfile.TemporaryDirectory() as folder, CompileClock() as clock:
 
         def train(recorder: Recorder) -> _Timed:
             timed = _Timed(recorder)
-            resumable_ppo.train(config, program, timed, Preemption(config.preemption_notice))
+            ppo_trainer.train(config, program, timed, Preemption(config.preemption_notice))
             return timed
 
         if way == "off":

@@ -19,15 +19,15 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, PyTree
 from timing import Carry, Row, Tally, Timed, add, env_keys, make_row, random_actions, sums
 
-from jetbot_mjx import brax_ppo, resumable_ppo
+from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.config import Config, parse_config
-from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.metrics import CompileClock
-from jetbot_mjx.policy import make_networks
-from jetbot_mjx.preemption import Preemption
-from jetbot_mjx.trainer import Progress, Recorder
-from jetbot_mjx.wrappers import wrap_for_training
+from jetbot_mjx.runs.metrics import CompileClock
+from jetbot_mjx.training import brax_trainer, ppo_trainer
+from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.preemption import Preemption
 
 _LONGEST_HOLD = 24  # environment steps
 WARM_UP_INTERVALS = 2  # the first compiles; the second, the little that runs between intervals
@@ -167,10 +167,10 @@ class Listener(Recorder):
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times the resumable trainer by its own reports, the first intervals left out."""
     config = training_config(config, num_envs, sizes, trainer="resumable")
-    program = resumable_ppo.Program(config, make_env(config))
+    program = ppo_trainer.Program(config, make_env(config))
     preemption = Preemption(config.preemption_notice)
     return _time_trainer(
-        "training", config, lambda to: resumable_ppo.train(config, program, to, preemption)
+        "training", config, lambda to: ppo_trainer.train(config, program, to, preemption)
     )
 
 
@@ -178,7 +178,7 @@ def measure_stock(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times Brax's own `ppo.train` under the same hyperparameters in the same way."""
     config = training_config(config, num_envs, sizes, trainer="brax")
     env = make_env(config)
-    return _time_trainer("stock", config, lambda to: brax_ppo.train(config, env, to))
+    return _time_trainer("stock", config, lambda to: brax_trainer.train(config, env, to))
 
 
 def _time_trainer(rate: str, config: Config, train: Callable[[Listener], None]) -> Row:

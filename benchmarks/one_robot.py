@@ -1,7 +1,7 @@
 """The tutorial's task on one robot in C MuJoCo, as people write it: NumPy, one step at a time.
 
 What Stable-Baselines3 is measured on. Observation, reward, goals, time limit and controller are
-those of `jetbot_mjx.task.GoalTask` with `observation: world`; a test holds the two together.
+those of `jetbot_mjx.envs.task.GoalTask` with `observation: world`; a test holds the two together.
 """
 
 import math
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.model import (
+from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
     QPOS_QUAT,
@@ -22,7 +22,7 @@ from jetbot_mjx.model import (
     ROBOTS,
     make_mj_model,
 )
-from jetbot_mjx.task import GOAL_HEIGHT
+from jetbot_mjx.envs.task import GOAL_HEIGHT
 
 
 def make_physics_model(config: Config) -> mujoco.MjModel:

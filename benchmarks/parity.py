@@ -1,8 +1,8 @@
 """Trains with both trainers and compares how they learn: `python benchmarks/parity.py --seeds 5`.
 
-The first training steps of both are equal to round-off, which `tests/test_ppo.py` holds. Then
-trainings are chaotic, and after an interval Brax draws another key: only how they learn can
-be compared. On two tasks, with N seeds:
+The first training steps of both are equal to round-off, which `tests/agents/test_ppo.py` holds.
+Then trainings are chaotic, and after an interval Brax draws another key: only how they learn can be
+compared. On two tasks, with N seeds:
   probe   the egocentric task with a robot that moves exactly as commanded: no physics
   config  the given configuration; LINEAR and the physical normalizer, which Brax does not know,
           give way to ADAPTIVE_KL and Brax's
@@ -59,22 +59,25 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
 
-from jetbot_mjx import brax_ppo, cli, kinematics, resumable_ppo
+from jetbot_mjx import cli
+from jetbot_mjx.agents.networks import make_networks
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, load_config, parse_config
-from jetbot_mjx.env import JetBotEnv, make_env
-from jetbot_mjx.evaluation import Evaluator, report_keys, summarize
-from jetbot_mjx.model import (
+from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
     QPOS_QUAT,
     QVEL_ANGULAR_B,
     QVEL_LINEAR_W,
 )
-from jetbot_mjx.policy import make_networks
-from jetbot_mjx.preemption import Preemption
-from jetbot_mjx.run_folder import versions, write_json
-from jetbot_mjx.state import PhysicsState
-from jetbot_mjx.trainer import Progress, Recorder
+from jetbot_mjx.envs.state import PhysicsState
+from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
+from jetbot_mjx.runs.run_dir import versions, write_json
+from jetbot_mjx.training import brax_trainer, ppo_trainer
+from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.preemption import Preemption
 
 _FOLDER = Path(__file__).resolve().parent
 TRAINERS = ("brax", "resumable")
@@ -193,10 +196,10 @@ def train(
     config = _with_trainer(config, trainer, seed)
     recorder, began = _Judge(judge), time.perf_counter()
     if trainer == "brax":
-        brax_ppo.train(config, env, recorder)
+        brax_trainer.train(config, env, recorder)
     else:
-        program = resumable_ppo.Program(config, env)
-        resumable_ppo.train(config, program, recorder, Preemption(config.preemption_notice))
+        program = ppo_trainer.Program(config, env)
+        ppo_trainer.train(config, program, recorder, Preemption(config.preemption_notice))
     seconds = time.perf_counter() - began
     return Curve(trainer, seed, recorder.env_steps, recorder.success, seconds)
 
@@ -326,7 +329,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.seeds < 2:
         parser.error("--seeds: a comparison needs at least 2")
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     config, probe = load_config(options.config, options.overrides), parse_config(PROBE)
     values = config.model_dump(mode="json")
     values["ppo"] |= STEERED if config.ppo.learning_rate_schedule == "LINEAR" else {}

@@ -18,16 +18,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 from results import check_output, conditions, default_output, write
 
-from jetbot_mjx import cli, training
-from jetbot_mjx.checkpoint import load_checkpoint
+from jetbot_mjx import cli
+from jetbot_mjx.agents.networks import make_networks
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.env import make_env
+from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import Evaluator, report_keys, summarize
-from jetbot_mjx.policy import make_networks
-from jetbot_mjx.randomization import VariedEnv
-from jetbot_mjx.robustness import CARRIES_AT, Sweeper, as_json
-from jetbot_mjx.run_folder import seed_folders
+from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
+from jetbot_mjx.evaluation.robustness import CARRIES_AT, Sweeper, as_json
+from jetbot_mjx.runs.checkpoint import load_checkpoint
+from jetbot_mjx.runs.run_dir import seed_folders
+from jetbot_mjx.training import session
 
 _CONFIG = Path(__file__).resolve().parents[1] / "configs" / "real_jetbot.yaml"
 WAYS = ("nominal", "randomised")
@@ -92,7 +94,7 @@ def run(config: Config, folder: Path, judge: Judge) -> Iterator[dict[str, Any]]:
         run_dir, begun = folder / way, time.perf_counter()
         if not run_dir.exists():
             trained = config.model_copy(update={"randomization": ranges})
-            training.run(trained, run_dir)
+            session.run(trained, run_dir)
         seconds = time.perf_counter() - begun
         for one in seed_folders(run_dir) or [run_dir]:
             row = {"way": way, "seed": one.name, "training_seconds": seconds}
@@ -213,7 +215,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if not config.randomization.drawn:
         raise UserError(f"--config {options.config}: its randomization draws nothing")
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     output = options.output or default_output("randomization-")
     check_output(output)
     rows: list[dict[str, Any]] = []

@@ -18,9 +18,9 @@ from results import check_output, conditions, default_output, write
 
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.env import make_env
+from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.resumable_ppo import Program
+from jetbot_mjx.training.ppo_trainer import Program
 
 _CONFIG = Path(__file__).resolve().parents[1] / "configs" / "real_jetbot.yaml"
 WAYS = ("off", "on")

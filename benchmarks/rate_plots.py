@@ -11,8 +11,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.plots import theme, to_png
-from jetbot_mjx.run_folder import write_bytes
+from jetbot_mjx.evaluation.plots import theme, to_png
+from jetbot_mjx.runs.run_dir import write_bytes
 
 
 def plot_rates(values: Mapping[str, Any]) -> Figure:

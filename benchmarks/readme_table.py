@@ -15,7 +15,7 @@ from typing import Any
 
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.run_folder import write_text
+from jetbot_mjx.runs.run_dir import write_text
 
 ROOT = Path(__file__).resolve().parents[1]
 _RATES = ("physics", "switched", "env", "rollout", "training", "stock")
@@ -64,6 +64,21 @@ def success_table(results: Results) -> str:
     return _table(head, "llll" + "r" * 5, rows)
 
 
+def summary_table(results: Results) -> str:
+    """How long success takes from a warm start: a row for each machine and observation."""
+    rows = []
+    for values in _holding(results, "runs"):
+        runs = [run for run in values["runs"] if run.get("start") == "warm"]
+        if not runs or values["config"]["trainer"] != "resumable":
+            continue
+        machine, observation, _, _, _, success, _, _, reached = _success_row(
+            values, runs, warm=False
+        )
+        rows.append([machine, observation, success, f"{len(runs)}", reached])
+    head = ("machine", "observation", "success", "seeds", "99 % reached after")
+    return _table(head, "llrrr", rows)
+
+
 def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) -> list[str]:
     reached = [run["target_reached_seconds"] for run in runs]
     success = min(run["policy"]["success_rate"] for run in runs)
@@ -72,7 +87,7 @@ def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) 
     impl = values["config"]["physics"].get("impl")
     return [
         _machine(values, runs[0]["versions"]) + (", warm cache" if warm else ""),
-        "the 16 numbers" if observation == "world" else observation,
+        "16 numbers (`world`)" if observation == "world" else observation,
         f"`{values['command'].split('/')[-1]}`",
         values["config"]["trainer"] + (", XLA's physics" if impl == "xla" else ""),
         str(len(runs)),
@@ -231,7 +246,8 @@ def _table(head: Sequence[str], alignment: str, rows: Sequence[Sequence[str]]) -
 
 
 BLOCKS: Mapping[str, Mapping[str, Callable[[Results], str]]] = {
-    "README.md": {"success": success_table, "rates": best_rates_table},
+    "README.md": {"summary": summary_table},
+    "docs/results.md": {"success": success_table, "rates": best_rates_table},
     "benchmarks/README.md": {"results": rates_tables},
     "docs/from-the-tutorial.md": {"adapters": adapters_table},
 }

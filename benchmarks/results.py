@@ -14,7 +14,7 @@ from timing import WARM_UP_CALLS, available_cores
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.run_folder import versions, write_json
+from jetbot_mjx.runs.run_dir import versions, write_json
 
 FOLDER = Path(__file__).resolve().parent / "results"
 

@@ -23,7 +23,7 @@ from typing import Any
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.run_folder import write_json
+from jetbot_mjx.runs.run_dir import write_json
 
 _FOLDER = Path(__file__).resolve().parent
 

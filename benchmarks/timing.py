@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
+from jetbot_mjx.envs.robot_model import WHEEL_RADIUS
+from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.model import WHEEL_RADIUS
-from jetbot_mjx.state import PhysicsState
 
 WARM_UP_CALLS = 3  # GPUs record their command graphs in the second call
 REPEAT_SECONDS = 0.25  # [s] a shorter repeat would time the dispatch

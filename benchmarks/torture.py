@@ -24,13 +24,20 @@ from typing import Any, NamedTuple
 import jax
 
 from jetbot_mjx import cli
+from jetbot_mjx.agents.ppo import TrainState
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import load_config
-from jetbot_mjx.env import make_env
+from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.ppo import TrainState
-from jetbot_mjx.resumable_ppo import Program
-from jetbot_mjx.resume import to_trees
-from jetbot_mjx.store import FOLDER, checkpoint_path, checkpoint_steps, read_about, read_tree
+from jetbot_mjx.runs.checkpoint_store import (
+    FOLDER,
+    checkpoint_path,
+    checkpoint_steps,
+    read_about,
+    read_tree,
+)
+from jetbot_mjx.runs.resume import to_trees
+from jetbot_mjx.training.ppo_trainer import Program
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "smoke.yaml"
 INTERVAL = 65_536
@@ -384,7 +391,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     jax.config.update("jax_platforms", "cpu")
     os.environ["JAX_PLATFORMS"] = "cpu"
-    cli.use_compilation_cache()
+    use_compilation_cache()
     timesteps = INTERVAL * (8 + 3 * options.kills)
     settings = [*SETTINGS, f"checkpoint_interval={INTERVAL}", "checkpoints_to_keep=4"]
     settings += [f"ppo.num_timesteps={timesteps}"]

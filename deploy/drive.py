@@ -286,16 +286,18 @@ def _leaving_by_signals() -> Iterator[None]:
             signal.signal(one, handler)
 
 
-def at_least(least: float) -> Callable[[str], float]:
-    """An argument that is a finite number, and no smaller."""
+def at_least(least: float, most: float = 1e9) -> Callable[[str], float]:
+    """An argument that is a number between two bounds."""
 
     def parse(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
             raise argparse.ArgumentTypeError(f"{text!r} is no number")
-        if not least <= value < float("inf"):
+        if not value >= least:
             raise argparse.ArgumentTypeError(f"{text} is not at least {least:g}")
+        if value > most:
+            raise argparse.ArgumentTypeError(f"{text} is more than {most:g}")
         return value
 
     return parse
@@ -320,7 +322,12 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("policy", help="the folder that jetbot_mjx.export wrote")
     parser.add_argument(
-        "--goal", nargs=2, type=at_least(-1000.0), metavar=("X", "Y"), required=True, help="[m]"
+        "--goal",
+        nargs=2,
+        type=at_least(-1000.0, 1000.0),
+        metavar=("X", "Y"),
+        required=True,
+        help="[m]",
     )
     parser.add_argument("--calibration", metavar="FILE", help="of calibrate.py")
     parser.add_argument("--tracker", type=int, metavar="PORT", help="UDP; default: dead reckoning")

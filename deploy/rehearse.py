@@ -1,8 +1,9 @@
 """Drives a simulated JetBot as drive.py drives a real one: `python deploy/rehearse.py POLICY`.
 
-Runs where jetbot_mjx is installed. The robot is `jetbot_mjx.stand_in`: delay, dead-band and lag
-between motor value and wheel. A tracker sees it `--rate` times a second, `--noise` metres beside
-the truth. Goals are drawn as the tutorial draws them, each from a fresh start.
+Runs where jetbot_mjx is installed. The robot is `jetbot_mjx.deployment.simulated_jetbot`: delay,
+dead-band and lag between motor value and wheel. A tracker sees it `--rate` times a second,
+`--noise` metres beside the truth. Goals are drawn as the tutorial draws them, each from a fresh
+start.
 """
 
 import argparse
@@ -17,7 +18,7 @@ from drive import Outcome, Policy, Settings, arrival_radius, at_least, drive, lo
 from motors import Calibration, DriveError, check_calibration, default_calibration
 from poses import Tracker
 
-from jetbot_mjx.stand_in import ROLLING_RADIUS, MotorModel, Pose, StandIn
+from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, StandIn
 
 
 class Camera:

@@ -1,9 +1,11 @@
-"""Writes `configuration.md` while the site is built, from the configuration itself: an MkDocs hook.
+"""Write pages while the site is built, from the package itself: an MkDocs hook.
 
-Types, bounds, defaults and explanations come from the schema of `Config`, the refusals from its
-checks, the values of the shipped files from the files. Nothing of it is written by hand.
+`configuration.md`: types, bounds, defaults and explanations come from the schema of `Config`, the
+refusals from its checks, the values of the shipped files from the files. `api/ROOM.md`: the modules
+of each room. Nothing of it is written by hand.
 """
 
+import ast
 import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
@@ -265,11 +267,31 @@ def page() -> str:
     return "\n".join(lines)
 
 
+def room_pages() -> dict[str, str]:
+    """Return the reference of each room, and of the root, as Markdown by the name of its page."""
+    package = ROOT / "jetbot_mjx"
+    faces = {path.parent.name: path for path in sorted(package.glob("*/__init__.py"))}
+    pages = {f"api/{room}.md": _room_page(room, face) for room, face in faces.items()}
+    return {**pages, "api/root.md": _room_page("", package / "__init__.py")}
+
+
+def _room_page(room: str, face: Path) -> str:
+    prefix = f"{room}." if room else ""
+    found = face.parent.rglob("*.py") if room else face.parent.glob("*.py")
+    paths = sorted(path for path in found if path.name != "__init__.py")
+    names = (".".join(path.relative_to(face.parent).with_suffix("").parts) for path in paths)
+    told = ast.get_docstring(ast.parse(face.read_text("utf-8"))) or ""
+    title = f"`{room}`" if room else "Configuration and commands"
+    modules = (f"::: jetbot_mjx.{prefix}{name}\n" for name in names)
+    return "\n".join([f"# {title}\n", f"{told}\n", *modules])
+
+
 def on_files(files: Any, *, config: Any) -> Any:
-    """MkDocs asks which files there are: one more."""
+    """MkDocs asks which files there are: some more."""
     from mkdocs.structure.files import File
 
-    files.append(File.generated(config, PAGE, content=page()))
+    for name, text in {PAGE: page(), **room_pages()}.items():
+        files.append(File.generated(config, name, content=text))
     return files
 
 

@@ -17,10 +17,10 @@ import mujoco
 from jaxtyping import Array, Bool, Float, UInt32
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from jetbot_mjx import kinematics
 from jetbot_mjx.config import NonNegative, Positive, TaskConfig
+from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.task import Field, GoalTask, Layout, RobotState
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.task import Field, GoalTask, Layout, RobotState
 
 # What the policy sees beside the goal, in the same form: where the pillar's axis stands.
 PILLAR: Layout = (

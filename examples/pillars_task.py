@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, UInt32
 
-from jetbot_mjx import kinematics
 from jetbot_mjx.config import TaskConfig
-from jetbot_mjx.task import Field, GoalTask, RobotState
+from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.task import Field, GoalTask, RobotState
 
 PILLARS = 3
 PILLAR_RADIUS = 0.06  # [m]

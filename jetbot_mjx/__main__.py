@@ -1,11 +1,14 @@
-"""Lists the commands: `python -m jetbot_mjx`."""
+"""List the commands, or run one: `python -m jetbot_mjx`, `jetbot-mjx train --config FILE`."""
 
 import ast
 import difflib
 import re
+import runpy
 import sys
 from collections.abc import Sequence
 from importlib import resources
+
+from jetbot_mjx import __version__
 
 COMMANDS = (
     "pretrained",
@@ -42,19 +45,26 @@ def run() -> dict[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Prints the list.
+    """Run the command that is named, or print the list.
 
     Args:
       arguments: without the program's name; None: those of the process.
 
     Returns:
-      0, or 2 where something was asked for that stands here only as a name.
+      0, or 2 where there is no such command. A command that runs ends the process with its own.
     """
-    asked = (sys.argv[1:] if arguments is None else list(arguments))[:1]
-    if asked and asked not in (["-h"], ["--help"]):
-        close = difflib.get_close_matches(asked[0], COMMANDS, n=1)
-        remedy = f"write python -m jetbot_mjx.{close[0]}" if close else f"say {_ALONE} for a list"
-        print(f"error: {_ALONE} {asked[0]}: {remedy}", file=sys.stderr)
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words and words[0] in COMMANDS:
+        # As `python -m jetbot_mjx.COMMAND` does, exit code and all.
+        sys.argv[1:] = words[1:]
+        runpy.run_module(f"jetbot_mjx.{words[0]}", run_name="__main__", alter_sys=True)
+    if words == ["--version"]:
+        print(f"jetbot_mjx {__version__}")
+        return 0
+    if words and words not in (["-h"], ["--help"]):
+        close = difflib.get_close_matches(words[0], COMMANDS, n=1)
+        remedy = f"did you mean {close[0]}?" if close else f"say {_ALONE} for a list"
+        print(f"error: {_ALONE} {words[0]}: there is no such command: {remedy}", file=sys.stderr)
         return 2
     listed = run()
     width = max(map(len, listed))

@@ -8,8 +8,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.task_checks import CHECKS, MEANINGS, Finding, check_task
+from jetbot_mjx.envs.checks.runner import CHECKS, MEANINGS, Finding, check_task
 
 BROKEN = 1
 """Exit code: something is wrong with the task."""
@@ -63,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         overrides.append(f"task.name={name}")
     config = load_config(options.config, overrides)
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     wrong, left = 0, list(CHECKS)
     for name, findings in run(config):
         wrong += len(findings)

@@ -12,15 +12,12 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from pathlib import Path
-from typing import Any, Literal, NoReturn
+from typing import Literal, NoReturn
 
 import jax
 
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.interrupts import raise_again
-from jetbot_mjx.programs import processor
-from jetbot_mjx.trusted_files import distrust, tell_once
 
 USER_ERROR = 2
 INTERRUPTED = 130
@@ -111,46 +108,6 @@ def wake_device() -> None:
             jax.block_until_ready(jax.device_put(0.0, jax.local_devices()[0]))
 
     threading.Thread(target=touch, daemon=True).start()
-
-
-def use_compilation_cache() -> None:
-    """Lets JAX keep what it compiles in the user's cache folder, for the next process.
-
-    `JAX_COMPILATION_CACHE_DIR` names another folder, and `JAX_ENABLE_COMPILATION_CACHE=false`
-    turns it off. What is compiled for one kind of processor does not run on every other: each
-    has a folder of its own. One that others may write to is not used, since JAX runs what it finds.
-    """
-    settings: Any = jax.config
-    given = settings.jax_compilation_cache_dir
-    # JAX alone knows of places such as gs://.
-    if not settings.jax_enable_compilation_cache or "://" in (given or ""):
-        return
-    folder = _cache_folder(given)
-    jax.config.update("jax_compilation_cache_dir", folder and str(folder))
-    if folder and not given:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
-
-
-def _cache_folder(given: str | None) -> Path | None:
-    """Return the folder of compiled programs, made where it is missing; None: there is no such."""
-    try:
-        if given:
-            folder = Path(given)
-        else:
-            root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-            folder = root / "jetbot_mjx" / f"jax-{jax.__version__}-{processor()}"
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        reason = distrust(folder, folder.stat())
-    except OSError as error:
-        print(f"no compilation cache: {error.filename}: {error.strerror}", file=sys.stderr)
-        return None
-    except RuntimeError:
-        print("no compilation cache: no home folder: set HOME or XDG_CACHE_HOME", file=sys.stderr)
-        return None
-    if reason is not None:
-        tell_once(folder, reason)
-        return None
-    return folder
 
 
 _LARGEST = 2**31 - 1

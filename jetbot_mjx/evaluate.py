@@ -12,12 +12,14 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 
 from jetbot_mjx import cli
-from jetbot_mjx.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.comparison import Comparison, check_comparable, compare
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import (
+from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
+from jetbot_mjx.evaluation.evaluator import (
     GOAL_SET_VERSION,
     MOST_GOALS,
     REPORT_GOALS,
@@ -25,10 +27,8 @@ from jetbot_mjx.evaluation import (
     report_keys,
     summarize,
 )
-from jetbot_mjx.metrics import read_history
-from jetbot_mjx.mujoco_simulator import OTHER_NUMERICS, Numerics
-from jetbot_mjx.randomization import VariedEnv
-from jetbot_mjx.report import (
+from jetbot_mjx.evaluation.html_report import write_comparison, write_report
+from jetbot_mjx.evaluation.report import (
     CurvePoint,
     Report,
     by_goal,
@@ -36,16 +36,23 @@ from jetbot_mjx.report import (
     find_failures,
     learning_curve,
 )
-from jetbot_mjx.report_files import write_comparison, write_report
-from jetbot_mjx.robustness import SWEEP_GOALS, InMujoco, MujocoEvaluator, SweepResult, sweep
-from jetbot_mjx.run_folder import seed_folders, versions
-from jetbot_mjx.tables import (
+from jetbot_mjx.evaluation.robustness import (
+    SWEEP_GOALS,
+    InMujoco,
+    MujocoEvaluator,
+    SweepResult,
+    sweep,
+)
+from jetbot_mjx.evaluation.tables import (
     best_known_lines,
     pairs_table,
     policies_table,
     robustness_table,
     runs_table,
 )
+from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
+from jetbot_mjx.runs.metrics import read_history
+from jetbot_mjx.runs.run_dir import seed_folders, versions
 
 BELOW_TARGET = 1
 
@@ -383,7 +390,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     if len(options.run) > 1 or seed_folders(Path(options.run[0])):
         return _main_comparison(options)
     report = run(

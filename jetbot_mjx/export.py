@@ -15,12 +15,19 @@ from typing import NamedTuple
 import numpy as np
 
 from jetbot_mjx import cli
-from jetbot_mjx.checkpoint import Which, load_checkpoint
-from jetbot_mjx.contract import FILE, contract
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.deployment.exporters import FORMATS, Source, require
+from jetbot_mjx.deployment.numpy_policy import (
+    TOLERANCE,
+    as_jax,
+    difference,
+    portable_policy,
+    record,
+)
+from jetbot_mjx.deployment.policy_spec import FILE, contract
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.formats import FORMATS, Source, require
-from jetbot_mjx.portable import TOLERANCE, as_jax, difference, portable_policy, record
-from jetbot_mjx.run_folder import write_json, writing_to
+from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
+from jetbot_mjx.runs.run_dir import write_json, writing_to
 
 FOLDER = "policy"
 """Where an export goes, in the run folder."""
@@ -147,7 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     exported = run(
         options.run, formats=options.format, which=options.checkpoint, output=options.out
     )

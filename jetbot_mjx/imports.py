@@ -20,6 +20,24 @@ from typing import Any
 _Around = Callable[[], contextlib.AbstractContextManager[None]]
 
 
+def load_lazily(
+    package: str, homes: Mapping[str, str]
+) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+    """Return a package's `__getattr__` and `__dir__`, which import public names at their first use.
+
+    Args:
+      package: its full name.
+      homes: the module of the package that each public name lives in.
+    """
+
+    def find(name: str) -> Any:
+        if name not in homes:
+            raise AttributeError(f"module {package!r} has no attribute {name!r}")
+        return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+
+    return find, lambda: sorted(homes)
+
+
 class PutOff(types.ModuleType):
     """Stands for a module that is imported when something in it is first asked for."""
 

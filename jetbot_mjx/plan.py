@@ -11,10 +11,11 @@ from typing import NamedTuple
 import jax
 
 from jetbot_mjx import cli
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.env import make_env
+from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.memory import GIB, Footprint, device_memory, ladder, sizes
+from jetbot_mjx.training.memory import GIB, Footprint, device_memory, ladder, sizes
 
 
 class Plan(NamedTuple):
@@ -106,7 +107,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     config = load_config(options.config, options.overrides)
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     plan = run(config, options.memory)
     print(table(plan))
     asked = next(one for one in plan.footprints if one.num_envs == config.ppo.num_envs)

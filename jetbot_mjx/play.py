@@ -13,11 +13,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from jetbot_mjx import cli, native
-from jetbot_mjx.checkpoint import PRETRAINED, Which
+from jetbot_mjx import cli
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.live import AGENTS
-from jetbot_mjx.player import Player
+from jetbot_mjx.runs.checkpoint import PRETRAINED, Which
+from jetbot_mjx.viewers import mujoco_window
+from jetbot_mjx.viewers.player import Player
+from jetbot_mjx.viewers.step_fns import AGENTS
 
 _LARGEST_PORT = 65_535
 _SHOWN = "jetbot_egocentric"
@@ -63,20 +65,20 @@ def run(
     """
     # What can fail at once comes before what takes time.
     if viewer == "browser":
-        browser = _browser()
-        free: int = browser.free_port(host, port)
+        server = _server()
+        free: int = server.free_port(host, port)
     else:
-        native.require_window()
+        mujoco_window.require_window()
     tell(f"loading {run_or_checkpoint} and compiling: some seconds")
     player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed)
     try:
         if viewer == "browser":
-            with browser.Browser(player, host=host, port=free, allow=allow, tell=tell) as page:
+            with server.Browser(player, host=host, port=free, allow=allow, tell=tell) as page:
                 for line in addresses(host, free):
                     tell(line)
                 page.run()
         else:
-            native.run(player)
+            mujoco_window.run(player)
     except KeyboardInterrupt:
         # The way to end it.
         pass
@@ -109,15 +111,15 @@ def addresses(host: str, port: int) -> list[str]:
     return lines
 
 
-def _browser() -> types.ModuleType:
+def _server() -> types.ModuleType:
     try:
-        from jetbot_mjx import browser
+        from jetbot_mjx.viewers import viser_server
     except ModuleNotFoundError as error:
         raise UserError(
             f"the browser viewer is an extra ({error.name} is missing): pip install"
             " 'jetbot_mjx[play]'"
         ) from None
-    return browser
+    return viser_server
 
 
 def _origin(text: str) -> str:
@@ -171,7 +173,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     if options.run is None:
         print(f"no run is named: this policy comes with the package, trained by {_SHOWN}.yaml")
     played = run(

@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.checkpoint import PRETRAINED
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.run_folder import writing_to
+from jetbot_mjx.runs.checkpoint import PRETRAINED
+from jetbot_mjx.runs.run_dir import writing_to
 
 FOLDER = Path("runs/pretrained")
 

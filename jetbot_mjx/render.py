@@ -18,15 +18,16 @@ import numpy as np
 from PIL import Image
 
 from jetbot_mjx import cli
-from jetbot_mjx.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
-from jetbot_mjx.env import JetBotEnv
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import REPORT_GOALS, Evaluator, report_keys
-from jetbot_mjx.film import GIF_STRIDE, Frame, Studio, drives, shrunk, write_gif, write_mp4
-from jetbot_mjx.plots import plot_trajectories
-from jetbot_mjx.rollout import Episodes
-from jetbot_mjx.run_folder import make_folder, writing_to
-from jetbot_mjx.store import checkpoint_steps
+from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
+from jetbot_mjx.evaluation.plots import plot_trajectories
+from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
+from jetbot_mjx.runs.run_dir import make_folder, writing_to
+from jetbot_mjx.viewers.video import GIF_STRIDE, Frame, Studio, drives, shrunk, write_gif, write_mp4
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # of the film's
@@ -288,7 +289,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.gallery and options.checkpoint != "best":
         parser.error("--checkpoint: a gallery shows the first, the middle and the last")
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     if options.gallery:
         return _main_gallery(options)
     pictures = run(

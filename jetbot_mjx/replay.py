@@ -10,13 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jetbot_mjx import cli
-from jetbot_mjx.env import JetBotEnv, make_env
-from jetbot_mjx.faults import StoredFault, load_fault
-from jetbot_mjx.kinematics import yaw
-from jetbot_mjx.randomization import as_trained
-from jetbot_mjx.state import State, robot_state
-from jetbot_mjx.store import flatten
-from jetbot_mjx.wrappers import wrap_for_training
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.envs.domain_randomization import as_trained
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.kinematics import yaw
+from jetbot_mjx.envs.state import State, robot_state
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.runs.checkpoint_store import flatten
+from jetbot_mjx.runs.nan_dump import StoredFault, load_fault
 
 NOT_REPRODUCED = 1
 
@@ -77,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("file", type=Path, help="a file in a run's faults/")
     options = parser.parse_args(arguments)
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     stored = load_fault(options.file)
     print(
         f"a world that blew up before step {stored.env_steps:,} of its training, from where its"

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jetbot_mjx import cli
-from jetbot_mjx.drive_log import figures, plot, read_log, replay
-from jetbot_mjx.plots import theme, to_png
-from jetbot_mjx.run_folder import make_folder, write_bytes, write_json, writing_to
+from jetbot_mjx.deployment.drive_log import figures, plot, read_log, replay
+from jetbot_mjx.evaluation.plots import theme, to_png
+from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, writing_to
 
 
 class Compared(NamedTuple):

@@ -8,12 +8,14 @@ processes, on one host or many, train one policy.
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli, processes
+from jetbot_mjx import cli
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import load_config
+from jetbot_mjx.envs.program_key import programs_of
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.preemption import STOPPED
-from jetbot_mjx.programs import programs_of
-from jetbot_mjx.run_folder import CONFIG, default_run_dir, stored_config
+from jetbot_mjx.runs.run_dir import CONFIG, default_run_dir, stored_config
+from jetbot_mjx.training import distributed
+from jetbot_mjx.training.preemption import STOPPED
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -62,27 +64,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         config = load_config(options.config, overrides)
         run_dir = options.run_dir or default_run_dir(options.config)
     if options.distributed:
-        processes.check(config)
-        processes.join()
+        distributed.check(config)
+        distributed.join()
     cli.wake_device()
     # What is heavy loads while the GPU wakes, and the programs while the rest of it loads.
-    from jetbot_mjx import resumable_ppo  # noqa: F401
+    from jetbot_mjx.training import ppo_trainer  # noqa: F401
 
     cli.require_device()
-    cli.use_compilation_cache()
+    use_compilation_cache()
     programs = programs_of(config, keep=True)
     programs.prefetch("advance", "init")
-    from jetbot_mjx import training
+    from jetbot_mjx.training import session
 
-    result = training.run(config, run_dir, programs)
-    if processes.is_first():
+    result = session.run(config, run_dir, programs)
+    if distributed.is_first():
         print(
-            training.summary(result)
+            session.summary(result)
             if result.finished
             else f"stopped; to go on: python -m jetbot_mjx.train --resume {run_dir}",
             flush=True,
         )
-    processes.leave()
+    distributed.leave()
     return 0 if result.finished else STOPPED
 
 

@@ -4,6 +4,7 @@ import fcntl
 import os
 import signal
 import socket
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,20 +22,23 @@ os.environ.setdefault("MPLBACKEND", "agg")
 # A shell lets its background jobs ignore Ctrl-C: tests that press it would wait for ever.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-# This checkout first, and whatever else there was: the libraries may lie there.
-_PATHS = [str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
+# Tests borrow from each other and from `helpers`, whichever folder they are in, also in processes
+# of their own: this checkout first, and whatever else there was, for the libraries may lie there.
+_FOLDERS = [str(folder) for folder in sorted((ROOT / "tests").iterdir()) if folder.is_dir()]
+sys.path += _FOLDERS
+_PATHS = [str(ROOT), str(ROOT / "tests"), *_FOLDERS, *filter(None, [os.environ.get("PYTHONPATH")])]
 os.environ["PYTHONPATH"] = os.pathsep.join(_PATHS)
 
 import jax
 import pytest
 
-from jetbot_mjx import programs
 from jetbot_mjx.config import Config, parse_config
-from jetbot_mjx.env import JetBotEnv, make_env
+from jetbot_mjx.envs import program_key
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 
-OWN_TASKS = programs.TRUSTED
+OWN_TASKS = program_key.TRUSTED
 # Tests replace parts of the package, of which programs that were kept would know nothing.
-programs.TRUSTED = frozenset()
+program_key.TRUSTED = frozenset()
 
 _LONGEST = (
     "test_notebooks",
@@ -93,8 +97,8 @@ def unused_port() -> Callable[[], int]:
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory) -> Path:
     """A run folder, trained once with `configs/smoke.yaml` and never written to by a test."""
-    from jetbot_mjx import training
     from jetbot_mjx.config import load_config
+    from jetbot_mjx.training import session
 
     folder = tmp_path_factory.getbasetemp()
     if "PYTEST_XDIST_WORKER" in os.environ:
@@ -102,6 +106,6 @@ def smoke_run(tmp_path_factory) -> Path:
     with (folder / "smoke.lock").open("a") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         if os.fstat(lock.fileno()).st_size == 0:
-            training.run(load_config(ROOT / "configs" / "smoke.yaml"), folder / "smoke")
+            session.run(load_config(ROOT / "configs" / "smoke.yaml"), folder / "smoke")
             lock.write("trained")
     return folder / "smoke"

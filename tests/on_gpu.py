@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[1]
 _SHORT = "--set ppo.num_timesteps=262144 --set checkpoint_interval=131072"
 _GPU = f"--config configs/gpu.yaml {_SHORT} --set ppo.num_envs=1024 --set ppo.batch_size=128"
 _LIVE = (
-    "from jetbot_mjx.player import Player; player = Player('{runs}/mine'); "
+    "from jetbot_mjx.viewers.player import Player; player = Player('{runs}/mine'); "
     "[player.tick() for _ in range(300)]; print(player.episodes, 'episodes')"
 )
 

@@ -5,19 +5,20 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx import cli
-from jetbot_mjx.adapters.settings import (
+from jetbot_mjx.adapters.arguments import (
     Arguments,
     Source,
     an_extra,
+    as_actions,
     key_from_seed,
     resolve,
     seeds_of,
 )
-from jetbot_mjx.adapters.view import RENDER_MODES
+from jetbot_mjx.adapters.renderer import RENDER_MODES
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
+from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.mujoco_jetbot import MujocoJetBot
 
 with an_extra("gymnasium"):
     import gymnasium
@@ -81,7 +82,7 @@ class JetBotGymEnv(gymnasium.Env):
                 " one robot if need be"
             )
         # Who comes from elsewhere has no reason to know that JAX would compile at every start.
-        cli.use_compilation_cache()
+        use_compilation_cache()
         self.robot = MujocoJetBot(settings.config)
         self.render_mode = settings.render_mode
         self._view = settings.view(self.robot.env)
@@ -129,7 +130,7 @@ class JetBotGymEnv(gymnasium.Env):
         """
         if self._next_key is None:
             raise gymnasium.error.ResetNeeded("call reset() before step()")
-        obs, reward, terminated, success, finite = self.robot.step(np.asarray(action, np.float32))
+        obs, reward, terminated, success, finite = self.robot.step(as_actions(action, (2,)))
         self._steps += 1
         out_of_time = self._steps >= self.config.task.episode_length
         truncated = not terminated and (out_of_time or not finite)

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.batch import Batch
-from jetbot_mjx.adapters.settings import Arguments, Source, an_extra, check_num_envs, resolve
+from jetbot_mjx.adapters.arguments import Arguments, Source, an_extra, check_num_envs, resolve
+from jetbot_mjx.adapters.batched_env import Batch
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 

@@ -5,8 +5,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.batch import Batch
-from jetbot_mjx.adapters.settings import (
+from jetbot_mjx.adapters.arguments import (
     Arguments,
     Seed,
     Source,
@@ -14,7 +13,8 @@ from jetbot_mjx.adapters.settings import (
     check_num_envs,
     resolve,
 )
-from jetbot_mjx.adapters.view import RENDER_MODES
+from jetbot_mjx.adapters.batched_env import Batch
+from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.config import Config
 
 with an_extra("gymnasium"):

@@ -1,5 +1,5 @@
 ; What XLA calls on a CPU, around a `step` of as many robots as a vector register has lanes. A template of
-; `jetbot_mjx.xla_ffi`: names after a dollar are filled in. Offsets are those of XLA's xla/ffi/api/c_api.h.
+; `jetbot_mjx.compiler.ffi_wrapper`: names after a dollar are filled in. Offsets are those of XLA's xla/ffi/api/c_api.h.
 
 ; What threads share of one call: blocks that are begun, blocks that are ended, who holds the job, blocks in all,
 ; robots in all, the addresses of arguments and results.

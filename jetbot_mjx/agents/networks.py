@@ -1,0 +1,119 @@
+"""The policy: Brax's networks, their parameters by name, and inference."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.acme import running_statistics
+from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.types import identity_observation_preprocessor
+from jaxtyping import Array, Float, UInt32
+
+from jetbot_mjx.compiler.xla_options import on_host
+from jetbot_mjx.config import NetworkConfig
+
+_ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
+    "tanh": nn.tanh,
+    "relu": nn.relu,
+    "elu": nn.elu,
+    "swish": nn.swish,
+}
+
+
+class PolicyParams(NamedTuple):
+    """Brax's positional triple, by name."""
+
+    normalizer: Any
+    """Running mean and deviation of the observation."""
+    policy: Any
+    """Weights of the policy network."""
+    value: Any
+    """Weights of the value network."""
+
+
+@runtime_checkable
+class Policy(Protocol):
+    """A policy as users call it."""
+
+    def __call__(
+        self, obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
+    ) -> Float[Array, "*batch action"]:
+        """Acts: the distribution's mode without a key, a sample with one."""
+        ...
+
+
+def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetworks]:
+    """Brax's `network_factory` argument for a network configuration.
+
+    Args:
+      config: layer sizes, activation, distribution.
+
+    Returns:
+      A function of (observation size, action size, preprocess_observations_fn=...).
+    """
+
+    def factory(
+        observation_size: Any,
+        action_size: int,
+        preprocess_observations_fn: Any = identity_observation_preprocessor,
+    ) -> ppo_networks.PPONetworks:
+        return ppo_networks.make_ppo_networks(
+            observation_size,
+            action_size,
+            preprocess_observations_fn=preprocess_observations_fn,
+            policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
+            value_hidden_layer_sizes=config.value_hidden_layer_sizes,
+            activation=_ACTIVATIONS[config.activation],
+            distribution_type=config.distribution_type,
+        )
+
+    return factory
+
+
+def make_networks(
+    config: NetworkConfig, observation_size: int, action_size: int, *, normalize: bool
+) -> ppo_networks.PPONetworks:
+    """Builds policy and value networks.
+
+    Args:
+      config: layer sizes, activation, distribution.
+      observation_size: length of the observation.
+      action_size: length of the action.
+      normalize: whether observations pass through the running normaliser.
+
+    Returns:
+      Brax's networks.
+    """
+    preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
+    # Brax's networks keep an observation of zeros, which has no need of a GPU.
+    with jax.ensure_compile_time_eval(), on_host():
+        return network_factory(config)(
+            observation_size, action_size, preprocess_observations_fn=preprocess
+        )
+
+
+def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Policy:
+    """Binds networks and parameters.
+
+    Args:
+      networks: as built by `make_networks`.
+      params: their parameters.
+
+    Returns:
+      The policy; it takes one observation or any batch of them.
+    """
+    inference = ppo_networks.make_inference_fn(networks)
+    greedy, exploring = inference(params, deterministic=True), inference(params)
+
+    def policy(
+        obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
+    ) -> Float[Array, "*batch action"]:
+        if key is None:
+            # Brax asks for a key that the mode does not use.
+            return greedy(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
+        return exploring(jnp.asarray(obs), key)[0]
+
+    return policy

@@ -1,0 +1,183 @@
+"""A kernel as a function that XLA calls on a CPU, in LLVM's intermediate representation.
+
+XLA hands over one address, of a call frame. Around a `step` of as many robots as a vector register
+has lanes, what is written here reads the frame, deals blocks of robots to XLA's own threads, and
+moves each block between XLA's arrays and a tile, of which a row holds one number of every robot.
+No Python takes part.
+
+Offsets are those of XLA's C header `xla/ffi/api/c_api.h`, version 0.3. Every structure tells its
+size; where one is other than expected, nothing is done.
+"""
+
+from collections.abc import Sequence
+from importlib import resources
+from string import Template
+
+from jetbot_mjx.compiler.llvm_codegen import STEP
+
+VERSION = (0, 3)
+"""Of the interface."""
+
+SYMBOLS = ("malloc", "free", "sched_yield")
+"""What a kernel calls of the C library."""
+
+_BLOCKS_PER_THREAD = 4
+"""Fewer are done sooner than another thread wakes."""
+
+_PATIENCE = 1000
+"""Looks at what other threads have still to do, some 20 µs, before the core is given away."""
+
+# Subnormal numbers are zeros: on whichever thread, for XLA's own have it so and others may not.
+_PROCESSORS = {
+    "x86_64": """
+declare void @llvm.x86.sse.stmxcsr(ptr)
+declare void @llvm.x86.sse.ldmxcsr(ptr)
+define internal i64 @begin() {
+  %place = alloca i32
+  call void @llvm.x86.sse.stmxcsr(ptr %place)
+  %before = load i32, ptr %place
+  %flushing = or i32 %before, 32832
+  store i32 %flushing, ptr %place
+  call void @llvm.x86.sse.ldmxcsr(ptr %place)
+  %wide = zext i32 %before to i64
+  ret i64 %wide
+}
+define internal void @end(i64 %before) {
+  %place = alloca i32
+  %narrow = trunc i64 %before to i32
+  store i32 %narrow, ptr %place
+  call void @llvm.x86.sse.ldmxcsr(ptr %place)
+  ret void
+}
+declare void @llvm.x86.sse2.pause()
+define internal void @relax() {
+  call void @llvm.x86.sse2.pause()
+  ret void
+}
+""",
+    "aarch64": """
+declare i64 @llvm.aarch64.get.fpcr()
+declare void @llvm.aarch64.set.fpcr(i64)
+define internal i64 @begin() {
+  %before = call i64 @llvm.aarch64.get.fpcr()
+  %flushing = or i64 %before, 16777216
+  call void @llvm.aarch64.set.fpcr(i64 %flushing)
+  ret i64 %before
+}
+define internal void @end(i64 %before) {
+  call void @llvm.aarch64.set.fpcr(i64 %before)
+  ret void
+}
+declare void @llvm.aarch64.hint(i32)
+define internal void @relax() {
+  call void @llvm.aarch64.hint(i32 1)
+  ret void
+}
+""",
+}
+MACHINES = tuple(_PROCESSORS)
+"""Processors that a kernel can be written for."""
+
+TEXT = resources.files("jetbot_mjx").joinpath("assets/xla_call.ll").read_text("utf-8")
+"""Of all kernels, with gaps."""
+
+
+def kernel_text(
+    step: str,
+    sizes: Sequence[int],
+    *,
+    carried: int,
+    lanes: int,
+    steps: int,
+    name: str,
+    machine: str,
+) -> str:
+    """Writes what XLA calls.
+
+    It takes float32 arrays of (robots, ...) and returns as many as are carried.
+
+    Args:
+      step: the text of what `lanes` robots do once.
+      sizes: of each argument, how many numbers one robot has.
+      carried: how many of the arguments change, and are the results.
+      lanes: robots in a block.
+      steps: how often each robot makes the step.
+      name: of the function, a C identifier.
+      machine: the processor, of `MACHINES`.
+
+    Returns:
+      The text of a module.
+    """
+    arrays = len(sizes) + carried
+    values = {
+        "addresses": "\n  ".join(_address(i) for i in range(arrays)),
+        "alignment": 4 * lanes,
+        "arrays": arrays,
+        "blocks_per_thread": _BLOCKS_PER_THREAD,
+        "fill": lanes - 1,
+        "lanes": lanes,
+        "major": VERSION[0],
+        "minor": VERSION[1],
+        "name": name,
+        "patience": _PATIENCE,
+        "pointers": "\n  ".join(_pointer(i, len(sizes)) for i in range(arrays)),
+        "reads": "\n  ".join(_reads(sizes, lanes)),
+        "rows": max(1, sum(sizes)),
+        "step": STEP,
+        "steps": steps,
+        "writes": "\n  ".join(_writes(sizes[:carried], len(sizes), lanes)),
+    }
+    return _PROCESSORS[machine] + step + Template(TEXT).substitute(values)
+
+
+def _address(i: int) -> str:
+    """Array `i` of a job."""
+    return (
+        f"%a{i}.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 {i}\n"
+        f"  %a{i} = load ptr, ptr %a{i}.at"
+    )
+
+
+def _pointer(i: int, arguments: int) -> str:
+    """Copies the address of an argument, or of a result, from the call frame into a job."""
+    source, place = ("buffers", i) if i < arguments else ("outputs", i - arguments)
+    return (
+        f"%b{i}.at = getelementptr ptr, ptr %{source}, i64 {place}\n"
+        f"  %b{i} = load ptr, ptr %b{i}.at\n"
+        f"  %d{i}.at = getelementptr i8, ptr %b{i}, i64 24\n"
+        f"  %d{i} = load ptr, ptr %d{i}.at\n"
+        f"  %j{i} = getelementptr %Job, ptr %job, i32 0, i32 5, i64 {i}\n"
+        f"  store ptr %d{i}, ptr %j{i}"
+    )
+
+
+def _reads(sizes: Sequence[int], lanes: int) -> list[str]:
+    lines, row = [], 0
+    for i, size in enumerate(sizes):
+        lines.append(f"%r{i} = mul i64 %robot, {size}")
+        for j in range(size):
+            lines += [
+                f"%ri{i}.{j} = add i64 %r{i}, {j}",
+                f"%rp{i}.{j} = getelementptr float, ptr %a{i}, i64 %ri{i}.{j}",
+                f"%rv{i}.{j} = load float, ptr %rp{i}.{j}",
+                f"%rt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %lane",
+                f"store float %rv{i}.{j}, ptr %rt{i}.{j}",
+            ]
+            row += 1
+    return lines
+
+
+def _writes(sizes: Sequence[int], first: int, lanes: int) -> list[str]:
+    lines, row = [], 0
+    for i, size in enumerate(sizes, start=first):
+        lines.append(f"%w{i} = mul i64 %to, {size}")
+        for j in range(size):
+            lines += [
+                f"%wt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %out",
+                f"%wv{i}.{j} = load float, ptr %wt{i}.{j}",
+                f"%wi{i}.{j} = add i64 %w{i}, {j}",
+                f"%wp{i}.{j} = getelementptr float, ptr %a{i}, i64 %wi{i}.{j}",
+                f"store float %wv{i}.{j}, ptr %wp{i}.{j}",
+            ]
+            row += 1
+    return lines

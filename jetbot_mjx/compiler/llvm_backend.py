@@ -1,0 +1,223 @@
+"""Kernels in LLVM's representation on CPUs: a `jetbot_mjx.compiler.kernel.Backend`.
+
+`llvmlite` compiles them for the very processor; XLA calls them by its foreign function interface,
+of which `is_available` tries a small one. Each has a name of its own, from its content: a compiled
+program that JAX kept asks for the kernel that it was compiled with.
+"""
+
+import ctypes
+import functools
+import hashlib
+import importlib
+import re
+import threading
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jetbot_mjx.compiler import ffi_wrapper, llvm_codegen
+from jetbot_mjx.compiler.kernel import Kernel, kept_bytes
+from jetbot_mjx.compiler.lower_jaxpr import scalarize
+
+IMPL = "llvm"
+PLATFORM = "cpu"
+NEEDS = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
+
+_NAME = "physics"
+_LEVEL = 2
+"""Of code generation; there are no passes before it, for a program has nothing left to shorten."""
+
+_XLA_NAME = re.compile(r"jetbot_mjx_[0-9a-f]{64}")
+
+
+class _Loaded(NamedTuple):
+    """Machine code that XLA may call as long as the process lives."""
+
+    engine: Any
+    code: bytes
+
+
+_lock = threading.Lock()
+_loaded: dict[str, _Loaded] = {}
+"""By the name that XLA knows it by."""
+
+
+class _Host(NamedTuple):
+    """The processor, in LLVM's words."""
+
+    machine: str
+    name: str
+    features: str
+    lanes: int
+    """Numbers in a vector register."""
+    version: str
+    """Of what compiles for it."""
+
+
+@functools.cache
+def is_available() -> bool:
+    """Whether llvmlite is here, and XLA calls a kernel of it on CPUs."""
+    try:
+        device = jax.local_devices(backend=PLATFORM)[0]
+        host = _host()
+    except (ImportError, OSError, RuntimeError, AttributeError, TypeError):
+        # No llvmlite, one that knows this processor not, a C library that lacks a function, or
+        # JAX_PLATFORMS without cpu.
+        return False
+    if host.machine not in ffi_wrapper.MACHINES:
+        return False
+    probe = Kernel(
+        scalarize(lambda x: 2.0 * x + 1.0, jax.ShapeDtypeStruct((2,), jnp.float32)),
+        carried=1,
+        steps=2,
+        fallback=lambda x: [4.0 * x + 3.0],
+    )
+    numbers = np.arange(4 * host.lanes + 2, dtype=np.float32).reshape(-1, 2)
+    # Whoever asks may be in the middle of tracing something else.
+    with jax.ensure_compile_time_eval(), jax.default_device(device):
+        try:
+            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(numbers))
+        except jax.errors.JaxRuntimeError:
+            return False
+        return bool((np.asarray(result) == 4 * numbers + 3).all())
+
+
+def kernel_text(kernel: Kernel) -> str:
+    """Write a kernel in LLVM's representation, for this processor.
+
+    Args:
+      kernel: the kernel.
+
+    Returns:
+      The text of a module.
+
+    Raises:
+      UnsupportedError: the program has an operation that is not written in LLVM.
+    """
+    host = _host()
+    return ffi_wrapper.kernel_text(
+        llvm_codegen.step_text(kernel.program, carried=kernel.carried, lanes=host.lanes),
+        [numbers.size for numbers in kernel.program.inputs],
+        carried=kernel.carried,
+        lanes=host.lanes,
+        steps=kernel.steps,
+        name=_NAME,
+        machine=host.machine,
+    )
+
+
+def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
+    """Run a kernel, as `jetbot_mjx.compiler.kernel.Backend` has it."""
+    text = kernel.text(IMPL, lambda: kernel_text(kernel))
+    results = leaves[: kernel.carried]
+    shapes = [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
+    return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves))
+
+
+def _registered(text: str) -> str:
+    """The name by which XLA knows a kernel; compiles it when it is first asked for."""
+    name = f"jetbot_mjx_{hashlib.sha256(_key(text)).hexdigest()}"
+    # Programs are traced in several threads.
+    with _lock:
+        if name not in _loaded:
+            _register(name, _machine_code(text))
+    return name
+
+
+def _register(name: str, code: bytes) -> None:
+    engine = _load(code)
+    address = ctypes.c_void_p(engine.get_function_address(_NAME))
+    jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
+    _loaded[name] = _Loaded(engine, code)
+
+
+def kernels_in(lowered: str) -> dict[str, bytes]:
+    """The kernels that a program calls.
+
+    Args:
+      lowered: the program's text.
+
+    Returns:
+      Their machine code by the names that XLA knows them by.
+    """
+    return {name: _loaded[name].code for name in sorted(set(_XLA_NAME.findall(lowered)))}
+
+
+def register(kernels: Mapping[str, bytes]) -> None:
+    """Makes kernels known to XLA, before it loads a program that calls them.
+
+    Args:
+      kernels: of `kernels_in`, from this processor and these versions of all libraries.
+    """
+    with _lock:
+        for name, code in kernels.items():
+            if name not in _loaded:
+                _register(name, code)
+
+
+def _key(text: str) -> bytes:
+    """All that a kernel's machine code depends on."""
+    host = _host()
+    return "\n".join([host.version, host.name, host.features, str(_LEVEL), text]).encode()
+
+
+def _machine_code(text: str) -> bytes:
+    """An object file, from the folder of compiled programs if it was compiled before."""
+    return kept_bytes("object", _key(text), lambda: _compile(text))
+
+
+def _compile(text: str) -> bytes:
+    binding = _binding()
+    module = binding.parse_assembly(text, binding.create_context())
+    module.triple = binding.get_process_triple()
+    return _target_machine().emit_object(module)
+
+
+def _load(code: bytes) -> Any:
+    binding = _binding()
+    empty = binding.parse_assembly("", binding.create_context())
+    engine = binding.create_mcjit_compiler(empty, _target_machine())
+    engine.add_object_file(binding.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return engine
+
+
+def _target_machine() -> Any:
+    binding, host = _binding(), _host()
+    target = binding.Target.from_triple(binding.get_process_triple())
+    return target.create_target_machine(
+        cpu=host.name, features=host.features, opt=_LEVEL, codemodel="jitdefault", jit=True
+    )
+
+
+@functools.cache
+def _binding() -> Any:
+    """LLVM, which takes a while to load."""
+    binding = importlib.import_module("llvmlite.binding")
+    binding.initialize_native_target()
+    binding.initialize_native_asmprinter()
+    process = ctypes.CDLL(None)
+    for name in ffi_wrapper.SYMBOLS:
+        address = ctypes.cast(getattr(process, name), ctypes.c_void_p).value
+        binding.add_symbol(name, address)
+    return binding
+
+
+@functools.cache
+def _host() -> _Host:
+    binding = _binding()
+    features = binding.get_host_cpu_features()
+    lanes = 16 if features.get("avx512f") else 8 if features.get("avx2") else 4
+    machine = binding.get_process_triple().partition("-")[0]
+    version = f"{importlib.import_module('llvmlite').__version__} {binding.llvm_version_info}"
+    return _Host(
+        machine="aarch64" if machine == "arm64" else machine,
+        name=binding.get_host_cpu_name(),
+        features=features.flatten(),
+        lanes=lanes,
+        version=version,
+    )

@@ -1,0 +1,220 @@
+"""Compiled programs, kept from one process to the next without being traced again.
+
+JAX keeps what XLA compiled under the program that it was compiled from; to look there, a process
+must first trace and lower that program, which takes far longer than to load it. Here a program is
+kept under a key that its user computes from all that it depends on.
+"""
+
+import contextlib
+import hashlib
+import os
+import pickle
+import platform
+import sys
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, Self
+
+import jax
+from jax.experimental import serialize_executable
+
+from jetbot_mjx.compiler import llvm_backend
+from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once, write_private
+from jetbot_mjx.compiler.xla_options import Options
+
+_UNUSED_DAYS = 30
+_CACHE_HIT = "/jax/compilation_cache/cache_hits"
+_DIGEST_BYTES = hashlib.sha256().digest_size
+
+
+class Programs:
+    """The compiled programs of one configuration, by name."""
+
+    def __init__(self, options: Options, folder: Path | None = None, key: str = "") -> None:
+        """Names the place where they are kept.
+
+        Args:
+          options: what they are compiled with.
+          folder: is there; None: they are not kept.
+          key: all that the programs depend on.
+        """
+        self._options = options
+        self._folder = folder
+        self._key = f"{key} {sorted(options.items())}"
+        self._coming: dict[str, Future[jax.stages.Compiled | None]] = {}
+
+    def prefetch(self, *names: str) -> None:
+        """Begins to load programs, in threads, and returns at once."""
+        with_folder = names if self._folder else ()
+        for name in with_folder:
+            pool = ThreadPoolExecutor(1)
+            self._coming[name] = pool.submit(_load, self._path(name))
+            pool.shutdown(wait=False)
+
+    def find(self, name: str) -> jax.stages.Compiled | None:
+        """A program if it was compiled before.
+
+        Args:
+          name: of the program, one of its own within the configuration.
+
+        Returns:
+          The program, or None.
+        """
+        if self._folder is None:
+            return None
+        coming = self._coming.pop(name, None)
+        return coming.result() if coming else _load(self._path(name))
+
+    def compile(self, name: str, trace: Callable[[], jax.stages.Traced]) -> jax.stages.Compiled:
+        """A program, compiled unless it was before.
+
+        Args:
+          name: of the program.
+          trace: traces it.
+
+        Returns:
+          The program. It takes arguments of the shapes and shardings that it was traced with.
+        """
+        program = self.find(name)
+        if program is not None:
+            return program
+        began = time.perf_counter()
+        with _CacheHits() as hits:
+            lowered = trace().lower()
+            program = lowered.compile(compiler_options=self._options)
+        # What XLA loaded for a CPU it cannot write again: some functions would be missing.
+        if self._folder and not (hits.count and jax.default_backend() == "cpu"):
+            seconds = time.perf_counter() - began
+            _keep(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
+        return program
+
+    def _path(self, name: str) -> Path:
+        assert self._folder is not None
+        text = f"{self._key} {name}"
+        return self._folder / f"program-{hashlib.sha256(text.encode()).hexdigest()}"
+
+
+def processor() -> str:
+    """A short name for this processor's instruction set."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = [platform.machine(), platform.processor()]
+    kind = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    return hashlib.sha256("\n".join(kind or lines).encode()).hexdigest()[:8]
+
+
+def use_compilation_cache() -> None:
+    """Lets JAX keep what it compiles in the user's cache folder, for the next process.
+
+    `JAX_COMPILATION_CACHE_DIR` names another folder, and `JAX_ENABLE_COMPILATION_CACHE=false`
+    turns it off. What is compiled for one kind of processor does not run on every other: each
+    has a folder of its own. One that others may write to is not used, since JAX runs what it finds.
+    """
+    settings: Any = jax.config
+    given = settings.jax_compilation_cache_dir
+    # JAX alone knows of places such as gs://.
+    if not settings.jax_enable_compilation_cache or "://" in (given or ""):
+        return
+    folder = _cache_folder(given)
+    jax.config.update("jax_compilation_cache_dir", folder and str(folder))
+    if folder and not given:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.2)
+
+
+def _cache_folder(given: str | None) -> Path | None:
+    """Return the folder of compiled programs, made where it is missing; None: there is no such."""
+    try:
+        if given:
+            folder = Path(given)
+        else:
+            root = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+            folder = root / "jetbot_mjx" / f"jax-{jax.__version__}-{processor()}"
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        reason = distrust(folder, folder.stat())
+    except OSError as error:
+        print(f"no compilation cache: {error.filename}: {error.strerror}", file=sys.stderr)
+        return None
+    except RuntimeError:
+        print("no compilation cache: no home folder: set HOME or XDG_CACHE_HOME", file=sys.stderr)
+        return None
+    if reason is not None:
+        tell_once(folder, reason)
+        return None
+    return folder
+
+
+class _CacheHits:
+    """How many programs this thread finds in JAX's own cache."""
+
+    def __enter__(self) -> Self:
+        self.count = 0
+        self._thread = threading.get_ident()
+        jax.monitoring.register_event_listener(self._listen)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        jax.monitoring.unregister_event_listener(self._listen)
+
+    def _listen(self, event: str, **kwargs: str | int) -> None:
+        del kwargs
+        self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
+
+
+def _load(path: Path) -> jax.stages.Compiled | None:
+    """The program in a file; None where there is none, none that is trusted or can be loaded."""
+    began = time.perf_counter()
+    content = read_trusted(path)
+    if content is None:
+        return None
+    digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
+    if hashlib.sha256(body).digest() != digest:
+        return None
+    seconds, kernels, ids, kept = pickle.loads(body)
+    llvm_backend.register(kernels)
+    devices = {device.id: device for device in jax.devices()}
+    try:
+        program = serialize_executable.deserialize_and_load(
+            # Else it would be one program for all devices, whatever it was.
+            *kept,
+            execution_devices=[devices[number] for number in ids],
+        )
+    except jax.errors.JaxRuntimeError:
+        # A driver that knows it no longer, say: compiling says what is wrong, if anything is.
+        return None
+    with contextlib.suppress(OSError):
+        path.touch()
+    # As JAX does when it finds a program in its own cache, for those who listen.
+    loaded = time.perf_counter() - began
+    monitoring = jax.monitoring
+    monitoring.record_event(_CACHE_HIT)
+    monitoring.record_event_duration_secs(
+        "/jax/compilation_cache/compile_time_saved_sec", max(0.0, seconds - loaded)
+    )
+    monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", loaded)
+    return program
+
+
+def _keep(
+    path: Path, program: jax.stages.Compiled, kernels: dict[str, bytes], seconds: float
+) -> None:
+    """Writes a program, the kernels that it calls and the time that it took.
+
+    A folder without room costs time, no more.
+    """
+    try:
+        kept = serialize_executable.serialize(program)
+        loaded: Any = program.runtime_executable()
+        ids = [device.id for device in loaded.local_devices()]
+    except (NotImplementedError, ValueError):
+        # This kind of device cannot.
+        return
+    body = pickle.dumps((seconds, kernels, ids, kept))
+    with contextlib.suppress(OSError):
+        for other in path.parent.glob("program-*"):
+            if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
+                other.unlink(missing_ok=True)
+        write_private(path, hashlib.sha256(body).digest() + body)

@@ -1,0 +1,239 @@
+"""What `deploy/drive.py` logged of a drive, and the same motor values in the simulator."""
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, replayed
+from jetbot_mjx.errors import UserError
+
+FORMAT = "jetbot_mjx-drive/1"
+"""Of a log's first line."""
+
+_LEAST_POSES = 2
+
+
+class Calibration(NamedTuple):
+    """The motors as the driver took them to be, (left, right)."""
+
+    dead_band: tuple[float, float]
+    """Motor value up to which a wheel stands."""
+    full_speed: tuple[float, float]
+    """Of the wheel's rim at a motor value of 1 [m/s]."""
+    lag: float
+    """[s]"""
+
+
+class DriveLog(NamedTuple):
+    """One drive."""
+
+    path: Path
+    header: Mapping[str, Any]
+    """Policy, goal and pose source."""
+    calibration: Calibration
+    goal_w: tuple[float, float]
+    """[m], in the frame of the poses."""
+    outcome: str
+    """`reached`, `timed out`, or `interrupted` where the log has no end."""
+    times: Float[np.ndarray, " n"]
+    """Of each control period [s], since the start."""
+    motors: Float[np.ndarray, "n 2"]
+    """Motor values (left, right)."""
+    pose_times: Float[np.ndarray, " m"]
+    """Of each pose, no two the same [s]."""
+    poses: Float[np.ndarray, "m 3"]
+    """(x, y, yaw) [m, m, rad]; yaw without jumps."""
+    latencies: Float[np.ndarray, " k"]
+    """From the start of a period to the motors [s]."""
+    stale_ticks: int
+    """Periods without a fresh pose."""
+
+
+class Replay(NamedTuple):
+    """A drive and its simulation, at the times of its poses."""
+
+    log: DriveLog
+    motors: MotorModel
+    """Of the simulated robot."""
+    simulated: Float[np.ndarray, "m 3"]
+    """(x, y, yaw) [m, m, rad]."""
+
+    @property
+    def distances(self) -> Float[np.ndarray, " m"]:
+        """From the logged to the simulated place [m]."""
+        return np.linalg.norm(self.simulated[:, :2] - self.log.poses[:, :2], axis=-1)
+
+    @property
+    def turns(self) -> Float[np.ndarray, " m"]:
+        """Simulated less logged heading [rad], to the nearest turn at the start."""
+        return self.simulated[:, 2] - self.log.poses[:, 2]
+
+
+def read_log(path: Path) -> DriveLog:
+    """Reads a log.
+
+    Args:
+      path: what `drive.py --log` wrote.
+
+    Returns:
+      The drive.
+
+    Raises:
+      UserError: there is none, it is none, or no pose is in it.
+    """
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is no log of deploy/drive.py: it is no text") from None
+    number = 1
+    try:
+        header = json.loads(lines[0])
+        if header["format"] != FORMAT:
+            raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
+        x, y = map(float, header["goal"])
+        sides = [header["calibration"][side] for side in ("left", "right")]
+        calibration = Calibration(
+            dead_band=(float(sides[0]["dead_band"]), float(sides[1]["dead_band"])),
+            full_speed=(float(sides[0]["full_speed"]), float(sides[1]["full_speed"])),
+            lag=float(header["calibration"]["lag"]),
+        )
+        if not max(calibration.dead_band) < 1:
+            raise ValueError(f"a dead-band of {max(calibration.dead_band):g} leaves no speed")
+        ticks: list[tuple[float, float, float]] = []
+        poses: dict[float, tuple[float, float, float]] = {}
+        latencies, stale, outcome = [], 0, "interrupted"
+        for number, text in enumerate(lines[1:], start=2):
+            if number == len(lines) and not text.endswith("}"):
+                break  # cut off while it was written
+            line = json.loads(text)
+            left, right = map(float, line["motors"])
+            ticks.append((float(line["t"]), left, right))
+            if "x" in line:
+                seen = float(line["t"]) - float(line["pose_age"])
+                pose = (float(line["x"]), float(line["y"]), float(line["yaw"]))
+                poses.setdefault(round(seen, 6), pose)
+            if "latency" in line:
+                latencies.append(float(line["latency"]))
+            stale += not line["fresh"]
+            outcome = line.get("outcome", outcome)
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        raise UserError(f"{path} is no log of deploy/drive.py: line {number}: {reason}") from None
+    if len(poses) < _LEAST_POSES:
+        raise UserError(f"{path} has {len(poses)} poses: there is nothing to compare")
+    table = np.array(ticks)
+    if not np.all(np.isfinite(table)) or np.any(np.diff(table[:, 0]) < 0):
+        raise UserError(f"{path} is no log of deploy/drive.py: its times do not ascend")
+    return DriveLog(
+        path=path,
+        header=header,
+        calibration=calibration,
+        goal_w=(x, y),
+        outcome=outcome,
+        times=table[:, 0],
+        motors=table[:, 1:],
+        pose_times=np.array(list(poses)),
+        poses=np.array(list(poses.values())),
+        latencies=np.array(latencies),
+        stale_ticks=stale,
+    )
+
+
+def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Replay:
+    """Gives a simulated robot the motor values of a log, at the same times.
+
+    Args:
+      log: the drive.
+      delay: of the simulated motors [s].
+      lag: their time constant [s]; None: the calibration's.
+
+    Returns:
+      The two drives, beside each other.
+    """
+    calibration = log.calibration
+    left, right = calibration.full_speed
+    motors = MotorModel(
+        dead_band=calibration.dead_band,
+        full_speed=(left / ROLLING_RADIUS, right / ROLLING_RADIUS),
+        lag=calibration.lag if lag is None else lag,
+        delay=delay,
+    )
+    path = replayed(motors, Pose(*log.poses[0]), log.times.tolist(), log.motors)
+    # The first yaw may lie some turns away from that of the log.
+    path[:, 2] += 2.0 * np.pi * np.round((log.poses[0, 2] - path[0, 2]) / (2.0 * np.pi))
+    columns = [np.interp(log.pose_times, log.times, column) for column in path.T]
+    return Replay(log, motors, np.stack(columns, axis=-1))
+
+
+def figures(replay: Replay) -> dict[str, Any]:
+    """The comparison in numbers, as JSON."""
+    log, distances = replay.log, replay.distances
+    periods = np.diff(log.times)
+
+    def length(path: Float[np.ndarray, "m 3"]) -> float:
+        return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=-1).sum())
+
+    def to_goal(pose: Float[np.ndarray, "3"]) -> float:
+        return float(np.linalg.norm(pose[:2] - np.array(log.goal_w)))
+
+    return {
+        "log": log.path.name,
+        "policy": log.header.get("policy"),
+        "pose_source": log.header.get("pose_source"),
+        "outcome": log.outcome,
+        "seconds": float(log.times[-1]),
+        "poses": len(log.poses),
+        "periods": len(log.times),
+        "stale_periods": log.stale_ticks,
+        "rate": float(1.0 / np.median(periods)) if len(periods) and np.median(periods) else None,
+        "latency_median": float(np.median(log.latencies)) if len(log.latencies) else None,
+        "latency_p95": float(np.percentile(log.latencies, 95)) if len(log.latencies) else None,
+        "position_error_mean": float(distances.mean()),
+        "position_error_max": float(distances.max()),
+        "position_error_final": float(distances[-1]),
+        "yaw_error_final": float(replay.turns[-1]),
+        "path_length_logged": length(log.poses),
+        "path_length_simulated": length(replay.simulated),
+        "goal_distance_logged": to_goal(log.poses[-1]),
+        "goal_distance_simulated": to_goal(replay.simulated[-1]),
+        "motors": replay.motors._asdict(),
+    }
+
+
+def plot(replay: Replay) -> Figure:
+    """Both drives from above, and their differences over time.
+
+    Args:
+      replay: the two drives.
+
+    Returns:
+      The figure.
+    """
+    log = replay.log
+    figure = Figure(figsize=(10, 4.6), layout="constrained")
+    axes = figure.subplot_mosaic([["plan", "place"], ["plan", "turn"]])
+    plan = axes["plan"]
+    plan.plot(*log.poses[:, :2].T, color="C0", label=f"logged ({log.outcome})")
+    plan.plot(*replay.simulated[:, :2].T, color="C1", linestyle="--", label="simulated")
+    plan.plot(*log.poses[0, :2], "o", color="C0", markersize=5)
+    plan.plot(*log.goal_w, "s", color="C2", label="goal")
+    plan.set(xlabel="x [m]", ylabel="y [m]", title="From above")
+    plan.set_aspect("equal", adjustable="datalim")
+    plan.margins(0.1)
+    plan.grid(visible=True)
+    figure.legend(*plan.get_legend_handles_labels(), loc="outside lower left", ncols=3)
+    place, turn = axes["place"], axes["turn"]
+    place.plot(log.pose_times, 1e3 * replay.distances, color="C0")
+    place.set(ylabel="apart [mm]", title="Simulated from logged")
+    turn.plot(log.pose_times, np.degrees(replay.turns), color="C0")
+    turn.set(xlabel="time [s]", ylabel="turned [°]")
+    for one in (place, turn):
+        one.grid(visible=True)
+    return figure

@@ -1,0 +1,188 @@
+"""The files that a policy is exported to, each read back by what will run it.
+
+`numpy` is one file of Python, `stablehlo` what `jax.export` serialises. `onnx` is built here node
+by node: the exporter that is kept, jax2onnx 0.17, asks for an Orbax older than ours and pulls a
+model viewer and a hub client along, for what is nine kinds of node.
+"""
+
+import base64
+import importlib
+import json
+import re
+import types
+from collections.abc import Callable
+from importlib import resources
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jetbot_mjx.deployment.numpy_policy import Outputs, PortablePolicy
+from jetbot_mjx.errors import UserError
+
+_TEXT_WIDTH = 96
+
+# What onnxruntime for a Jetson Nano's JetPack reads: later ones add nothing that is needed here.
+_ONNX_OPSET = 13
+_ONNX_IR_VERSION = 7
+
+_PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+
+Act = Callable[[Float[np.ndarray, "n obs"]], Outputs]
+"""A batch of observations to actions and wheel speeds."""
+
+
+class Source(NamedTuple):
+    """What is written."""
+
+    policy: PortablePolicy
+    as_jax: Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]
+
+
+class Format(NamedTuple):
+    """One kind of file."""
+
+    file: str
+    write: Callable[[Source, Path], None]
+    read: Callable[[Path], Act]
+    """Loads the file as its user would, with nothing of this package."""
+    needs: tuple[str, ...] = ()
+    """Packages of the extra `export`."""
+
+
+def require(name: str) -> None:
+    """Looks whether a format can be written and checked here.
+
+    Args:
+      name: of `FORMATS`.
+
+    Raises:
+      UserError: a package is missing.
+    """
+    for package in FORMATS[name].needs:
+        try:
+            importlib.import_module(package)
+        except ImportError:
+            raise UserError(
+                f"--format {name} needs {package}, which is not installed:"
+                " pip install 'jetbot_mjx[export]'"
+            ) from None
+
+
+def _write_numpy(source: Source, path: Path) -> None:
+    policy = source.policy
+    arrays = [policy.mean, policy.std, *(array for layer in policy.layers for array in layer)]
+    about = {
+        "shapes": [list(array.shape) for array in arrays],
+        "activation": policy.activation,
+        "squash": policy.squash,
+        "controller": policy.controller._asdict(),
+    }
+    numbers = base64.b64encode(b"".join(np.asarray(a, "<f4").tobytes() for a in arrays)).decode()
+    lines = "\n".join(re.findall(f".{{1,{_TEXT_WIDTH}}}", numbers))
+    template = resources.files("jetbot_mjx").joinpath("assets/policy.py").read_text("utf-8")
+    text = template.replace('"""{}"""', f'"""{json.dumps(about)}"""')
+    text = text.replace('NUMBERS = """\n"""', f'NUMBERS = """\n{lines}\n"""')
+    path.write_text(text, encoding="utf-8")
+
+
+def _read_numpy(path: Path) -> Act:
+    # Without leaving bytecode in a folder that is to be copied to a robot.
+    module = types.ModuleType(path.stem)
+    exec(compile(path.read_text("utf-8"), path, "exec"), module.__dict__)
+    return module.act
+
+
+def _write_stablehlo(source: Source, path: Path) -> None:
+    from jax import export
+
+    size = source.policy.mean.size
+    (batch,) = export.symbolic_shape("batch")
+    obs = jax.ShapeDtypeStruct((batch, size), np.float32)
+    exported = export.export(jax.jit(source.as_jax), platforms=_PLATFORMS)(obs)
+    path.write_bytes(exported.serialize())
+
+
+def _read_stablehlo(path: Path) -> Act:
+    from jax import export
+
+    act = jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
+    return lambda obs: act(obs)
+
+
+def _write_onnx(source: Source, path: Path) -> None:
+    import onnx
+    from onnx import TensorProto, helper, numpy_helper
+
+    policy, nodes, constants = source.policy, [], []
+
+    def constant(name: str, value: Any) -> str:
+        constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
+        return name
+
+    def node(kind: str, *inputs: str, to: str, **attributes: Any) -> str:
+        nodes.append(helper.make_node(kind, inputs, [to], name=to, **attributes))
+        return to
+
+    x = node("Sub", "obs", constant("mean", policy.mean), to="centred")
+    x = node("Div", x, constant("std", policy.std), to="normalised")
+    last = len(policy.layers) - 1
+    for index, layer in enumerate(policy.layers):
+        kernel = constant(f"kernel_{index}", layer.kernel)
+        x = node("Gemm", x, kernel, constant(f"bias_{index}", layer.bias), to=f"layer_{index}")
+        if index < last and policy.activation == "swish":
+            x = node("Mul", x, node("Sigmoid", x, to=f"gate_{index}"), to=f"hidden_{index}")
+        elif index < last:
+            kind = {"tanh": "Tanh", "relu": "Relu", "elu": "Elu"}[policy.activation]
+            x = node(kind, x, to=f"hidden_{index}")
+    if policy.squash:
+        x = node("Tanh", x, to="squashed")
+    node("Clip", x, constant("low", -1.0), constant("high", 1.0), to="action")
+    # The controller is linear in the action.
+    drive = 0.5 * policy.controller.max_speed / policy.controller.wheel_radius
+    turn = policy.controller.fastest - 2.0 * drive
+    mixing = constant("mixing", [[drive, drive], [-turn, turn]])
+    node("Gemm", "action", mixing, constant("half_speed", [drive, drive]), to="wheel_speeds")
+
+    def tensor(name: str, size: int) -> Any:
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+
+    graph = helper.make_graph(
+        nodes,
+        "policy",
+        [tensor("obs", policy.mean.size)],
+        [tensor("action", 2), tensor("wheel_speeds", 2)],
+        constants,
+    )
+    model = helper.make_model(
+        graph,
+        opset_imports=[helper.make_opsetid("", _ONNX_OPSET)],
+        ir_version=_ONNX_IR_VERSION,
+        producer_name="jetbot_mjx",
+    )
+    onnx.checker.check_model(model, full_check=True)
+    onnx.save(model, path)
+
+
+def _read_onnx(path: Path) -> Act:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+
+    def act(obs: Float[np.ndarray, "n obs"]) -> Outputs:
+        action, wheel_speeds = session.run(["action", "wheel_speeds"], {"obs": obs})
+        return np.asarray(action), np.asarray(wheel_speeds)
+
+    return act
+
+
+FORMATS = {
+    "numpy": Format("policy.py", _write_numpy, _read_numpy),
+    "onnx": Format("policy.onnx", _write_onnx, _read_onnx, ("onnx", "onnxruntime")),
+    "stablehlo": Format("policy.stablehlo", _write_stablehlo, _read_stablehlo),
+}
+"""By the name that `--format` takes."""

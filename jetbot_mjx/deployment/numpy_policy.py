@@ -1,0 +1,197 @@
+"""A policy as plain numbers, as one function of JAX, and observations to hold the two together.
+
+What leaves this package is one function of a batch of observations, with all inside that lies
+between them and the motors: normaliser, network, the distribution's mode, the environment's clip
+to [-1, 1], and the controller that makes wheel speeds of an action. Its two results are both.
+"""
+
+from collections.abc import Callable, Mapping
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jetbot_mjx.agents.networks import make_policy
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.mujoco_env import MujocoJetBot
+from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
+from jetbot_mjx.evaluation.evaluator import report_keys
+from jetbot_mjx.runs.checkpoint import Checkpoint
+
+RECORDED = 10_000
+"""How many observations an export is checked on."""
+
+TOLERANCE = 1e-5
+"""Largest difference to JAX that an export may have, of an action's unit."""
+
+Outputs = tuple[Float[Array | np.ndarray, "n 2"], Float[Array | np.ndarray, "n 2"]]
+"""Actions in [-1, 1], and the wheel speeds (left, right) [rad/s] that they command."""
+
+
+class Controller(NamedTuple):
+    """What turns an action into wheel speeds; `kinematics` has the formulas."""
+
+    max_speed: float
+    """Forward speed of a₀ = 1 [m/s]."""
+    max_yaw_rate: float
+    """Yaw rate of a₁ = 1 [rad/s]."""
+    wheel_radius: float
+    """Of the controller, not of a robot [m]."""
+    wheel_separation: float
+    """Likewise [m]."""
+
+    @property
+    def fastest(self) -> float:
+        """The largest wheel speed that an action can command [rad/s]."""
+        turn = 0.5 * self.max_yaw_rate * self.wheel_separation
+        return (self.max_speed + turn) / self.wheel_radius
+
+
+class Layer(NamedTuple):
+    """x ↦ x · kernel + bias."""
+
+    kernel: Float[np.ndarray, "inputs outputs"]
+    bias: Float[np.ndarray, " outputs"]
+
+
+class PortablePolicy(NamedTuple):
+    """A deterministic policy as numbers."""
+
+    mean: Float[np.ndarray, " obs"]
+    """Of the observation's normaliser; zeros without one."""
+    std: Float[np.ndarray, " obs"]
+    """Likewise; ones without one."""
+    layers: tuple[Layer, ...]
+    """The last gives the distribution's location alone."""
+    activation: Literal["tanh", "relu", "elu", "swish"]
+    """Between the layers."""
+    squash: bool
+    """Whether tanh follows the last layer; the clip to [-1, 1] follows in any case."""
+    controller: Controller
+
+
+class Recording(NamedTuple):
+    """What a policy saw while it drove, and what JAX made of it. On the host, float32."""
+
+    obs: Float[np.ndarray, "n obs"]
+    action: Float[np.ndarray, "n 2"]
+    wheel_speeds: Float[np.ndarray, "n 2"]
+    """(left, right) [rad/s]."""
+
+
+def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
+    """Takes a policy out of a checkpoint.
+
+    Args:
+      checkpoint: of a network as `make_networks` builds it.
+
+    Returns:
+      Its numbers. Nothing here knows whether they are used as Brax does: compare with `as_jax`.
+    """
+    config = checkpoint.config
+    network = config.ppo.network
+    params: Any = jax.device_get(checkpoint.params)
+    size = checkpoint.about["observation_size"]
+    mean, std = np.zeros(size, np.float32), np.ones(size, np.float32)
+    if config.ppo.normalize_observations:
+        mean, std = np.asarray(params.normalizer.mean), np.asarray(params.normalizer.std)
+    dense: Mapping[str, Any] = params.policy["params"]
+    if network.distribution_type == "normal":
+        # Brax keeps the last layer of this one apart, and a deviation beside it.
+        dense = {**dense["MLP_0"], f"hidden_{len(dense['MLP_0'])}": dense["Dense_0"]}
+    layers = [
+        Layer(np.asarray(one["kernel"]), np.asarray(one["bias"]))
+        for one in (dense[f"hidden_{index}"] for index in range(len(dense)))
+    ]
+    actions = checkpoint.about["action_size"]
+    layers[-1] = Layer(layers[-1].kernel[:, :actions], layers[-1].bias[:actions])
+    return PortablePolicy(
+        mean=mean,
+        std=std,
+        layers=tuple(layers),
+        activation=network.activation,
+        squash=network.distribution_type == "tanh_normal",
+        controller=Controller(
+            max_speed=config.task.max_speed,
+            max_yaw_rate=config.task.max_yaw_rate,
+            wheel_radius=CONTROLLER_WHEEL_RADIUS,
+            wheel_separation=CONTROLLER_WHEEL_SEPARATION,
+        ),
+    )
+
+
+def as_jax(
+    checkpoint: Checkpoint, env: JetBotEnv
+) -> Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]:
+    """The same policy as training and judging use it: what every export is measured by.
+
+    Args:
+      checkpoint: the policy's.
+      env: its environment.
+
+    Returns:
+      A pure function of a batch of observations, in full float32 on every device.
+    """
+    policy = make_policy(checkpoint.networks, checkpoint.params)
+
+    def act(obs: Float[Array, "n obs"]) -> tuple[Float[Array, "n 2"], Float[Array, "n 2"]]:
+        with jax.default_matmul_precision("highest"):
+            action = jnp.clip(policy(obs), -1.0, 1.0)
+        return action, jax.vmap(env.wheel_targets)(action)
+
+    return act
+
+
+def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Recording:
+    """Drives to the report's fixed goals, one after the other, and keeps what the policy sees.
+
+    In C MuJoCo, which needs no program compiled for it and is the same robot.
+
+    Args:
+      checkpoint: the policy's.
+      env: its environment.
+      count: how many observations.
+
+    Returns:
+      The recording, the same for the same checkpoint on the same machine.
+    """
+    robot = MujocoJetBot(checkpoint.config)
+    act = jax.jit(as_jax(checkpoint, env))
+    keys = iter(np.asarray(report_keys(count)))
+    seen: list[np.ndarray] = []
+    while len(seen) < count:
+        obs, _ = robot.reset(next(keys))
+        for _ in range(min(checkpoint.config.task.episode_length, count - len(seen))):
+            seen.append(obs)
+            (action,), _ = jax.device_get(act(obs[None]))
+            step = robot.step(action)
+            obs = step.obs
+            if step.terminated or not step.finite:
+                break
+    obs = np.stack(seen)
+    action, wheel_speeds = jax.device_get(act(obs))
+    return Recording(obs, action, wheel_speeds)
+
+
+def difference(recording: Recording, outputs: Outputs, controller: Controller) -> float:
+    """How far another implementation's results are from JAX's.
+
+    Args:
+      recording: observations, and what JAX makes of them.
+      outputs: what the other makes of them.
+      controller: tells the range of wheel speeds.
+
+    Returns:
+      The largest difference of any number, wheel speeds as a share of the fastest; infinite
+      where a result has another shape or is no number.
+    """
+    worst = 0.0
+    pairs = ((recording.action, 1.0), (recording.wheel_speeds, controller.fastest))
+    for (wanted, unit), found in zip(pairs, outputs, strict=True):
+        values = np.asarray(found)
+        if values.shape != wanted.shape or not np.all(np.isfinite(values)):
+            return float("inf")
+        worst = max(worst, float(np.abs(values - wanted).max()) / unit)
+    return worst

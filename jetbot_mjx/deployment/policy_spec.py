@@ -1,0 +1,115 @@
+"""What a policy has to be told to someone who has only its file: `policy.json`."""
+
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from jetbot_mjx.deployment.numpy_policy import PortablePolicy
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
+from jetbot_mjx.envs.task import GOAL_HEIGHT, Layout
+from jetbot_mjx.runs.checkpoint import Checkpoint
+from jetbot_mjx.runs.run_dir import versions
+
+FILE = "policy.json"
+
+FORMAT = "jetbot_mjx-policy/1"
+"""Of `policy.json`."""
+
+FRAMES = {
+    "world": "fixed to the floor, z up; training starts at its origin, heading along x",
+    "body": "moves with the robot: axle midpoint, x forward, y left, z up",
+}
+
+_COMPONENTS = {
+    ("quaternion", 4): ["w", "x", "y", "z"],
+    ("position", 3): ["x", "y", "z"],
+    ("linear_velocity", 3): ["x", "y", "z"],
+    ("angular_velocity", 3): ["x", "y", "z"],
+    ("goal_position", 3): ["x", "y", "z"],
+    ("goal_position", 2): ["x", "y"],
+    ("goal_direction", 2): ["x", "y"],
+}
+
+
+def contract(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> dict[str, Any]:
+    """Explains a policy, whatever format it is exported to.
+
+    Args:
+      checkpoint: the policy's.
+      env: its environment.
+      policy: as numbers.
+
+    Returns:
+      JSON; `export` adds the files and how far each is from JAX.
+    """
+    config = checkpoint.config
+    rest = env.mj_model.qpos0
+    return {
+        "format": FORMAT,
+        "run": checkpoint.run_dir.name,
+        "env_steps": checkpoint.env_steps,
+        "task": config.task.name,
+        "robot": config.robot.preset,
+        "control_rate": 1.0 / env.dt,
+        "control_period": env.dt,
+        "observation": _observations(env.task.layout),
+        "action": [
+            {"name": "drive", "index": 0, "unit": "1", "low": -1.0, "high": 1.0},
+            {"name": "turn", "index": 1, "unit": "1", "low": -1.0, "high": 1.0},
+        ],
+        "wheel_speeds": {
+            "order": ["left", "right"],
+            "unit": "rad/s",
+            "formula": [
+                "v = (drive + 1)/2 * max_speed",
+                "w = turn * max_yaw_rate",
+                "left = (v - w * wheel_separation/2) / wheel_radius",
+                "right = (v + w * wheel_separation/2) / wheel_radius",
+            ],
+            **policy.controller._asdict(),
+            "limit_in_training": env.robot.max_wheel_speed,
+        },
+        "inside": ["normaliser", "network", "clip to [-1, 1]", "action to wheel speeds"],
+        "outside": ["limits and dead-band of the motors", "wheel speed to motor value"],
+        "network": {
+            "layers": [layer.bias.size for layer in policy.layers],
+            "activation": policy.activation,
+            "squash": "tanh" if policy.squash else None,
+        },
+        "frames": FRAMES,
+        "success_radius": config.task.success_radius,
+        "goal_height": GOAL_HEIGHT,
+        "rest_height": float(rest[QPOS_XYZ][2]),
+        "rest_quaternion": [float(one) for one in rest[QPOS_QUAT]],
+        "episode_seconds": config.task.episode_length * env.dt,
+        "evaluation": _evaluation(checkpoint),
+        "versions": versions(),
+    }
+
+
+def _observations(layout: Layout) -> list[dict[str, Any]]:
+    found, start = [], 0
+    for field in layout:
+        components = _COMPONENTS.get((field.name, field.size))
+        found.append(
+            {
+                "name": field.name,
+                "index": list(range(start, start + field.size)),
+                **({"components": components} if components else {}),
+                "unit": field.unit,
+                "frame": field.frame,
+            }
+        )
+        start += field.size
+    return found
+
+
+def _evaluation(checkpoint: Checkpoint) -> Mapping[str, Any] | None:
+    """The summary of this checkpoint's report, where `evaluate` wrote one."""
+    path = checkpoint.run_dir / "evaluations" / checkpoint.path.name / "report.json"
+    try:
+        report = json.loads(path.read_text(encoding="utf-8"))
+        return {"goal_set_version": report["goal_set_version"], **report["policy"]}
+    except (OSError, ValueError, LookupError, TypeError):
+        return None

@@ -1,0 +1,164 @@
+"""A stand-in for a JetBot: motor values in, a pose out, in the time of its own simulation.
+
+It has the two methods of NVIDIA's `jetbot.Robot` that a driver calls, and a clock that a driver
+can wait on: waiting is what moves it. Physics is the preset `real` in C MuJoCo. Between motor
+value and wheel stand a delay, a dead-band, the motor's full speed and a lag:
+
+    s = m of `delay` ago        target = sign(s) full (|s| - dead) / (1 - dead), 0 below `dead`
+    ω' = d ω + (1 - d) target    d = exp(-dt / lag)
+"""
+
+import collections
+import dataclasses
+import math
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from jetbot_mjx.config import PhysicsConfig
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
+
+ROLLING_RADIUS = 0.0321
+"""Way over the floor for each radian that a wheel turns [m]: loaded, it sinks in by 0.4 mm."""
+
+
+class MotorModel(NamedTuple):
+    """What lies between a motor value and a wheel. Pairs are (left, right)."""
+
+    dead_band: tuple[float, float] = (0.12, 0.12)
+    """Motor value up to which the wheel stands. PICOBOT: 0.11; others up to 0.25."""
+    full_speed: tuple[float, float] = (12.56, 12.56)
+    """Wheel speed at a motor value of 1 [rad/s]; the preset's."""
+    lag: float = 0.1
+    """Time constant [s]. PICOBOT: 0.085."""
+    delay: float = 0.05
+    """From a motor value to the motor [s]."""
+
+
+class Pose(NamedTuple):
+    """Where the axle midpoint is, and where it heads; world frame."""
+
+    x: float
+    """[m]"""
+    y: float
+    """[m]"""
+    yaw: float
+    """Counter-clockwise from the world's x axis, in (-π, π] [rad]."""
+
+
+class StandIn:
+    """One simulated JetBot, its motors and its clock."""
+
+    def __init__(self, motors: MotorModel | None = None) -> None:
+        """Builds the robot, at rest at the origin.
+
+        Args:
+          motors: None: a dead-band of 0.12, a lag of 0.1 s and a delay of 0.05 s.
+        """
+        self.motor_model = MotorModel() if motors is None else motors
+        # The motor model says how fast a wheel turns, in place of the preset's limit.
+        robot = dataclasses.replace(REAL, max_wheel_speed=None)
+        self._model = make_mj_model(robot, PhysicsConfig(), visual=False)
+        self._data = mujoco.MjData(self._model)
+        self._time = 0.0
+        self.place(Pose(0.0, 0.0, 0.0))
+
+    def place(self, pose: Pose) -> None:
+        """Puts the robot down, at rest and with no command on its way. The clock goes on."""
+        mujoco.mj_resetData(self._model, self._data)
+        qpos = self._data.qpos
+        qpos[QPOS_XYZ][:2] = pose.x, pose.y
+        turned = np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)])
+        mujoco.mju_mulQuat(qpos[QPOS_QUAT], turned, self._model.qpos0[QPOS_QUAT])
+        self._arrived = np.zeros(2)
+        self._wheels = np.zeros(2)
+        self._under_way: collections.deque[tuple[float, np.ndarray]] = collections.deque()
+        self.motors = (0.0, 0.0)
+        """The motor values that were set last (left, right)."""
+
+    def set_motors(self, left_speed: float, right_speed: float) -> None:
+        """Sets both motor values, as `jetbot.Robot` does.
+
+        Args:
+          left_speed: in [-1, 1]; what is beyond is clipped.
+          right_speed: likewise.
+        """
+        self.motors = (float(left_speed), float(right_speed))
+        values = np.clip(self.motors, -1.0, 1.0)
+        self._under_way.append((self._time + self.motor_model.delay, values))
+
+    def stop(self) -> None:
+        """Sets both motor values to zero."""
+        self.set_motors(0.0, 0.0)
+
+    def now(self) -> float:
+        """Time of the simulation [s], since it was built."""
+        return self._time
+
+    def sleep(self, seconds: float) -> None:
+        """Lets time pass, in whole physics steps.
+
+        Args:
+          seconds: how long; what is left of a step passes with the next call.
+        """
+        dt = self._model.opt.timestep
+        end = self._time + seconds
+        # Half a step early or late: times are sums of rounded numbers.
+        while self._time < end - 0.5 * dt:
+            self._tick(dt)
+
+    def pose(self) -> Pose:
+        """Where it is."""
+        x, y, _ = self._data.qpos[QPOS_XYZ]
+        w, i, j, k = self._data.qpos[QPOS_QUAT]
+        yaw = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
+        return Pose(float(x), float(y), yaw)
+
+    def speed(self) -> float:
+        """Of the axle midpoint over the floor [m/s]."""
+        return float(np.hypot(*self._data.qvel[:2]))
+
+    def _tick(self, dt: float) -> None:
+        while self._under_way and self._under_way[0][0] <= self._time + 1e-9:
+            self._arrived = self._under_way.popleft()[1]
+        model = self.motor_model
+        target = np.array([*map(_wheel_speed, self._arrived, model.dead_band, model.full_speed)])
+        decay = math.exp(-dt / model.lag) if model.lag > 0 else 0.0
+        self._wheels = decay * self._wheels + (1.0 - decay) * target
+        self._data.ctrl[:] = self._wheels
+        mujoco.mj_step(self._model, self._data)
+        self._time += dt
+
+
+def _wheel_speed(value: float, dead_band: float, full_speed: float) -> float:
+    beyond = max(abs(value) - dead_band, 0.0)
+    return math.copysign(full_speed * beyond / (1.0 - dead_band), value)
+
+
+def replayed(
+    motors: MotorModel, start: Pose, times: Sequence[float], values: Float[np.ndarray, "n 2"]
+) -> Float[np.ndarray, "n 3"]:
+    """Drives a stand-in by motor values that were logged.
+
+    Args:
+      motors: its motors.
+      start: where it begins, at rest.
+      times: when each value was set [s], ascending.
+      values: motor values (left, right).
+
+    Returns:
+      (x, y, yaw) [m, m, rad] at each of the times, before its value is set; yaw without jumps.
+    """
+    robot = StandIn(motors)
+    robot.place(start)
+    poses = []
+    for time, (left, right) in zip(times, values, strict=True):
+        robot.sleep(time - times[0] - robot.now())
+        poses.append(robot.pose())
+        robot.set_motors(left, right)
+    path = np.array(poses)
+    path[:, 2] = np.unwrap(path[:, 2])
+    return path

@@ -1,0 +1,273 @@
+"""What a task's methods have to keep to: a check yields a line for everything that is wrong."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jetbot_mjx.envs.checks.probe import DRAWS, TERMS, Subject, ask_all, first_key
+from jetbot_mjx.envs.task import AdvancesGoal, Field, MovesGoal, Task, layout_size, min_std
+from jetbot_mjx.errors import UserError
+
+
+def layout(subject: Subject) -> Iterator[str]:
+    """Names, sizes, units, frames and smallest deviations of the observation."""
+    fields = subject.task.layout
+    if not isinstance(fields, tuple) or not all(isinstance(field, Field) for field in fields):
+        yield "layout is no tuple of Field(name, size, unit, frame): make it one"
+        return
+    if not fields:
+        yield "layout is empty: name at least one Field"
+    names = [field.name for field in fields]
+    for name in sorted({name for name in names if names.count(name) > 1}):
+        yield f"layout names {name!r} {names.count(name)} times: give each field a name of its own"
+    for field in fields:
+        if not isinstance(field.size, int) or field.size < 1:
+            yield f"layout: {field.name!r} has the size {field.size!r}: it should be 1 or more"
+        missing = [
+            what
+            for what in ("name", "unit", "frame")
+            if not isinstance(getattr(field, what), str) or not getattr(field, what).strip()
+        ]
+        for what in missing:
+            yield f"layout: {field.name!r} has no {what}: say it, such as {_LIKE[what]}"
+        if not missing and subject.config.ppo.normalizer == "physical":
+            try:
+                min_std(field)
+            except UserError as error:
+                yield str(error)
+
+
+_LIKE = {"name": "goal_distance", "unit": "m, or 1 for none", "frame": "world or body"}
+
+
+def purity(subject: Subject) -> Iterator[str]:
+    """Methods trace, twice into the same program, and leave `self` alone."""
+    task = subject.task
+    before = _attributes(task)
+    for name, function, arguments in _calls(subject):
+        try:
+            traced = [_traced(function, arguments) for _ in range(2)]
+        except Exception as error:
+            yield subject.explain(error)
+            continue
+        if traced[0] != traced[1]:
+            yield (
+                f"{name} is another program each time it is traced: draw from key with jax.random"
+                " alone, and keep no counters"
+            )
+    after = _attributes(task)
+    for attribute in sorted(before.keys() | after.keys()):
+        if before.get(attribute) != after.get(attribute):
+            yield (
+                f"a method changes self.{attribute}: methods must be pure; what an episode has to"
+                " remember belongs into the goal, see `advance`"
+            )
+
+
+def _calls(subject: Subject) -> list[tuple[str, Callable[..., Any], tuple[Any, ...]]]:
+    """Every method that is traced, with arguments for it."""
+    task = subject.task
+    try:
+        before, after, goal, action = subject.example
+    except Exception:
+        # `sample` itself fails; being traced it says so.
+        return [("sample", task.sample, (first_key(),))]
+    calls = [
+        ("sample", task.sample, (first_key(),)),
+        ("observe", task.observe, (after, goal)),
+        ("reward", task.reward, (before, after, goal, action)),
+        ("terminated", task.terminated, (after, goal)),
+        ("success", task.success, (after, goal)),
+        ("goal_position", task.goal_position, (goal,)),
+        ("markers", task.markers, (goal,)),
+    ]
+    if isinstance(task, AdvancesGoal):
+        calls.append(("advance", task.advance, (before, after, goal)))
+    return calls
+
+
+def _traced(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, list[bytes]]:
+    # A new function each time: JAX remembers what it has traced.
+    closed = jax.make_jaxpr(lambda *given: function(*given))(*arguments)
+    return str(closed.jaxpr), [np.asarray(constant).tobytes() for constant in closed.consts]
+
+
+def _attributes(task: Task) -> dict[str, str]:
+    """What `self` holds, to be compared."""
+    held = getattr(task, "__dict__", {})
+    return {name: f"{type(value).__name__} {value!r}" for name, value in held.items()}
+
+
+def types(subject: Subject) -> Iterator[str]:
+    """Shapes and dtypes are those of the contract."""
+    task, (before, after, goal, action) = subject.task, subject.example
+    yield from _weak("sample", jax.eval_shape(task.sample, first_key()))
+    rewarded = jax.eval_shape(task.reward, before, after, goal, action)
+    if not (isinstance(rewarded, tuple) and len(rewarded) == 2 and isinstance(rewarded[1], dict)):
+        yield "reward returns something else than (reward, {name: term}): return both"
+        return
+    if not isinstance(jax.eval_shape(task.markers, goal), dict):
+        yield "markers returns something else than {name: place}: return a dict"
+        return
+    told = jax.eval_shape(ask_all(task), subject.example)
+    length = layout_size(task.layout)
+    wanted = {
+        "observe": ((length,), "float32", f"as long as layout says, {length}"),
+        "reward": ((), "float32", "one number"),
+        "terminated": ((), "bool", "one truth value"),
+        "success": ((), "bool", "one truth value"),
+        "goal_position": ((3,), "float32", "x, y, z"),
+    }
+    for name, (shape, dtype, meaning) in wanted.items():
+        yield from _unlike(name, told[name], shape, dtype, meaning)
+    for name, term in told[TERMS].items():
+        yield from _unlike(f"reward's term {name!r}", term, (), "float32", "one number")
+    for name, place in told["markers"].items():
+        yield from _unlike(f"markers' {name!r}", place, (3,), "float32", "x, y, z")
+    if isinstance(task, AdvancesGoal):
+        yield from _other_tree("advance", told["advance"], goal)
+
+
+def _unlike(name: str, got: Any, shape: Any, dtype: str, meaning: str) -> Iterator[str]:
+    if not hasattr(got, "shape"):
+        yield f"{name} returns {type(got).__name__}: it should be an array, {meaning}"
+    elif got.shape != shape:
+        yield f"{name} has the shape {list(got.shape)}: it should be {list(shape)}, {meaning}"
+    elif str(got.dtype) != dtype:
+        yield f"{name} is {got.dtype}: it should be {dtype}{_CAST.get(dtype, '')}"
+    else:
+        yield from _weak(name, got)
+
+
+_CAST = {"bool": ", such as a comparison gives", "float32": ", as .astype(jnp.float32) makes it"}
+
+
+def _weak(name: str, tree: Any) -> Iterator[str]:
+    """Types that Python's numbers bring along: a loop refuses them, or is compiled twice."""
+    if any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(tree)):
+        yield f"{name} has a weak type, of Python's own number: write jnp.float32(...) instead"
+
+
+def _other_tree(name: str, got: Any, goal: Any) -> Iterator[str]:
+    if jax.tree.structure(got) != jax.tree.structure(goal):
+        yield f"{name} returns another tree than sample: change the goal's leaves alone"
+        return
+    for ours, theirs in zip(jax.tree.leaves(got), jax.tree.leaves(goal), strict=True):
+        if (ours.shape, ours.dtype) != (theirs.shape, theirs.dtype):
+            yield (
+                f"{name} makes {theirs.dtype}{list(theirs.shape)} of sample"
+                f" {ours.dtype}{list(ours.shape)}: shapes and dtypes must stay"
+            )
+            return
+    yield from _weak(name, got)
+
+
+def draws(subject: Subject) -> Iterator[str]:
+    """A key gives one draw, and another key another."""
+    draw = jax.jit(jax.vmap(subject.task.sample))
+    keys = jax.random.split(first_key(), DRAWS)
+    first, again = (jax.device_get(draw(keys)) for _ in range(2))
+    if not all(map(np.array_equal, jax.tree.leaves(first), jax.tree.leaves(again))):
+        yield "sample draws something else for the same key: draw from key with jax.random alone"
+        return
+    rows = np.concatenate([np.reshape(x, (DRAWS, -1)) for x in jax.tree.leaves(first)], axis=1)
+    if len(np.unique(rows, axis=0)) == 1:
+        yield "sample draws the same for every key: draw from key with jax.random"
+
+
+def batches(subject: Subject) -> Iterator[str]:
+    """`jax.vmap` gives what a loop gives."""
+    ask, count = ask_all(subject.task), 4
+    case = subject.cases["anywhere on the floor"]
+    few = jax.tree.map(lambda x: x[:count], case)
+    together = jax.device_get(jax.jit(jax.vmap(ask))(few))
+    one = jax.jit(ask)
+    alone = [jax.device_get(one(jax.tree.map(lambda x, i=i: x[i], few))) for i in range(count)]
+    for name, value in together.items():
+        apart = jax.tree.map(lambda *x: np.stack(x), *[each[name] for each in alone])
+        for a, b in zip(jax.tree.leaves(value), jax.tree.leaves(apart), strict=True):
+            if not np.allclose(a, b, rtol=1e-4, atol=1e-5, equal_nan=True):
+                yield (
+                    f"{name} under jax.vmap differs from one robot at a time: no robot may depend"
+                    " on another; look for callbacks"
+                )
+                break
+
+
+def finite(subject: Subject) -> Iterator[str]:
+    """Whatever the robot, what a task says is finite."""
+    if not _is_finite(subject.goals):
+        yield "sample draws what is not finite: guard divisions and roots"
+    told: set[str] = set()
+    for where, answers in subject.answers.items():
+        for name, value in answers.items():
+            if name not in told and not _is_finite(value):
+                told.add(name)
+                yield (
+                    f"{name} is not finite for a robot {where}: guard the division or root, such"
+                    " as x / jnp.maximum(length, 1e-3)"
+                )
+
+
+def _is_finite(tree: Any) -> bool:
+    return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
+
+
+def reward(subject: Subject) -> Iterator[str]:
+    """The terms add up to the reward."""
+    for where, answers in subject.answers.items():
+        reward = answers["reward"]
+        total = sum(answers[TERMS].values(), np.zeros(DRAWS))
+        wrong = ~np.isclose(reward, total, rtol=1e-3, atol=1e-4) & np.isfinite(reward + total)
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            yield (
+                f"reward is {reward[at]:.4g} where its terms add up to {total[at]:.4g} (a robot"
+                f" {where}): name every part of the reward among the terms, with its sign"
+            )
+            return
+
+
+def endings(subject: Subject) -> Iterator[str]:
+    """Success ends an episode, and none ends where it begins."""
+    told = subject.answers
+    for where, answers in told.items():
+        if (answers["success"] & ~answers["terminated"]).any():
+            yield (
+                f"success without terminated (a robot {where}): what is done has ended for good,"
+                " so terminated must hold wherever success does"
+            )
+            break
+    ended = told["at the start"]["terminated"]
+    if all(answers["terminated"].all() for answers in told.values()):
+        yield "terminated is always true: no episode lasts longer than a step"
+    elif ended.any():
+        yield (
+            f"{ended.sum()} of {DRAWS} episodes have ended where the robot starts: draw goals that"
+            " leave something to do"
+        )
+
+
+def goal(subject: Subject) -> Iterator[str]:
+    """`goal_position` follows `move_goal`."""
+    task, goal = subject.task, subject.example.goal
+    if not isinstance(task, MovesGoal):
+        return
+    wanted = jnp.array([0.31, -0.47, 0.0]).at[2].set(task.goal_position(goal)[2])
+    remedy = "write a move_goal for what sample draws"
+    try:
+        moved = jax.eval_shape(task.move_goal, goal, wanted)
+        if unlike := list(_other_tree("move_goal", moved, goal)):
+            yield f"{unlike[0]}; {remedy}"
+            return
+        reached = jax.vmap(lambda goal: task.goal_position(task.move_goal(goal, wanted)))(
+            subject.goals
+        )
+    except Exception as error:
+        yield f"{subject.explain(error)}; {remedy}"
+        return
+    if not np.allclose(reached[:, :2], wanted[:2], atol=1e-4):
+        yield f"goal_position is not where move_goal has put the goal: {remedy}"

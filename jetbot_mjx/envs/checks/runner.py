@@ -1,0 +1,216 @@
+"""What a task has to keep to, checked without training: each fault in one line, with the remedy.
+
+The environment, the trainer and the reports rely on it. A task that breaks one of these rules
+often trains all the same, on something else than was meant.
+"""
+
+import collections
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs import mjx
+from jetbot_mjx.envs.checks import methods
+from jetbot_mjx.envs.checks.probe import DRAWS, Subject, first_key, in_one_line
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model
+from jetbot_mjx.envs.task import make_task
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.errors import UserError
+
+DRIVE_ENVS, DRIVE_STEPS = 16, 64
+"""Of the test drive: robots, and environment steps of each."""
+
+
+class Finding(NamedTuple):
+    """A rule that a task breaks."""
+
+    check: str
+    """By which check it was found: a key of `CHECKS`."""
+    message: str
+    """What is wrong and what would be right, in one line."""
+
+
+def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
+    """Checks the task that a configuration names.
+
+    Args:
+      config: the run.
+
+    Yields:
+      Each check's name and what it found, in the order of `CHECKS`. Nothing is found twice. Where
+      the next checks could but fail as well, they are left out.
+
+    Raises:
+      UserError: there is no such task, or it refuses the configuration.
+    """
+    try:
+        subject = Subject(make_task(config.task), config)
+    except UserError:
+        raise
+    except Exception as error:
+        yield "layout", [Finding("layout", in_one_line(error, config.task.name, ()))]
+        return
+    seen: set[str] = set()
+    for name, check in CHECKS.items():
+        messages: list[str] = []
+        try:
+            messages.extend(check(subject))
+        except UserError as error:
+            messages.append(str(error))
+        except Exception as error:
+            messages.append(subject.explain(error))
+        found = [Finding(name, one) for one in dict.fromkeys(messages) if one not in seen]
+        seen.update(messages)
+        yield name, found
+        if found and name in _NEEDED:
+            return
+
+
+# Those of the scene and the whole environment.
+
+
+def _scene(subject: Subject) -> Iterator[str]:
+    task, config = subject.task, subject.config
+    placed = set(task.markers(subject.example.goal))
+
+    def build(*, visual: bool) -> mujoco.MjModel:
+        robot = ROBOTS[config.robot.preset]
+        return make_mj_model(robot, config.physics, build_scene=task.build_scene, visual=visual)
+
+    try:
+        model, solid = build(visual=True), build(visual=False)
+    except RuntimeError as error:
+        yield f"build_scene: {error}: nothing of the task may touch the robot where it starts"
+        return
+    except ValueError as error:
+        yield f"build_scene: MuJoCo refuses the scene: {error}"
+        return
+    try:
+        mjx.put_model(solid)
+    except NotImplementedError as error:
+        yield f"build_scene: MJX cannot simulate it: {error}: pair spheres and capsules"
+        return
+    names, solids = _mocap_bodies(model), _mocap_bodies(solid)
+    for name in sorted(placed - names):
+        yield f"markers places {name!r}, no mocap body: add_body(name={name!r}, mocap=True)"
+    for name in sorted((names | solids) - placed - {"goal"}):
+        yield f"markers does not say where {name!r} stands, a mocap body of build_scene"
+    if not solids - placed:
+        yield from _touching(subject, solid)
+    paired = set(solid.pair_geom1) | set(solid.pair_geom2)
+    for i in range(solid.ngeom):
+        if i not in paired and (solid.geom_contype[i] or solid.geom_conaffinity[i]):
+            yield (
+                f"geom {solid.geom(i).name or i!r} can collide and meets nothing: give it"
+                " contype=0, conaffinity=0, and a pair where the robot is to run into it"
+            )
+
+
+def _touching(subject: Subject, solid: mujoco.MjModel) -> Iterator[str]:
+    """What the robot stands in when episodes begin."""
+    places = jax.device_get(jax.vmap(subject.task.markers)(subject.goals))
+    data, touched = mujoco.MjData(solid), collections.Counter()
+    for draw in range(DRAWS if solid.nmocap else 1):
+        for name in _mocap_bodies(solid):
+            data.mocap_pos[solid.body(name).mocapid[0]] = places[name][draw]
+        mujoco.mj_forward(solid, data)
+        pairs = data.contact.geom[data.contact.dist < 0]
+        touched.update({solid.geom(geom).name for pair in pairs for geom in pair})
+    ours = {"floor", "left_wheel", "right_wheel", "caster_front", "caster_rear"}
+    for name, often in sorted(touched.items()):
+        if name not in ours:
+            yield (
+                f"{name!r} touches something in {often} of {DRAWS if solid.nmocap else 1} episodes"
+                " as they begin: leave room about the robot, 0.2 m from the origin"
+            )
+
+
+def _mocap_bodies(model: mujoco.MjModel) -> set[str]:
+    return {model.body(i).name for i in range(model.nbody) if model.body(i).mocapid[0] >= 0}
+
+
+def _drive(subject: Subject) -> Iterator[str]:
+    """Steps of a training's environment, under random and extreme actions."""
+    env = make_env(subject.config)
+    begun = jax.eval_shape(env.reset, first_key())
+    gone = jax.eval_shape(env.step, begun, jax.eval_shape(lambda: jnp.zeros(2)))
+    if unlike := _changed(begun, gone):
+        yield f"a step changes the state's {unlike}: keep names, tree, shapes and dtypes"
+        return
+    batch = wrap_for_training(env, episode_length=DRIVE_STEPS // 2)
+    traces = 0
+
+    def step(state: Any, action: jax.Array) -> Any:
+        nonlocal traces
+        traces += 1
+        return batch.step(state, action)
+
+    keys = jax.random.split(first_key(), DRIVE_ENVS)
+    actions = jax.random.uniform(keys[0], (DRIVE_STEPS, DRIVE_ENVS, 2), minval=-1.0)
+    # Half of the robots are driven with all they have.
+    actions = jnp.where(jnp.arange(DRIVE_ENVS)[:, None] % 2, actions, jnp.sign(actions))
+    state = jax.jit(batch.reset)(keys)
+    compiled, nonfinite = jax.jit(step), 0
+    for action in actions:
+        state = compiled(state, action)
+        nonfinite += int(state.metrics["nonfinite_worlds"].sum())
+    if traces > 1:
+        yield f"a step is traced {traces} times and not once: keep tree, shapes and dtypes"
+    if nonfinite:
+        yield (
+            f"{nonfinite} of {DRIVE_STEPS * DRIVE_ENVS} steps are not finite: look at observe and"
+            " reward, and at what the robot runs into"
+        )
+
+
+def _changed(first: Any, last: Any) -> str:
+    """Which part of two states differs in more than its numbers; empty where none does."""
+    sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
+    for path in (*sides[0], *sides[1]):
+        one, other = (side.get(path) for side in sides)
+        if one is None or other is None or _type(one) != _type(other):
+            return jax.tree_util.keystr(path).lstrip(".")
+    return ""
+
+
+def _type(leaf: Any) -> tuple[Any, ...]:
+    return leaf.shape, leaf.dtype, leaf.weak_type
+
+
+CHECKS: Mapping[str, Callable[[Subject], Iterator[str]]] = {
+    "layout": methods.layout,
+    "purity": methods.purity,
+    "types": methods.types,
+    "draws": methods.draws,
+    "batches": methods.batches,
+    "finite": methods.finite,
+    "reward": methods.reward,
+    "endings": methods.endings,
+    "goal": methods.goal,
+    "scene": _scene,
+    "drive": _drive,
+}
+"""The checks by name, in their order: each yields a line for everything that is wrong."""
+
+MEANINGS: Mapping[str, str] = {
+    "layout": "names, sizes, units, frames and smallest deviations of the observation",
+    "purity": "methods trace, twice into the same program, and leave self alone",
+    "types": "shapes and dtypes as the contract has them, none of them weak",
+    "draws": "a key gives one draw, and another key another",
+    "batches": "jax.vmap gives what a loop gives",
+    "finite": f"{DRAWS} ordinary and extreme robots each, goals and actions too",
+    "reward": "the terms add up to the reward",
+    "endings": "success ends an episode, and none ends where it begins",
+    "goal": "goal_position follows move_goal",
+    "scene": "MuJoCo and MJX build it, markers place its bodies",
+    "drive": f"{DRIVE_ENVS} robots for {DRIVE_STEPS} steps, traced once and finite",
+}
+"""What each check looks at, in words."""
+
+_NEEDED = ("layout", "purity", "types")
+"""With what these find, the checks after them could but fail as well."""

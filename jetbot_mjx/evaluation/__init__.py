@@ -1,0 +1,21 @@
+"""Score policies on fixed goals, compare them and write reports."""
+
+from typing import TYPE_CHECKING
+
+from jetbot_mjx.imports import load_lazily
+
+if TYPE_CHECKING:
+    from jetbot_mjx.evaluation.evaluator import Evaluator as Evaluator
+    from jetbot_mjx.evaluation.evaluator import report_keys as report_keys
+    from jetbot_mjx.evaluation.html_report import write_comparison as write_comparison
+    from jetbot_mjx.evaluation.html_report import write_report as write_report
+
+__getattr__, __dir__ = load_lazily(
+    __name__,
+    {
+        "Evaluator": "evaluator",
+        "report_keys": "evaluator",
+        "write_comparison": "html_report",
+        "write_report": "html_report",
+    },
+)

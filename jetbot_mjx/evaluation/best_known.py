@@ -1,0 +1,88 @@
+"""The best-known time to each of the report's goals, to read a policy's time against.
+
+The file in the package holds what `benchmarks/best_known.py` found: commands of one goal, searched
+with the true model and driven without looking, are an upper bound of the shortest time. Each search
+states the settings that it holds for; of any other task, robot or time step nothing is known.
+"""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION
+from jetbot_mjx.evaluation.rollout import Episodes
+
+FILE = Path(__file__).parents[1] / "assets" / "best_known.json"
+
+FORMAT = "jetbot_mjx-best-known/1"
+"""Of that file."""
+
+SETTINGS = (
+    "robot.preset",
+    "task.name",
+    "task.max_speed",
+    "task.max_yaw_rate",
+    "task.goal_distance_min",
+    "task.goal_distance_span",
+    "task.success_radius",
+    "physics.ctrl_dt",
+    "physics.sim_dt",
+)
+"""What the goals and the times to them depend on."""
+
+_SAME_GOAL = 1.5e-3  # [m] the file holds whole millimetres
+
+
+class Known(NamedTuple):
+    """The best-known times of a report's goals, or why there are none."""
+
+    steps: Float[np.ndarray, " n"] | None
+    """Environment steps to each goal."""
+    missing: str | None
+    """Why there are none, in one line."""
+
+
+def settings_of(config: Config) -> dict[str, Any]:
+    """Return what the times of a configuration depend on, by key."""
+    flat = config.flat()
+    return {name: flat[name] for name in SETTINGS}
+
+
+def find(config: Config, episodes: Episodes) -> Known:
+    """Find the best-known times of the goals that a policy was driven to.
+
+    Args:
+      config: of its run.
+      episodes: on the host, to the first of the report's goals.
+
+    Returns:
+      The times, or why there are none.
+    """
+    searches = [
+        one
+        for one in json.loads(FILE.read_text(encoding="utf-8"))["searches"]
+        if one["goal_set_version"] == GOAL_SET_VERSION
+    ]
+    if not searches:
+        return Known(None, "no search was made for these goals")
+    ours = settings_of(config)
+    differing = [
+        [name for name in SETTINGS if one["settings"][name] != ours[name]] for one in searches
+    ]
+    nearest = min(range(len(searches)), key=lambda index: len(differing[index]))
+    search, names = searches[nearest], differing[nearest]
+    if names:
+        told = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
+        own = ", ".join(str(ours[name]) for name in names)
+        return Known(None, f"it was searched for {told}, and this is {own}")
+    count = episodes.steps.size
+    goals, steps = np.asarray(search["goals"], float) / 1e3, np.asarray(search["steps"], float)
+    if len(steps) < count:
+        return Known(None, f"it was searched for {len(steps):,} of these {count:,} goals")
+    if np.abs(goals[:count] - episodes.goal_w[:, :2]).max() > _SAME_GOAL:
+        return Known(None, "it was searched for goals that lie elsewhere")
+    return Known(steps[:count], None)

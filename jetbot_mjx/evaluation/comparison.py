@@ -1,0 +1,329 @@
+"""Several policies judged on the same goals: what trainings reach, and which is better.
+
+Two kinds of chance are kept apart. How a training turns out depends on its seed: where a run has
+two seeds or more, intervals come from a bootstrap that draws whole seeds, each run from its own.
+A run of one seed can only tell how one policy does on other goals: there the interval is over
+episodes. Runs are also compared goal by goal, since all policies drive to the same goals; that
+is about these very policies.
+"""
+
+import itertools
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+import scipy.stats
+from jaxtyping import Bool, Float
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.bootstrap import (
+    Estimate,
+    bootstrap,
+    interquartile_mean,
+    mean,
+    mean_band,
+    mean_difference,
+    median_estimate,
+    probability_of_improvement,
+)
+from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary
+from jetbot_mjx.evaluation.report import Report
+
+
+class Aggregate(NamedTuple):
+    """One quantity of one run."""
+
+    over: Literal["seeds", "episodes"]
+    """What the intervals are over."""
+    count: int
+    """How many of those had a figure."""
+    mean: Estimate
+    """Over seeds; of one seed, its own figure."""
+    iqm: Estimate
+    """Interquartile mean over seeds: without the best and the worst quarter. Of one seed, none."""
+
+
+class BandPoint(NamedTuple):
+    """One evaluation during the training of all seeds of a run."""
+
+    env_steps: int
+    success_rate: float
+    """Mean over seeds."""
+    success_low: float
+    success_high: float
+
+
+class Run(NamedTuple):
+    """The seeds of one training."""
+
+    name: str
+    seeds: Mapping[str, Report]
+    success_rate: Aggregate
+    time_to_goal: Aggregate
+    """[s] of the seeds' medians."""
+    learning_curve: tuple[BandPoint, ...]
+    """At the steps at which every seed was judged; its band is over seeds where there are two."""
+
+
+class Duel(NamedTuple):
+    """Two runs, `a` and `b`, in one quantity."""
+
+    difference: Estimate
+    """Mean of a minus mean of b."""
+    improvement: Estimate
+    """Probability that a seed of a does better than one of b; of equals, half counts."""
+    wins: int
+    """Goals on which a did better."""
+    losses: int
+    """Goals on which b did better."""
+    ties: int
+    p: float
+    """Exact two-sided binomial test that wins and losses are equally likely."""
+
+
+class Pair(NamedTuple):
+    """Two runs against each other."""
+
+    a: str
+    b: str
+    seeds: int
+    """How many of each are compared goal by goal, the first ones: more of the one than of the
+    other would not be fair."""
+    success_rate: Duel
+    """Goal by goal: which run reached it with more of its seeds."""
+    time_to_goal: Duel
+    """[s], less is better; goal by goal where both runs reached it."""
+
+
+class Comparison(NamedTuple):
+    """All that is told of several policies."""
+
+    folder: Path
+    """Where its files lie."""
+    episodes: int
+    settings: Mapping[str, Any]
+    """What all of them had to do: the settings of task, robot and time that they share."""
+    runs: tuple[Run, ...]
+    pairs: tuple[Pair, ...]
+    differences: Mapping[str, Sequence[Any]]
+    """Settings in which the runs differ, besides the seed: the value of each run by the key."""
+    baselines: Mapping[str, Summary]
+    versions: Mapping[str, Any]
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the episodes."""
+        return {
+            "goal_set_version": GOAL_SET_VERSION,
+            "episodes": self.episodes,
+            "settings": dict(self.settings),
+            "runs": [_run_json(run) for run in self.runs],
+            "pairs": [_nested(pair) for pair in self.pairs],
+            "differences": {key: list(values) for key, values in self.differences.items()},
+            "baselines": {name: one._asdict() for name, one in self.baselines.items()},
+            "versions": dict(self.versions),
+        }
+
+
+def _run_json(run: Run) -> dict[str, Any]:
+    seeds = [
+        {
+            "name": name,
+            "checkpoint": report.checkpoint.name,
+            "env_steps": report.env_steps,
+            "policy": report.policy._asdict(),
+            "mujoco": report.mujoco.to_json() if report.mujoco else None,
+        }
+        for name, report in run.seeds.items()
+    ]
+    return _nested(run._replace(seeds={})) | {"seeds": seeds}
+
+
+def _nested(value: Any) -> Any:
+    """Named tuples within named tuples as objects."""
+    if hasattr(value, "_asdict"):
+        return {name: _nested(one) for name, one in value._asdict().items()}
+    return [_nested(one) for one in value] if isinstance(value, tuple) else value
+
+
+def check_comparable(configs: Mapping[str, Config]) -> None:
+    """Refuses runs that did not have the same to do.
+
+    What they see, how their networks look and how they were trained may differ.
+
+    Args:
+      configs: of each run, by what the user calls it.
+
+    Raises:
+      UserError: they differ in the task, the robot, or how long an episode takes.
+    """
+    (first, wanted), *others = ((name, _to_do(config)) for name, config in configs.items())
+    for name, found in others:
+        for key in sorted(wanted.keys() | found.keys()):
+            if wanted.get(key) != found.get(key):
+                raise UserError(
+                    f"{name} cannot be compared with {first}: {key} = {found.get(key)!r}, and not"
+                    f" {wanted.get(key)!r}; compare runs of one task and one robot"
+                )
+
+
+def _to_do(config: Config) -> dict[str, Any]:
+    return {
+        key: value
+        for key, value in config.flat().items()
+        if key.startswith(("task.", "robot.", "physics.ctrl_dt")) and key != "task.observation"
+    }
+
+
+def _differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
+    flat = [config.flat() for config in configs]
+    keys = dict.fromkeys(key for one in flat for key in one if key not in ("seed", "seeds"))
+    found = {key: [one.get(key) for one in flat] for key in keys}
+    return {key: values for key, values in found.items() if any(v != values[0] for v in values)}
+
+
+def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Comparison:
+    """Compares runs on the goals that all of them drove to.
+
+    Args:
+      folder: where the files of the comparison are to lie.
+      runs: the seeds' reports by their names, by the run's name; all of the same goals.
+
+    Returns:
+      The comparison.
+
+    Raises:
+      UserError: their tasks drew other goals under the same keys.
+    """
+    _check_goals(runs)
+    rows = tuple(_run(name, seeds) for name, seeds in runs.items())
+    first = next(iter(rows[0].seeds.values()))
+    return Comparison(
+        folder=folder,
+        episodes=first.policy.episodes,
+        settings=_to_do(first.config),
+        runs=rows,
+        pairs=tuple(_pair(a, b) for a, b in itertools.combinations(rows, 2)),
+        differences=_differences([next(iter(seeds.values())).config for seeds in runs.values()]),
+        baselines=first.baselines,
+        versions=first.versions,
+    )
+
+
+def _check_goals(runs: Mapping[str, Mapping[str, Report]]) -> None:
+    (first, wanted), *others = (
+        (name, report.episodes.goal_w) for name, seeds in runs.items() for report in seeds.values()
+    )
+    for name, found in others:
+        # Other programs round differently.
+        if not np.allclose(found, wanted, atol=1e-3):
+            raise UserError(
+                f"{name} cannot be compared with {first}: its task drew other goals from the same"
+                " keys; let `sample` depend on what the runs have in common alone"
+            )
+
+
+def _run(name: str, seeds: Mapping[str, Report]) -> Run:
+    reports = list(seeds.values())
+    if len(reports) == 1:
+        success, time = _of_one_seed(reports[0])
+    else:
+        success = _over_seeds([one.policy.success_rate for one in reports])
+        time = _over_seeds(_times(reports))
+    return Run(name, seeds, success, time, _band([one.learning_curve for one in reports]))
+
+
+def _times(reports: Sequence[Report]) -> list[float]:
+    """Median times to the goal, of the seeds that reached any."""
+    medians = (one.policy.time_to_goal_median for one in reports)
+    return [median for median in medians if median is not None]
+
+
+def _of_one_seed(report: Report) -> tuple[Aggregate, Aggregate]:
+    """Over its episodes: success with its Wilson interval, and the median time."""
+    policy, episodes = report.policy, report.episodes
+    success = Estimate(policy.success_rate, policy.success_low, policy.success_high)
+    steps = np.asarray(episodes.steps)[np.asarray(episodes.success) > 0]
+    time = median_estimate(steps * report.config.physics.ctrl_dt)
+    return (
+        Aggregate("episodes", policy.episodes, success, Estimate(None)),
+        Aggregate("episodes", policy.successes, time, Estimate(None)),
+    )
+
+
+def _over_seeds(values: Sequence[float]) -> Aggregate:
+    return Aggregate(
+        "seeds", len(values), bootstrap(mean, values), bootstrap(interquartile_mean, values)
+    )
+
+
+def _band(curves: Sequence[Sequence[Any]]) -> tuple[BandPoint, ...]:
+    if len(curves) == 1:
+        return tuple(BandPoint(*point[:4]) for point in curves[0])
+    by_steps = [{point.env_steps: point.success_rate for point in curve} for curve in curves]
+    common = sorted(set.intersection(*(set(curve) for curve in by_steps)))
+    if not common:
+        return ()
+    rates = np.array([[curve[step] for step in common] for curve in by_steps])
+    lows, highs = mean_band(rates)
+    columns = (common, rates.mean(axis=0), lows, highs)
+    return tuple(
+        BandPoint(int(step), float(mean), float(low), float(high))
+        for step, mean, low, high in zip(*columns, strict=True)
+    )
+
+
+def _pair(a: Run, b: Run) -> Pair:
+    ours, theirs = list(a.seeds.values()), list(b.seeds.values())
+    seeds = min(len(ours), len(theirs))
+    rate_a, steps_a = _goal_by_goal(ours[:seeds])
+    rate_b, steps_b = _goal_by_goal(theirs[:seeds])
+    both = (rate_a > 0) & (rate_b > 0)
+    success = [[one.policy.success_rate for one in reports] for reports in (ours, theirs)]
+    return Pair(
+        a.name,
+        b.name,
+        seeds,
+        _duel(success[0], success[1], rate_a > rate_b, rate_a < rate_b),
+        _duel(
+            _times(ours),
+            _times(theirs),
+            (steps_a < steps_b)[both],
+            (steps_a > steps_b)[both],
+            less_is_better=True,
+        ),
+    )
+
+
+def _goal_by_goal(
+    reports: Sequence[Report],
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Which part of the seeds reached a goal, and in how many steps, of those that did."""
+    won = np.stack([one.episodes.success > 0 for one in reports])
+    # Whole numbers, so that equals stay equal in whatever order they are added.
+    steps = np.stack([np.asarray(one.episodes.steps, int) for one in reports])
+    reached = won.sum(axis=0)
+    return reached / len(reports), (won * steps).sum(axis=0) / np.maximum(reached, 1)
+
+
+def _duel(
+    a: Sequence[float],
+    b: Sequence[float],
+    better: Bool[np.ndarray, " n"],
+    worse: Bool[np.ndarray, " n"],
+    *,
+    less_is_better: bool = False,
+) -> Duel:
+    wins, losses = int(better.sum()), int(worse.sum())
+    several = len(a) > 1 and len(b) > 1
+    order = (b, a) if less_is_better else (a, b)
+    return Duel(
+        difference=bootstrap(mean_difference, a, b),
+        # One seed against another says nothing of the next two.
+        improvement=bootstrap(probability_of_improvement, *order) if several else Estimate(None),
+        wins=wins,
+        losses=losses,
+        ties=better.size - wins - losses,
+        p=float(scipy.stats.binomtest(wins, wins + losses).pvalue) if wins + losses else 1.0,
+    )

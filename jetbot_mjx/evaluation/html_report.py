@@ -1,0 +1,208 @@
+"""Reports as files: JSON with everything, figures, and a page of HTML and one of Markdown.
+
+A page is made from the values of its JSON file, each number of it by its place in there, so that
+they cannot tell two things. It holds its figures and asks no network for anything.
+"""
+
+import base64
+import json
+import os
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jinja2
+from markupsafe import Markup
+from matplotlib.figure import Figure
+
+from jetbot_mjx.evaluation.comparison import Comparison
+from jetbot_mjx.evaluation.learning_curves import (
+    plot_learning_curve,
+    plot_learning_curves,
+    plot_runs,
+)
+from jetbot_mjx.evaluation.plots import (
+    THEMES,
+    plot_by_goal,
+    plot_distributions,
+    plot_robustness,
+    plot_trajectories,
+    shown_trajectories,
+    theme,
+    to_png,
+)
+from jetbot_mjx.evaluation.report import Report, replay_command
+from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, write_text, writing_to
+
+LISTED_FAILURES = 50
+"""As many stand on a page; all stand in the JSON file."""
+
+_REPLAYED = 8
+
+_NOT_ALWAYS = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
+"""Figures that a page may be without."""
+
+_FORMS = {
+    "percent": "{:.2%}",
+    "whole percent": "{:.0%}",
+    "seconds": "{:.2f} s",
+    "milliseconds": "{:.3f} s",
+    "metres": "{:.2f} m",
+    "signed metres": "{:+.3f} m",
+    "count": "{:,}",
+    "plain": "{}",
+    "short": "{:g}",
+    "degrees": "{:+.0f}°",
+    "signed percent": "{:+.2%}",
+    "signed seconds": "{:+.3f} s",
+    "p": "{:.2g}",
+}
+
+_PAGES = jinja2.Environment(
+    loader=jinja2.PackageLoader("jetbot_mjx", "assets"),
+    autoescape=jinja2.select_autoescape(["html"]),
+    undefined=jinja2.StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+    # Settings: as many digits as a reader wants.
+    finalize=lambda value: f"{value:.6g}" if isinstance(value, float) else value,
+)
+
+# A bar would begin the next cell of a Markdown table.
+_PAGES.filters["cell"] = lambda text: text.replace("|", "\\|")
+
+
+class _Picture(NamedTuple):
+    """A figure within a page."""
+
+    file: str
+    light: str
+    dark: str
+
+
+def write_report(report: Report) -> Path:
+    """Writes a report into its folder.
+
+    Args:
+      report: of one policy.
+
+    Returns:
+      The page: `report.html`; beside it `report.md`, `report.json` and the figures.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    episodes = report.episodes
+    shown = shown_trajectories(episodes)
+    successes = sum(bool(episodes.success[index] > 0) for index in shown)
+    figures = {
+        "by_goal": lambda: plot_by_goal(report.cells),
+        "trajectories": lambda: plot_trajectories(episodes, which=shown),
+        "distributions": lambda: plot_distributions(report),
+    }
+    if report.learning_curve:
+        figures["learning_curve"] = lambda: plot_learning_curve(report)
+    if report.robustness:
+        figures["robustness"] = lambda: plot_robustness(report.robustness)
+    goals = [failure.goal for failure in report.failures if failure.replay][:_REPLAYED]
+    return _write(
+        report.folder,
+        "report",
+        report.to_json(),
+        figures,
+        {
+            "shown": {"successes": successes, "failures": len(shown) - successes},
+            "listed": LISTED_FAILURES,
+            "replay": replay_command(report.run, report.env_steps, goals),
+            "replayed": len(goals),
+            "judge": report.judge_command(),
+        },
+    )
+
+
+def write_comparison(comparison: Comparison) -> Path:
+    """Writes a comparison into its folder.
+
+    Args:
+      comparison: of runs whose own reports are written.
+
+    Returns:
+      The page: `comparison.html`; beside it `comparison.md`, `comparison.json` and the figures.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    figures = {"runs": lambda: plot_runs(comparison)}
+    if any(run.learning_curve for run in comparison.runs):
+        figures["learning_curves"] = lambda: plot_learning_curves(comparison)
+    links = [
+        [os.path.relpath(one.folder / "report", comparison.folder) for one in run.seeds.values()]
+        for run in comparison.runs
+    ]
+    return _write(comparison.folder, "comparison", comparison.to_json(), figures, {"links": links})
+
+
+def _write(
+    folder: Path,
+    name: str,
+    values: Mapping[str, Any],
+    figures: Mapping[str, Callable[[], Figure]],
+    more: Mapping[str, Any],
+) -> Path:
+    """Draws all before anything is written; the page comes last."""
+    drawn = {figure: _draw(draw) for figure, draw in figures.items()}
+    pictures = {
+        figure: _Picture(f"{figure}.png", *(_data_uri(png) for png in pngs))
+        for figure, pngs in drawn.items()
+    }
+    pages = {
+        suffix: _PAGES.get_template(f"{name}{suffix}").render(
+            values=values, figures=pictures, number=_numbers(values, suffix), **more
+        )
+        for suffix in (".md", ".html")
+    }
+    make_folder(folder)
+    with writing_to(folder):
+        # Of an earlier report that had more.
+        for figure in sorted(_NOT_ALWAYS[name] - drawn.keys()):
+            (folder / f"{figure}.png").unlink(missing_ok=True)
+        for figure, (light, _) in drawn.items():
+            write_bytes(folder / f"{figure}.png", light)
+        write_json(folder / f"{name}.json", values)
+        for suffix, text in pages.items():
+            write_text(folder / f"{name}{suffix}", text)
+    return folder / f"{name}.html"
+
+
+def _draw(draw: Callable[[], Figure]) -> list[bytes]:
+    """A figure in every theme."""
+    pngs = []
+    for name in THEMES:
+        with theme(name):
+            pngs.append(to_png(draw()))
+    return pngs
+
+
+def _data_uri(png: bytes) -> str:
+    return f"data:image/png;base64,{base64.b64encode(png).decode()}"
+
+
+def _numbers(values: Mapping[str, Any], suffix: str) -> Callable[[str, str], str]:
+    """What shows a number of the JSON file by its place, such as `policy.success_rate`."""
+
+    def number(place: str, form: str) -> str:
+        value = _look_up(values, place)
+        text = "-" if value is None else _FORMS[form].format(value)
+        if suffix != ".html":
+            return text
+        exact = json.dumps(value)
+        return Markup('<data value="{}" data-json="{}">{}</data>').format(exact, place, text)
+
+    return number
+
+
+def _look_up(values: Any, place: str) -> Any:
+    for key in place.split("."):
+        values = values[int(key)] if isinstance(values, list) else values[key]
+    return values

@@ -1,0 +1,142 @@
+"""Figures of trainings: how they learn, and what they reach beside each other."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, PercentFormatter
+
+from jetbot_mjx.evaluation.comparison import Aggregate, BandPoint, Comparison
+from jetbot_mjx.evaluation.report import Report
+
+
+def plot_learning_curve(report: Report) -> Figure:
+    """Success over the training, and where the reported policy stands.
+
+    Args:
+      report: of one policy, whose run has a learning curve.
+
+    Returns:
+      The figure.
+    """
+    figure = Figure(figsize=(10.4, 3.6), layout="constrained")
+    axes = figure.add_subplot()
+    _curve(axes, report.learning_curve, "C0", "during the training, its own goals")
+    policy = report.policy
+    error = [
+        [policy.success_rate - policy.success_low],
+        [policy.success_high - policy.success_rate],
+    ]
+    axes.axvline(report.env_steps, color=matplotlib.rcParams["grid.color"], lw=1, zorder=0)
+    axes.errorbar(
+        [report.env_steps],
+        [policy.success_rate],
+        np.abs(error),
+        fmt="D",
+        color="C1",
+        markersize=5,
+        capsize=4,
+        label="this report, the report's goals",
+        zorder=3,
+    )
+    _label_curves(axes)
+    return figure
+
+
+def plot_learning_curves(comparison: Comparison) -> Figure:
+    """Success over the training of every run, with a band.
+
+    Args:
+      comparison: of runs, some of which have a learning curve.
+
+    Returns:
+      The figure.
+    """
+    figure = Figure(figsize=(10.4, 4.0), layout="constrained")
+    axes = figure.add_subplot()
+    # Two checkpoints of one run have one curve.
+    named: dict[tuple[BandPoint, ...], list[str]] = {}
+    for run in comparison.runs:
+        seeds = f", {len(run.seeds)} seeds" if len(run.seeds) > 1 else ""
+        named.setdefault(run.learning_curve, []).append(run.name + seeds)
+    colours = {run.learning_curve: f"C{index}" for index, run in enumerate(comparison.runs)}
+    for points, names in named.items():
+        if points:
+            _curve(axes, points, colours[points], "; ".join(names))
+    _label_curves(axes)
+    return figure
+
+
+def _curve(axes: Axes, points: Sequence[Any], colour: str, label: str) -> None:
+    steps = [point.env_steps for point in points]
+    axes.fill_between(
+        steps,
+        [point.success_low for point in points],
+        [point.success_high for point in points],
+        color=colour,
+        alpha=0.2,
+        lw=0,
+    )
+    rates = [point.success_rate for point in points]
+    axes.plot(steps, rates, color=colour, marker="o", markersize=3, lw=1.5, label=label)
+
+
+def _label_curves(axes: Axes) -> None:
+    axes.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.02, 1.04))
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: _short(steps)))
+    axes.grid()
+    axes.set_axisbelow(True)
+    axes.legend(loc="best", fontsize="small")
+
+
+def _short(count: float) -> str:
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(count) >= size:
+            return f"{count / size:g} {letter}"
+    return f"{count:g}"
+
+
+def plot_runs(comparison: Comparison) -> Figure:
+    """Success rate and time to the goal of every run, with intervals and every seed.
+
+    Args:
+      comparison: of runs.
+
+    Returns:
+      The figure.
+    """
+    height = 1.0 + 0.45 * len(comparison.runs)
+    figure = Figure(figsize=(10.4, height), layout="constrained")
+    success, seconds = figure.subplots(1, 2, sharey=True)
+    for row, run in enumerate(comparison.runs):
+        policies = [report.policy for report in run.seeds.values()]
+        _forest(success, row, run.success_rate, [one.success_rate for one in policies])
+        _forest(seconds, row, run.time_to_goal, [one.time_to_goal_median for one in policies])
+    success.set_yticks(range(len(comparison.runs)), [run.name for run in comparison.runs])
+    success.set_ylim(len(comparison.runs) - 0.5, -0.6)
+    success.xaxis.set_major_formatter(PercentFormatter(1.0))
+    success.set(xlabel="success rate")
+    seconds.set(xlabel="median time to goal [s]")
+    for axes in (success, seconds):
+        axes.grid(axis="x")
+        axes.set_axisbelow(True)
+        axes.tick_params(axis="y", length=0)
+    return figure
+
+
+def _forest(axes: Axes, row: int, aggregate: Aggregate, values: Sequence[float | None]) -> None:
+    """A run's seeds, its mean with interval, and below it the interquartile mean."""
+    colour = f"C{row}"
+    kinds = [(aggregate.mean, 0.0, "o"), (aggregate.iqm, 0.22, "s")]
+    if aggregate.over == "seeds":
+        found = [value for value in values if value is not None]
+        axes.scatter(found, [row - 0.2] * len(found), s=12, color=colour, alpha=0.5, lw=0)
+    for (value, low, high), below, marker in kinds:
+        if low is not None and high is not None:
+            axes.plot([low, high], [row + below] * 2, color=colour, lw=2.5)
+        if value is not None:
+            axes.plot(value, row + below, marker=marker, color=colour, markersize=6)

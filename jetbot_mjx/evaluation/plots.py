@@ -1,0 +1,326 @@
+"""Figures of episodes and of judgements: each function returns one, and writes nothing.
+
+Their colours come from the theme in which they are drawn: `with theme("dark"): ...`.
+"""
+
+import contextlib
+import io
+from collections.abc import Iterator, Sequence
+from typing import Any, Literal
+
+import matplotlib
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+from matplotlib.rcsetup import cycler
+from matplotlib.ticker import FuncFormatter, PercentFormatter
+
+from jetbot_mjx.evaluation.evaluator import Summary, final_distances, path_efficiencies
+from jetbot_mjx.evaluation.report import SECTORS, Cell, Report
+from jetbot_mjx.evaluation.robustness import CARRIES_AT, SweepResult
+from jetbot_mjx.evaluation.rollout import Episodes
+
+Theme = Literal["light", "dark"]
+THEMES: tuple[Theme, ...] = ("light", "dark")
+
+# Paper, ink, faint lines, and colours that the colour-blind can tell apart, the first two for
+# goals that were reached and missed.
+_COLOURS = {
+    "light": ("#ffffff", "#22272e", "#d5dae1", "#1f6fd0 #d9480f #2b8a3e #862e9c #b08900 #0b7285"),
+    "dark": ("#161b22", "#d5dbe3", "#363e49", "#5aa2f5 #ff8a4c #5bbd6e #c98be0 #e0b73c #4dbfd0"),
+}
+_REACHED, _MISSED = "C0", "C1"
+
+_DPI = 160
+
+_MOST_SUCCESSES = 100
+_MOST_FAILURES = 200
+
+
+@contextlib.contextmanager
+def theme(name: Theme) -> Iterator[None]:
+    """Draws what is drawn meanwhile for light or for dark surroundings."""
+    paper, ink, faint, cycle = _COLOURS[name]
+    style: Any = {
+        "figure.facecolor": paper,
+        "savefig.facecolor": paper,
+        "axes.facecolor": paper,
+        "legend.facecolor": paper,
+        "legend.edgecolor": faint,
+        "legend.framealpha": 0.85,
+        "text.color": ink,
+        "axes.labelcolor": ink,
+        "axes.edgecolor": faint,
+        "xtick.color": ink,
+        "ytick.color": ink,
+        "grid.color": faint,
+        "grid.linewidth": 0.7,
+        "hatch.color": faint,
+        "axes.prop_cycle": cycler(color=cycle.split()),
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.titlesize": 11,
+        "axes.titleweight": "bold",
+        "axes.titlelocation": "left",
+        "font.size": 10,
+    }
+    with matplotlib.rc_context(style):
+        yield
+
+
+def to_png(figure: Figure) -> bytes:
+    """A figure as a file, the same bytes for the same figure whenever it is drawn."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def shown_trajectories(episodes: Episodes) -> list[int]:
+    """Which episodes a readable plan view shows: failures before successes, the first of each.
+
+    Args:
+      episodes: on the host.
+    """
+    won = np.asarray(episodes.success) > 0
+    failures, successes = np.flatnonzero(~won), np.flatnonzero(won)
+    return [*successes[:_MOST_SUCCESSES].tolist(), *failures[:_MOST_FAILURES].tolist()]
+
+
+def plot_trajectories(
+    episodes: Episodes,
+    title: str = "",
+    others_w: Sequence[Float[np.ndarray, "n 3"]] = (),
+    which: Sequence[int] | None = None,
+) -> Figure:
+    """Plan view of recorded episodes: where the robot went and where it should have gone.
+
+    Args:
+      episodes: recorded.
+      title: of the figure.
+      others_w: what else stood in each episode's world [m], drawn as grey dots.
+      which: the episodes to draw, the last on top; None: all.
+
+    Returns:
+      The figure.
+    """
+    if episodes.qpos is None:
+        raise ValueError("these episodes were not recorded: rollout_fn(..., record=True)")
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    axes = figure.add_subplot()
+    for index in range(episodes.success.size) if which is None else which:
+        colour = _REACHED if episodes.success[index] > 0 else _MISSED
+        way = np.asarray(episodes.qpos[index, : int(episodes.steps[index]) + 1, :2])
+        goal_w = np.asarray(episodes.goal_w[index])
+        axes.plot(way[:, 0], way[:, 1], color=colour, linewidth=1.0, alpha=0.7)
+        axes.add_patch(
+            Rectangle((goal_w[0] - 0.05, goal_w[1] - 0.05), 0.1, 0.1, color=colour, alpha=0.3, lw=0)
+        )
+        axes.plot(*way[-1], marker="o", color=colour, markersize=3)
+    for places in others_w:
+        axes.scatter(places[:, 0], places[:, 1], color="grey", alpha=0.5, zorder=0)
+    ink = matplotlib.rcParams["text.color"]
+    axes.plot(0, 0, marker=(3, 0, -90), color=ink, ls="", ms=11, label="start, heading +x")
+    axes.plot([], [], color=_REACHED, label="reached")
+    axes.plot([], [], color=_MISSED, label="not reached")
+    axes.set(aspect="equal", xlabel="x [m]", ylabel="y [m]", title=title)
+    reach = 1.1 * max(1.25, float(np.abs(np.asarray(episodes.goal_w)[:, :2]).max()))
+    axes.set(xlim=(-reach, reach), ylim=(-reach, reach))
+    axes.grid()
+    axes.set_axisbelow(True)
+    axes.legend(loc="upper left", fontsize="small")
+    return figure
+
+
+def plot_by_goal(cells: Sequence[Cell]) -> Figure:
+    """Success and time to the goal by its distance and bearing, as seen from above the start.
+
+    Args:
+      cells: of a report.
+
+    Returns:
+      The figure; cells without a goal, or without a time, are hatched.
+    """
+    figure = Figure(figsize=(10.4, 5.4), layout="constrained")
+    success, seconds = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
+    middle, cycle = matplotlib.rcParams["grid.color"], _cycle()
+    ramp = LinearSegmentedColormap.from_list
+    times = [cell.time_to_goal_median for cell in cells if cell.time_to_goal_median is not None]
+    slowest, fastest = max(times, default=1.0), min(times, default=0.0)
+    _polar(
+        success,
+        cells,
+        [cell.success_rate for cell in cells],
+        [f"{cell.successes}\nof {cell.episodes}" for cell in cells],
+        ramp("", [cycle[1], middle, cycle[0]]),
+        Normalize(0, 1),
+    )
+    _polar(
+        seconds,
+        cells,
+        [cell.time_to_goal_median for cell in cells],
+        [f"{cell.time_to_goal_median or 0:.2f}" for cell in cells],
+        ramp("", [middle, cycle[3]]),
+        Normalize(fastest - 0.15 * (slowest - fastest) - 1e-6, slowest),
+    )
+    success.set_title("Goals reached", pad=22)
+    seconds.set_title("Median time to goal [s]", pad=22)
+    return figure
+
+
+def _cycle() -> list[str]:
+    return matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
+
+
+def _polar(
+    axes: Any,
+    cells: Sequence[Cell],
+    values: Sequence[float | None],
+    labels: Sequence[str],
+    colours: Colormap,
+    scale: Normalize,
+) -> None:
+    """Cells of rings and sectors; ahead is up, left is left."""
+    ink, paper = (matplotlib.rcParams[key] for key in ("text.color", "figure.facecolor"))
+    for cell, value, label in zip(cells, values, labels, strict=True):
+        middle = np.radians(cell.bearing_low + cell.bearing_high) / 2
+        height = cell.distance_high - cell.distance_low
+        place = {"width": np.radians(360 / SECTORS), "bottom": cell.distance_low}
+        if value is None:
+            axes.bar(middle, height, **place, facecolor="none", hatch="////", lw=0)
+            continue
+        fill = colours(scale(value))
+        axes.bar(middle, height, **place, color=fill, edgecolor=paper, linewidth=1.5)
+        # Whichever of the two reads better on the colour.
+        text = max((ink, paper), key=lambda colour, fill=fill: _contrast(colour, fill))
+        radius = cell.distance_low + 0.5 * height
+        axes.text(middle, radius, label, ha="center", va="center", color=text, fontsize=7)
+    edges = sorted({cell.distance_low for cell in cells} | {cell.distance_high for cell in cells})
+    axes.set_theta_zero_location("N")
+    axes.set_ylim(0, edges[-1])
+    axes.set_yticks(edges, [f"{edge:g} m" for edge in edges], fontsize=7)
+    for label in axes.get_yticklabels():
+        label.set_bbox({"boxstyle": "round,pad=0.15", "fc": paper, "ec": "none"})
+    axes.set_rlabel_position(180 / SECTORS)
+    bearings = np.arange(SECTORS) * 360 // SECTORS
+    names = [f"{b if b <= 180 else b - 360:+d}°" if b % 180 else f"{b}°" for b in bearings]
+    names[0] = "ahead 0°"
+    axes.set_xticks(np.radians(bearings), names, fontsize=8)
+    axes.grid(visible=False)
+    axes.spines["polar"].set_visible(False)
+    axes.plot(0, 0, marker="^", color=ink, markersize=9)
+
+
+def _contrast(one: Any, other: Any) -> float:
+    """Between two colours, as the eye sees it."""
+    low, high = sorted(float(np.dot(to_rgb(c), (0.299, 0.587, 0.114))) for c in (one, other))
+    return high - low
+
+
+def plot_distributions(report: Report) -> Figure:
+    """How far from its goal every episode ended, and how straight the successes went.
+
+    Args:
+      report: of one policy.
+
+    Returns:
+      The figure.
+    """
+    episodes = report.episodes
+    won = np.asarray(episodes.success) > 0
+    remaining = final_distances(episodes)
+    figure = Figure(figsize=(10.4, 3.4), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    radius = report.config.task.success_radius
+    bins = np.linspace(0, max(float(remaining.max()), 2 * radius), 61)
+    left.hist(
+        [remaining[won], remaining[~won]],
+        bins=bins.tolist(),
+        stacked=True,
+        color=[_REACHED, _MISSED],
+        label=["reached", "not reached"],
+        log=True,
+    )
+    ink = matplotlib.rcParams["text.color"]
+    left.axvline(radius, color=ink, lw=1, ls="--", label=f"success radius {radius:g} m")
+    left.set(xlabel="distance to the goal at the end [m]", ylabel="goals (logarithmic)")
+    left.set_ylim(bottom=0.7)
+    left.yaxis.set_major_formatter(FuncFormatter(lambda count, _: f"{count:g}"))
+    left.set_title("Final distance")
+    left.legend(fontsize="small")
+    right.set_title("Path efficiency of the successes")
+    if won.any():
+        right.hist(path_efficiencies(episodes)[won], bins=40, color=_REACHED)
+        right.set(xlabel="straight line over way travelled", ylabel="goals")
+        right.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    else:
+        right.set_axis_off()
+        right.text(0.5, 0.5, "no goal was reached", ha="center", transform=right.transAxes)
+    return figure
+
+
+def plot_robustness(results: Sequence[SweepResult]) -> Figure:
+    """How far a policy carries: success, and time to goal below it, over each quantity.
+
+    Args:
+      results: of one policy, one for each quantity.
+
+    Returns:
+      The figure: bands are 95 % Wilson intervals, a dashed line stands at the preset's value.
+    """
+    medians = [
+        summary.time_to_goal_median or 0.0
+        for result in results
+        for summary in (*result.policy, *result.scripted)
+    ]
+    ink = matplotlib.rcParams["text.color"]
+    columns = min(3 if len(results) <= 9 else 4, len(results))
+    lines = -(-len(results) // columns)
+    figure = Figure(figsize=(3.6 * columns, 3.6 * lines), layout="constrained")
+    grid = figure.add_gridspec(2 * lines, columns, height_ratios=[3, 2] * lines)
+    for index, result in enumerate(results):
+        line, column = divmod(index, columns)
+        success = figure.add_subplot(grid[2 * line, column])
+        time = figure.add_subplot(grid[2 * line + 1, column], sharex=success)
+        for name, summaries, colour in (
+            ("scripted", result.scripted, "tab:gray"),
+            ("policy", result.policy, "C0"),
+        ):
+            _plot_over(success, time, result.sweep.values, summaries, label=name, color=colour)
+        for axes in (success, time):
+            axes.axvline(result.sweep.nominal, color=ink, linestyle="--", linewidth=0.8)
+            axes.grid(alpha=0.3)
+        success.axhline(CARRIES_AT, color=ink, linestyle=":", linewidth=0.8)
+        success.set(ylim=(-0.03, 1.03), title=result.sweep.label)
+        success.yaxis.set_major_formatter(PercentFormatter(1.0))
+        success.tick_params(labelbottom=False)
+        time.set(xlabel=f"[{result.sweep.unit}]", ylim=(0.0, 1.1 * max(medians) or 1.0))
+        if column == 0:
+            success.set(ylabel="success")
+            time.set(ylabel="median time\nto goal [s]")
+        if index == 0:
+            success.legend(loc="lower right", fontsize="small")
+    return figure
+
+
+def _plot_over(
+    success: Axes,
+    time: Axes,
+    values: Sequence[float],
+    summaries: Sequence[Summary],
+    *,
+    label: str,
+    color: str,
+) -> None:
+    rates = [summary.success_rate for summary in summaries]
+    low = [summary.success_low for summary in summaries]
+    high = [summary.success_high for summary in summaries]
+    medians = [
+        np.nan if summary.time_to_goal_median is None else summary.time_to_goal_median
+        for summary in summaries
+    ]
+    success.fill_between(values, low, high, color=color, alpha=0.25, linewidth=0)
+    success.plot(values, rates, marker="o", markersize=4, color=color, label=label)
+    time.plot(values, medians, marker="o", markersize=4, color=color)

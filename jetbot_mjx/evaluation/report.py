@@ -1,0 +1,375 @@
+"""What a report of one policy holds: figures, where they come from, where it fails; and its JSON.
+
+Bearings are seen from the robot as it starts: 0° ahead, positive to the left.
+"""
+
+import math
+import shlex
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from jetbot_mjx.config import Config, RandomizationConfig
+from jetbot_mjx.evaluation import best_known
+from jetbot_mjx.evaluation.evaluator import (
+    GOAL_SET_VERSION,
+    REPORT_GOALS,
+    Summary,
+    final_distances,
+    wilson_interval,
+)
+from jetbot_mjx.evaluation.robustness import InMujoco, SweepResult, as_json
+from jetbot_mjx.evaluation.rollout import Episodes
+
+TIME_LIMIT = "time limit"
+ENDED_BY_TASK = "ended by the task"
+NON_FINITE = "world not finite"
+
+SECTORS = 8
+"""Of the bearing; the first is centred straight ahead, the next lie to the left."""
+
+_RINGS = 4
+_EDGE_STEP = 0.05  # [m] to which the rings' outer and inner edges are rounded
+
+_SETTINGS = (
+    "seed",
+    "trainer",
+    "robot.preset",
+    "physics.ctrl_dt",
+    "ppo.num_timesteps",
+    "ppo.network.policy_hidden_layer_sizes",
+)
+"""What a report tells of the configuration, besides the task."""
+
+
+class Cell(NamedTuple):
+    """The goals of one stretch of distances and bearings."""
+
+    distance_low: float
+    """[m] on the floor, from the start; so is `distance_high`."""
+    distance_high: float
+    bearing_low: float
+    """[°]; the sector behind the robot ends above 180°."""
+    bearing_high: float
+    episodes: int
+    successes: int
+    success_rate: float | None
+    """None without a goal in the cell, like its interval."""
+    success_low: float | None
+    """Lower end of the 95 % Wilson interval."""
+    success_high: float | None
+    """Upper end of it."""
+    time_to_goal_median: float | None
+    """[s] of the successes; None without one."""
+
+
+class Failure(NamedTuple):
+    """A goal that was not reached."""
+
+    goal: int
+    """Its number in the fixed set, from 0."""
+    distance: float
+    """[m] of the goal, on the floor, from the start."""
+    bearing: float
+    """[°] of the goal, in (-180, 180]."""
+    final_distance: float
+    """[m] to the goal at the end, on the floor."""
+    ended: str
+    """`time limit`, `ended by the task`, or `world not finite`."""
+    replay: str | None
+    """The command that shows it; None past the goals that can be filmed."""
+
+
+class CurvePoint(NamedTuple):
+    """One evaluation during the training, on the goals that all of them use."""
+
+    env_steps: int
+    success_rate: float
+    success_low: float
+    success_high: float
+    time_to_goal_median: float | None
+
+
+class Gap(NamedTuple):
+    """How much longer a policy takes than the best known, over the goals that it reached."""
+
+    bearing_low: float
+    """[°] of the goals, like `bearing_high`."""
+    bearing_high: float
+    reached: int
+    """Goals that the policy reached; without one the rest is None."""
+    policy_mean: float | None
+    """[s] mean time to these goals."""
+    best_mean: float | None
+    """[s] mean of the best-known times to the same goals."""
+    gap: float | None
+    """`policy_mean` / `best_mean` - 1."""
+
+
+class BestKnown(NamedTuple):
+    """The best-known times to the report's goals, and a policy's gap to them."""
+
+    time_to_goal_median: float
+    """[s] over all goals of the report, reached by the policy or not; so is the next."""
+    time_to_goal_p95: float
+    total: Gap
+    by_direction: tuple[Gap, ...]
+    """Of each sector of the bearing, from straight ahead to the left and round."""
+
+
+class Report(NamedTuple):
+    """All that is told of one policy."""
+
+    folder: Path
+    """Where its files lie."""
+    run: Path
+    """The run folder, as commands name it."""
+    checkpoint: Path
+    env_steps: int
+    config: Config
+    policy: Summary
+    baselines: Mapping[str, Summary]
+    cells: tuple[Cell, ...]
+    failures: tuple[Failure, ...]
+    learning_curve: tuple[CurvePoint, ...]
+    """Empty where the run folder holds no metrics."""
+    episodes: Episodes
+    """The policy's, on the host."""
+    versions: Mapping[str, Any]
+    robustness: tuple[SweepResult, ...] = ()
+    """On robots that differ from the preset; empty where none were asked for."""
+    randomized: Summary | None = None
+    """On the same goals, with a robot drawn for each; None without ranges to draw from."""
+    ranges: RandomizationConfig | None = None
+    """What those robots were drawn from."""
+    ranges_file: Path | None = None
+    """Where the ranges stand; None: in the run's own configuration."""
+    mujoco: InMujoco | None = None
+    """On the same goals in C MuJoCo; None where it was not asked for."""
+    best_known: BestKnown | None = None
+    """None where nothing is known for these goals and settings."""
+    best_known_missing: str | None = None
+    """Why nothing is known."""
+
+    @property
+    def name(self) -> str:
+        """Of the run, for people; a seed's with the folder that holds all seeds."""
+        run_dir = self.checkpoint.parents[1]
+        alone = not run_dir.name.startswith("seed-")
+        return run_dir.name if alone else f"{run_dir.parent.name}/{run_dir.name}"
+
+    def judge_command(self) -> str:
+        """The command line that makes this report."""
+        return (
+            f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
+            f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
+            f"{' --sweep' if self.robustness else ' --simulator mujoco' if self.mujoco else ''}"
+            f"{f' --ranges {shlex.quote(str(self.ranges_file))}' if self.ranges_file else ''}"
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """All but the episodes."""
+        return {
+            "goal_set_version": GOAL_SET_VERSION,
+            "run": self.name,
+            "checkpoint": self.checkpoint.name,
+            "env_steps": self.env_steps,
+            "settings": {
+                key: value
+                for key, value in self.config.flat().items()
+                if key in _SETTINGS or key.startswith("task.")
+            },
+            "policy": self.policy._asdict(),
+            "baselines": {name: one._asdict() for name, one in self.baselines.items()},
+            "best_known": _best_known_json(self.best_known),
+            "best_known_missing": self.best_known_missing,
+            "cells": [cell._asdict() for cell in self.cells],
+            "failures": [failure._asdict() for failure in self.failures],
+            "learning_curve": [point._asdict() for point in self.learning_curve],
+            "robustness": as_json(self.robustness) if self.robustness else None,
+            "randomized": self.randomized._asdict() if self.randomized else None,
+            "ranges": self.ranges.drawn if self.ranges else None,
+            "mujoco": self.mujoco.to_json() if self.mujoco else None,
+            "versions": dict(self.versions),
+        }
+
+
+def goal_places(
+    episodes: Episodes,
+) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """Where the goals lie as the robot sees them at the start.
+
+    Args:
+      episodes: on the host.
+
+    Returns:
+      Distance on the floor [m], and bearing in (-180, 180] [°].
+    """
+    x, y = np.asarray(episodes.goal_w[:, :2] - episodes.start_w, float).T
+    bearing = np.degrees(np.arctan2(y, x) - np.asarray(episodes.start_yaw, float))
+    return np.hypot(x, y), 180 - (180 - bearing) % 360
+
+
+def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[Cell, ...]:
+    """Success and time by the goal's distance and bearing.
+
+    Args:
+      episodes: on the host.
+      ctrl_dt: duration of one environment step [s].
+
+    Returns:
+      Rings from the inner to the outer one, each from straight ahead to the left and round.
+      The rings are equally wide and together hold all goals.
+    """
+    distance, bearing = goal_places(episodes)
+    edges = _ring_edges(distance)
+    ring = np.clip(np.digitize(distance, edges) - 1, 0, len(edges) - 2)
+    width = 360 / SECTORS
+    sector = _sectors(bearing)
+    won = np.asarray(episodes.success) > 0
+    seconds = np.asarray(episodes.steps) * ctrl_dt
+    cells = []
+    for r in range(len(edges) - 1):
+        for s in range(SECTORS):
+            here = (ring == r) & (sector == s)
+            place = (edges[r], edges[r + 1], (s - 0.5) * width, (s + 0.5) * width)
+            cells.append(_cell(place, won[here], seconds[here]))
+    return tuple(cells)
+
+
+def _sectors(bearing: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
+    """Return the sector that each bearing [°] lies in."""
+    width = 360 / SECTORS
+    return np.floor((bearing + width / 2) / width).astype(int) % SECTORS
+
+
+def compare_with_best_known(
+    config: Config, episodes: Episodes
+) -> tuple[BestKnown | None, str | None]:
+    """Compare a policy's times with the best known.
+
+    Args:
+      config: of its run.
+      episodes: on the host, to the first of the report's goals.
+
+    Returns:
+      The comparison, or None and why there is none.
+    """
+    known = best_known.find(config, episodes)
+    if known.steps is None:
+        return None, known.missing
+    best = known.steps * config.physics.ctrl_dt
+    seconds = np.asarray(episodes.steps, float) * config.physics.ctrl_dt
+    won, sector = np.asarray(episodes.success) > 0, _sectors(goal_places(episodes)[1])
+
+    def gap(low: float, high: float, here: np.ndarray) -> Gap:
+        if not here.any():
+            return Gap(low, high, 0, None, None, None)
+        ours, theirs = float(seconds[here].mean()), float(best[here].mean())
+        return Gap(low, high, int(here.sum()), ours, theirs, ours / theirs - 1)
+
+    width = 360 / SECTORS
+    by_direction = tuple(
+        gap((s - 0.5) * width, (s + 0.5) * width, won & (sector == s)) for s in range(SECTORS)
+    )
+    median, p95 = float(np.median(best)), float(np.percentile(best, 95))
+    return BestKnown(median, p95, gap(-180.0, 180.0, won), by_direction), None
+
+
+def _best_known_json(found: BestKnown | None) -> dict[str, Any] | None:
+    if found is None:
+        return None
+    by_direction = [one._asdict() for one in found.by_direction]
+    return {**found._asdict(), "total": found.total._asdict(), "by_direction": by_direction}
+
+
+def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
+    # What rounding has moved over an edge belongs to the ring beside it all the same.
+    low = math.floor(distance.min() / _EDGE_STEP + 1e-4) * _EDGE_STEP
+    high = math.ceil(distance.max() / _EDGE_STEP - 1e-4) * _EDGE_STEP
+    # Goals that are all as far need no rings.
+    rings = _RINGS if high - low > _RINGS * _EDGE_STEP else 1
+    return [
+        round(float(edge), 4) for edge in np.linspace(low, max(high, low + _EDGE_STEP), rings + 1)
+    ]
+
+
+def _cell(
+    place: tuple[float, float, float, float],
+    won: np.ndarray,
+    seconds: Float[np.ndarray, " n"],
+) -> Cell:
+    count, wins = won.size, int(won.sum())
+    low, high = wilson_interval(wins, count) if count else (None, None)
+    return Cell(
+        *place,
+        episodes=count,
+        successes=wins,
+        success_rate=wins / count if count else None,
+        success_low=low,
+        success_high=high,
+        time_to_goal_median=float(np.median(seconds[won])) if wins else None,
+    )
+
+
+def find_failures(episodes: Episodes, run: Path, env_steps: int) -> tuple[Failure, ...]:
+    """The goals that were not reached, in their order.
+
+    Args:
+      episodes: on the host.
+      run: the run folder, as a command names it.
+      env_steps: of the checkpoint.
+
+    Returns:
+      One entry for each.
+    """
+    distance, bearing = goal_places(episodes)
+    remaining = final_distances(episodes)
+    return tuple(
+        Failure(
+            goal=goal,
+            distance=float(distance[goal]),
+            bearing=float(bearing[goal]),
+            final_distance=float(remaining[goal]),
+            ended=_how_it_ended(episodes, goal),
+            replay=replay_command(run, env_steps, [goal]),
+        )
+        for goal in np.flatnonzero(~(np.asarray(episodes.success) > 0)).tolist()
+    )
+
+
+def _how_it_ended(episodes: Episodes, goal: int) -> str:
+    if episodes.nonfinite[goal] > 0:
+        return NON_FINITE
+    return ENDED_BY_TASK if episodes.terminated[goal] > 0 else TIME_LIMIT
+
+
+def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | None:
+    """The command line that films a policy on some of the goals; None where none can be filmed."""
+    which = ",".join(str(goal) for goal in goals if goal < REPORT_GOALS)
+    if not which:
+        return None
+    return (
+        f"python -m jetbot_mjx.render {shlex.quote(str(run))}"
+        f" --checkpoint {env_steps} --goals {which}"
+    )
+
+
+def learning_curve(history: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[CurvePoint, ...]:
+    """The evaluations among what a training has logged.
+
+    Args:
+      history: environment steps and figures, as in `metrics.jsonl`.
+
+    Returns:
+      One point for each line that holds a success rate with its interval.
+    """
+    points = []
+    for env_steps, figures in history:
+        rate, low, high, seconds = (figures.get(f"eval/{name}") for name in CurvePoint._fields[1:])
+        if rate is not None and low is not None and high is not None:
+            points.append(CurvePoint(env_steps, rate, low, high, seconds))
+    return tuple(sorted(points, key=lambda point: point.env_steps))

@@ -1,0 +1,427 @@
+"""How far a policy carries: judged on robots that differ from the one it was trained on.
+
+One quantity at a time leaves the preset's value; goals, rules and figures are those of the
+report. One compiled program serves all robots, and beside the policy the scripted controller.
+And on the same robot in another simulator: C MuJoCo, with numerics that no training uses.
+
+Sources, by tag; BOM, EST and SIM as in `model.py`:
+  CAD         the room that the battery has, and the clearance of the casters; see `model.py`.
+  CSE276A     gassajor000/cse276a_jetbot: a JetBot's motors, calibrated.
+  DUCKIETOWN  gym-duckietown: the simulator of a robot with the same motors.
+  ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: how that randomises Isaac's JetBot.
+  PICOBOT     uni-obuda picobot: a robot with the same motors, identified.
+  TT          measurements of the same motors: newscrewdriver.com, SunFounder's data.
+  WHEELEDLAB  WheeledLab: how that randomises a drifting car.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.training.agents.ppo import networks as ppo_networks
+from jaxtyping import Array, Float, Int, UInt32
+
+from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.compiler.xla_options import compiler_options, on_host
+from jetbot_mjx.config import RandomizationConfig
+from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
+from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.evaluation.evaluator import (
+    BASELINES,
+    GOAL_SET_VERSION,
+    Evaluator,
+    Summary,
+    policy_controller,
+    summarize,
+)
+from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
+
+SWEEP_GOALS = 128
+"""How many of the report's fixed goals a sweep takes for each robot."""
+
+CARRIES_AT = 0.95
+"""Success rate down to which a policy is said to carry."""
+
+
+class Sweep(NamedTuple):
+    """One quantity, and the values at which a policy is judged."""
+
+    name: str
+    """Field of `Variation`."""
+    label: str
+    unit: str
+    values: tuple[float, ...]
+    """Rising; the preset's among them."""
+    source: str
+    """What the range rests on."""
+
+    @property
+    def nominal(self) -> float:
+        """The preset's value."""
+        return getattr(Variation(), self.name)
+
+    @property
+    def robots(self) -> list[Variation]:
+        """The robot of each value."""
+        return [Variation()._replace(**{self.name: value}) for value in self.values]
+
+
+SWEEPS = (
+    Sweep(
+        "friction",
+        "wheel-floor friction",
+        "× preset",
+        (0.3, 0.4, 0.6, 0.8, 1.0, 1.2),
+        "ISAACRL 0.4 to 1.2; WHEELEDLAB from 0.3",
+    ),
+    Sweep(
+        "mass",
+        "chassis mass and inertia",
+        "× preset",
+        (0.85, 0.92, 1.0, 1.12, 1.25),
+        "EST 0.60 to 0.85 kg in all, from the BOM's parts; ISAACRL ±15 %",
+    ),
+    Sweep(
+        "com_x",
+        "centre of mass, forward",
+        "m",
+        (-0.03, -0.015, 0.0, 0.015),
+        "CAD ±15 mm; further forward the robot tips over its wheels",
+    ),
+    Sweep("com_y", "centre of mass, left", "m", (-0.01, -0.005, 0.0, 0.005, 0.01), "CAD ±5 mm"),
+    Sweep("com_z", "centre of mass, up", "m", (-0.01, 0.0, 0.01, 0.02), "EST ±10 mm"),
+    Sweep(
+        "wheel_radius",
+        "radius of the wheels",
+        "× preset",
+        (0.92, 0.96, 1.0, 1.04, 1.08),
+        "BOM wheels of 60 and 65 mm, worn or new; measured to 68 mm",
+    ),
+    Sweep(
+        "wheel_radius_mismatch",
+        "unequal wheels",
+        "(left - right) / mean",
+        (-0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1),
+        "EST radius ±2 %",
+    ),
+    Sweep(
+        "wheel_separation",
+        "wheel separation",
+        "× preset",
+        (0.9, 0.95, 1.0, 1.05, 1.25, 1.6),
+        "CAD ±5 %; CSE276A turns as if 1.4 to 1.8 times as wide",
+    ),
+    Sweep(
+        "motor_gain",
+        "motor gain",
+        "× preset",
+        (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15),
+        "ISAACRL ±10 %",
+    ),
+    Sweep(
+        "motor_gain_mismatch",
+        "unequal motors",
+        "(left - right) / mean",
+        (-0.2, -0.1, 0.0, 0.1, 0.2),
+        "CSE276A 3 % apart; DUCKIETOWN deviation 2 %, to 5 % EST",
+    ),
+    Sweep(
+        "supply_voltage",
+        "supply voltage",
+        "× nominal",
+        (0.8, 0.9, 1.0, 1.05, 1.15),
+        "BOM 5 V bank 0.9 to 1.05; three cells 9.6 to 12.6 V",
+    ),
+    Sweep(
+        "dead_band",
+        "dead-band of the motors",
+        "of full voltage",
+        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3),
+        "CSE276A 1 %, PICOBOT 11 %, TT 11 to 25 %",
+    ),
+    Sweep(
+        "motor_lag",
+        "further lag of the motors",
+        "s",
+        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25),
+        "PICOBOT 0.085 s, DUCKIETOWN 0.20 to 0.25 s, motors and all",
+    ),
+    Sweep(
+        "action_delay",
+        "delay of actions",
+        "control steps",
+        (0.0, 1.0, 2.0, 3.0, 6.0, 9.0),
+        "ISAACRL 0 to 3 steps; DUCKIETOWN 0.15 s",
+    ),
+    Sweep(
+        "position_noise",
+        "noise of the position",
+        "m",
+        (0.0, 0.01, 0.02, 0.03, 0.06),
+        "ISAACRL 0.01 to 0.03 m",
+    ),
+    Sweep(
+        "yaw_noise",
+        "noise of the heading",
+        "rad",
+        (0.0, 0.01, 0.03, 0.1),
+        "ISAACRL 0.01 to 0.03 rad",
+    ),
+    Sweep("speed_noise", "noise of the velocity", "m/s", (0.0, 0.01, 0.03), "ISAACRL 0.01 m/s"),
+    Sweep(
+        "yaw_rate_noise",
+        "noise of the yaw rate",
+        "rad/s",
+        (0.0, 0.03, 0.1),
+        "ISAACRL 0.03 rad/s",
+    ),
+    Sweep(
+        "observation_delay",
+        "delay of observations",
+        "control steps",
+        (0.0, 1.0, 2.0, 3.0, 6.0),
+        "EST 30 to 60 ms of a camera of 30 pictures a second",
+    ),
+    Sweep(
+        "height_offset",
+        "observed height, offset",
+        "m",
+        (-0.003, -0.001, 0.0, 0.001, 0.003),
+        "SIM MuJoCo's default contact carries the robot 0.4 mm higher; EST 3 mm, a carpet",
+    ),
+    Sweep(
+        "pitch_offset",
+        "observed pitch, offset",
+        "rad",
+        (-0.0175, 0.0, 0.0175),
+        "EST 1°, how straight a sensor is mounted",
+    ),
+    Sweep("start_x", "start, forward", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
+    Sweep("start_y", "start, left", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
+    Sweep(
+        "start_yaw",
+        "heading at the start",
+        "rad",
+        (-3.14, -1.57, 0.0, 1.57, 3.14),
+        "EST any heading",
+    ),
+)
+
+
+class SweepResult(NamedTuple):
+    """A policy, and the scripted controller beside it, over one quantity."""
+
+    sweep: Sweep
+    policy: tuple[Summary, ...]
+    """One for each value."""
+    scripted: tuple[Summary, ...]
+
+
+class Sweeper:
+    """Judges policies over quantities, all of them in one compiled program."""
+
+    def __init__(
+        self,
+        env: JetBotEnv,
+        networks: ppo_networks.PPONetworks,
+        keys: UInt32[Array, "n 2"],
+        sweeps: Sequence[Sweep] = SWEEPS,
+    ) -> None:
+        """Prepares the program; it compiles at its first use.
+
+        Args:
+          env: one environment, unwrapped, with its preset's robot.
+          networks: of the policies.
+          keys: one reset key an episode, such as `report_keys(128)`.
+          sweeps: the quantities.
+        """
+        self._env, self._keys, self._sweeps = env, keys, tuple(sweeps)
+        # The preset's robot occurs in every sweep, and drives once.
+        self._robots = list(dict.fromkeys(robot for one in sweeps for robot in one.robots))
+        # A CPU takes robots one after the other: the solver iterates until the last of a batch is
+        # done, and those that slide would hold up the rest. A GPU would have nothing to do.
+        at_once = 1 if jax.default_backend() == "cpu" else len(self._robots)
+        controllers = [policy_controller(networks), BASELINES["scripted"](env)]
+        length = env.config.task.episode_length
+
+        def drive(
+            index: int | Int[Array, ""],
+            params: PolicyParams,
+            keys: UInt32[Array, "n 2"],
+            variations: Float[Array, "robots quantities"],
+        ) -> Episodes:
+            def one(variation: Float[Array, " quantities"]) -> Episodes:
+                varied = VariedEnv(env, Variation(*variation))
+                return rollout_fn(varied, controllers, length)(index, params, keys)
+
+            return jax.lax.map(one, variations, batch_size=at_once)
+
+        self._drive = jax.jit(drive, compiler_options=compiler_options(env.config))
+        self._scripted: dict[Variation, Summary] = {}
+
+    def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
+        """Judges a policy at every value of every quantity, on the same goals.
+
+        Args:
+          params: the policy's.
+
+        Returns:
+          One result for each quantity.
+        """
+        host = jax.device_get(params)
+        policy = self._judged(0, host)
+        self._scripted = self._scripted or self._judged(1, host)
+        return tuple(
+            SweepResult(
+                one,
+                tuple(policy[robot] for robot in one.robots),
+                tuple(self._scripted[robot] for robot in one.robots),
+            )
+            for one in self._sweeps
+        )
+
+    def _judged(self, controller: int, params: PolicyParams) -> dict[Variation, Summary]:
+        variations = jnp.asarray(self._robots, jnp.float32)
+        driven = jax.device_get(self._drive(controller, params, self._keys, variations))
+        each = (jax.tree.map(lambda x, i=i: x[i], driven) for i in range(len(self._robots)))
+        summaries = (summarize(one, self._env.dt) for one in each)
+        return dict(zip(self._robots, summaries, strict=True))
+
+
+def sweep(
+    env: JetBotEnv,
+    networks: ppo_networks.PPONetworks,
+    params: PolicyParams,
+    keys: UInt32[Array, "n 2"],
+    sweeps: Sequence[Sweep] = SWEEPS,
+) -> tuple[SweepResult, ...]:
+    """Judges one policy, as `Sweeper` does several.
+
+    Args:
+      env: one environment, unwrapped, with its preset's robot.
+      networks: of the policy.
+      params: the policy's.
+      keys: one reset key an episode, such as `report_keys(128)`.
+      sweeps: the quantities.
+
+    Returns:
+      One result for each quantity.
+    """
+    return Sweeper(env, networks, keys, sweeps).run(params)
+
+
+class InMujoco(NamedTuple):
+    """A policy in C MuJoCo, on the same goals as in the simulator that it was trained in."""
+
+    numerics: Numerics
+    policy: Summary
+    """On the preset's robot."""
+    randomized: Summary | None
+    """With a robot drawn for each goal; None without ranges to draw from."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return all of it as plain values, for a report's file."""
+        numerics = self.numerics._asdict().items()
+        return {
+            "numerics": {k: list(v) if isinstance(v, tuple) else v for k, v in numerics},
+            "policy": self.policy._asdict(),
+            "randomized": self.randomized._asdict() if self.randomized else None,
+        }
+
+
+class MujocoEvaluator:
+    """Evaluates policies in C MuJoCo."""
+
+    def __init__(
+        self,
+        env: JetBotEnv,
+        networks: ppo_networks.PPONetworks,
+        ranges: RandomizationConfig | None = None,
+        numerics: Numerics = OTHER_NUMERICS,
+    ) -> None:
+        """Builds the simulator; its programs compile at their first use.
+
+        Args:
+          env: one environment, unwrapped, with its preset's robot.
+          networks: of the policies.
+          ranges: what a robot is drawn from for each goal, beside the preset's; None: nothing.
+          numerics: how C MuJoCo computes.
+
+        Raises:
+          UserError: JAX was told to do without a CPU.
+        """
+        self._numerics, self._dt = numerics, env.dt
+        simulator = in_mujoco(env, numerics)
+        self._preset = Evaluator(simulator, networks)
+        drawn = ranges is not None and ranges.drawn
+        self._drawn = Evaluator(VariedEnv(simulator, ranges=ranges), networks) if drawn else None
+
+    def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> InMujoco:
+        """Evaluate a policy.
+
+        Args:
+          params: the policy's.
+          keys: one reset key an episode, such as `report_keys(1024)`.
+        """
+        with on_host():
+            return InMujoco(
+                self._numerics,
+                summarize(self._preset.run(params, keys), self._dt),
+                summarize(self._drawn.run(params, keys), self._dt) if self._drawn else None,
+            )
+
+
+def carries(result: SweepResult) -> tuple[float, float] | None:
+    """How far from the preset's value the policy's success stays at `CARRIES_AT` or above.
+
+    Args:
+      result: over one quantity.
+
+    Returns:
+      Lowest and highest judged value, without a gap from the preset's on; None where the
+      policy fails at the preset's already.
+    """
+    values = result.sweep.values
+    good = [summary.success_rate >= CARRIES_AT for summary in result.policy]
+    low = high = values.index(result.sweep.nominal)
+    if not good[low]:
+        return None
+    while low > 0 and good[low - 1]:
+        low -= 1
+    while high < len(values) - 1 and good[high + 1]:
+        high += 1
+    return values[low], values[high]
+
+
+def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
+    """The results as plain values, for a report's file.
+
+    Args:
+      results: of one policy.
+
+    Returns:
+      The quantities with their values, figures and the range over which the policy carries.
+    """
+    return {
+        "goal_set_version": GOAL_SET_VERSION,
+        "carries_at": CARRIES_AT,
+        "goals": results[0].policy[0].episodes,
+        "quantities": [
+            {
+                **result.sweep._asdict(),
+                "nominal": result.sweep.nominal,
+                "carries": _as_list(carries(result)),
+                "lowest": min(summary.success_rate for summary in result.policy),
+                "policy": [summary._asdict() for summary in result.policy],
+                "scripted": [summary._asdict() for summary in result.scripted],
+            }
+            for result in results
+        ],
+    }
+
+
+def _as_list(span: tuple[float, float] | None) -> list[float] | None:
+    return None if span is None else list(span)

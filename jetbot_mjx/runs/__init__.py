@@ -1,0 +1,19 @@
+"""Read and write what a run folder holds: configuration, metrics, checkpoints, NaN dumps."""
+
+from typing import TYPE_CHECKING
+
+from jetbot_mjx.imports import load_lazily
+
+if TYPE_CHECKING:
+    from jetbot_mjx.runs.checkpoint import PRETRAINED as PRETRAINED
+    from jetbot_mjx.runs.checkpoint import load_checkpoint as load_checkpoint
+    from jetbot_mjx.runs.checkpoint import load_policy as load_policy
+
+__getattr__, __dir__ = load_lazily(
+    __name__,
+    {
+        "PRETRAINED": "checkpoint",
+        "load_checkpoint": "checkpoint",
+        "load_policy": "checkpoint",
+    },
+)

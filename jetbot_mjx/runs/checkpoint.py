@@ -1,0 +1,235 @@
+"""A policy read back from a run, with all that is needed to use it."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import jax
+import numpy as np
+from brax.training.acme import running_statistics, specs
+from brax.training.agents.ppo import networks as ppo_networks
+
+from jetbot_mjx.agents.networks import Policy, PolicyParams, make_networks, make_policy
+from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.task import layout_data
+from jetbot_mjx.runs.checkpoint_store import (
+    FOLDER,
+    CheckpointError,
+    checkpoint_path,
+    checkpoint_steps,
+    read_about,
+    read_tree,
+)
+
+Which = Literal["best", "last"] | int
+"""A checkpoint of a run: the best, the last, or the one at that many environment steps."""
+
+PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
+"""Runs that come with the package, each named after its configuration."""
+
+POLICY = "policy"
+"""The tree that holds a policy's parameters."""
+
+FORMAT = "jetbot_mjx/2"
+"""Of what lies in a checkpoint; another number means that it cannot be read here."""
+
+_KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "figures")
+
+
+class Checkpoint(NamedTuple):
+    """A policy read back, with what explains it."""
+
+    path: Path
+    run_dir: Path
+    """Where reports and videos of this policy go."""
+    env_steps: int
+    config: Config
+    params: PolicyParams
+    networks: ppo_networks.PPONetworks
+    about: Mapping[str, Any]
+
+    def make_env(self) -> JetBotEnv:
+        """Build the environment that the policy was trained in, for the devices that are here.
+
+        Raises:
+          UserError: the task cannot be built.
+          CheckpointError: its observation is not the one that the policy knows.
+        """
+        env = make_env(self.config.for_any_device())
+        layout = layout_data(env.task.layout)
+        if layout != self.about["layout"]:
+            raise CheckpointError(
+                f"checkpoint {self.path} was trained on another observation than"
+                f" {self.config.task.name} gives: {_names(self.about['layout'])} then,"
+                f" {_names(layout)} here"
+            )
+        return env
+
+
+def _names(layout: Sequence[Mapping[str, Any]]) -> str:
+    return " ".join(f"{field['name']}[{field['size']}]" for field in layout)
+
+
+def about_policy(config: Config, env: JetBotEnv) -> dict[str, Any]:
+    """What explains every checkpoint of a run, as JSON."""
+    return {
+        "format": FORMAT,
+        "config": config.model_dump(mode="json"),
+        "layout": layout_data(env.task.layout),
+        "observation_size": env.observation_size,
+        "action_size": env.action_size,
+        "ctrl_dt": env.dt,
+    }
+
+
+def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
+    """Reads a policy and what explains it.
+
+    Args:
+      path: a run folder, or one checkpoint folder of it.
+      which: the checkpoint of a run folder; one checkpoint folder stands for itself.
+
+    Returns:
+      The checkpoint.
+
+    Raises:
+      CheckpointError: there is none, it is not one of ours, or it is not as it was written.
+    """
+    folder = find_checkpoint(path, which)
+    about = explanation(folder)
+    try:
+        config = parse_config(about["config"], source="stored config")
+        networks = make_networks(
+            config.ppo.network,
+            about["observation_size"],
+            about["action_size"],
+            normalize=config.ppo.normalize_observations,
+        )
+        template = policy_template(networks, about["observation_size"])
+    except (KeyError, TypeError, ConfigError) as error:
+        raise CheckpointError(f"checkpoint {folder} does not explain itself: {error}") from None
+    return Checkpoint(
+        path=folder,
+        run_dir=folder.parent.parent,
+        env_steps=about["env_steps"],
+        config=config,
+        params=read_tree(folder, POLICY, template),
+        networks=networks,
+        about=about,
+    )
+
+
+def explanation(folder: Path) -> dict[str, Any]:
+    """Reads what explains a checkpoint of this project.
+
+    Args:
+      folder: the checkpoint folder.
+
+    Returns:
+      The JSON object, every key of `about_policy` and more in it.
+
+    Raises:
+      CheckpointError: it is not one of ours, not whole, or of another format.
+    """
+    about = read_about(folder, _KEYS)
+    if about["format"] != FORMAT:
+        raise CheckpointError(
+            f"checkpoint {folder} is in the format {about['format']!r}, and only {FORMAT!r} can be"
+            " read here"
+        )
+    return about
+
+
+def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
+    """Reads a policy, ready to act.
+
+    Args:
+      run_or_checkpoint: a run folder, or one checkpoint folder of it.
+      which: the checkpoint of a run folder.
+
+    Returns:
+      `policy(obs, key=None) -> action`: deterministic without a key.
+
+    Raises:
+      CheckpointError: as for `load_checkpoint`.
+    """
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    return make_policy(checkpoint.networks, checkpoint.params)
+
+
+def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
+    """Finds a checkpoint folder.
+
+    Args:
+      path: a run folder, or one checkpoint folder of it.
+      which: the checkpoint of a run folder.
+
+    Returns:
+      The checkpoint folder.
+
+    Raises:
+      CheckpointError: there is none.
+    """
+    path = Path(path).absolute()
+    try:
+        return _find(path, which)
+    except OSError as error:
+        raise CheckpointError(f"no checkpoint at {path}: {error.strerror}") from None
+
+
+def _find(path: Path, which: Which) -> Path:
+    if not path.is_dir():
+        raise CheckpointError(
+            f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
+        )
+    # A run folder may hold `policy/` too: what `export` made.
+    if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():
+        return path
+    if seeds := sorted(path.glob("seed-*")):
+        raise CheckpointError(
+            f"no checkpoint at {path}: it holds several seeds; name one, such as {seeds[0]}"
+        )
+    if not (path / FOLDER).is_dir():
+        raise CheckpointError(
+            f"no checkpoint at {path}: it holds neither {FOLDER}/ nor {POLICY}/;"
+            " give a run folder or a checkpoint in it"
+        )
+    steps = checkpoint_steps(path)
+    if not steps:
+        raise CheckpointError(f"no checkpoint in {path / FOLDER}: the run saved none")
+    if which == "last":
+        step = steps[-1]
+    elif which == "best":
+        # Of equals, the later: it has learnt for longer.
+        step = max(steps, key=lambda step: (_success_rate(checkpoint_path(path, step)), step))
+    elif which in steps:
+        step = which
+    else:
+        known = ", ".join(str(step) for step in steps)
+        raise CheckpointError(f"no checkpoint at {which} steps in {path}: there are {known}")
+    return checkpoint_path(path, step)
+
+
+def _success_rate(folder: Path) -> float:
+    """What a checkpoint was judged by; below 0 where it was not, or cannot be read."""
+    try:
+        return float(explanation(folder)["figures"].get("success_rate", -1.0))
+    except CheckpointError:
+        return -1.0
+
+
+def policy_template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:
+    """Shapes and dtypes of a policy's parameters; no numbers that could pass for a policy."""
+
+    def init() -> PolicyParams:
+        key = jax.random.PRNGKey(0)
+        return PolicyParams(
+            normalizer=running_statistics.init_state(
+                specs.Array((observation_size,), np.dtype("float32"))
+            ),
+            policy=networks.policy_network.init(key),
+            value=networks.value_network.init(key),
+        )
+
+    return jax.eval_shape(init)

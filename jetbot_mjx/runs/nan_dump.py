@@ -1,0 +1,108 @@
+"""Worlds that stopped being finite, kept in a file so that somebody can look into them."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jetbot_mjx.agents.ppo import Fault
+from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.state import State
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint_store import flatten
+
+FOLDER = "faults"
+"""In a run folder."""
+
+MOST = 20
+"""Faults that a run keeps; more would say no more."""
+
+_FORMAT = "jetbot_mjx.fault/1"
+
+
+class StoredFault(NamedTuple):
+    """A fault read back."""
+
+    config: Config
+    env_steps: int
+    """Environment steps of the training at the end of the call in which it happened."""
+    fault: Fault
+
+
+def save_fault(run_dir: Path, config: Config, env_steps: int, fault: Fault) -> Path | None:
+    """Keeps a fault in `faults/<env_steps>.npz`, unless there are many already.
+
+    Args:
+      run_dir: the run folder.
+      config: of the run.
+      env_steps: environment steps so far.
+      fault: on the host.
+
+    Returns:
+      Where it lies; None where it was not kept.
+
+    Raises:
+      OSError: it cannot be written.
+    """
+    folder = run_dir / FOLDER
+    folder.mkdir(exist_ok=True)
+    path = folder / f"{env_steps:012d}.npz"
+    if len(list(folder.glob("*.npz"))) >= MOST and not path.exists():
+        return None
+    about = {"format": _FORMAT, "config": config.model_dump(mode="json"), "env_steps": env_steps}
+    unfinished = path.with_suffix(".unfinished")
+    with unfinished.open("wb") as file:
+        np.savez(file, about=np.array(json.dumps(about)), **flatten(fault))
+    return unfinished.replace(path)
+
+
+def load_fault(path: Path) -> StoredFault:
+    """Reads a fault.
+
+    Args:
+      path: a file of `save_fault`.
+
+    Returns:
+      It and what explains it.
+
+    Raises:
+      UserError: there is no such file, or it is not one of those.
+    """
+    try:
+        with np.load(path, allow_pickle=False) as stored:
+            arrays = {name: stored[name] for name in stored.files}
+        about = json.loads(str(arrays.pop("about")))
+        if about["format"] != _FORMAT:
+            raise ValueError(f"its format is {about['format']}, not {_FORMAT}")
+        config = parse_config(about["config"], source="stored config")
+        template = _template(config)
+        wanted = flatten(template)
+        if wanted.keys() != arrays.keys():
+            odd = sorted(wanted.keys() ^ arrays.keys())[0]
+            raise ValueError(f"{odd} is missing, or does not belong there")
+        fault = jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
+        return StoredFault(config, about["env_steps"], fault)
+    except FileNotFoundError:
+        raise UserError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
+    except ConfigError as error:
+        raise UserError(f"{path} cannot be used: {error}") from None
+    # NumPy reports a damaged archive by many kinds of exception.
+    except Exception as error:
+        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
+        raise UserError(f"{path} is not a fault kept by a training: {reason[0]}") from None
+
+
+def _template(config: Config) -> Fault:
+    env = wrap_for_training(JetBotEnv(config), config.task.episode_length)
+    batched: Any = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
+    state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
+    return Fault(
+        found=np.bool_(True),  # pyright: ignore[reportArgumentType]
+        env_state=state,
+        actions=np.zeros((config.ppo.unroll_length, env.action_size)),  # pyright: ignore[reportArgumentType]
+        step=np.int32(0),  # pyright: ignore[reportArgumentType]
+    )

@@ -1,0 +1,108 @@
+"""Where a training was: its whole state in a checkpoint, and the newest one that is good.
+
+Beside the policy, a checkpoint of the resumable trainer holds the tree `training`, which is the
+rest of `ppo.TrainState`. Nothing is restored that differs in a name, a shape, a dtype or a bit
+from what was written, or that another configuration wrote.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.agents.ppo import TrainState
+from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.runs.checkpoint import POLICY, explanation
+from jetbot_mjx.runs.checkpoint_store import (
+    FOLDER,
+    CheckpointError,
+    checkpoint_path,
+    checkpoint_steps,
+    read_tree,
+    set_aside,
+)
+
+TRAINING = "training"
+"""The tree that holds what acting does not need."""
+
+_REST = ("optimizer_state", "env_state", "key", "env_steps", "tally")
+
+
+class Resumption(NamedTuple):
+    """Where every seed of a run stands."""
+
+    env_steps: int
+    states: list[TrainState]
+    progress: list[dict[str, Any]]
+    """What the recorder of each seed left in its checkpoint."""
+    passed_over: list[str]
+    """Newer checkpoints that could not be used, and why."""
+
+
+def to_trees(state: TrainState) -> dict[str, Any]:
+    """A state as the trees of a checkpoint."""
+    return {
+        POLICY: state.policy_params,
+        TRAINING: {name: getattr(state, name) for name in _REST},
+    }
+
+
+def resume(
+    run_dirs: Sequence[Path], configs: Sequence[Config], template: TrainState
+) -> Resumption | None:
+    """Finds the newest checkpoint that is good in every seed's folder, and reads it.
+
+    Newer ones are moved into the run's `set_aside/` once an older one proves good.
+
+    Args:
+      run_dirs: the run folder of each seed.
+      configs: the configuration of each.
+      template: shapes and dtypes of a state.
+
+    Returns:
+      Where the seeds stand; None where not one checkpoint was begun.
+
+    Raises:
+      CheckpointError: there are checkpoints, and none of them can be used; all is left as it is.
+    """
+    known = sorted({step for run_dir in run_dirs for step in checkpoint_steps(run_dir)})
+    passed_over: list[str] = []
+    for step in reversed(known):
+        try:
+            found = [
+                _read(checkpoint_path(run_dir, step), config, template)
+                for run_dir, config in zip(run_dirs, configs, strict=True)
+            ]
+        except CheckpointError as error:
+            passed_over.append(str(error))
+            continue
+        for run_dir in run_dirs:
+            for newer in checkpoint_steps(run_dir):
+                if newer > step:
+                    set_aside(checkpoint_path(run_dir, newer))
+        states, progress = zip(*found, strict=True)
+        return Resumption(step, list(states), list(progress), passed_over)
+    if not known:
+        return None
+    raise CheckpointError(
+        f"no checkpoint in {run_dirs[0] / FOLDER} can be used. The newest: {passed_over[0]}."
+        " Train into a new folder"
+    )
+
+
+def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
+    if not path.is_dir():
+        raise CheckpointError(f"checkpoint {path} is missing")
+    about = explanation(path)
+    try:
+        parse_config(about["config"], source="stored config").check_resume(config)
+    except ConfigError as error:
+        raise CheckpointError(f"checkpoint {path} belongs to another run: {error}") from None
+    policy: PolicyParams = read_tree(path, POLICY, template.policy_params)
+    rest = read_tree(path, TRAINING, {name: getattr(template, name) for name in _REST})
+    state = TrainState(
+        params=template.params.replace(policy=policy.policy, value=policy.value),
+        normalizer=policy.normalizer,
+        **rest,
+    )
+    return state, about.get("progress", {})

@@ -1,0 +1,17 @@
+"""Drive PPO from a configuration to a finished run: record it and survive interruptions."""
+
+from typing import TYPE_CHECKING
+
+from jetbot_mjx.imports import load_lazily
+
+if TYPE_CHECKING:
+    from jetbot_mjx.training.session import Result as Result
+    from jetbot_mjx.training.session import run as run
+
+__getattr__, __dir__ = load_lazily(
+    __name__,
+    {
+        "Result": "session",
+        "run": "session",
+    },
+)

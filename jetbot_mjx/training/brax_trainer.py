@@ -1,0 +1,111 @@
+"""The stock trainer: `brax.training.agents.ppo.train.train` on our environment.
+
+Nothing of PPO is written here. This module translates the configuration, hands Brax our
+wrappers, and reports each epoch to a `Recorder`. `trainer: brax` selects it.
+"""
+
+import contextlib
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.agents.ppo import train as brax_train
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from jetbot_mjx.agents.networks import PolicyParams, network_factory
+from jetbot_mjx.agents.ppo import LOSSES
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.training.callbacks import Progress, Recorder
+
+
+class _Enough(Exception):
+    """Brax's loop has no other way out."""
+
+
+def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
+    """Trains until the end, or until the recorder has enough.
+
+    Args:
+      config: the run; `check_devices` has passed it.
+      env: the environment, unwrapped.
+      recorder: hears before the first step and after every interval.
+    """
+    ppo = config.ppo.model_dump(exclude={"network", "normalizer"})
+    num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
+    latest: dict[str, Any] = {}
+    # Brax annotates it as a function of the environment alone, and calls it with all four.
+    wrap_env_fn: Any = wrap_for_training
+    clock = time.perf_counter()
+
+    # Brax calls back twice an epoch: first with the parameters, then with the metrics.
+    def on_params(env_steps: int, make_policy: object, params: tuple[Any, Any, Any]) -> None:
+        del make_policy
+        latest["params"] = PolicyParams(*params)
+        if env_steps == 0:
+            report(0, {}, 0.0)
+
+    def on_metrics(env_steps: int, metrics: Mapping[str, Any]) -> None:
+        report(env_steps, metrics, time.perf_counter() - clock)
+
+    def report(env_steps: int, metrics: Mapping[str, Any], seconds: float) -> None:
+        nonlocal clock
+        figures = _figures(metrics, config.ppo.entropy_cost)
+        params = jax.device_get(latest["params"])
+        if not recorder.report([Progress(env_steps, params, figures, seconds)]):
+            raise _Enough
+        clock = time.perf_counter()
+
+    with device_put_replicated(), contextlib.suppress(_Enough):
+        brax_train.train(
+            environment=env,
+            episode_length=config.task.episode_length,
+            wrap_env_fn=wrap_env_fn,
+            network_factory=network_factory(config.ppo.network),
+            seed=config.seed,
+            # One initial report and one after every interval; the evaluations are ours.
+            num_evals=num_intervals + 1,
+            run_evals=False,
+            # Without evaluations Brax still resets an evaluation batch of this size.
+            num_eval_envs=1,
+            progress_fn=on_metrics,
+            policy_params_fn=on_params,
+            **ppo,
+        )
+
+
+def _figures(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+    """Brax's figures under this project's names."""
+    brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
+    figures = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
+    if "entropy_loss" in brax and entropy_cost > 0:
+        figures["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
+    return figures
+
+
+@contextlib.contextmanager
+def device_put_replicated() -> Iterator[None]:
+    """Lends JAX ≥ 0.10 the function that it dropped and that Brax 0.14.2 still calls.
+
+    The mesh axis is named `i`, as in Brax's `pmap`: under any other name the shardings of
+    the first and the later epochs differ, and the epoch compiles twice.
+    """
+    if hasattr(jax, "device_put_replicated"):
+        yield
+        return
+
+    def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
+        sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
+        return jax.tree.map(
+            lambda x: jax.device_put(jnp.stack([jnp.asarray(x)] * len(devices)), sharding), tree
+        )
+
+    jax.device_put_replicated = device_put_replicated
+    try:
+        yield
+    finally:
+        del jax.device_put_replicated

@@ -1,0 +1,154 @@
+"""A player's panel in viser: what there is to read, to press and to drive with."""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import viser
+
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.viewers.player import SPEEDS, Player
+from jetbot_mjx.viewers.step_fns import AGENTS, KEYBOARD
+from jetbot_mjx.viewers.viser_scene import CAMERAS, Scene
+
+_BUTTONS = ("Step", "New episode")
+
+
+class Panel:
+    """The controls of a page, shared by all pages."""
+
+    def __init__(
+        self, server: viser.ViserServer, player: Player, scene: Scene, ask: Callable[..., None]
+    ) -> None:
+        """Builds the panel.
+
+        Args:
+          server: shows it.
+          player: what drives.
+          scene: what the page shows of it.
+          ask: has the loop that drives the player call something; viser has its own threads.
+        """
+        self._server, self._player, self._scene, self._ask = server, player, scene, ask
+        gui = server.gui
+        gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 105, 0))
+        self.goals = gui.add_text("Goals", "", disabled=True)
+        self.episode = gui.add_text("Episode", "", disabled=True)
+        self.distance = gui.add_text("Distance", "", disabled=True)
+        self.pace = gui.add_text("Pace", "", disabled=True)
+        self._add_choices()
+        self._add_wheel()
+        gui.add_markdown(
+            player.cannot_move_goal
+            or "Click on the floor, or drag the cube, to move the goal. Its time limit then begins"
+            " anew."
+        )
+        self._switch_agent()
+        self.tell()
+
+    def tell(self) -> None:
+        """Writes the present figures."""
+        player = self._player
+        ended = f", {player.outcome}" if player.shown.done else ""
+        self.goals.value = f"{player.successes} of {player.episodes} reached"
+        self.episode.value = f"{player.time:.1f} of {player.time_limit:.1f} s{ended}"
+        self.distance.value = f"{player.distance:.2f} m"
+        self.pace.value = (
+            f"{player.steps_per_second:.0f} steps/s, {player.frames_per_second:.0f} frames/s"
+        )
+        # Setting what is set already would have the page build it anew.
+        checkpoints = _labels(player)
+        if checkpoints != self.checkpoint.options:
+            self.checkpoint.options = checkpoints
+        buttons = ("Go on" if player.paused else "Pause", *_BUTTONS)
+        if buttons != self.buttons.options:
+            self.buttons.options = buttons
+
+    def _add_choices(self) -> None:
+        gui, player = self._server.gui, self._player
+        self.agent = gui.add_dropdown("Agent", AGENTS, initial_value=player.agent)
+        self.checkpoint = gui.add_dropdown(
+            "Checkpoint", _labels(player), initial_value=_label(player.checkpoint)
+        )
+        self.buttons = gui.add_button_group("", ("Pause", *_BUTTONS))
+        self.speed = speed = gui.add_slider("Real time x", *SPEEDS, 0.1, player.speed)
+        self.camera = camera = gui.add_dropdown("Camera", CAMERAS)
+        shadows = gui.add_checkbox("Shadows", False)
+        self.agent.on_update(lambda _: self._ask(self._switch_agent))
+        self.checkpoint.on_update(lambda _: self._ask(self._switch_checkpoint))
+        self.buttons.on_click(lambda event: self._ask(self._press, event.target.value))
+        speed.on_update(lambda _: self._ask(setattr, player, "speed", speed.value))
+        camera.on_update(lambda _: self._ask(setattr, self._scene, "camera", camera.value))
+        shadows.on_update(lambda _: self._ask(self._scene.cast_shadows, shadows.value))
+
+    def _add_wheel(self) -> None:
+        """What a user drives with: two sliders, and keys that move them."""
+        gui, player, limits = self._server.gui, self._player, self._player.env.config.task
+        fastest = math.ceil(math.degrees(limits.max_yaw_rate))
+        self.wheel = gui.add_folder("Drive")
+        with self.wheel:
+            self.ahead = ahead = gui.add_slider("Ahead m/s", 0.0, limits.max_speed, 0.01, 0.0)
+            self.left = left = gui.add_slider("Left °/s", -fastest, fastest, 1, 0)
+            gui.add_markdown(
+                "Keys: I faster, K slower, J left, L right, H halt. The page hears of presses only:"
+                " what was asked for stays."
+            )
+
+        def follow_sliders() -> None:
+            player.drive(ahead.value, math.radians(left.value))
+
+        def press(do: Callable[..., None], *given: int) -> None:
+            do(*given)
+            # The sliders call back when they are set, and round.
+            ahead.value, left.value = player.asked[0], round(math.degrees(player.asked[1]))
+
+        for slider in (ahead, left):
+            slider.on_update(lambda _: self._ask(follow_sliders))
+        self._keys = [
+            self._add_key("I", "faster", press, player.nudge, 1, 0),
+            self._add_key("K", "slower", press, player.nudge, -1, 0),
+            self._add_key("J", "left", press, player.nudge, 0, 1),
+            self._add_key("L", "right", press, player.nudge, 0, -1),
+            self._add_key("H", "halt", press, player.drive, 0, 0),
+        ]
+
+    def _add_key(self, key: Any, label: str, *press: Any) -> viser.CommandHandle:
+        command = self._server.gui.add_command(f"Drive: {label}", hotkey=key)
+        command.on_trigger(lambda _: self._ask(*press))
+        return command
+
+    def _switch_agent(self) -> None:
+        self._player.agent = self.agent.value
+        by_hand = self.agent.value == KEYBOARD
+        # The wheel comes last: where a page shows it, the keys are heard.
+        for command in self._keys:
+            command.disabled = not by_hand
+        self.wheel.visible = by_hand
+
+    def _switch_checkpoint(self) -> None:
+        wanted = int(self.checkpoint.value.partition(" ")[0].replace(",", ""))
+        if wanted == self._player.checkpoint:
+            return
+        try:
+            self._player.switch_checkpoint(wanted)
+        except UserError as error:
+            self.checkpoint.value = _label(self._player.checkpoint)
+            for client in self._server.get_clients().values():
+                client.add_notification("Not switched", str(error), color="red")
+
+    def _press(self, button: str) -> None:
+        match button:
+            case "Step":
+                self._player.paused = True
+                self._player.tick()
+            case "New episode":
+                self._player.reset()
+            case _:
+                self._player.paused = not self._player.paused
+
+
+def _label(env_steps: int) -> str:
+    return f"{env_steps:,} steps"
+
+
+def _labels(player: Player) -> tuple[str, ...]:
+    return tuple(_label(steps) for steps in player.checkpoints)

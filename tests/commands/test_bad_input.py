@@ -1,0 +1,219 @@
+"""Further mistakes that must cost one line: found by probing, each once a traceback or worse."""
+
+import os
+import re
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import pytest
+from test_cli import COMMANDS, SMOKE, damage_about, damaged, here, refused, trained
+from test_config import refusal, write
+from test_metrics import read_events
+
+from jetbot_mjx import cli, evaluate, render, train
+from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.metrics import TensorBoardSink
+from jetbot_mjx.runs.run_dir import stored_config
+from jetbot_mjx.training import ppo_trainer
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("physics: {sim_dt: 5e-324}", "physics"),  # OverflowError
+        ("physics: {ctrl_dt: 1e300, sim_dt: 1e-5}", "physics"),  # a scan of 1e305 steps
+        ("physics: {sim_dt: 1e-9}", "sim_dt"),  # settling takes hours
+        ("ppo: {num_envs: 1000000000000}", "ppo.num_envs = 1000000000000 is wrong"),
+        ('ppo: {"a\\nb": 1}', "is unknown"),
+        (f"seed: {'9' * 5000}", "is not valid YAML"),  # ValueError
+        ("seed: !!int x", "is not valid YAML"),  # ValueError
+        ("seed: !!bool x", "is not valid YAML"),  # KeyError
+        (f"seed: {'[' * 3000}", "is not valid YAML"),  # RecursionError
+        ("ppo: {network: {policy_hidden_layer_sizes: 32}}", "it should be a list"),
+        ("ppo: {network: {policy_hidden_layer_sizes: []}}", "should have at least 1 item"),
+        ("ppo: {1: 2}", "is no key: keys should be strings"),
+        ("task: {options: {a: [1]}}", "task.options.a = [1] is wrong"),
+    ],
+)
+def test_config(refusal, text, said):
+    assert said in refusal(text)
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        ".task:GoalTask",
+        "..:GoalTask",
+        "jetbot_mjx.envs.task:WORLD",
+        "jetbot_mjx.envs.task:math",
+        "jetbot_mjx.envs.task:Field",
+        "jetbot_mjx.envs.task:Task",
+        "jetbot_mjx.envs.jetbot_env:JetBotEnv",
+        "jetbot_mjx.config:TaskConfig",
+        "os:getcwd",
+    ],
+)
+def test_tasks(name):
+    with pytest.raises(UserError, match=re.escape(f"task.name = {name!r}")):
+        make_env(parse_config({"task": {"name": name}}))
+
+
+@pytest.mark.parametrize("preset", ["isaac", "real"])
+@pytest.mark.parametrize("dt", [0.018, 0.1, 0.5, 10.0])
+def test_unstable_time_steps(preset, dt):
+    values = {"robot": {"preset": preset}, "physics": {"ctrl_dt": dt, "sim_dt": dt}}
+    with pytest.raises(UserError, match=r"physics\.sim_dt = "):
+        make_env(parse_config(values))
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("train", ["--config", "a\nb"]),
+        ("train", ["--config", SMOKE, "--set", "a\nb=3"]),
+        ("train", ["--config", SMOKE, "--set", "seed=[\n"]),
+        ("train", ["--config", SMOKE, "--nonsense\nb"]),
+        ("train", ["--config", SMOKE, "--run-dir", "x" * 300]),
+        ("evaluate", ["a\nb"]),
+        ("evaluate", ["x" * 300]),
+        ("evaluate", ["run", "--min-success", "2\n"]),
+    ],
+)
+def test_command_line(refused, command, arguments):
+    refused(COMMANDS[command], *arguments)
+
+
+def test_a_checkpoint_of_more_digits_than_python_reads_is_refused(refused):
+    assert "is neither best, last nor a number" in refused(
+        evaluate, "run", "--checkpoint", "9" * 5000
+    )
+
+
+def test_a_seed_of_32_bits_trains(root):
+    config = load_config(root / "configs" / "smoke.yaml", ["seed=3000000000", "seeds=2"])
+    seeds = ppo_trainer.Program(config, make_env(config))._seeds
+    keys = [jax.random.PRNGKey(seed) for seed in (3_000_000_000, 3_000_000_001)]
+    assert jax.vmap(jax.random.PRNGKey)(seeds).tolist() == [key.tolist() for key in keys]
+
+
+def test_a_terminal_without_letters_is_told_all_the_same(tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-c",
+            "from jetbot_mjx import cli\ncli.run_command(lambda _: print('r\\xfcn \\udcff') or 0)",
+        ],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONIOENCODING": "ascii"},
+        capture_output=True,
+        text=True,
+    )
+    assert (done.returncode, done.stdout) == (0, "r\\xfcn \\udcff\n")
+
+
+def test_more_episodes_than_can_be_counted_are_refused(refused):
+    assert "argument --episodes" in refused(evaluate, "run", "--episodes", "9" * 24)
+
+
+@pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "render"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda about: about.update(layout=about["layout"][::-1]),
+        lambda about: about.pop("layout"),
+        lambda about: about.pop("env_steps"),
+    ],
+)
+def test_checkpoint_of_another_task(refused, damaged, command, change):
+    damage_about(change)(damaged)
+    refused(command, damaged, "--episodes", "1")
+
+
+@pytest.mark.parametrize(
+    ("command", "folder"), [(evaluate, "evaluations"), (render, "videos")], ids=str
+)
+def test_results_that_cannot_be_written(refused, damaged, command, folder):
+    (damaged.parents[1] / folder).write_text("a file where a folder should be")
+    refused(command, damaged, "--episodes", "1")
+
+
+@pytest.mark.parametrize("sizes", [[5], [4, 4]])
+@pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "render"])
+def test_other_layers(refused, damaged, command, sizes):
+    network = {"policy_hidden_layer_sizes": sizes}
+    damage_about(lambda about: about["config"]["ppo"]["network"].update(network))(damaged)
+    assert "cannot be read: policy.params.hidden_" in refused(command, damaged)
+
+
+def test_a_stray_folder_among_the_checkpoints_does_not_matter(refused, damaged):
+    (damaged.parent / "²" / "policy").mkdir(parents=True)
+    refused(evaluate, damaged.parents[1], "--checkpoint", "123")
+
+
+def test_missing_parameters_cost_one_line(damaged):
+    shutil.rmtree(damaged / "policy" / "d")
+    process = subprocess.run(
+        [sys.executable, "-m", "jetbot_mjx.evaluate", str(damaged)],
+        capture_output=True,
+        text=True,
+    )
+    assert (process.returncode, len(process.stderr.splitlines())) == (2, 1)
+
+
+def test_a_platform_that_is_not_there_costs_one_line(tmp_path):
+    process = subprocess.run(
+        [sys.executable, "-m", "jetbot_mjx.train", "--config", SMOKE],
+        cwd=tmp_path,
+        env={**os.environ, "JAX_PLATFORMS": "nowhere"},
+        capture_output=True,
+        text=True,
+    )
+    assert (process.returncode, len(process.stderr.splitlines())) == (2, 1)
+    assert "JAX_PLATFORMS = 'nowhere'" in process.stderr
+
+
+def test_too_little_memory_costs_one_line(capfd):
+    def command(_):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating")
+
+    with pytest.raises(SystemExit) as caught:
+        cli.run_command(command)
+    assert caught.value.code == 2
+    assert len(capfd.readouterr().err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("method", "use"),
+    [
+        ("exists", lambda: stored_config(Path("run"))),
+        ("iterdir", lambda: stored_config(Path(__file__).parent)),
+        ("is_dir", lambda: evaluate.main(["run"])),
+    ],
+)
+def test_a_forbidden_path_costs_one_line(monkeypatch, method, use):
+    def deny(path, **kwargs):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, method, deny)
+    # Denied its folder, JAX would do without one in all later tests.
+    monkeypatch.setattr(evaluate, "use_compilation_cache", lambda: None)
+    with pytest.raises(UserError, match="Permission denied"):
+        use()
+
+
+def test_tensorboard_can_be_read_while_training_runs(tmp_path):
+    sink = TensorBoardSink(tmp_path / "tensorboard")
+    for env_steps in range(20):
+        sink.write(env_steps, {"loss/total": 1.5})
+    deadline = time.monotonic() + 10
+    while len(read_events(tmp_path / "tensorboard")) < 20 and time.monotonic() < deadline:
+        time.sleep(0.1)
+    seen = len(read_events(tmp_path / "tensorboard"))
+    sink.close()
+    assert seen == 20

@@ -1,0 +1,508 @@
+"""The command line: a user's mistake costs one line and exit code 2, and leaves nothing behind."""
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+from brax.training.acme import running_statistics, specs
+from test_report import make_episodes, make_report
+
+from jetbot_mjx import cli, evaluate, plan, render, replay, train
+from jetbot_mjx.agents.networks import PolicyParams, make_networks
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.task import WORLD, layout_data
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import checkpoint_store
+from jetbot_mjx.runs.checkpoint import FORMAT
+from jetbot_mjx.training import session
+
+SMOKE = str(Path(__file__).parents[2] / "configs" / "smoke.yaml")
+COMMANDS = {
+    "plan": plan,
+    "train": train,
+    "evaluate": evaluate,
+    "render": render,
+    "replay": replay,
+}
+
+
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """An empty folder to stand in; what a command leaves behind is left here."""
+    folder = tmp_path / "here"
+    folder.mkdir()
+    monkeypatch.chdir(folder)
+    return folder
+
+
+@pytest.fixture
+def refused(here, capfd):
+    """Gives a command arguments that it must refuse; returns the one line that it says."""
+
+    def refused(command, *arguments):
+        before = sorted(here.rglob("*"))
+        with pytest.raises(SystemExit) as caught:
+            cli.run_command(lambda _: command.main([str(argument) for argument in arguments]))
+        out, err = capfd.readouterr()
+        assert caught.value.code == 2
+        assert out == ""
+        assert err.endswith("\n")
+        assert len(err.splitlines()) == 1
+        assert sorted(here.rglob("*")) == before
+        return err
+
+    return refused
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "one of the arguments --config --resume is required"),
+        ([SMOKE], "one of the arguments --config --resume is required"),
+        (["--config", SMOKE, "--resume", "run"], "--resume: not allowed with argument --config"),
+        (["--resume", "run", "--run-dir", "run"], "--run-dir: --resume names the folder already"),
+        (["--config", SMOKE, "--seeds", "x"], "argument --seeds: invalid int value: 'x'"),
+        (["--config"], "argument --config: expected one argument"),
+        (["--config", SMOKE, "more"], "unrecognized arguments: more"),
+        (["--config", SMOKE, "--lr", "1"], "unrecognized arguments: --lr 1"),
+        (["--config", SMOKE, "--set"], "argument --set: expected one argument"),
+        (["--config", SMOKE, "--seed", "x"], "argument --seed: invalid int value: 'x'"),
+    ],
+)
+def test_train_refuses_a_mistaken_command_line(refused, arguments, said):
+    line = refused(train, *arguments)
+    assert line.startswith("python -m jetbot_mjx.train: error: ")
+    assert said in line
+    assert "(--help lists the arguments)" in line
+
+
+BAD_FILES = {
+    "typo.yaml": ("ppo: {num_env: 3}", "ppo.num_env = 3 is unknown: did you mean num_envs?"),
+    "twice.yaml": ("seed: 1\nseed: 2", "line 2 is not valid YAML: found duplicate key"),
+    "open.yaml": ("ppo: [", "line 1 is not valid YAML"),
+    "list.yaml": ("- seed", "holds ['seed']: write `key: value` lines"),
+    "binary.yaml": ("\udcff\x00", "it is not UTF-8 text"),
+}
+
+
+@pytest.mark.parametrize("name", BAD_FILES)
+def test_train_refuses_a_bad_file(refused, tmp_path, name):
+    text, said = BAD_FILES[name]
+    (tmp_path / name).write_text(text, encoding="utf-8", errors="surrogateescape")
+    line = refused(train, "--config", tmp_path / name)
+    assert line.startswith("error: ")
+    assert str(tmp_path / name) in line
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    ("path", "said"),
+    [
+        ("nonsense.yaml", "config nonsense.yaml does not exist: give the path of a YAML file"),
+        (".", "config . cannot be read: Is a directory"),
+        ("", "config . cannot be read: Is a directory"),
+    ],
+)
+def test_train_refuses_a_path_without_a_file(refused, path, said):
+    assert refused(train, "--config", path) == f"error: {said}\n"
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("seed", "--set seed: write section.key=value, as in ppo.num_envs=256"),
+        ("ppo.num_envs.x=3", "--set ppo.num_envs.x=3: num_envs is a value, not a section"),
+        ("seed=[", "--set seed=[, line 1 is not valid YAML"),
+        ("zzz=1", "zzz = 1 is unknown: known are seed"),
+        ("ppo.num_envs=many", "ppo.num_envs = 'many' is wrong: it should be integer"),
+        ("ppo.num_envs=-1", "ppo.num_envs = -1 is wrong: it should be greater than or equal to 1"),
+        ("ppo.num_envs=100", "is not a multiple of num_envs = 100: for example batch_size = 75"),
+        ("ppo.discounting=1.5", "ppo.discounting = 1.5 is wrong"),
+        ("ppo.learning_rate=.nan", "learning_rate = nan is wrong: it should be a finite number"),
+        ("ppo.network=3", "ppo.network = 3 is not a section: write its keys below it"),
+        ("physics.sim_dt=0.01", "for example sim_dt = 0.00833333333"),
+        ("checkpoint_interval=100", "make it at least 4096"),
+        ("checkpoints_to_keep=0", "checkpoints_to_keep = 0 is wrong"),
+        ("preemption_notice=1", "preemption_notice = 1 is wrong: it should be greater than or eq"),
+        ("stop_at_success=99", "stop_at_success = 99 is wrong: it should be less than or equal"),
+        ("seeds=0", "seeds = 0 is wrong: it should be greater than or equal to 1"),
+        ("trainer=stock", "trainer = 'stock' is wrong: it should be 'resumable' or 'brax'"),
+        ("ppo.learning_rate_schedule=COSINE", "it should be 'NONE', 'LINEAR' or 'ADAPTIVE_KL'"),
+        ("task.name=GoalTask", "task.name = 'GoalTask' is wrong: write package.module:Class"),
+        ("task.name=nowhere:Task", "no module named 'nowhere' can be imported"),
+        ("task.name=jetbot_mjx:GaolTask", "jetbot_mjx has no 'GaolTask'"),
+        ("task.name=builtins:str", "is no task: it lacks "),
+    ],
+)
+def test_train_refuses_a_bad_setting(refused, setting, said):
+    line = refused(train, "--config", SMOKE, "--set", "ppo.num_minibatches=4", "--set", setting)
+    assert line.startswith("error: ")
+    assert said in line
+
+
+def test_train_refuses_a_bad_seed(refused):
+    assert "seed = -1 is wrong" in refused(train, "--config", SMOKE, "--seed", "-1")
+
+
+@pytest.mark.parametrize(
+    ("setting", "said"),
+    [
+        ("seeds=2", "seeds = 2 is not known to trainer = 'brax'"),
+        ("deterministic=true", "deterministic = true is not known to trainer = 'brax'"),
+        ("ppo.normalizer=physical", "ppo.normalizer = 'physical' is not known to trainer = 'brax'"),
+        ("ppo.learning_rate_schedule=LINEAR", "'LINEAR' is not known to trainer = 'brax'"),
+    ],
+)
+def test_train_refuses_what_the_stock_trainer_cannot_do(refused, setting, said):
+    stock = ("--set", "trainer=brax", "--set", "ppo.normalizer=brax")
+    assert said in refused(train, "--config", SMOKE, *stock, "--set", setting)
+
+
+@pytest.mark.parametrize("run", ["nothing", "empty"])
+def test_train_refuses_to_resume_where_there_is_no_run(refused, here, run):
+    (here / "empty").mkdir()
+    line = refused(train, "--resume", run)
+    assert line == f"error: --resume {run}: there is no run in this folder\n"
+
+
+def test_train_refuses_environments_that_the_devices_cannot_share(refused, monkeypatch):
+    monkeypatch.setattr(jax, "device_count", lambda: 3)
+    assert "ppo.num_envs = 128 cannot be shared evenly by 3 devices" in refused(
+        train, "--config", SMOKE
+    )
+
+
+def test_train_refuses_a_run_folder_in_use(refused, here):
+    (here / "run").mkdir()
+    (here / "run" / "metrics.jsonl").write_text("precious")
+    line = refused(train, "--config", SMOKE, "--run-dir", "run")
+    assert "run is in use, and holds no run (no config.yaml): name a new folder" in line
+    assert (here / "run" / "metrics.jsonl").read_text() == "precious"
+
+
+@pytest.mark.parametrize(
+    ("run_dir", "said"),
+    [
+        ("file", "--run-dir file is in use, and holds no run (no config.yaml): name a new folder"),
+        ("file/run", "--run-dir file/run cannot be written: Not a directory"),
+    ],
+)
+def test_train_refuses_a_run_folder_that_cannot_be_written(refused, here, run_dir, said):
+    (here / "file").write_text("precious")
+    assert refused(train, "--config", SMOKE, "--run-dir", run_dir) == f"error: {said}\n"
+    assert (here / "file").read_text() == "precious"
+
+
+# evaluate and render find their policy in the same way.
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory):
+    """A run folder with two checkpoints, untrained."""
+    network = {"policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}
+    config = parse_config({"ppo": {"network": network}})
+    networks = make_networks(config.ppo.network, 16, 2, normalize=True)
+    key = jax.random.PRNGKey(0)
+    params = PolicyParams(
+        running_statistics.init_state(specs.Array((16,), np.dtype("float32"))),
+        networks.policy_network.init(key),
+        networks.value_network.init(key),
+    )
+    about = {
+        "format": FORMAT,
+        "config": config.model_dump(mode="json"),
+        "layout": layout_data(WORLD),
+        "observation_size": 16,
+        "action_size": 2,
+    }
+    folder = tmp_path_factory.mktemp("trained") / "run"
+    folder.mkdir()
+    params = jax.tree.map(lambda leaf: np.asarray(jnp.asarray(leaf)), params)
+    about["figures"] = {"success_rate": 0.5}
+    with checkpoint_store.Store(folder, keep=5) as checkpoints:
+        for env_steps in (0, 2048):
+            checkpoints.save(env_steps, {"policy": params}, about, 0.5)
+    return folder
+
+
+@pytest.fixture
+def damaged(trained, here):
+    """A copy of the run, and the folder of its last checkpoint, to be damaged."""
+    shutil.copytree(trained, here / "run")
+    return here / "run" / "checkpoints" / "000000002048"
+
+
+both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "render"])
+
+
+@both
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        ([], "the following arguments are required: run"),
+        (["run", "--more"], "unrecognized arguments: --more"),
+        (["run", "--episodes", "0"], "argument --episodes: 0 is too small: give at least 1"),
+        (["run", "--episodes", "-3"], "argument --episodes: -3 is too small: give at least 1"),
+        (["run", "--episodes", "many"], "argument --episodes: 'many' is no whole number"),
+        (["run", "--episodes", "1.5"], "argument --episodes: '1.5' is no whole number"),
+        (["run", "--checkpoint", "first"], "'first' is neither best, last nor a number of steps"),
+        (["run", "--checkpoint", "-1"], "'-1' is neither best, last nor a number of steps"),
+        (["run", "--checkpoint"], "argument --checkpoint: expected one argument"),
+    ],
+)
+def test_a_mistaken_command_line_is_refused(refused, command, arguments, said):
+    line = refused(command, *arguments)
+    assert line.startswith(f"python -m {command.__name__}: error: ")
+    assert said in line
+
+
+@pytest.mark.parametrize(
+    ("value", "said"),
+    [
+        ("2", "2 is not between 0 and 1"),
+        ("-0.1", "-0.1 is not between 0 and 1"),
+        ("nan", "nan is not between 0 and 1"),
+        ("95%", "'95%' is no number"),
+    ],
+)
+def test_evaluate_refuses_a_success_rate_that_is_none(refused, value, said):
+    line = refused(evaluate, "run", "--min-success", value)
+    assert f"argument --min-success: {said}" in line
+
+
+@both
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda path: None, "no such folder; give a run folder or a checkpoint in it"),
+        (lambda path: path.write_text("x"), "no such folder; give a run folder"),
+        (lambda path: path.mkdir(), "it holds neither checkpoints/ nor policy/; give a run folder"),
+        (lambda path: (path / "src").mkdir(parents=True), "neither checkpoints/ nor policy/"),
+        (lambda path: (path / "checkpoints").mkdir(parents=True), "the run saved none"),
+        (lambda path: (path / "seed-1").mkdir(parents=True), "it holds several seeds; name one"),
+    ],
+    ids=["missing", "file", "empty", "not a run", "without checkpoints", "seeds"],
+)
+def test_a_path_without_a_policy_is_refused(refused, here, command, make, said):
+    make(here / "run")
+    line = refused(command, "run")
+    assert line.startswith("error: no checkpoint ")
+    assert str(here / "run") in line
+    assert said in line
+
+
+@both
+def test_a_checkpoint_that_is_not_there_is_refused(refused, trained, command):
+    line = refused(command, trained, "--checkpoint", "123")
+    assert line == f"error: no checkpoint at 123 steps in {trained}: there are 0, 2048\n"
+
+
+@both
+@pytest.mark.parametrize("item", ["policy", "default", None])
+def test_a_foreign_checkpoint_is_refused(refused, here, command, item):
+    folder = here / "run" / "checkpoints" / "000000000007"
+    folder.mkdir(parents=True)
+    if item is not None:
+        with ocp.StandardCheckpointer() as writer:
+            writer.save(folder / item, {"kernel": np.ones(3)})
+    line = refused(command, "run")
+    assert "is not one of jetbot_mjx: about/metadata is missing or damaged" in line
+
+
+def damage_about(change):
+    def damage(checkpoint):
+        path = checkpoint / "about" / "metadata"
+        about = json.loads(path.read_text())
+        change(about)
+        del about["sha256"]["about"]
+        about["sha256"]["about"] = checkpoint_store._digest_json(about)
+        path.write_text(json.dumps(about))
+
+    return damage
+
+
+DAMAGES = {
+    "no explanation": (
+        lambda checkpoint: shutil.rmtree(checkpoint / "about"),
+        "is not one of jetbot_mjx: about/metadata is missing or damaged",
+    ),
+    "half an explanation": (
+        lambda checkpoint: (checkpoint / "about" / "metadata").write_text('{"format"'),
+        "is not one of jetbot_mjx: about/metadata is missing or damaged",
+    ),
+    "another format": (
+        damage_about(lambda about: about.update(format="jetbot_mjx/9")),
+        "is in the format 'jetbot_mjx/9', and only 'jetbot_mjx/2' can be read here",
+    ),
+    "no configuration": (
+        damage_about(lambda about: about.pop("config")),
+        "does not explain itself: .*config",
+    ),
+    "a setting of another version": (
+        damage_about(lambda about: about["config"]["ppo"].update(momentum=0.9)),
+        "does not explain itself: .*ppo.momentum = 0.9 is unknown",
+    ),
+    "no list of parameters": (
+        lambda checkpoint: (checkpoint / "policy" / "manifest.ocdbt").unlink(),
+        "cannot be read: ",
+    ),
+    "a task that is gone": (
+        damage_about(lambda about: about["config"]["task"].update(name="gone:Task")),
+        "task.name = 'gone:Task': no module named 'gone' can be imported",
+    ),
+}
+
+
+@both
+@pytest.mark.parametrize(("damage", "said"), DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_checkpoint_is_refused(refused, damaged, command, damage, said):
+    damage(damaged)
+    assert re.search(said, refused(command, damaged))
+
+
+# What the exit codes mean.
+
+
+def test_an_exit_code_passes_through(capfd):
+    for code in (0, 1):
+        with pytest.raises(SystemExit) as caught:
+            cli.run_command(lambda _, code=code: code)
+        assert caught.value.code == code
+    assert capfd.readouterr() == ("", "")
+
+
+def raising(error):
+    def command(_):
+        raise error
+
+    return command
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [(UserError("mend it"), 2, "error: mend it\n"), (KeyboardInterrupt(), 130, "interrupted\n")],
+)
+def test_what_a_user_causes_has_a_line_and_a_code(capfd, error, code, said):
+    with pytest.raises(SystemExit) as caught:
+        cli.run_command(raising(error))
+    assert caught.value.code == code
+    assert capfd.readouterr() == ("", said)
+
+
+def test_a_mistake_of_ours_keeps_its_traceback():
+    with pytest.raises(ZeroDivisionError):
+        cli.run_command(raising(ZeroDivisionError()))
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_is_no_mistake(capfd, name):
+    with pytest.raises(SystemExit) as caught:
+        cli.run_command(lambda _: COMMANDS[name].main(["--help"]))
+    out, err = capfd.readouterr()
+    assert (caught.value.code, err) == (0, "")
+    assert out.startswith(f"usage: python -m jetbot_mjx.{name}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code"),
+    [([], 0), (["--min-success", "0.5"], 0), (["--min-success", "0.51"], 1)],
+)
+def test_only_a_success_rate_below_the_target_gives_1(monkeypatch, capfd, arguments, code):
+    report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]))
+    monkeypatch.setattr(evaluate, "run", lambda *args, **kwargs: report)
+    assert evaluate.main(["run", *arguments]) == code
+    assert ("is below the 51.00% asked for" in capfd.readouterr().out) == (code == 1)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What `train.main` would train, without training it."""
+
+    def asked(*arguments):
+        calls = []
+
+        def run(config, run_dir, programs):
+            calls.append((config, run_dir))
+            raise UserError("no training here")
+
+        monkeypatch.setattr(session, "run", run)
+        with pytest.raises(UserError):
+            train.main(arguments)
+        return calls[0]
+
+    return asked
+
+
+def test_train_takes_settings_in_order_and_the_seed_last(asked):
+    config, run_dir = asked(
+        *("--config", SMOKE, "--run-dir", "a/b"),
+        *("--set", "seed=1", "--seed", "5", "--set", "seed=2"),
+        *("--set", "ppo.learning_rate=1", "--set", "ppo.learning_rate=1e-4"),
+    )
+    assert config.seed == 5
+    assert config.ppo.learning_rate == 1e-4
+    assert config.ppo.num_envs == 128  # the file's
+    assert run_dir == Path("a/b")
+
+
+def test_train_takes_seeds(asked):
+    assert asked("--config", SMOKE, "--seeds", "4")[0].seeds == 4
+
+
+def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
+    assert "nothing.npz does not exist: give a file of a run's faults/" in refused(
+        replay, here / "nothing.npz"
+    )
+    for name, write in {
+        "text.npz": lambda path: path.write_text("no archive"),
+        "other.npz": lambda path: np.savez(path, a=np.ones(3)),
+        "empty.npz": lambda path: path.touch(),
+    }.items():
+        write(tmp_path / name)
+        assert "is not a fault kept by a training" in refused(replay, tmp_path / name)
+
+
+def test_train_names_its_run_folder_after_the_configuration(asked):
+    _, run_dir = asked("--config", SMOKE)
+    assert run_dir.parent == Path("runs")
+    assert run_dir.name.startswith("smoke-")
+
+
+# The same as a user meets it, in processes of their own.
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (
+            ["train", "--config", "nonsense.yaml"],
+            "error: config nonsense.yaml does not exist: give the path of a YAML file\n",
+        ),
+        (
+            ["evaluate", "."],
+            "it holds neither checkpoints/ nor policy/; give a run folder or a checkpoint in it\n",
+        ),
+        (["render", ".", "--episodes", "0"], "0 is too small: give at least 1"),
+    ],
+)
+def test_a_mistake_costs_one_line(tmp_path, arguments, said):
+    command, *rest = arguments
+    process = subprocess.run(
+        [sys.executable, "-m", f"jetbot_mjx.{command}", *rest],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+    )
+    assert process.returncode == 2
+    assert process.stdout == ""
+    assert len(process.stderr.splitlines()) == 1
+    assert said in process.stderr
+    assert list(tmp_path.iterdir()) == []

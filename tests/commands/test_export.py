@@ -1,0 +1,415 @@
+"""What leaves the package does as JAX does, runs without the package, and is whole or not there."""
+
+import ast
+import functools
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+from brax.training.acme import running_statistics, specs
+
+from jetbot_mjx import export
+from jetbot_mjx.agents.networks import PolicyParams, make_networks
+from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.deployment import exporters, numpy_policy
+from jetbot_mjx.deployment.exporters import FORMATS, Source
+from jetbot_mjx.deployment.numpy_policy import (
+    TOLERANCE,
+    Recording,
+    as_jax,
+    difference,
+    portable_policy,
+    record,
+)
+from jetbot_mjx.deployment.policy_spec import contract
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.state import robot_state
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.evaluator import report_keys
+from jetbot_mjx.runs.checkpoint import Checkpoint, about_policy, load_checkpoint
+from jetbot_mjx.runs.run_dir import write_json
+
+ROOT = Path(__file__).parents[2]
+
+for package in FORMATS["onnx"].needs:
+    pytest.importorskip(package)
+
+
+@pytest.fixture(scope="module")
+def run_dir(smoke_run, tmp_path_factory):
+    """A copy of the run, to export from."""
+    return shutil.copytree(smoke_run, tmp_path_factory.mktemp("export") / "run")
+
+
+@pytest.fixture(scope="module")
+def exported(run_dir):
+    assert export.main([str(run_dir), "--format", "all"]) == 0
+    return run_dir / "policy"
+
+
+@pytest.fixture
+def shortly(monkeypatch):
+    """Exports are checked on few observations."""
+    monkeypatch.setattr(export, "record", functools.partial(record, count=20))
+
+
+def checkpoint_of(settings, tmp_path):
+    """A policy that nobody trained, with a normaliser that matters."""
+    config = parse_config(settings)
+    env = make_env(config)
+    size = env.observation_size
+    networks = make_networks(
+        config.ppo.network, size, 2, normalize=config.ppo.normalize_observations
+    )
+    key = jax.random.PRNGKey(3)
+    normalizer = running_statistics.init_state(specs.Array((size,), np.dtype("float32")))
+    normalizer = normalizer.replace(
+        mean=jnp.linspace(-1.0, 1.0, size), std=jnp.linspace(0.1, 2.0, size)
+    )
+    params = PolicyParams(normalizer, networks.policy_network.init(key), None)
+    return Checkpoint(
+        path=tmp_path / "checkpoints" / "000000000000",
+        run_dir=tmp_path,
+        env_steps=0,
+        config=config,
+        params=params,
+        networks=networks,
+        about=about_policy(config, env),
+    ), env
+
+
+def outputs_of(checkpoint, env, obs):
+    action, wheel_speeds = jax.device_get(jax.jit(as_jax(checkpoint, env))(obs))
+    return Recording(obs, action, wheel_speeds)
+
+
+@pytest.mark.parametrize(
+    ("activation", "distribution", "normalize"),
+    [
+        ("tanh", "tanh_normal", False),
+        ("relu", "normal", True),
+        ("elu", "tanh_normal", True),
+        ("swish", "normal", True),
+    ],
+)
+def test_every_network_is_written_as_it_is(activation, distribution, normalize, tmp_path):
+    network = {"activation": activation, "distribution_type": distribution}
+    layers = {"policy_hidden_layer_sizes": [24, 16]}
+    ppo = {"network": {**network, **layers}, "normalize_observations": normalize}
+    checkpoint, env = checkpoint_of({"ppo": ppo, "task": {"max_speed": 0.4}}, tmp_path)
+    obs = np.random.default_rng(0).normal(size=(200, 16)).astype(np.float32) * 3.0
+    recording = outputs_of(checkpoint, env, obs)
+    assert recording.action.std() > 0.1
+    policy = portable_policy(checkpoint)
+    for name in ("numpy", "onnx"):
+        path = tmp_path / FORMATS[name].file
+        FORMATS[name].write(Source(policy, as_jax(checkpoint, env)), path)
+        found = difference(recording, FORMATS[name].read(path)(obs), policy.controller)
+        assert found < TOLERANCE, name
+    one, speeds = FORMATS["numpy"].read(tmp_path / "policy.py")(obs[0])
+    assert np.abs(one - recording.action[0]).max() < TOLERANCE
+    assert speeds.shape == (2,)
+
+
+def test_an_export_tells_how_far_each_file_is_from_jax(exported, run_dir, shortly, capsys):
+    told = json.loads((exported / "policy.json").read_text())
+    names = {path.name for path in exported.iterdir()}
+    assert names == {"policy.json", "recording.npz", *(one.file for one in FORMATS.values())}
+    assert told["recording"]["observations"] == 10_000
+    for name, file in told["files"].items():
+        assert file["file"] == FORMATS[name].file
+        assert file["largest_difference"] < 1e-5
+    # Again, in place of the first, from a run folder that holds `policy/` by now.
+    assert export.main([str(run_dir), "--out", str(run_dir / "again")]) == 0
+    assert "20 observations" in capsys.readouterr().out
+    assert json.loads((run_dir / "again" / "policy.json").read_text())["files"].keys() == {"numpy"}
+    same = (run_dir / "again" / "policy.py").read_bytes()
+    assert same == (exported / "policy.py").read_bytes()
+
+
+def test_the_recording_is_what_the_policy_saw_in_its_environment(exported, run_dir):
+    checkpoint = load_checkpoint(run_dir)
+    env = checkpoint.make_env()
+    with np.load(exported / "recording.npz") as recording:
+        obs, action = recording["obs"], recording["action"]
+    assert obs.shape == (10_000, env.observation_size)
+    keys = report_keys(1)
+    np.testing.assert_array_equal(obs[0], env.reset(keys[0]).obs)
+    # In C MuJoCo it moves as it was told: MJX, one step on.
+    physics = env.reset(keys[0]).pipeline_state
+    data = mujoco.MjData(env.mj_model)
+    data.ctrl[:] = env.wheel_targets(jnp.asarray(action[0]))
+    mujoco.mj_step(env.mj_model, data, env.config.physics.n_substeps)
+    physics = physics.replace(qpos=jnp.asarray(data.qpos), qvel=jnp.asarray(data.qvel))
+    seen = env.task.observe(robot_state(physics), env.reset(keys[0]).goal)
+    np.testing.assert_allclose(obs[1], seen, atol=1e-6)
+    # Where the distance grows at once, another episode has begun.
+    distance = obs[:, env.observation_size - 3]
+    assert np.count_nonzero(np.abs(np.diff(distance)) > 0.1) > 30
+
+
+def test_the_contract_tells_the_layout_and_the_formula(exported, run_dir):
+    told = json.loads((exported / "policy.json").read_text())
+    env = load_checkpoint(run_dir).make_env()
+    layout = [
+        (one["name"], len(one["index"]), one["unit"], one["frame"]) for one in told["observation"]
+    ]
+    assert layout == [field[:4] for field in env.task.layout]
+    indices = [index for one in told["observation"] for index in one["index"]]
+    assert indices == list(range(env.observation_size))
+    assert told["control_rate"] == pytest.approx(60.0)
+    assert (told["rest_height"], told["evaluation"]) == (env.mj_model.qpos0[2], None)
+    with np.load(exported / "recording.npz") as recording:
+        action, wheel_speeds = recording["action"].astype(float), recording["wheel_speeds"]
+    names = {"drive": action[:, 0], "turn": action[:, 1], **told["wheel_speeds"]}
+    for line in told["wheel_speeds"]["formula"]:
+        name, _, expression = line.partition(" = ")
+        names[name] = eval(expression, {}, names)
+    np.testing.assert_allclose(names["left"], wheel_speeds[:, 0], atol=1e-4)
+    np.testing.assert_allclose(names["right"], wheel_speeds[:, 1], atol=1e-4)
+
+
+def test_the_contract_holds_the_summary_of_a_report(run_dir, tmp_path):
+    checkpoint = load_checkpoint(run_dir)._replace(run_dir=tmp_path)
+    folder = tmp_path / "evaluations" / checkpoint.path.name
+    folder.mkdir(parents=True)
+    policy, env = portable_policy(checkpoint), checkpoint.make_env()
+    for text in ("", "{}", "[]"):
+        (folder / "report.json").write_text(text)
+        assert contract(checkpoint, env, policy)["evaluation"] is None
+    write_json(folder / "report.json", {"goal_set_version": 7, "policy": {"success_rate": 0.5}})
+    told = contract(checkpoint, env, policy)["evaluation"]
+    assert told == {"goal_set_version": 7, "success_rate": 0.5}
+
+
+def test_the_time_of_an_action_is_told_for_every_file(exported, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    import action_latency
+
+    cores = os.sched_getaffinity(0)
+    assert action_latency.main([str(exported), "--calls", "5"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    assert [row[0] for row in rows] == list(FORMATS)
+    assert all(0 < float(row[1]) <= float(row[2]) <= float(row[3]) for row in rows)
+    assert os.sched_getaffinity(0) == cores
+    assert action_latency.main([str(exported / "nothing")]) == 2
+
+
+def towards(checkpoint, env):
+    """In place of a policy: it drives towards what the task shows first a direction of."""
+    del checkpoint
+
+    def act(obs):
+        bearing = jnp.arctan2(obs[:, 3], obs[:, 2])
+        drive = jnp.where(jnp.abs(bearing) < 0.5, 0.3, -1.0)
+        action = jnp.clip(jnp.stack([drive, bearing], axis=1), -1.0, 1.0)
+        return action, jax.vmap(env.wheel_targets)(action)
+
+    return act
+
+
+@pytest.fixture
+def record_example(monkeypatch, tmp_path):
+    monkeypatch.syspath_prepend(str(ROOT / "examples"))
+    monkeypatch.setattr(numpy_policy, "as_jax", towards)
+
+    def record_example(name, count):
+        settings = load_config(ROOT / "examples" / f"{name}.yaml").model_dump()
+        return record(*checkpoint_of(settings, tmp_path), count).obs
+
+    return record_example
+
+
+def test_a_recording_passes_gate_after_gate(record_example):
+    left = record_example("gates", 700)[:, 10]
+    passed = -np.diff(left)
+    assert set(left) == {3, 2, 1}  # the last gate ends the episode
+    assert set(passed) == {0, 1, -2}  # -2: the next episode
+    assert np.count_nonzero(passed == -2) >= 2
+
+
+def test_a_recording_runs_into_solid_pillars(record_example):
+    from pillars_task import BUMPER_POS, BUMPER_RADIUS, PILLAR_RADIUS
+
+    nearest = record_example("pillars", 300)[:, -3]
+    at_the_front = PILLAR_RADIUS + BUMPER_RADIUS + BUMPER_POS[0]
+    assert nearest.min() == pytest.approx(at_the_front, abs=0.01)
+
+
+# Without the package.
+
+
+def site_with(tmp_path, names):
+    """A folder in which these packages of this environment can be imported, and no others."""
+    site = tmp_path / "site"
+    site.mkdir()
+    home = Path(np.__file__).parents[1]
+    for name in names:
+        (site / name).symlink_to(home / name)
+    return site
+
+
+def alone(site, source):
+    """Runs a program with the standard library and what a site holds."""
+    program = (
+        f"import sys; sys.dont_write_bytecode = True; sys.path.append({str(site)!r})\n{source}"
+    )
+    # Neither the environment's packages nor the user's, nor this checkout.
+    return subprocess.run(
+        [sys.executable, "-I", "-S", "-c", program], capture_output=True, text=True, cwd=site
+    )
+
+
+NUMPY = [path.name for path in Path(np.__file__).parents[1].glob("numpy*")]
+
+
+def test_the_numpy_file_needs_numpy_alone(exported, tmp_path):
+    site = site_with(tmp_path, NUMPY)
+    path = exported / "policy.py"
+    done = alone(site, f"import runpy; runpy.run_path({str(path)!r}, run_name='__main__')")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "from JAX" in done.stdout
+    assert alone(site, "import jax").returncode == 1
+    # It would have told of a difference.
+    other = path.read_text().replace('"max_speed": 1.0', '"max_speed": 1.001')
+    (tmp_path / "policy.py").write_text(other)
+    shutil.copy(exported / "recording.npz", tmp_path)
+    done = alone(
+        site,
+        f"import runpy; runpy.run_path({str(tmp_path / 'policy.py')!r}, run_name='__main__')",
+    )
+    assert done.returncode == 1
+
+
+def test_the_onnx_file_needs_onnxruntime_alone(exported, tmp_path):
+    needed = [*NUMPY, "onnxruntime", "flatbuffers", "packaging", "google"]
+    done = alone(
+        site_with(tmp_path, needed),
+        "import numpy as np, onnxruntime\n"
+        f"recording = np.load({str(exported / 'recording.npz')!r})\n"
+        f"session = onnxruntime.InferenceSession({str(exported / 'policy.onnx')!r})\n"
+        "action, wheels = session.run(['action', 'wheel_speeds'], {'obs': recording['obs']})\n"
+        "assert not {'jax', 'jetbot_mjx', 'onnx'} & set(sys.modules)\n"
+        "print(abs(action - recording['action']).max())\n"
+        "print(abs(wheels - recording['wheel_speeds']).max())",
+    )
+    assert done.returncode == 0, done.stderr
+    action, wheels = map(float, done.stdout.split())
+    assert action < 1e-5
+    assert wheels < 36.2e-5
+
+
+def test_the_files_for_a_robot_are_python_3_6(exported, root):
+    paths = [path for path in (root / "deploy").glob("*.py") if path.name != "rehearse.py"]
+    assert len(paths) == 6
+    for path in [*paths, exported / "policy.py"]:
+        tree = ast.parse(path.read_text("utf-8"), feature_version=(3, 6))
+        imported = {
+            name.split(".")[0]
+            for node in ast.walk(tree)
+            if isinstance(node, ast.Import | ast.ImportFrom)
+            for name in (
+                [node.module] if isinstance(node, ast.ImportFrom) else [a.name for a in node.names]
+            )
+        }
+        known = {"argparse", "base64", "contextlib", "hashlib", "hmac", "ipaddress", "json", "math"}
+        known |= {"os", "secrets", "signal", "socket", "stat", "sys", "time", "types", "typing"}
+        known |= {"numpy", "jetbot"} | {one.stem for one in paths}
+        assert imported <= known, path.name
+        assert "'='" not in ast.dump(tree), path.name  # f"{x=}" came with 3.8
+        if path.name == "policy.py":
+            # A robot's terminal may know ASCII only.
+            assert path.read_text("utf-8").isascii()
+
+
+# Mistakes.
+
+
+def test_what_differs_from_jax_is_not_written(run_dir, exported, shortly, monkeypatch, tmp_path):
+    before = {path.name: path.read_bytes() for path in exported.iterdir()}
+    write = FORMATS["numpy"].write
+
+    def write_another(source, path):
+        *layers, last = source.policy.layers
+        other = last._replace(bias=last.bias + np.float32(1e-3))
+        write(source._replace(policy=source.policy._replace(layers=(*layers, other))), path)
+
+    monkeypatch.setitem(exporters.FORMATS, "numpy", FORMATS["numpy"]._replace(write=write_another))
+    for folder in (tmp_path / "new", exported):
+        with pytest.raises(
+            UserError, match=r"nothing was written to .*policy\.py differs from JAX"
+        ):
+            export.run(run_dir, formats=("onnx", "numpy"), output=folder)
+    assert os.listdir(tmp_path) == []
+    assert {path.name: path.read_bytes() for path in exported.iterdir()} == before
+    assert not [path for path in run_dir.iterdir() if path.name.startswith(".policy")]
+
+
+def test_an_export_that_is_stopped_leaves_the_earlier_one(run_dir, exported, shortly, monkeypatch):
+    def stop(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(export, "write_json", stop)
+    with pytest.raises(KeyboardInterrupt):
+        export.run(run_dir)
+    assert (exported / "policy.onnx").is_file()
+    assert not [path for path in run_dir.iterdir() if path.name.startswith(".policy")]
+
+
+@pytest.mark.parametrize(
+    ("action", "wheel_speeds"),
+    [
+        (np.full((2, 2), np.nan), np.zeros((2, 2))),
+        (np.zeros((2, 2)), np.full((2, 2), 1e-3)),
+        (np.zeros((1, 2)), np.zeros((2, 2))),
+    ],
+)
+def test_a_difference_is_seen(action, wheel_speeds, run_dir):
+    controller = portable_policy(load_checkpoint(run_dir)).controller
+    recording = Recording(np.zeros((2, 16)), np.zeros((2, 2)), np.zeros((2, 2)))
+    assert difference(recording, (action, wheel_speeds), controller) > TOLERANCE
+    assert difference(recording, recording[1:], controller) == 0.0
+
+
+def test_a_missing_package_is_told_with_its_remedy(run_dir, monkeypatch, tmp_path):
+    monkeypatch.setitem(sys.modules, "onnx", None)
+    with pytest.raises(
+        UserError, match=r"--format onnx needs onnx.*pip install 'jetbot_mjx\[export"
+    ):
+        export.main([str(run_dir), "--format", "all", "--out", str(tmp_path / "p")])
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_with_something_else_is_left_alone(run_dir, tmp_path):
+    (tmp_path / "thesis.txt").write_text("years of work")
+    with pytest.raises(UserError, match="is there and no export"):
+        export.run(run_dir, output=tmp_path)
+    assert os.listdir(tmp_path) == ["thesis.txt"]
+
+
+def test_a_folder_that_cannot_be_is_told(run_dir, tmp_path):
+    with pytest.raises(UserError, match="cannot be written: File name too long"):
+        export.run(run_dir, output=tmp_path / ("x" * 300))
+    assert os.listdir(tmp_path) == []
+
+
+def test_an_unknown_format_is_told(run_dir, capsys):
+    with pytest.raises(SystemExit) as left:
+        export.main([str(run_dir), "--format", "torch"])
+    assert left.value.code == 2
+    assert "'torch' is none of numpy, onnx, stablehlo, all" in capsys.readouterr().err
+
+
+def test_a_shorter_recording_is_the_beginning_of_a_longer_one(exported, run_dir):
+    checkpoint = load_checkpoint(run_dir)
+    short = record(checkpoint, checkpoint.make_env(), 20)
+    with np.load(exported / "recording.npz") as recording:
+        np.testing.assert_array_equal(short.obs, recording["obs"][:20])

@@ -1,0 +1,107 @@
+"""What is left out of an import, and what is not."""
+
+import subprocess
+import sys
+import types
+from importlib.util import find_spec
+
+import pytest
+
+from jetbot_mjx.imports import PutOff, standing_in
+
+
+def test_inside_the_stand_in_is_found_and_afterwards_the_module_is_as_it_was():
+    stand_in = types.ModuleType("not_there")
+    with standing_in("not_there", stand_in):
+        import colorsys  # any module that nobody has loaded yet
+
+        import not_there
+    assert not_there is stand_in
+    assert "not_there" not in sys.modules
+    assert sys.modules["colorsys"] is colorsys
+
+
+def test_a_module_can_be_absent():
+    with standing_in("wave", None), pytest.raises(ImportError):
+        import wave  # noqa: F401
+
+
+def test_a_module_that_is_loaded_stays():
+    with standing_in("types", None):
+        import types as found
+    assert found is types
+
+
+def test_an_error_inside_leaves_nothing_behind():
+    with pytest.raises(ZeroDivisionError), standing_in("not_there", None):
+        _ = 1 / 0
+    assert "not_there" not in sys.modules
+
+
+def test_a_module_that_was_put_off_is_there_when_it_is_needed(monkeypatch):
+    monkeypatch.delitem(sys.modules, "fractions", raising=False)
+    with standing_in("fractions", PutOff("fractions")):
+        import fractions
+    assert "fractions" not in sys.modules
+    assert fractions.Fraction(1, 2) == 0.5
+    assert sys.modules["fractions"].Fraction is fractions.Fraction
+
+
+def test_a_module_that_was_put_off_may_be_needed_while_it_is(monkeypatch):
+    monkeypatch.delitem(sys.modules, "fractions", raising=False)
+    with standing_in("fractions", PutOff("fractions")):
+        from fractions import Fraction
+    assert sys.modules["fractions"].Fraction is Fraction
+
+
+LIGHT = """
+import sys
+import {first}
+{then}
+import jetbot_mjx.training.session
+heavy = ["glfw", "jaxopt", "scipy.optimize", "scipy.spatial", "tensorboardX.comet_utils",
+    "torch", "trimesh"]
+print(*[name for name in heavy if name in sys.modules])
+from brax.generalized import constraint
+print(constraint.jaxopt.ProjectedGradient.__name__)
+import inspect
+import mujoco.mjx
+from mujoco.mjx._src import mesh
+print(mesh.spatial.ConvexHull.__name__, "import" in inspect.getsource(mujoco.mjx))
+"""
+
+
+@pytest.mark.parametrize(
+    ("first", "then"), [("jetbot_mjx", ""), ("jetbot_mjx", "import brax.envs, mujoco.mjx")]
+)
+def test_a_training_loads_nothing_heavy_and_all_of_it_is_there_when_asked_for(first, then):
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", LIGHT.format(first=first, then=then)],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.splitlines() == ["", "ProjectedGradient", "ConvexHull True"]
+
+
+@pytest.mark.skipif(find_spec("glfw") is None, reason="MuJoCo was installed without GLFW")
+def test_glfw_is_there_when_asked_for():
+    code = "import jetbot_mjx, sys, mujoco.glfw as m; print('glfw' in sys.modules, m.glfw.init)"
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True
+    )
+    assert done.stdout.startswith("False <function init "), done.stderr[-2000:]
+
+
+def test_a_mistyped_command_says_so_before_anything_heavy_is_loaded():
+    code = """
+import sys
+from jetbot_mjx import train
+try:
+    train.main(["--config", "nowhere.yaml", "--sed", "1"])
+except SystemExit as error:
+    loaded = [name for name in ("brax", "flax", "mujoco", "optax", "orbax") if name in sys.modules]
+    print(error.code, loaded)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout == "2 []\n", done.stderr[-2000:]

@@ -1,0 +1,69 @@
+"""What the template writes: it passes the checks and trains, and nothing is ever overwritten."""
+
+import sys
+
+import gliding
+import pytest
+
+from jetbot_mjx import check_env, new_task
+from jetbot_mjx.config import load_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.training import session
+
+# So small that compiling is all that takes time.
+TINY = (
+    "checkpoint_interval=1024",
+    "task.episode_length=16",
+    "ppo.num_timesteps=1024",
+    "ppo.num_envs=32",
+    "ppo.unroll_length=8",
+    "ppo.batch_size=16",
+    "ppo.num_minibatches=2",
+    "ppo.num_updates_per_batch=1",
+    "ppo.network.policy_hidden_layer_sizes=[8]",
+    "ppo.network.value_hidden_layer_sizes=[8]",
+    "evaluation.episodes=4",
+)
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(tmp_path))
+    yield tmp_path
+    sys.modules.pop("park_here", None)
+
+
+def test_what_is_written_passes_the_checks_and_trains(folder, capsys):
+    assert new_task.main([str(folder / "park_here.py")]) == 0
+    config = folder / "park_here.yaml"
+    assert f"--config {config}" in capsys.readouterr().out
+    with gliding.everywhere():
+        assert check_env.main(["--config", str(config)]) == 0
+        result = session.run(load_config(config, TINY), folder / "run")
+    assert result.finished
+    assert "class ParkHere(GoalTask)" in (folder / "park_here.py").read_text("utf-8")
+    assert "$" not in (folder / "park_here.py").read_text("utf-8") + config.read_text("utf-8")
+
+
+@pytest.mark.parametrize("there", ["mine.py", "mine.yaml"])
+def test_nothing_is_overwritten(folder, there):
+    (folder / there).write_text("mine")
+    with pytest.raises(UserError, match=f"{there} is there already"):
+        new_task.run(folder / "mine.py")
+    assert [file.name for file in folder.iterdir()] == [there]
+    assert (folder / there).read_text() == "mine"
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("my-task.py", "name a Python module"),
+        ("class.py", "name a Python module"),
+        ("my_task.txt", "name a Python module"),
+        ("json.py", "there is a module json already"),
+    ],
+)
+def test_names_that_cannot_be_imported_are_refused(folder, name, told):
+    with pytest.raises(UserError, match=told):
+        new_task.run(folder / name)
+    assert list(folder.iterdir()) == []

@@ -1,0 +1,106 @@
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jetbot_mjx import PRETRAINED, evaluate, load_policy, play, pretrained, train
+from jetbot_mjx.config import load_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint import load_checkpoint
+
+NAMES = ("jetbot_egocentric", "real_jetbot")
+LONGER = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
+"""What a run that comes with the package changes of its configuration."""
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    return pretrained.run()
+
+
+def test_there_is_a_run_for_each_of_two_configurations(runs):
+    assert runs == tuple(Path("runs/pretrained") / name for name in NAMES)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_was_trained_by_the_configuration_of_its_name(name, root):
+    trained = load_config(PRETRAINED / name / "config.yaml")
+    changed = [f"{key}={value}" for key, value in LONGER.get(name, {}).items()]
+    assert trained == load_config(root / "configs" / f"{name}.yaml", changed)
+    assert load_checkpoint(PRETRAINED / name).config == trained
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_it_reaches_the_goals_of_the_report(name, runs):
+    assert evaluate.main([str(runs[NAMES.index(name)]), "--min-success", "0.99"]) == 0
+    (report,) = runs[NAMES.index(name)].glob("evaluations/*/report.json")
+    assert json.loads(report.read_text("utf-8"))["policy"]["episodes"] == 1024
+
+
+def test_it_acts():
+    # Turns towards a goal on its left, 1 m away.
+    policy = load_policy(PRETRAINED / "jetbot_egocentric")
+    left, right = (jnp.array([0.0, side, 0.0, side, 1.0, 0.3, 0.0]) for side in (1.0, -1.0))
+    assert float(policy(left)[1]) > 0.1
+    assert float(policy(right)[1]) < -0.1
+
+
+def test_it_can_be_trained_further(runs):
+    run = runs[0]
+    (start,) = (int(path.name) for path in (run / "checkpoints").iterdir())
+    interval = load_config(run / "config.yaml").checkpoint_interval
+    further = f"ppo.num_timesteps={start + interval}"
+    assert train.main(["--resume", str(run), "--set", further]) == 0
+    assert load_checkpoint(run, "last").env_steps == start + interval
+
+
+def test_nothing_is_overwritten(runs):
+    kept = runs[1] / "config.yaml"
+    kept.write_text("mine")
+    with pytest.raises(UserError, match="runs/pretrained/jetbot_egocentric is there already: give"):
+        pretrained.main([])
+    for path in sorted(runs[0].rglob("*"), reverse=True):
+        path.unlink() if path.is_file() else path.rmdir()
+    runs[0].rmdir()
+    with pytest.raises(UserError, match="runs/pretrained/real_jetbot is there already: give --out"):
+        pretrained.main([])
+    assert kept.read_text() == "mine"
+    assert not runs[0].exists()
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(
+        UserError, match=r"file/runs/jetbot_egocentric cannot be written: Not a dir"
+    ):
+        pretrained.run(tmp_path / "file" / "runs")
+
+
+def test_it_tells_where_the_runs_are(tmp_path, capsys):
+    assert pretrained.main(["--out", str(tmp_path / "here")]) == 0
+    printed = capsys.readouterr().out
+    for name in NAMES:
+        assert f"run folder: {tmp_path / 'here' / name}\n" in printed
+    assert f"python -m jetbot_mjx.play {tmp_path / 'here' / NAMES[0]}\n" in printed
+
+
+def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):
+    given = []
+    monkeypatch.setattr(
+        play, "run", lambda run, **more: given.append((run, more["which"])) or play.Played(0, 0)
+    )
+    assert play.main([]) == 0
+    assert given == [(PRETRAINED / "jetbot_egocentric", "best")]
+    assert "no run is named" in capsys.readouterr().out
+    assert play.main(["runs/mine"]) == 0
+    assert given[1] == ("runs/mine", "best")
+    assert "no run is named" not in capsys.readouterr().out
+
+
+def test_nothing_in_it_names_the_machine_it_was_made_on():
+    for path in PRETRAINED.rglob("*"):
+        if path.is_file():
+            assert not np.any([word in path.read_bytes() for word in (b"/home", b"/root", b"/tmp")])

@@ -1,0 +1,277 @@
+import functools
+import inspect
+import os
+import shutil
+import subprocess
+import sys
+
+import imageio.v3 as iio
+import jax
+import numpy as np
+import pytest
+
+from jetbot_mjx import evaluate, render
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
+from jetbot_mjx.runs.checkpoint import load_checkpoint
+from jetbot_mjx.viewers import offscreen
+from jetbot_mjx.viewers.video import Studio
+
+
+@pytest.fixture(scope="module")
+def needs_opengl():
+    try:
+        offscreen.find_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+
+
+def test_the_cameras_show_the_robot_the_cube_and_where_they_are(world_env, needs_opengl):
+    qpos = np.array(world_env.mj_model.qpos0)
+    with offscreen.Renderer(world_env.mj_model, width=160, height=160) as renderer:
+        top = renderer.frame(qpos, {"goal": (0.9, 0.0, 0.05)}, "top").astype(int)
+        left = renderer.frame(qpos, {"goal": (0.0, 0.9, 0.05)}, "top").astype(int)
+        chase = renderer.frame(qpos, {"goal": (0.9, 0.0, 0.05)}, "chase").astype(int)
+        onboard = renderer.frame(qpos, {"goal": (0.9, 0.0, 0.05)}, "onboard").astype(int)
+
+    def red(image):
+        r, g, b = np.moveaxis(image, -1, 0)
+        return np.argwhere((r > 100) & (r > 2 * g) & (r > 2 * b)).mean(axis=0)
+
+    assert top.shape == (160, 160, 3)
+    row, column = red(top)  # world x is up in the picture, y to the left
+    assert row < 60
+    assert 70 < column < 90
+    row, column = red(left)
+    assert column < 60
+    assert 70 < row < 90
+    for image in (chase, onboard):
+        assert 60 < red(image)[1] < 100  # straight ahead
+    assert image.std() > 5
+
+
+@pytest.fixture(scope="module", autouse=True)
+def evaluator(smoke_run):
+    """Every picture of this file is of two goals: their program is compiled once."""
+    checkpoint = load_checkpoint(smoke_run)
+    evaluator = Evaluator(checkpoint.make_env(), checkpoint.networks, record=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(render, "Evaluator", lambda env, networks, record: evaluator)
+        yield evaluator
+
+
+@pytest.fixture
+def coarse(monkeypatch):
+    """Films in few and small pictures."""
+    monkeypatch.setattr(render, "Studio", functools.partial(Studio, side=80, fps=5))
+
+
+@pytest.fixture
+def filmed(monkeypatch):
+    """What would be filmed, instead of filming it."""
+    shots = []
+
+    class Listener:
+        def __init__(self, env):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *exception):
+            pass
+
+        def film_episode(self, drive):
+            shots.append([("", drive)])
+            yield np.zeros((2, 2, 3), np.uint8)
+
+        def film_together(self, shown):
+            shots.append(shown)
+            yield np.zeros((2, 2, 3), np.uint8)
+
+    monkeypatch.setattr(render, "Studio", Listener)
+    return shots
+
+
+@pytest.fixture
+def run_copy(smoke_run, tmp_path):
+    return shutil.copytree(smoke_run, tmp_path / "run")
+
+
+def names(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_rendering_writes_a_film_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
+    assert render.main([str(run_copy), "--episodes", "2"]) == 0
+    (folder,) = (run_copy / "videos").iterdir()
+    film = iio.imread(folder / "episodes.mp4", plugin="pyav")
+    assert film.shape[1:] == (80, 160, 3)
+    assert film.shape[0] > 8
+    assert np.abs(film[0].astype(int) - film[5]).mean() > 1  # it moves
+    assert iio.imread(folder / "episodes.gif").shape[1:] == (48, 96, 3)
+    assert iio.imread(folder / "trajectories.png").shape[0] > 400
+    shown = capsys.readouterr().out
+    for name in ("episodes.mp4", "episodes.gif", "trajectories.png"):
+        assert str(folder / name) in shown
+
+
+def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
+    pictures = render.run(run_copy, goals=[3, 1])
+    env = load_checkpoint(run_copy).make_env()
+    goals_w = {drive.goal_number: drive.goal_w for ((_, drive),) in filmed}
+    assert list(goals_w) == [3, 1]
+    assert pictures.episodes == 2
+    every = jax.vmap(env.reset)(report_keys(4)).goal
+    for number, goal_w in goals_w.items():
+        np.testing.assert_array_equal(goal_w, every[number])
+    assert names(pictures.mp4.parent) == ["goals-3,1.gif", "goals-3,1.mp4", "goals-3,1.png"]
+
+
+@pytest.mark.parametrize(
+    ("text", "goals", "name"),
+    [
+        ("3,17", [3, 17], "3,17"),
+        ("0-7", [0, 1, 2, 3, 4, 5, 6, 7], "0-7"),
+        ("17, 3-5,1023", [17, 3, 4, 5, 1023], "17,3-5,1023"),
+        ("5,4", [5, 4], "5,4"),
+        ("4,5", [4, 5], "4-5"),
+    ],
+)
+def test_goals_are_written_as_indices_and_ranges(text, goals, name):
+    assert render._goals(text) == goals
+    assert render._spans(goals) == name
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--goals", "1024"], "goal 1024 is none of the 1,024 fixed goals: they are 0 to 1023"),
+        (["--goals", "5-999999999"], "goal 1024 is none of the 1,024 fixed goals"),
+        (["--goals", "3,x"], "'x' is no goal: write indices and ranges, as in 3,17 or 0-7"),
+        (["--goals", "3,"], "'' is no goal"),
+        (["--goals=-3"], "'-3' is no goal"),
+        (["--goals", "²"], "'²' is no goal"),
+        (["--goals", "7-3"], "7-3 runs backwards: write 3-7"),
+        (["--goals", "3,1-4"], "goal 3 is named twice"),
+        (["--goals", "3", "--episodes", "2"], "--episodes: not allowed with argument --goals"),
+        (["--gallery", "--goals", "3"], "--goals: a gallery shows the first goals"),
+        (["--gallery", "--checkpoint", "last"], "--checkpoint: a gallery shows the first"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, said, capsys):
+    with pytest.raises(SystemExit) as left:
+        render.main(["run", *arguments])
+    assert left.value.code == 2
+    error = capsys.readouterr().err
+    assert said in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize("goals", [[], [-1], [1024], [2, 2]])
+def test_goals_that_are_none_are_refused_from_python_too(goals):
+    with pytest.raises(UserError, match="goal"):
+        render.run("run", goals=goals)
+
+
+def test_a_report_takes_the_goals_that_can_be_filmed():
+    assert inspect.signature(evaluate.run).parameters["episodes"].default == REPORT_GOALS
+
+
+@pytest.mark.parametrize(
+    ("steps", "chosen"),
+    [
+        ([0], [0]),
+        ([0, 10], [0, 10]),
+        ([0, 10, 20], [0, 10, 20]),
+        ([0, 10, 20, 30], [0, 10, 30]),
+        ([5, 10, 20, 30, 70], [5, 20, 70]),
+    ],
+)
+def test_a_gallery_shows_the_first_the_middle_and_the_last(steps, chosen):
+    assert render.early_middle_final(steps) == chosen
+
+
+def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys):
+    assert render.main([str(run_copy), "--gallery", "--episodes", "2"]) == 0
+    assert len(filmed) == 2
+    for number, shots in enumerate(filmed):
+        headings, shown = zip(*shots, strict=True)
+        assert headings == ("0 steps", "32,768 steps", "65,536 steps")
+        assert {drive.goal_number for drive in shown} == {number}
+        for drive in shown[1:]:
+            np.testing.assert_array_equal(drive.goal_w, shown[0].goal_w)
+        # Three policies, not one thrice.
+        ends = {tuple(drive.qpos[min(drive.steps, 20)]) for drive in shown}
+        assert len(ends) == 3
+    shown = capsys.readouterr().out
+    assert "           0 steps  0 of 2 goals reached" in shown
+    for suffix in ("mp4", "gif", "png"):
+        assert str(run_copy / "videos" / f"gallery.{suffix}") in shown
+
+
+def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
+    gallery = render.run_gallery(run_copy, episodes=2)
+    film = iio.imread(gallery.mp4, plugin="pyav")
+    assert film.shape[1:] == (80, 240, 3)
+    assert names(run_copy / "videos") == ["gallery.gif", "gallery.mp4", "gallery.png"]
+    assert iio.imread(gallery.gif).shape[1:] == (60, 180, 3)
+    height, width, _ = iio.imread(gallery.plans).shape
+    assert width == 3 * height
+    assert list(gallery.successes) == [0, 32_768, 65_536]
+
+
+def test_one_checkpoint_makes_no_gallery(run_copy):
+    with pytest.raises(UserError, match="is one checkpoint: give the run folder it lies in"):
+        render.run_gallery(run_copy / "checkpoints" / f"{65_536:012}")
+    with pytest.raises(UserError, match="no such folder"):
+        render.run_gallery(run_copy / "nothing")
+
+
+def test_without_opengl_one_line_names_the_remedy(monkeypatch, run_copy):
+    monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit(1) # {backend}")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    offscreen.find_backend.cache_clear()
+    try:
+        with pytest.raises(UserError, match="apt-get install") as caught:
+            render.run(run_copy, episodes=2)
+    finally:
+        offscreen.find_backend.cache_clear()
+    assert "\n" not in str(caught.value)
+    # What needs no OpenGL is there all the same.
+    assert list(run_copy.glob("videos/*/trajectories.png"))
+
+
+def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "osmesa")
+    monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit('{backend}' == 'osmesa')")
+    offscreen.find_backend.cache_clear()
+    try:
+        with pytest.raises(UserError, match="'osmesa' does not work here: unset it, or install"):
+            offscreen.find_backend()
+    finally:
+        offscreen.find_backend.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("wanted", "said"),
+    [("osmesa", "'osmesa' does not work here"), ("software", "'software': no such back end")],
+)
+def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
+    tmp_path, monkeypatch, wanted, said
+):
+    (tmp_path / "OpenGL.py").write_text("None.glGetError", "utf-8")  # what PyOpenGL does
+    monkeypatch.setenv("MUJOCO_GL", wanted)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
+    program = """
+import jetbot_mjx.envs.physics
+from jetbot_mjx import errors
+from jetbot_mjx.viewers import offscreen
+try:
+    offscreen.find_backend()
+except errors.UserError as error:
+    print(error)
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert said in done.stdout

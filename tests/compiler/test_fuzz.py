@@ -1,0 +1,88 @@
+"""Random functions through every step of the kernel compiler, against JAX."""
+
+import call_frame
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import random_functions
+
+from jetbot_mjx.compiler import ffi_wrapper, llvm_backend, llvm_codegen, lower_jaxpr, ptx_backend
+from jetbot_mjx.compiler.kernel import Kernel, as_step
+
+if not llvm_backend.is_available():
+    pytest.skip("llvmlite compiles nothing here", allow_module_level=True)
+
+QUICK = 12
+BATCH = 50  # functions in one test of the slow suite
+BATCHES = 20
+
+ARGUMENT = jax.ShapeDtypeStruct((random_functions.INPUTS,), jnp.float32)
+RESULT = jax.ShapeDtypeStruct((random_functions.RESULTS,), jnp.float32)
+_engines = []
+
+
+def _quick():
+    """What lets XLA compile in half the time on a CPU."""
+    if jax.default_backend() != "cpu":
+        return {}
+    return {"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True}
+
+
+def agree(ours, theirs, errors, what):
+    assert np.isfinite(theirs).all()
+    wrong = np.argwhere(~(np.abs(ours - theirs) <= errors))
+    assert not len(wrong), f"{what}: robot and number {wrong[0]}"
+
+
+def by_llvm(program, lanes, arguments):
+    """What a kernel of so many lanes makes of the arguments; one lane is a GPU's thread."""
+    text = ffi_wrapper.kernel_text(
+        llvm_codegen.step_text(program, carried=1, lanes=lanes),
+        [array.size for array in program.inputs],
+        carried=1,
+        lanes=lanes,
+        steps=1,
+        name=llvm_backend._NAME,
+        machine=llvm_backend._host().machine,
+    )
+    _engines.append(llvm_backend._load(llvm_backend._compile(text)))
+    handler = call_frame.Handler(_engines[-1].get_function_address(llvm_backend._NAME))
+    result = np.full_like(arguments[0], np.nan)
+    assert call_frame.call(handler, arguments, [result]) is None
+    return result
+
+
+def check(seed, monkeypatch):
+    function = random_functions.RandomFunction(seed)
+    lanes = llvm_backend._host().lanes
+    x = random_functions.inputs(seed, 2 * lanes + 3)
+    theirs = np.asarray(jax.jit(jax.vmap(function), compiler_options=_quick())(x))
+    if seed % 2:
+        # Loops and branches where there would be none: all are small here.
+        monkeypatch.setattr(lower_jaxpr, "LEAST_IN_BRANCH", 2)
+        monkeypatch.setattr(lower_jaxpr, "MOST_WRITTEN_OUT", 8)
+    program = lower_jaxpr.scalarize(lambda result, x: function(x), RESULT, ARGUMENT)
+    monkeypatch.undo()
+    arguments = [np.zeros_like(theirs), x]
+    agree(program.evaluate(arguments)[0], theirs, function.errors, "in NumPy")
+    for count in (lanes, 1):
+        ours = by_llvm(program, count, arguments)
+        agree(ours, theirs, function.errors, f"{count} lanes")
+    kernel = Kernel(program, carried=1, steps=1, fallback=list, impl="ptx")
+    assert "physics" in ptx_backend.compiled(kernel, ptx_backend._ARCHITECTURES[seed % 3])
+    if ptx_backend.is_available():
+        ours = np.asarray(jax.jit(jax.vmap(as_step(kernel)))(*arguments))
+        agree(ours, theirs, function.errors, "on a GPU")
+
+
+@pytest.mark.parametrize("seed", range(QUICK))
+def test_a_function_is_what_jax_makes_of_it(seed, monkeypatch):
+    check(seed, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("batch", range(BATCHES))
+def test_a_thousand_functions_are_what_jax_makes_of_them(batch, monkeypatch):
+    for seed in range(QUICK + BATCH * batch, QUICK + BATCH * (batch + 1)):
+        check(seed, monkeypatch)

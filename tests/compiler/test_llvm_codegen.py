@@ -1,0 +1,230 @@
+"""What is written for CPUs, compiled and called as XLA does it; XLA itself: test_cpu."""
+
+import ctypes
+
+import call_frame
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from call_frame import Pool
+from kernel_cases import FUNCTIONS, LOOPS, VECTOR, robots
+
+from jetbot_mjx.compiler import ffi_wrapper, llvm_backend
+from jetbot_mjx.compiler.kernel import Kernel
+from jetbot_mjx.compiler.lower_jaxpr import scalarize
+from jetbot_mjx.compiler.scalar_ir import UnsupportedError
+
+pytest.importorskip("llvmlite")
+if not llvm_backend.is_available():
+    pytest.skip("there is no CPU that it is written for", allow_module_level=True)
+
+LANES = llvm_backend._host().lanes
+_engines = []
+
+
+def text_of(program, carried=1, steps=1):
+    return llvm_backend.kernel_text(Kernel(program, carried=carried, steps=steps, fallback=list))
+
+
+def compiled(program, carried=1, steps=1):
+    """A kernel as a function of a call frame."""
+    _engines.append(llvm_backend._load(llvm_backend._compile(text_of(program, carried, steps))))
+    return call_frame.Handler(_engines[-1].get_function_address(llvm_backend._NAME))
+
+
+def run(program, arguments, carried=1, steps=1):
+    outputs = [np.full_like(x, np.nan) for x in arguments[:carried]]
+    assert call_frame.call(compiled(program, carried, steps), arguments, outputs) is None
+    return outputs
+
+
+@pytest.fixture(params=["as many lanes as there are", "one lane"])
+def lanes(request, monkeypatch):
+    """One lane is what a GPU's thread does."""
+    if request.param == "one lane":
+        host = llvm_backend._host()._replace(lanes=1)
+        monkeypatch.setattr(llvm_backend, "_host", lambda: host)
+    return llvm_backend._host().lanes
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_kernel_does_what_the_function_does(name, lanes):
+    function, x = FUNCTIONS[name], robots(2 * LANES + 3)
+    program = scalarize(function, VECTOR)
+    theirs = jax.vmap(function)(x)
+    np.testing.assert_allclose(program.evaluate([x])[0], theirs, rtol=2e-5, atol=2e-6)
+    (ours,) = run(program, [x])
+    np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", LOOPS)
+def test_a_lane_that_is_done_keeps_its_numbers(name):
+    # Alone each robot ends its loops by itself; in a register the slowest keeps all of them there.
+    x = robots(LANES)
+    program = scalarize(LOOPS[name], VECTOR)
+    handler = compiled(program)
+    together = np.zeros_like(x)
+    call_frame.call(handler, [x], [together])
+    for i in range(LANES):
+        alone = np.zeros((1, 4), np.float32)
+        call_frame.call(handler, [x[i : i + 1]], [alone])
+        np.testing.assert_array_equal(alone[0], together[i])
+
+
+def test_what_is_not_a_number_stays_so_in_an_extreme():
+    x = np.float32([[np.nan, 1, 2, 3]])
+    (ours,) = run(scalarize(lambda x: jnp.maximum(x, x[::-1]) + jnp.minimum(1.5, x), VECTOR), [x])
+    np.testing.assert_array_equal(np.isnan(ours), [[True, False, False, True]])
+    (ours,) = run(scalarize(lambda x: jnp.maximum(x, 0.0), VECTOR), [x])
+    np.testing.assert_array_equal(ours, x)
+    (ours,) = run(scalarize(lambda x: jnp.minimum(x[::-1], x), VECTOR), [x])
+    np.testing.assert_array_equal(np.isnan(ours), [[True, False, False, True]])
+
+
+def test_subnormal_numbers_are_zeros_on_every_thread():
+    # As in XLA's own threads, or a result would depend on who made it.
+    x = np.full((8 * LANES * ffi_wrapper._BLOCKS_PER_THREAD, 4), 1e-39, np.float32)
+    out = np.full_like(x, np.nan)
+    handler = compiled(scalarize(lambda x: x * 3.0, VECTOR))
+    call_frame.call(handler, [x], [out], Pool(threads=3))
+    np.testing.assert_array_equal(out, 0)
+    # The caller's own arithmetic is what it was.
+    assert np.float32(1e-39) * np.float32(3) > 0
+
+
+def test_results_become_arguments_and_what_is_held_stays():
+    def step(x, held):
+        return jnp.roll(x, 1) + held
+
+    x = np.float32(np.random.default_rng(0).normal(size=(5, 4)))
+    held = np.float32([[0.5], [1], [2], [3], [4]])
+    program = scalarize(step, VECTOR, jax.ShapeDtypeStruct((1,), jnp.float32))
+    (ours,) = run(program, [x, held], steps=6)
+    np.testing.assert_allclose(ours, np.roll(x, 6, 1) + 6 * held, rtol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def plus_one():
+    shapes = VECTOR, jax.ShapeDtypeStruct((), jnp.float32)
+    return compiled(scalarize(lambda x, n: (x + n, n + 1), *shapes), carried=2, steps=2)
+
+
+@pytest.mark.parametrize("robots", [0, 1, LANES - 1, LANES, LANES + 1, 1000])
+@pytest.mark.parametrize("threads", [1, 3])
+def test_every_robot_is_stepped_once_and_nothing_beside_them_is_touched(plus_one, robots, threads):
+    x = np.arange(4 * robots, dtype=np.float32).reshape(robots, 4)
+    n = np.arange(robots, dtype=np.float32)
+    around = [np.full(4 * robots + 64, 7, np.float32), np.full(robots + 64, 7, np.float32)]
+    outputs = [around[0][32:-32].reshape(robots, 4), around[1][32:-32]]
+    call_frame.call(plus_one, [x, n], outputs, Pool(threads))
+    np.testing.assert_array_equal(outputs[0], x + 2 * n[:, None] + 1)
+    np.testing.assert_array_equal(outputs[1], n + 2)
+    for array in around:
+        np.testing.assert_array_equal([array[:32], array[-32:]], 7)
+
+
+def test_robots_beyond_the_end_are_not_read(plus_one):
+    # A page that may not be touched follows the last robot.
+    page = 4096
+    libc = ctypes.CDLL(None)
+    libc.mmap.restype = ctypes.c_void_p
+    libc.mmap.argtypes = [ctypes.c_void_p, *[ctypes.c_size_t] * 5]
+    libc.mprotect.argtypes = [ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int]
+    start = libc.mmap(None, 2 * page, 3, 0x22, -1 % 2**64, 0)
+    assert libc.mprotect(start + page, page, 0) == 0
+    robots = LANES + 1
+    numbers = (ctypes.c_float * (4 * robots)).from_address(start + page - 16 * robots)
+    x = np.frombuffer(numbers, np.float32).reshape(robots, 4)
+    x[:] = 3
+    n = np.zeros(robots, np.float32)
+    outputs = [np.zeros_like(x), np.zeros_like(n)]
+    call_frame.call(plus_one, [x, n], outputs)
+    np.testing.assert_array_equal(outputs[0], 4)
+    call_frame.call(plus_one, [outputs[0], n], [x, outputs[1]])
+    np.testing.assert_array_equal(x, 5)
+
+
+def many(blocks):
+    robots = blocks * LANES - 1
+    return np.ones((robots, 4), np.float32), np.zeros(robots, np.float32)
+
+
+@pytest.mark.parametrize("pool", [{"refuses": True}, {"waits": True}, {}])
+def test_threads_help_and_nobody_waits_for_one_that_does_not_come(plus_one, pool):
+    arguments = many(4 * ffi_wrapper._BLOCKS_PER_THREAD)
+    outputs = [np.zeros_like(x) for x in arguments]
+    pool = Pool(threads=3, **pool)
+    assert call_frame.call(plus_one, arguments, outputs, pool) is None
+    assert len(pool.scheduled) == 2
+    assert pool.destroyed == ([0xBAD] * 2 if pool.refuses else [])
+    np.testing.assert_array_equal(outputs[0], 2)
+
+
+def test_the_call_is_over_when_all_robots_are_done():
+    steps = 50_000  # a block takes so long that the last ones end one after the other
+    handler = compiled(scalarize(lambda x: x + 1, VECTOR), steps=steps)
+    x, _ = many(2 * ffi_wrapper._BLOCKS_PER_THREAD + 1)
+    pool = Pool(threads=2)
+    for _ in range(20):
+        call_frame.call(handler, [x], [np.zeros_like(x)], pool)
+        np.testing.assert_array_equal(pool.left[0], 1 + steps)
+
+
+def test_few_robots_wake_no_thread(plus_one):
+    arguments = many(2 * ffi_wrapper._BLOCKS_PER_THREAD - 1)
+    pool = Pool(threads=8)
+    call_frame.call(plus_one, arguments, [np.zeros_like(x) for x in arguments], pool)
+    assert pool.scheduled == []
+
+
+def test_it_says_for_which_interface_it_was_written(plus_one):
+    assert call_frame.ask_metadata(plus_one) == ffi_wrapper.VERSION
+
+
+def grown(part):
+    def change(frame):
+        part(frame).struct_size += 8
+
+    return change
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        grown(lambda frame: frame),
+        grown(lambda frame: frame.arguments),
+        grown(lambda frame: frame.results),
+        grown(lambda frame: frame.arguments.buffers[0].contents),
+        lambda frame: setattr(frame.api.contents.version, "major", 1),
+    ],
+)
+def test_of_another_interface_nothing_is_touched(plus_one, change):
+    outputs = [np.full((5, 4), 7, np.float32), np.full(5, 7, np.float32)]
+    arguments = np.ones((5, 4), np.float32), np.ones(5, np.float32)
+    assert call_frame.call(plus_one, arguments, outputs, change=change) is None
+    np.testing.assert_array_equal(outputs[0], 7)
+    np.testing.assert_array_equal(outputs[1], 7)
+
+
+def test_what_is_not_written_for_a_cpu_is_named():
+    with pytest.raises(UnsupportedError, match="tanh"):
+        text_of(scalarize(lambda x: jnp.tanh(x), VECTOR))
+    program = scalarize(lambda i: i + 1, jax.ShapeDtypeStruct((1,), jnp.int32))
+    with pytest.raises(UnsupportedError, match="not float32"):
+        text_of(program)
+
+
+@pytest.mark.parametrize("triple", ["x86_64-linux-gnu", "aarch64-linux-gnu", "arm64-apple-macosx"])
+def test_the_text_is_good_for_every_machine(triple, monkeypatch):
+    import llvmlite.binding as binding
+
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    machine = "x86_64" if triple.startswith("x86") else "aarch64"
+    host = llvm_backend._host()._replace(machine=machine, lanes=4)
+    monkeypatch.setattr(llvm_backend, "_host", lambda: host)
+    text = text_of(scalarize(FUNCTIONS["a loop of conditions"], VECTOR))
+    module = binding.parse_assembly(text)
+    module.triple = triple
+    assert binding.Target.from_triple(triple).create_target_machine().emit_object(module)

@@ -1,0 +1,474 @@
+"""Functions taken apart into numbers do what JAX does with them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jetbot_mjx.compiler import lower_jaxpr
+from jetbot_mjx.compiler.lower_jaxpr import LEAST_IN_BRANCH, MOST_WRITTEN_OUT
+from jetbot_mjx.compiler.scalar_ir import UnsupportedError, Value
+from jetbot_mjx.compiler.schedule import PlacedBranch, PlacedLoop
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs import mjx
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.state import PhysicsState
+
+MATRIX = jax.ShapeDtypeStruct((3, 4), jnp.float32)
+VECTOR = jax.ShapeDtypeStruct((4,), jnp.float32)
+
+
+def in_full_precision(function, x):
+    """What JAX makes of it for every robot, without a GPU's TF32."""
+    with jax.default_matmul_precision("highest"):
+        return jax.jit(jax.vmap(function))(x)
+
+
+INDICES = jnp.array([[2, 1], [0, 3], [2, 9]])
+
+
+def newton(x):
+    def closer(carry):
+        root, i = carry
+        return 0.5 * (root + jnp.abs(x) / root), i + 1
+
+    def goes_on(carry):
+        root, i = carry
+        return (i < 5) & (jnp.abs(root * root - jnp.abs(x)).sum() > 1e-3)
+
+    return jax.lax.while_loop(goes_on, closer, (jnp.ones_like(x), 0))[0]
+
+
+def branch(x):
+    return jax.lax.cond(x[0, 0] > 0, lambda x: x * 2, lambda x: x - 1, x)
+
+
+def switched(x):
+    branches = [lambda x: x * 2, lambda x: jnp.sin(x), lambda x: x - 1, jnp.cos]
+    return jax.lax.switch((x[0, 0] * 3).astype(int), branches, x)
+
+
+def branch_for_each_row(x):
+    return jax.vmap(lambda row: jax.lax.cond(row[0] > 0, lambda r: r * 2, lambda r: r - 1, row))(x)
+
+
+def switch_for_each_row(x):
+    branches = [lambda r: r * 2, lambda r: r - 1, lambda r: r[::-1]]
+    return jax.vmap(lambda r: jax.lax.switch((r[0] * 2).astype(int), branches, r))(x)
+
+
+def loop_for_each_row(x):
+    def halved(row):
+        return jax.lax.while_loop(lambda s: jnp.abs(s[0]).max() > 0.3, halve, (row, 0))
+
+    def halve(state):
+        return state[0] / 2, state[1] + 1
+
+    return jax.vmap(halved)(x)
+
+
+def loop_that_counts(x):
+    def body(state):
+        i, total, is_even = state
+        return i - 1, jnp.where(is_even, total + x[0], total * 0.5), ~is_even
+
+    first = (x[0, 0] * 4).astype(int), jnp.ones(4), x[1, 1] > 0
+    return jax.lax.while_loop(lambda s: s[0] > 0, body, first)
+
+
+def loop_in_loop(x):
+    last = (jnp.abs(x).sum() / 2).astype(int)
+
+    def outer(state):
+        i, total = state
+        inner = jax.lax.while_loop(
+            lambda s: (s[0] < i) & (s[1] < 30),
+            lambda s: (s[0] + 1, s[1] * 2),
+            (0, 1 + x[0, 0] ** 2),
+        )
+        return i + 1, total + inner[1]
+
+    return jax.lax.while_loop(lambda state: state[0] < last, outer, (0, 0.0))
+
+
+def running(x):
+    def body(carry, row):
+        return carry + row, carry * row
+
+    return jax.lax.scan(body, jnp.zeros(4), x), jax.lax.scan(body, jnp.ones(4), x, reverse=True)
+
+
+FUNCTIONS = {
+    "products": lambda x: (x @ x.T, jnp.einsum("ij,ij->i", x, x), jnp.linalg.norm(x, axis=1)),
+    "batched product": lambda x: jnp.einsum("bi,bj->bij", x, x) @ jnp.ones((3, 4, 2)),
+    "reductions": lambda x: (x.sum(0), x.max(), x.min(1), (x > 0).all(0), (x > 2).any()),
+    "running sums": lambda x: (jnp.cumsum(x, 1), jnp.cumsum(x, 0, dtype=jnp.float32)),
+    "running sums backwards": lambda x: jax.lax.cumsum(x, 1, reverse=True),
+    "places": lambda x: (jnp.argmin(x, 1), jnp.argmax(x[:, 0])),
+    "gather": lambda x: x[INDICES[:, 0], :2],
+    "gather beyond the end": lambda x: x.at[INDICES[:, 0], INDICES[:, 1]].get(mode="clip"),
+    "gather that fills": lambda x: x.at[:, INDICES[:, 1]].get(mode="fill", fill_value=7),
+    "batched gather": lambda x: jax.vmap(lambda row, i: row[i])(x, jnp.array([3, 0, 1])),
+    "scatter": lambda x: x.at[INDICES[:2, 0], INDICES[:2, 1]].set(0.5),
+    "scatter that drops": lambda x: x.at[INDICES[:, 0], INDICES[:, 1]].add(x[:, 0], mode="drop"),
+    "scatter that multiplies": lambda x: x.at[jnp.array([0, 2]), 1:3].multiply(3.0),
+    "moves": lambda x: (
+        x.T[::-1, 1:],
+        jnp.pad(x, ((1, 0), (0, 2))),
+        jnp.tile(x, (2, 1)),
+        x.ravel(),
+    ),
+    "joins": lambda x: (jnp.concatenate([x, x], 1), jnp.stack([x, x], 1), jnp.split(x, 2, 1)),
+    "sorted constants": lambda x: x[:, jnp.argsort(jnp.array([3, 1, 2, 0]))],
+    "selection": lambda x: (jnp.where(x > 0, x, -x), jnp.clip(x, -0.5, 0.5), jnp.sign(x)),
+    "a place that depends": lambda x: jax.lax.dynamic_slice(
+        x, (jnp.argmax(x[:, 0]), jnp.int32(1)), (1, 2)
+    ),
+    "powers": lambda x: (
+        x**3,
+        x**-2,
+        jax.lax.integer_pow(x, 0),
+        jnp.square(x),
+        jax.lax.rsqrt(x * x),
+        x**2.0,
+    ),
+    "angles": lambda x: (jnp.sin(9 * x), jnp.cos(9 * x), jnp.arctan2(x, x[::-1]), jnp.floor(x)),
+    "whole numbers": lambda x: ((x > 0).astype(jnp.int32) * 3 + 1, (x * 3).astype(jnp.int32)),
+    "a loop that ends early": newton,
+    "a branch": branch,
+    "one of four branches": switched,
+    "a branch for each row": branch_for_each_row,
+    "one of three branches for each row": switch_for_each_row,
+    "a loop for each row": loop_for_each_row,
+    "a loop that counts down": loop_that_counts,
+    "a loop in a loop": loop_in_loop,
+    "a choice of three": lambda x: jax.lax.select_n(
+        jnp.clip((x * 2).astype(int), 0, 2), x, -x, jnp.ones_like(x)
+    ),
+    "a gather that is promised": lambda x: x.at[INDICES[:, 0], INDICES[:, 1]].get(
+        mode="promise_in_bounds"
+    ),
+    "loops over rows": running,
+    "constants": lambda x: x + jnp.arange(4) * jax.lax.iota(jnp.float32, 3)[:, None],
+}
+
+
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_a_program_does_what_the_function_does(name):
+    function = FUNCTIONS[name]
+    x = np.float32(np.random.default_rng(3).normal(size=(20, *MATRIX.shape)))
+    program = lower_jaxpr.scalarize(function, MATRIX)
+    ours = program.evaluate([x])
+    theirs = jax.tree.leaves(in_full_precision(function, x))
+    for one, other in zip(ours, theirs, strict=True):
+        assert one.shape == other.shape
+        np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-6)
+
+
+def test_a_product_of_two_dtypes_is_one_of_the_results():
+    # As in the frame of a contact that has friction.
+    program = lower_jaxpr.scalarize(lambda x: jnp.dot(x, jnp.where(x[0] > 0, 1, 0)), MATRIX)
+    x = np.float32(np.random.default_rng(3).normal(size=MATRIX.shape))
+    np.testing.assert_allclose(program.evaluate([x])[0], x @ (x[0] > 0), rtol=1e-6)
+    for value in program.block.values():
+        if value.op == "mul":
+            assert {x.dtype for x in value.operands} == {value.dtype}
+
+
+def filled_up(x):
+    """Where it writes is known only if it is written out, and how often it does is not."""
+    return jax.lax.while_loop(
+        lambda state: state[1].sum() < 9,
+        lambda state: (state[0] + 1, state[1].at[0, state[0]].add(1.0, mode="drop")),
+        (0, x),
+    )[1]
+
+
+@pytest.mark.parametrize(
+    ("function", "reason"),
+    [
+        (lambda x: x[x[0].astype(int)], "depends on the state"),
+        (lambda x: jnp.sort(x), "depends on the state"),
+        (filled_up, "more than 64 times"),
+        (lambda x: jax.lax.fori_loop(0, 5, lambda i, x: x[x[0].astype(int)[:3]], x), "the state"),
+        (lambda x: x.astype(jnp.float16) * 2, "float16"),
+        (lambda x: jax.random.uniform(jax.random.PRNGKey(0), (4,)) * x, "random"),
+        (jax.lax.erf, "erf"),
+    ],
+)
+def test_what_cannot_be_written_so_is_named(function, reason):
+    with pytest.raises(UnsupportedError, match=reason):
+        lower_jaxpr.scalarize(function, MATRIX)
+
+
+def items(block, kind):
+    """All loops, or branches, of a block and of those inside it."""
+    for item in block.items:
+        if isinstance(item, kind):
+            yield item
+        if not isinstance(item, Value):
+            for inner in item.blocks:
+                yield from items(inner, kind)
+
+
+def check(function, robots=50, shape=VECTOR):
+    """A program of a function of one vector, which does what the function does for all robots."""
+    program = lower_jaxpr.scalarize(function, shape)
+    x = np.float32(np.random.default_rng(7).normal(size=(robots, *shape.shape)))
+    ours = program.evaluate([x])
+    theirs = jax.tree.leaves(in_full_precision(function, x))
+    for one, other in zip(ours, theirs, strict=True):
+        np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-6)
+    return program
+
+
+def steps(x):
+    """How many trips a robot's loop makes: 0 to 5."""
+    return jnp.clip((4 * jnp.abs(x[0])).astype(int), 0, 6) - 1
+
+
+def repeated(body, x, *first):
+    """A loop of as many trips as `steps` says."""
+
+    def trip(state):
+        return (state[0] + 1, *body(*state[1:]))
+
+    return jax.lax.while_loop(lambda state: state[0] < steps(x), trip, (0, *first))[1:]
+
+
+def test_a_loop_stays_one_and_some_robots_make_no_trip():
+    program = check(lambda x: repeated(lambda y: (y * 1.5 - x,), x, x))
+    (loop,) = items(program.block, PlacedLoop)
+    assert len(loop.places) == 1 + 4
+
+
+def test_what_a_loop_carries_and_never_changes_stays_known():
+    def function(x):
+        def body(y, held, matrix, flag):
+            return jnp.where(flag, matrix @ y + held, y), held, matrix, flag
+
+        return repeated(body, x, x, x * 2, 2 * jnp.eye(4), True)
+
+    program = check(function)
+    (loop,) = items(program.block, PlacedLoop)
+    assert len(loop.places) == 1 + 4
+    # Of the product only what the diagonal has is left.
+    assert [value.op for value in loop.body.values()].count("mul") == 4
+
+
+def test_what_changes_only_because_something_else_does_is_carried():
+    # The second is found to change one round after the first, the third two rounds.
+    program = check(lambda x: repeated(lambda a, b, c: (a + 1, a * 2, b), x, 1.0, 2.0, 2.0))
+    (loop,) = items(program.block, PlacedLoop)
+    assert len(loop.places) == 4
+
+
+def test_what_a_solver_prepares_for_its_next_trip_is_computed_when_that_begins():
+    def prepared(y):
+        return jnp.sqrt(y * y + 1), jnp.sin(y)
+
+    def function(x):
+        def body(y, root, sine):
+            y = 0.7 * y - 0.1 * root * sine
+            return y, *prepared(y)
+
+        return repeated(body, x, x, *prepared(x))
+
+    program = check(function)
+    (loop,) = items(program.block, PlacedLoop)
+    # The counter and y; the other eight numbers follow from y.
+    assert len(loop.places) == 1 + 4
+    roots = [value for value in program.block.values() if value.op == "sqrt"]
+    assert len(roots) == 4
+
+
+def test_what_follows_through_another_number_that_follows_is_not_carried_either():
+    def function(x):
+        def body(y, root, both):
+            y = y / 2 + both
+            return y, jnp.sqrt(jnp.abs(y)), jnp.sqrt(jnp.abs(y)) * 0.25 + x
+
+        return repeated(body, x, x, jnp.sqrt(jnp.abs(x)), jnp.sqrt(jnp.abs(x)) * 0.25 + x)
+
+    (loop,) = items(check(function).block, PlacedLoop)
+    assert len(loop.places) == 1 + 4
+
+
+def test_what_only_looks_as_if_it_followed_is_carried():
+    def function(x):
+        def body(y, root):
+            # At first the root is of y, later of what y was a trip before.
+            return y * 0.5 + 1, jnp.sqrt(jnp.abs(y))
+
+        return repeated(body, x, x, jnp.sqrt(jnp.abs(x)))
+
+    (loop,) = items(check(function).block, PlacedLoop)
+    assert len(loop.places) == 1 + 4 + 4
+
+
+def test_numbers_that_change_places_are_all_carried():
+    program = check(lambda x: repeated(lambda a, b: (b, a + b * 0.25), x, x, x[::-1]))
+    (loop,) = items(program.block, PlacedLoop)
+    assert len(loop.places) == 1 + 8
+
+
+def test_loops_of_whole_numbers_and_truths():
+    def function(x):
+        def body(number, truth, y):
+            return number * 2 - 1, ~truth, jnp.where(truth, y, -y) + number.astype(jnp.float32)
+
+        return repeated(body, x, (x * 3).astype(int), x > 0, x)
+
+    program = check(function)
+    (loop,) = items(program.block, PlacedLoop)
+    assert {loop.loop.carries[place].dtype.kind for place in loop.places} == set("fib")
+
+
+def test_a_loop_in_a_loop_makes_its_trips_anew_each_time():
+    def function(x):
+        def body(y):
+            (inner,) = repeated(lambda z: (z * 0.5 + y,), x[1:] + y[0], y)
+            return (y * 0.25 + inner,)
+
+        return repeated(body, x, x)
+
+    program = check(function)
+    outer, inner = items(program.block, PlacedLoop)
+    assert inner in outer.body.items
+
+
+@pytest.mark.parametrize(("length", "loops"), [(3, 0), (200, 1)])
+def test_a_loop_of_known_length_is_written_out_only_if_it_is_small(length, loops):
+    def function(x):
+        return jax.lax.fori_loop(0, length, lambda i, y: jnp.sqrt(jnp.abs(y + i)), x)
+
+    program = check(function)
+    assert len(list(items(program.block, PlacedLoop))) == loops
+    assert program.size < MOST_WRITTEN_OUT
+
+
+def test_a_loop_with_a_flag_that_is_known_at_first_stays_one():
+    def function(x):
+        def body(state):
+            y, i, _ = state
+            return jnp.cos(y), i + 1, jnp.abs(jnp.cos(y) - y).max() < 0.3
+
+        return jax.lax.while_loop(lambda s: (s[1] < 60) & ~s[2], body, (x, 0, False))
+
+    program = check(function)
+    assert len(list(items(program.block, PlacedLoop))) == 1
+    assert program.size < MOST_WRITTEN_OUT
+
+
+def test_a_loop_over_rows_is_written_out_because_an_index_counts_its_trips():
+    def function(x):
+        return jax.lax.fori_loop(0, 100, lambda i, y: y.at[i % 4].add(jnp.sin(x[0])), x)
+
+    assert list(items(check(function).block, PlacedLoop)) == []
+
+
+def large(x):
+    for _ in range(LEAST_IN_BRANCH):
+        x = x * x[::-1] + 0.5
+    return x / (1 + jnp.abs(x))
+
+
+def test_a_large_branch_stays_one_and_a_small_one_becomes_a_choice():
+    program = check(lambda x: jax.lax.cond(x[0] > 0, large, lambda x: x, x))
+    (branch,) = items(program.block, PlacedBranch)
+    assert list(branch.no.values()) == []
+    assert len(list(branch.yes.values())) > LEAST_IN_BRANCH
+    program = check(lambda x: jax.lax.cond(x[0] > 0, lambda x: x + 1, lambda x: x, x))
+    assert list(items(program.block, PlacedBranch)) == []
+
+
+def test_of_many_cases_each_is_a_side_of_its_own():
+    def function(x):
+        cases = [large, lambda x: large(x + 1), lambda x: x, lambda x: large(x - 1)]
+        return jax.lax.switch((x[0] * 3).astype(int), cases, x)
+
+    program = check(function)
+    branches = list(items(program.block, PlacedBranch))
+    assert len(branches) == 3
+    # One inside the other: none is asked for once an earlier one was.
+    assert branches[1] in branches[0].yes.items
+    assert branches[2] in branches[1].yes.items
+
+
+def test_a_loop_holds_up_nobody_who_does_not_need_it():
+    # Below zero it would never end: with a branch around it no robot comes to that.
+    def doubled(x):
+        doubling = jax.lax.while_loop(lambda y: (y < 100).all(), lambda y: 2 * y, x)
+        return jax.lax.cond(x[1] > 2, large, lambda x: x, doubling)
+
+    program = lower_jaxpr.scalarize(
+        lambda x: jax.lax.cond(x[0] > 0, doubled, lambda x: x, x), jax.ShapeDtypeStruct((2,), "f4")
+    )
+    (loop,) = items(program.block, PlacedLoop)
+    (outer, _) = items(program.block, PlacedBranch)
+    assert loop in outer.yes.items
+    x = np.float32([[1, 2], [0, 3], [-1, -1], [3, 0.5]])
+    np.testing.assert_array_equal(
+        program.evaluate([x])[0], [[64, 128], [0, 3], [-1, -1], [192, 32]]
+    )
+
+
+def test_a_loop_in_a_loop_holds_up_nobody_who_is_done():
+    # For y = 0 the inner loop would never end: who comes to that is done with the outer one.
+    def body(y):
+        return y - (jax.lax.while_loop(lambda z: z < 8, lambda z: z + y, 0.0) >= 8)
+
+    def function(x):
+        return jax.lax.while_loop(lambda y: y > 0, body, x[0])
+
+    program = lower_jaxpr.scalarize(function, VECTOR)
+    x = np.float32([[3, 0, 0, 0], [1, 0, 0, 0], [0, 0, 0, 0], [2, 0, 0, 0]])
+    np.testing.assert_array_equal(program.evaluate([x])[0], 0)
+
+
+def test_a_program_that_is_too_large_is_refused(monkeypatch):
+    monkeypatch.setattr(lower_jaxpr, "MOST_IN_PROGRAM", 50)
+    lower_jaxpr.scalarize(lambda x: x + 1, VECTOR)
+    with pytest.raises(UnsupportedError, match=r"^\d+ operations, more than 50$"):
+        lower_jaxpr.scalarize(large, VECTOR)
+
+
+@pytest.fixture(scope="module")
+def env():
+    # Of the presets the one with more of everything: a motor's limit, a third Newton iteration.
+    return make_env(parse_config({"robot": {"preset": "real"}}))
+
+
+def test_the_arithmetic_of_mjx_is_mjxs_own(env):
+    def step(physics, ctrl):
+        return env.physics.substep(physics, (ctrl, []))
+
+    first = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    program = lower_jaxpr.scalarize(step, first, jnp.zeros(2))
+    rng = np.random.default_rng(0)
+    robots = 16
+    states = jax.tree.map(lambda x: jnp.repeat(x[None], robots, 0), first)
+    step = jax.jit(jax.vmap(step))
+    for number in range(8):
+        if number % 4 == 0:
+            ctrl = jnp.asarray(rng.uniform(-12, 31, (robots, 2)), jnp.float32)
+        leaves = [np.asarray(leaf) for leaf in jax.tree.leaves((states, ctrl))]
+        states = step(states, ctrl)
+        ours = PhysicsState(*program.evaluate(leaves))
+        # A wheel of 3e-4 kg m² under 0.05 N m s/rad: an acceleration's last digit is some 1e-4.
+        np.testing.assert_allclose(ours.qpos, states.qpos, atol=2e-6)
+        np.testing.assert_allclose(ours.qvel, states.qvel, atol=2e-5)
+        np.testing.assert_allclose(ours.time, states.time, atol=0)
+    # They drive off, each its own way.
+    assert np.ptp(np.asarray(states.qvel[:, 0])) > 0.05
+
+
+def test_of_the_arithmetic_of_mjx_most_is_multiplication_by_zero(env):
+    data = mjx.make_data(env.mj_model)
+    size = sum(leaf.size for leaf in jax.tree.leaves(data))
+    step = lower_jaxpr.scalarize(
+        lambda physics: env.physics.substep(physics, (jnp.zeros(2), [])),
+        env.reset(jax.random.PRNGKey(0)).pipeline_state,
+    )
+    # The traced step has some 15,000 operations on arrays of up to 64 numbers.
+    assert size < step.size < 15_000

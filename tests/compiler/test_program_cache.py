@@ -1,0 +1,326 @@
+"""Compiled programs that outlive their process: found untraced, and only where they belong."""
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import gliding
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from conftest import OWN_TASKS
+from jax.experimental.compilation_cache import compilation_cache
+
+import jetbot_mjx
+from jetbot_mjx.compiler import program_cache
+from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.envs import program_key, robot_model
+from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.task import GoalTask, make_task
+from jetbot_mjx.runs.checkpoint import PRETRAINED
+from jetbot_mjx.training.ppo_trainer import Program
+
+KEY = "all that it depends on"
+
+
+def double():
+    return jax.jit(lambda x: {"twice": 2 * x}).trace(jnp.ones(3))
+
+
+def never():
+    raise AssertionError("traced")
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Where JAX keeps nothing: what it found in its own cache, a CPU could not write again."""
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()  # or what an earlier test had asked for would hold
+    yield tmp_path
+    jax.config.update("jax_enable_compilation_cache", before)
+    compilation_cache.reset_cache()
+
+
+@pytest.fixture
+def kept(folder):
+    """The only file in the folder."""
+    Programs({}, folder, KEY).compile("double", double)
+    (path,) = folder.glob("program-*")
+    return path
+
+
+def twice(program):
+    return program(jnp.arange(3.0))["twice"].tolist()
+
+
+def test_a_program_is_found_without_being_traced(kept):
+    program = Programs({}, kept.parent, KEY).compile("double", never)
+    assert twice(program) == [0.0, 2.0, 4.0]
+    assert program.out_info["twice"].shape == (3,)
+
+
+def test_a_program_that_was_fetched_ahead_is_that_program(kept):
+    ahead = Programs({}, kept.parent, KEY)
+    ahead.prefetch("double", "another")
+    assert ahead.find("another") is None
+    assert twice(ahead.compile("double", never)) == [0.0, 2.0, 4.0]
+
+
+@pytest.mark.parametrize(
+    ("options", "key", "name"),
+    [
+        ({}, "something else", "double"),
+        ({}, KEY, "another"),
+        ({"xla_backend_optimization_level": 1}, KEY, "double"),
+    ],
+)
+def test_another_program_is_not_taken_for_it(kept, options, key, name):
+    assert Programs(options, kept.parent, key).find(name) is None
+
+
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda content: content[: len(content) // 2],
+        lambda content: b"",
+        lambda content: content[:-1] + bytes([content[-1] ^ 1]),
+        lambda content: b"\0" * len(content),
+    ],
+)
+def test_a_damaged_file_is_compiled_anew_and_replaced(kept, damage):
+    whole = kept.read_bytes()
+    kept.write_bytes(damage(whole))
+    again = Programs({}, kept.parent, KEY)
+    assert again.find("double") is None
+    assert twice(again.compile("double", double)) == [0.0, 2.0, 4.0]
+    assert twice(again.compile("double", never)) == [0.0, 2.0, 4.0]
+
+
+def test_one_that_the_device_no_longer_loads_is_compiled_anew(kept, monkeypatch):
+    def refuse(*kept, **devices):
+        raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: another driver")
+
+    monkeypatch.setattr(program_cache.serialize_executable, "deserialize_and_load", refuse)
+    again = Programs({}, kept.parent, KEY)
+    assert again.find("double") is None
+    assert twice(again.compile("double", double)) == [0.0, 2.0, 4.0]
+
+
+def test_a_folder_that_cannot_be_written_costs_nothing_but_time(folder):
+    nowhere = Programs({}, folder / "missing", KEY)
+    assert twice(nowhere.compile("double", double)) == [0.0, 2.0, 4.0]
+    assert not list(folder.iterdir())
+
+
+def test_without_a_folder_nothing_is_kept(folder):
+    assert twice(Programs({}).compile("double", double)) == [0.0, 2.0, 4.0]
+    assert Programs({}).find("double") is None
+
+
+@pytest.mark.parametrize(("platform", "written"), [("cpu", 0), ("gpu", 1)])
+def test_what_a_cpu_found_in_jax_s_cache_is_not_written_again(
+    folder, monkeypatch, platform, written
+):
+    hits = program_cache._CacheHits.__exit__
+
+    def found(self, *exception):
+        jax.monitoring.record_event(program_cache._CACHE_HIT)
+        hits(self, *exception)
+
+    monkeypatch.setattr(program_cache._CacheHits, "__exit__", found)
+    monkeypatch.setattr(jax, "default_backend", lambda: platform)
+    Programs({}, folder, KEY).compile("double", double)
+    assert len(list(folder.iterdir())) == written
+
+
+def test_what_nobody_used_for_long_makes_room(kept):
+    old = kept.parent / "program-of-last-year"
+    old.touch()
+    os.utime(old, (0, time.time() - 31 * 86_400))
+    Programs({}, kept.parent, KEY).compile("another", double)
+    assert not old.exists()
+    assert kept.exists()
+
+
+# By configuration.
+
+
+@pytest.fixture
+def paths(tmp_path, monkeypatch):
+    """Where a configuration's program would lie; None where it would not be kept."""
+    monkeypatch.setattr(program_key, "TRUSTED", OWN_TASKS)
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+
+    def paths(settings, *, keep=True):
+        found = programs_of(parse_config(settings), keep=keep)
+        return found._path("advance") if found._folder else None
+
+    yield paths
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+def test_a_configuration_finds_its_own_programs_whatever_its_seed(paths):
+    assert paths({}) == paths({}) == paths({"seed": 7})
+    others = [{"seeds": 2}, {"ppo": {"unroll_length": 8}}, {"robot": {"preset": "real"}}]
+    assert len({paths({}), *map(paths, others)}) == 4
+
+
+def test_other_flags_of_xla_are_another_program(paths, monkeypatch):
+    before = paths({})
+    monkeypatch.setenv("XLA_FLAGS", "--xla_something")
+    assert paths({}) != before
+
+
+def test_changed_source_is_another_program(paths, monkeypatch):
+    before = paths({})
+    monkeypatch.setattr(program_key, "_own_source", lambda: "changed")
+    assert paths({}) != before
+
+
+def test_another_model_is_another_program(paths, monkeypatch):
+    before = paths({})
+    make = robot_model.make_mj_model
+
+    def with_another_solver(*arguments, **options):
+        made = make(*arguments, **options)
+        made.opt.iterations += 1
+        return made
+
+    monkeypatch.setattr(robot_model, "make_mj_model", with_another_solver)
+    assert paths({}) != before
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["someone.module:Task", "jetbot_mjx_tasks:GoalTask", "jetbot_mjx.mine:Task", "jetbot_mjx:Mine"],
+)
+def test_a_task_of_someone_else_is_always_traced(paths, name):
+    assert paths({"task": {"name": name}}) is None
+
+
+def test_the_packages_own_tasks_are_named_by_the_package_alone(paths):
+    """So that no module's name is in a configuration or in a run."""
+    assert {parse_config({}).task.name} == OWN_TASKS
+    for name in OWN_TASKS:
+        config = parse_config({"task": {"name": name}})
+        assert isinstance(make_task(config.task), GoalTask)
+        assert paths({"task": {"name": name}}) is not None
+
+
+def test_programs_are_kept_only_where_that_is_asked_for(paths):
+    assert paths({}, keep=False) is None
+
+
+def test_the_source_is_all_python_and_all_models():
+    """A file that is left out would let an old program be taken for a new one."""
+    root = Path(jetbot_mjx.__file__).parent
+    assert root == program_key._ROOT
+    files = [path for path in root.rglob("*") if path.is_file()]
+    # Finished runs, and what reports tell beside them, decide nothing.
+    suffixes = {path.suffix for path in files if PRETRAINED not in path.parents}
+    assert (
+        suffixes - {".html", ".json", ".md", ".pyc", ".template", ".typed", ""}
+        <= program_key.SOURCES
+    )
+
+
+# A training.
+
+TINY = {
+    "seed": 3,
+    "task": {"observation": "egocentric", "episode_length": 16},
+    "ppo": {"num_envs": 4, "unroll_length": 4, "batch_size": 4, "num_minibatches": 1},
+}
+
+
+def test_a_training_from_kept_programs_is_the_same_to_the_bit(root, folder, monkeypatch):
+    config = load_config(root / "configs" / "smoke.yaml")
+    config = parse_config({**config.model_dump(mode="json"), **TINY})
+    with gliding.everywhere():
+        env = gliding.Gliding(config)
+
+        def trained():
+            program = Program(config, env, Programs({}, folder, KEY))
+            state, _ = program.compile()(program.init(), 2, False)
+            return program.template(), program.get(state)[0]
+
+        shapes, first = trained()
+        monkeypatch.setattr(Program, "trace", never)
+        monkeypatch.setattr(Program, "_init", never)
+        again, second = trained()
+    assert jax.tree.structure(shapes) == jax.tree.structure(again)
+    assert jax.tree.leaves(shapes) == jax.tree.leaves(again)
+    for a, b in zip(jax.tree.leaves(first), jax.tree.leaves(second), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_second_process_traces_nothing_and_trains_to_the_same_bits(root, tmp_path):
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache), "JAX_LOG_COMPILES": "1"}
+
+    def trained(seed):
+        arguments = ["--config", "configs/smoke.yaml", "--seed", str(seed)]
+        for setting in (
+            "ppo.num_timesteps=64",
+            "ppo.num_envs=4",
+            "ppo.unroll_length=4",
+            "ppo.batch_size=4",
+            "ppo.num_minibatches=1",
+            "evaluation.episodes=2",
+            "task.episode_length=8",
+            "checkpoint_interval=64",
+        ):
+            arguments += ["--set", setting]
+        arguments += ["--run-dir", str(tmp_path / f"run-{time.monotonic_ns()}")]
+        done = subprocess.run(
+            [sys.executable, "-m", "jetbot_mjx.train", *arguments],
+            cwd=root,
+            env=environment,
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, done.stderr[-2000:]
+        (said,) = [line for line in done.stdout.splitlines() if "sha256" in line]
+        return said.partition("sha256 ")[2], "Finished tracing advance" in done.stderr
+
+    first, traced = trained(0)
+    assert traced
+    again, traced = trained(0)
+    assert not traced
+    assert again == first
+    other, traced = trained(1)
+    assert not traced
+    assert other != first
+
+
+def test_a_program_for_one_of_several_devices_is_kept_for_that_one(tmp_path):
+    code = f"""
+import sys
+import jax, jax.numpy as jnp
+from pathlib import Path
+from jetbot_mjx.compiler.program_cache import Programs
+step = jax.jit(lambda x: 3 * x + 1)
+found = Programs({{}}, Path({str(tmp_path)!r}), "key")
+kept = found.find("it") is not None
+program = found.compile("it", lambda: step.trace(jnp.ones(4)))
+print(jax.device_count(), kept, float(program(jnp.ones(4)).sum()))
+"""
+    flags = "--xla_force_host_platform_device_count=2"
+    environment = {
+        **os.environ,
+        "JAX_PLATFORMS": "cpu",
+        "XLA_FLAGS": flags,
+        "JAX_ENABLE_COMPILATION_CACHE": "false",
+    }
+    for kept in (False, True):
+        command = [sys.executable, "-c", code]
+        done = subprocess.run(command, env=environment, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        assert done.stdout.split() == ["2", str(kept), "16.0"]

@@ -1,0 +1,92 @@
+"""What a robot knows of itself: late by whole steps, inexact as far as asked, and no more."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.envs.sensors import sense, sensors_at_start
+from jetbot_mjx.envs.task import RobotState
+
+KEY = jax.random.PRNGKey(0)
+SAMPLES = 2_000
+
+
+def robot(x=0.0, heading=0.0):
+    quat = jnp.array([jnp.cos(heading / 2), 0.0, 0.0, jnp.sin(heading / 2)])
+    return RobotState(jnp.array([x, 0.0, 0.03]), quat, jnp.zeros(3), jnp.zeros(3))
+
+
+def test_a_robot_sees_itself_as_it_was():
+    variation = Variation(observation_delay=jnp.float32(2.0))
+    sensors = sensors_at_start(robot(), KEY, variation, 4)
+    seen = []
+    for step in range(5):
+        sensors, now = sense(sensors, robot(1.0 + step, 0.1 * step), variation, jnp.int32(step))
+        seen.append((float(now.position_w[0]), float(kinematics.yaw(now.quat))))
+    expected = [(0.0, 0.0), (0.0, 0.0), (1.0, 0.0), (2.0, 0.1), (3.0, 0.2)]
+    np.testing.assert_allclose(seen, expected, atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def seen():
+    """One robot that stands, as it sees itself over many steps, at noise of four sizes."""
+    variation = Variation(
+        position_noise=jnp.float32(0.02),
+        yaw_noise=jnp.float32(0.03),
+        speed_noise=jnp.float32(0.01),
+        yaw_rate_noise=jnp.float32(0.04),
+    )
+    one = functools.partial(sense, sensors_at_start(robot(), KEY, variation, 0))
+    _, found = jax.jit(jax.vmap(lambda step: one(robot(heading=0.5), variation, step)))(
+        jnp.arange(SAMPLES)
+    )
+    return found
+
+
+def test_noise_has_the_deviation_asked_for_and_no_mean(seen):
+    yaw = np.asarray(jax.vmap(kinematics.yaw)(seen.quat)) - 0.5
+    columns = [
+        (np.asarray(seen.position_w)[:, 0], 0.02),
+        (np.asarray(seen.position_w)[:, 1], 0.02),
+        (yaw, 0.03),
+        (np.asarray(seen.linear_velocity_w)[:, 0], 0.01),
+        (np.asarray(seen.linear_velocity_w)[:, 1], 0.01),
+        (np.asarray(seen.angular_velocity_w)[:, 2], 0.04),
+    ]
+    for values, deviation in columns:
+        assert values.std() == pytest.approx(deviation, rel=0.1)
+        assert abs(values.mean()) < 4 * deviation / np.sqrt(SAMPLES)
+    together = np.corrcoef([values for values, _ in columns]) - np.eye(6)
+    assert np.abs(together).max() < 0.1
+
+
+def test_noise_leaves_height_and_level_and_is_new_at_every_step(seen):
+    np.testing.assert_array_equal(np.asarray(seen.position_w)[:, 2], np.float32(0.03))
+    np.testing.assert_array_equal(np.asarray(seen.angular_velocity_w)[:, :2], 0.0)
+    assert np.abs(np.asarray(jax.vmap(kinematics.tilt)(seen.quat))).max() < 1e-3
+    assert len(np.unique(np.asarray(seen.position_w)[:, 0])) > 0.99 * SAMPLES
+
+
+def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_heading():
+    variation = Variation(observation_delay=1, height_offset=0.003, pitch_offset=0.02)
+    sensors = sensors_at_start(robot(), KEY, variation, 1)
+    sensors, _ = sense(sensors, robot(1.0, 0.7), variation, jnp.int32(0))
+    _, now = sense(sensors, robot(2.0, 0.9), variation, jnp.int32(1))
+    # Height and pitch differ, and nothing else; the delayed state has them once.
+    np.testing.assert_allclose(now.position_w, (1.0, 0.0, 0.033), atol=1e-7)
+    ahead = kinematics.rotate(now.quat, jnp.array([1.0, 0.0, 0.0]))
+    np.testing.assert_allclose(ahead[2], -np.sin(0.02), atol=1e-6)
+    assert float(kinematics.yaw(now.quat)) == pytest.approx(0.7, abs=1e-6)
+    assert float(kinematics.tilt(now.quat)) == pytest.approx(0.02, abs=1e-6)
+
+
+def test_an_exact_robot_sees_every_bit_and_remembers_nothing():
+    sensors = sensors_at_start(robot(), KEY, Variation(), 0)
+    assert sensors == (None, None)
+    _, now = sense(sensors, robot(1.5, 0.7), Variation(), jnp.int32(3))
+    jax.tree.map(np.testing.assert_array_equal, now, robot(1.5, 0.7))

@@ -1,0 +1,270 @@
+"""The best-known times: counted as a policy's, told where they hold, and a policy's gap to them."""
+
+import json
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from gliding import Gliding
+from test_report import make_episodes, make_report, polar
+
+from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import best_known
+from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, report_keys
+from jetbot_mjx.evaluation.html_report import write_report
+from jetbot_mjx.evaluation.report import SECTORS, compare_with_best_known
+from jetbot_mjx.evaluation.rollout import rollout_fn
+from jetbot_mjx.evaluation.tables import best_known_lines, policies_table
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks"))
+
+import best_known as benchmark
+
+DT = 1 / 60
+CONFIG = parse_config({})
+RECORDED = {"qpos": np.zeros((8, 3, 9), np.float32)}
+VERSIONS = {
+    "packages": {},
+    "python": "",
+    "platform": "",
+    "device": "",
+    "device_count": 1,
+    "git": None,
+}
+GOALS = polar(np.full(8, 1.0), np.arange(8) * 45.0)
+STEPS = np.arange(60, 68)
+
+
+@pytest.fixture
+def searched(tmp_path, monkeypatch):
+    """A function that puts a search into the file, of goals made by hand unless told otherwise."""
+    monkeypatch.setattr(best_known, "FILE", tmp_path / "best_known.json")
+
+    def put(settings=None, **changes):
+        search = {
+            "settings": best_known.settings_of(parse_config(settings or {})),
+            "goal_set_version": GOAL_SET_VERSION,
+            "goals": np.rint(1000 * GOALS).astype(int).tolist(),
+            "steps": STEPS.tolist(),
+        }
+        benchmark.store(best_known.FILE, search | changes)
+
+    return put
+
+
+# Where they hold.
+
+
+def test_times_of_the_same_goals_and_settings_are_found(searched):
+    searched()
+    searched({"robot": {"preset": "real"}}, steps=(STEPS * 3).tolist())
+    known = best_known.find(CONFIG, make_episodes(GOALS, np.ones(8)))
+    np.testing.assert_array_equal(known.steps, STEPS)
+    first = best_known.find(CONFIG, make_episodes(GOALS[:3], np.ones(3)))
+    np.testing.assert_array_equal(first.steps, STEPS[:3])
+    real = parse_config({"robot": {"preset": "real"}})
+    slow = best_known.find(real, make_episodes(GOALS, np.ones(8)))
+    np.testing.assert_array_equal(slow.steps, STEPS * 3)
+
+
+@pytest.mark.parametrize(
+    ("settings", "episodes", "missing"),
+    [
+        ({"robot": {"preset": "real"}}, 8, "robot.preset = isaac, and this is real"),
+        ({"task": {"max_speed": 0.5}}, 8, "task.max_speed = 1.0, and this is 0.5"),
+        (
+            {"task": {"name": "gates:Gates"}},
+            8,
+            "task.name = jetbot_mjx:GoalTask, and this is gates",
+        ),
+        ({}, 9, "it was searched for 8 of these 9 goals"),
+    ],
+)
+def test_elsewhere_the_reason_is_told(searched, settings, episodes, missing):
+    searched()
+    goals = polar(np.full(episodes, 1.0), np.arange(episodes) * 45.0)
+    driven = make_episodes(goals, np.ones(episodes))
+    found, reason = compare_with_best_known(parse_config(settings), driven)
+    assert found is None
+    assert missing in reason
+
+
+def test_what_a_policy_sees_and_how_it_learns_does_not_matter(searched):
+    searched()
+    settings = {
+        "task": {"observation": "egocentric", "episode_length": 300},
+        "ppo": {"discounting": 0.9},
+        "physics": {"iterations": 7},
+    }
+    assert (
+        best_known.find(parse_config(settings), make_episodes(GOALS, np.ones(8))).steps is not None
+    )
+
+
+def test_other_goals_have_no_known_times(searched):
+    searched(goals=np.rint(1000 * GOALS + [0, 3]).astype(int).tolist())
+    driven = make_episodes(GOALS, np.ones(8))
+    assert "goals that lie elsewhere" in best_known.find(CONFIG, driven).missing
+    searched(goal_set_version=GOAL_SET_VERSION + 1)
+    assert "no search was made for these goals" in best_known.find(CONFIG, driven).missing
+
+
+# A policy's gap.
+
+
+def test_the_gap_is_that_of_the_means_over_the_goals_reached(searched):
+    searched()
+    won = np.array([1, 1, 0, 1, 1, 0, 1, 1])
+    driven = make_episodes(GOALS, won, steps=STEPS + np.arange(8))
+    found, reason = compare_with_best_known(CONFIG, driven)
+    assert reason is None
+    assert found.time_to_goal_median == pytest.approx(63.5 * DT)
+    reached = np.flatnonzero(won)
+    ours, best = (STEPS + np.arange(8))[reached].mean(), STEPS[reached].mean()
+    assert (found.total.reached, found.total.policy_mean) == (6, pytest.approx(ours * DT))
+    assert found.total.best_mean == pytest.approx(best * DT)
+    assert found.total.gap == pytest.approx(ours / best - 1)
+    assert len(found.by_direction) == SECTORS
+    gaps = [one.gap for one in found.by_direction]
+    assert gaps[2] is gaps[5] is None
+    assert gaps[3] == pytest.approx(3 / 63)
+    left = found.by_direction[2]
+    assert (left.bearing_low, left.bearing_high, left.reached) == (67.5, 112.5, 0)
+
+
+def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
+    searched()
+    driven = make_episodes(GOALS, [1, 1, 0, 1, 1, 1, 1, 1], steps=STEPS + 6, **RECORDED)
+    found, _ = compare_with_best_known(CONFIG, driven)
+    report = make_report(driven)._replace(
+        folder=tmp_path / "report", best_known=found, versions=VERSIONS
+    )
+    assert "\nbest known         -                 -    1.06 s" in policies_table(
+        {"policy": report}
+    )
+    assert "above the best known: +9.42% in the mean of 7 goals reached (1.162 s, 1.062 s)" in (
+        best_known_lines(report)
+    )
+    assert "0° +10.0%, 45° +9.8%, 135° +9.5%, 180° +9.4%, -135° +9.2%" in best_known_lines(report)
+    write_report(report)
+    values = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert values["best_known"]["total"]["gap"] == pytest.approx(found.total.gap)
+    text = (tmp_path / "report" / "report.md").read_text()
+    assert "| best known | - | - | 1.06 s | 1.11 s |" in text
+    assert "this policy takes 1.162 s in the mean, +9.42% above the best known" in text
+    assert "| +68° to +112° | 0 | - | - | - |" in text
+    page = (tmp_path / "report" / "report.html").read_text()
+    assert 'data-json="best_known.total.gap">+9.42%</data>' in page
+    assert 'data-json="best_known.by_direction.7.gap">' in page
+
+
+def test_a_report_without_it_says_why(searched, tmp_path):
+    searched({"robot": {"preset": "real"}})
+    driven = make_episodes(GOALS, np.ones(8), **RECORDED)
+    found, missing = compare_with_best_known(CONFIG, driven)
+    report = make_report(driven)._replace(
+        folder=tmp_path / "report", best_known_missing=missing, versions=VERSIONS
+    )
+    assert found is None
+    assert "best known" not in policies_table({"policy": report})
+    assert "robot.preset = real, and this is isaac" in best_known_lines(report)
+    write_report(report)
+    values = json.loads((tmp_path / "report" / "report.json").read_text())
+    assert (values["best_known"], values["best_known_missing"]) == (None, missing)
+    for name in ("report.md", "report.html"):
+        assert f"are not told: {missing}." in (tmp_path / "report" / name).read_text()
+
+
+def test_a_policy_that_reaches_nothing_has_no_gap(searched):
+    searched()
+    found, _ = compare_with_best_known(CONFIG, make_episodes(GOALS, np.zeros(8)))
+    assert found.total == (-180.0, 180.0, 0, None, None, None)
+    report = make_report(make_episodes(GOALS, np.zeros(8)))._replace(best_known=found)
+    assert "reached no goal" in best_known_lines(report)
+
+
+# The file of the package, and the search.
+
+
+def test_the_file_of_the_package_holds_for_a_shipped_configuration():
+    values = json.loads(best_known.FILE.read_text())
+    assert values["format"] == best_known.FORMAT
+    settings = [search["settings"] for search in values["searches"]]
+    assert best_known.settings_of(load_config(ROOT / "configs" / "jetbot.yaml")) in settings
+    for search in values["searches"]:
+        assert set(search["settings"]) == set(best_known.SETTINGS)
+        assert len(search["goals"]) == len(search["steps"])
+
+
+def test_its_goals_are_the_reports():
+    for search in json.loads(best_known.FILE.read_text())["searches"]:
+        overrides = [f"{key}={value}" for key, value in search["settings"].items()]
+        config = load_config(None, overrides)
+        count = len(search["steps"])
+        goals = jax.vmap(Gliding(config).reset)(report_keys(count)).goal[:, :2]
+        known = best_known.find(config, make_episodes(goals, np.ones(count)))
+        np.testing.assert_array_equal(known.steps, search["steps"])
+
+
+@pytest.fixture(scope="module")
+def found():
+    """A small search by a robot that glides, and the same goals by the scripted baseline."""
+    env = Gliding(CONFIG)
+    settings = benchmark.Settings(knots=8, samples=64, rounds=8, starts=2)
+    return env, *benchmark.run(env, settings, goals=3, chunk=2)
+
+
+def test_a_search_finds_shorter_ways_than_the_baseline(found):
+    _, best, beside = found
+    assert best.steps.shape == beside.steps.shape == (3,)
+    assert np.all(best.steps < beside.steps)
+
+
+def test_its_times_are_those_of_the_reports_own_count(found):
+    """The commands again, looked up step by step, under the rollout that counts for policies."""
+    env, best, _ = found
+    for goal, key in enumerate(report_keys(3)):
+        commands = jax.tree.map(lambda x, goal=goal: x[goal], best.commands)
+
+        def play(params, state, key):
+            del key
+            at = state.info["steps"] / params.steps * (len(params.knots) - 1)
+            places = np.arange(len(params.knots))
+            return jax.numpy.stack(
+                [jax.numpy.interp(at, places, params.knots[:, axis]) for axis in range(2)]
+            )
+
+        rollout = rollout_fn(env, [play], CONFIG.task.episode_length)
+        again = jax.device_get(jax.jit(rollout)(0, commands, key[None]))
+        assert (again.success[0], again.steps[0]) == (1, best.steps[goal])
+
+
+def test_a_search_that_finds_nothing_is_one_line():
+    settings = benchmark.Settings(knots=2, samples=2, rounds=1, starts=1)
+    with pytest.raises(UserError, match="no way was found to 2 goals, such as 0: more --samples"):
+        benchmark.run(Gliding(CONFIG), settings, goals=2, chunk=2)
+
+
+def test_a_search_replaces_one_of_the_same_settings_alone(searched):
+    searched()
+    searched({"robot": {"preset": "real"}})
+    searched(steps=[1] * 8)
+    values = json.loads(best_known.FILE.read_text())
+    presets = [one["settings"]["robot.preset"] for one in values["searches"]]
+    assert sorted(presets) == ["isaac", "real"]
+    assert values["searches"][presets.index("isaac")]["steps"] == [1] * 8
+    assert values["searches"][presets.index("real")]["steps"] == STEPS.tolist()
+
+
+@pytest.mark.parametrize("text", ["{}", "[1]", "mine", '{"format": "another/1", "searches": []}'])
+def test_a_file_of_something_else_is_refused_before_the_search(tmp_path, monkeypatch, text):
+    monkeypatch.setattr(benchmark, "run", lambda *args, **kwargs: pytest.fail("it searches"))
+    file = tmp_path / "mine.json"
+    file.write_text(text)
+    with pytest.raises(UserError, match=r"mine\.json is no file of best-known times: name another"):
+        benchmark.main(["--goals", "1", "--output", str(file)])
+    assert file.read_text() == text

@@ -1,0 +1,181 @@
+"""What a report says of a policy, from episodes made by hand."""
+
+import json
+import math
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.evaluation.evaluator import summarize, wilson_interval
+from jetbot_mjx.evaluation.report import (
+    ENDED_BY_TASK,
+    NON_FINITE,
+    SECTORS,
+    TIME_LIMIT,
+    CurvePoint,
+    Report,
+    by_goal,
+    find_failures,
+    goal_places,
+    learning_curve,
+)
+from jetbot_mjx.evaluation.rollout import Episodes
+
+CTRL_DT = 1 / 60
+
+
+def make_episodes(goals_w, won, steps=60, **changed):
+    """Episodes from the origin that end on the goal, or 0.3 m before it."""
+    goals_w = np.column_stack([np.asarray(goals_w, np.float32), np.full(len(goals_w), 0.05)])
+    won = np.asarray(won, np.float32)
+    count = won.size
+    distance = np.linalg.norm(goals_w[:, :2], axis=-1, keepdims=True)
+    zeros = np.zeros(count, np.float32)
+    fields = {
+        "success": won,
+        "steps": np.broadcast_to(np.asarray(steps, np.float32), count),
+        "episode_return": zeros,
+        "terminated": won,
+        "nonfinite": zeros,
+        "path_length": distance[:, 0],
+        "start_w": np.zeros((count, 2), np.float32),
+        "start_yaw": zeros,
+        "end_w": np.where(won[:, None] > 0, 1.0, 1.0 - 0.3 / distance) * goals_w[:, :2],
+        "goal_w": goals_w,
+        "goal": None,
+        "qpos": None,
+    }
+    return Episodes(**{**fields, **changed})
+
+
+def make_report(episodes, run_dir="runs/a", curve=(), env_steps=2048, settings=None):
+    """A report of episodes made by hand, without baselines."""
+    return Report(
+        folder=Path(run_dir) / "evaluations" / "2048",
+        run=Path(run_dir),
+        checkpoint=Path(run_dir) / "checkpoints" / f"{env_steps:012d}",
+        env_steps=env_steps,
+        config=parse_config(settings or {}),
+        policy=summarize(episodes, CTRL_DT),
+        baselines={},
+        cells=by_goal(episodes, CTRL_DT),
+        failures=find_failures(episodes, Path(run_dir), env_steps),
+        learning_curve=tuple(curve),
+        episodes=episodes,
+        versions={},
+    )
+
+
+def polar(distance, degrees):
+    angle = np.radians(degrees)
+    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
+
+
+def test_bearings_are_those_of_the_robot_as_it_starts():
+    goals = [[1, 0], [0, 1], [0, -1], [-1, 0]]
+    distance, bearing = goal_places(make_episodes(goals, np.ones(4)))
+    np.testing.assert_allclose(bearing, [0, 90, -90, 180], atol=1e-4)
+    np.testing.assert_allclose(distance, 1)
+    turned = make_episodes(goals, np.ones(4), start_yaw=np.full(4, math.pi / 2, np.float32))
+    np.testing.assert_allclose(goal_places(turned)[1], [-90, 0, 180, 90], atol=1e-4)
+    moved = make_episodes(goals, np.ones(4), start_w=np.tile(np.float32([1, 1]), (4, 1)))
+    np.testing.assert_allclose(goal_places(moved)[1], [-90, 180, -116.565, -153.435], atol=1e-2)
+
+
+def test_a_cell_counts_the_goals_of_its_ring_and_sector():
+    rng = np.random.default_rng(0)
+    distance, bearing = rng.uniform(0.2, 1.2, 400), rng.uniform(-180, 180, 400)
+    won = rng.random(400) < 0.7
+    steps = rng.integers(20, 200, 400)
+    cells = by_goal(make_episodes(polar(distance, bearing), won, steps), CTRL_DT)
+    assert len(cells) % SECTORS == 0
+    assert sum(cell.episodes for cell in cells) == 400
+    for cell in cells:
+        behind = cell.bearing_high > 180
+        turned = np.where(bearing < 0, bearing + 360, bearing) if behind else bearing
+        here = (cell.bearing_low <= turned) & (turned < cell.bearing_high)
+        here &= (cell.distance_low <= distance) & (distance < cell.distance_high)
+        assert (cell.episodes, cell.successes) == (here.sum(), (here & won).sum())
+        assert cell.time_to_goal_median == pytest.approx(np.median(steps[here & won]) * CTRL_DT)
+        assert (cell.success_low, cell.success_high) == wilson_interval(
+            cell.successes, cell.episodes
+        )
+
+
+def test_a_cell_without_a_goal_has_no_rate_and_one_without_a_success_no_time():
+    cells = by_goal(make_episodes([[0.3, 0], [1.1, 0]], [0, 1]), CTRL_DT)
+    inner, outer = cells[0], cells[-SECTORS]
+    empty = cells[1]
+    assert (empty.episodes, empty.success_rate, empty.success_low) == (0, None, None)
+    assert (inner.success_rate, inner.time_to_goal_median) == (0.0, None)
+    assert (outer.success_rate, outer.time_to_goal_median) == (1.0, pytest.approx(1.0))
+
+
+@pytest.mark.parametrize("distance", [0.2, 1.0, 40.0])
+def test_goals_that_are_all_as_far_make_one_ring(distance):
+    goals = polar(np.full(16, distance), np.arange(16) * 22.5 + 5)
+    cells = by_goal(make_episodes(goals, np.ones(16)), CTRL_DT)
+    assert [cell.episodes for cell in cells] == [2] * SECTORS
+
+
+def test_a_failure_tells_where_the_goal_was_and_how_it_ended():
+    episodes = make_episodes(
+        [[1, 0], [0, 0.5], [0, -0.5], [-1, 0]],
+        [1, 0, 0, 0],
+        terminated=np.float32([1, 0, 1, 0]),
+        nonfinite=np.float32([0, 0, 0, 1]),
+    )
+    found = find_failures(episodes, Path("runs/a"), 2048)
+    assert [failure.goal for failure in found] == [1, 2, 3]
+    assert [failure.ended for failure in found] == [TIME_LIMIT, ENDED_BY_TASK, NON_FINITE]
+    np.testing.assert_allclose([failure.distance for failure in found], [0.5, 0.5, 1.0])
+    np.testing.assert_allclose([failure.bearing for failure in found], [90, -90, 180], atol=1e-4)
+    np.testing.assert_allclose([failure.final_distance for failure in found], 0.3, rtol=1e-5)
+
+
+def test_a_replay_command_survives_the_shell():
+    episodes = make_episodes([[1, 0], [0, 1]], [1, 0])
+    (failure,) = find_failures(episodes, Path("my runs/it's"), 2048)
+    words = shlex.split(failure.replay)
+    assert words[:3] == ["python", "-m", "jetbot_mjx.render"]
+    assert words[3:] == ["my runs/it's", "--checkpoint", "2048", "--goals", "1"]
+
+
+def test_goals_that_cannot_be_filmed_have_no_command(monkeypatch):
+    monkeypatch.setattr("jetbot_mjx.evaluation.report.REPORT_GOALS", 1)
+    found = find_failures(make_episodes([[1, 0], [0, 1]], [0, 0]), Path("runs/a"), 2048)
+    assert found[0].replay.endswith("--goals 0")
+    assert found[1].replay is None
+
+
+def test_a_learning_curve_is_made_of_the_evaluations_alone():
+    judged = {f"eval/{name}": 0.5 for name in CurvePoint._fields[1:]}
+    history = [
+        (2048, {**judged, "eval/time_to_goal_median": None}),
+        (0, judged),
+        (4096, {"loss/total": 1.0}),
+        (6144, {**judged, "eval/success_rate": None}),
+    ]
+    assert learning_curve(history) == (
+        CurvePoint(0, 0.5, 0.5, 0.5, 0.5),
+        CurvePoint(2048, 0.5, 0.5, 0.5, None),
+    )
+
+
+def test_a_report_is_json_and_names_its_run():
+    report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]), "runs/five/seed-2")
+    values = json.loads(json.dumps(report.to_json(), allow_nan=False))
+    assert values["run"] == report.name == "five/seed-2"
+    assert values["settings"]["task.episode_length"] == 256
+    assert sum(cell["episodes"] for cell in values["cells"]) == values["policy"]["episodes"]
+    assert len(values["failures"]) == 1
+    assert make_report(report.episodes, "runs/alone").name == "alone"
+
+
+def test_a_goal_that_rounding_moved_over_the_edge_makes_no_further_ring():
+    cells = by_goal(make_episodes([[0.2 - 1e-7, 0], [1.2 + 1e-7, 0]], [1, 1]), CTRL_DT)
+    assert (cells[0].distance_low, cells[-1].distance_high) == (0.2, 1.2)
+    assert sum(cell.episodes for cell in cells) == 2

@@ -1,0 +1,150 @@
+"""How far a policy carries: what is swept, by one program, and what the figures say."""
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from jetbot_mjx.agents.networks import PolicyParams, make_networks
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, MAX_OBSERVATION_DELAY, Variation
+from jetbot_mjx.evaluation import robustness
+from jetbot_mjx.evaluation.evaluator import Summary, report_keys, wilson_interval
+from jetbot_mjx.evaluation.plots import plot_robustness
+from jetbot_mjx.evaluation.robustness import SWEEPS, Sweep, SweepResult, as_json, carries, sweep
+
+EPISODES = 16
+
+
+def summary(rate, episodes=100):
+    wins = round(rate * episodes)
+    low, high = wilson_interval(wins, episodes)
+    seconds = 1.5 if wins else None
+    return Summary(episodes, wins, rate, low, high, seconds, seconds, 0.9 * bool(wins), 0, 0, 0)
+
+
+def result(policy, values=(0.4, 0.6, 1.0, 1.2)):
+    one = Sweep("friction", "wheel-floor friction", "× preset", values, "here")
+    return SweepResult(
+        one, tuple(summary(rate) for rate in policy), tuple(summary(1.0) for _ in policy)
+    )
+
+
+def test_every_difference_is_swept_around_the_presets_value():
+    assert tuple(one.name for one in SWEEPS) == Variation._fields
+    for one in SWEEPS:
+        assert one.nominal in one.values
+        assert list(one.values) == sorted(set(one.values))
+        assert one.label
+        assert one.unit
+        assert one.source
+    by_name = {one.name: max(one.values) for one in SWEEPS}
+    assert by_name["action_delay"] == MAX_ACTION_DELAY
+    assert by_name["observation_delay"] == MAX_OBSERVATION_DELAY
+
+
+@pytest.mark.parametrize("one", SWEEPS, ids=lambda one: one.name)
+def test_the_page_tells_what_is_swept(root, one):
+    page = (root / "docs" / "robustness.md").read_text("utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| `{one.name}` |"))
+    _, _, label, unit, values, source, _ = (cell.strip() for cell in row.split("|"))
+    assert (label, unit) == (one.label, one.unit)
+    assert values == ", ".join(f"{value:g}" for value in one.values)
+    assert source == one.source
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        ((1.0, 1.0, 1.0, 1.0), (0.4, 1.2)),
+        ((0.2, 0.95, 1.0, 0.94), (0.6, 1.0)),
+        ((1.0, 0.9, 1.0, 1.0), (1.0, 1.2)),  # what lies beyond a gap does not count
+        ((1.0, 1.0, 0.94, 1.0), None),
+    ],
+)
+def test_a_policy_carries_from_the_presets_value_to_the_first_failure(policy, expected):
+    assert carries(result(policy)) == expected
+
+
+def test_the_results_are_plain_values():
+    told = json.loads(json.dumps(as_json([result((0.0, 0.95, 1.0, 0.94))]), allow_nan=False))
+    (quantity,) = told["quantities"]
+    assert quantity["name"] == "friction"
+    assert quantity["values"] == [0.4, 0.6, 1.0, 1.2]
+    assert (quantity["nominal"], quantity["carries"]) == (1.0, [0.6, 1.0])
+    assert [one["success_rate"] for one in quantity["policy"]] == [0.0, 0.95, 1.0, 0.94]
+    assert quantity["policy"][0]["time_to_goal_median"] is None
+    assert [one["success_rate"] for one in quantity["scripted"]] == [1.0] * 4
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_the_figure_shows_success_its_band_and_the_presets_value(count):
+    results = [result((0.0, 0.95, 1.0, 0.94))] * count
+    figure = plot_robustness(results)
+    figure.canvas.draw()
+    assert len(figure.axes) == 2 * count
+    success, time = figure.axes[:2]
+    assert success.get_title() == "wheel-floor friction"
+    assert time.get_xlabel() == "[× preset]"
+    lines = {line.get_label(): line for line in success.lines}
+    np.testing.assert_allclose(lines["policy"].get_ydata(), (0.0, 0.95, 1.0, 0.94))
+    assert [1.0, 1.0] in [list(line.get_xdata()) for line in success.lines]
+    band = success.collections[1].get_paths()[0].vertices[:, 1]
+    ends = [(one.success_low, one.success_high) for one in results[0].policy]
+    assert set(np.ravel(ends)) <= set(band)
+    np.testing.assert_array_equal(np.isnan(time.lines[1].get_ydata()), [True, False, False, False])
+
+
+class Counted(VariedEnv):
+    """Counts how often a robot is built, which is once for each trace."""
+
+    built = 0
+
+    def __init__(self, env, variation):
+        type(self).built += 1
+        super().__init__(env, variation)
+
+
+@pytest.fixture(scope="module")
+def swept():
+    """An untrained policy over two quantities, and how often the program was traced."""
+    env = make_env(parse_config({"task": {"observation": "egocentric"}}))
+    networks = make_networks(
+        env.config.ppo.network,
+        env.observation_size,
+        env.action_size,
+        normalize=False,
+    )
+    key = jax.random.PRNGKey(0)
+    params = PolicyParams(None, networks.policy_network.init(key), None)
+    values = {"motor_gain": (0.2, 1.0), "action_delay": (0.0, 9.0)}
+    sweeps = [one._replace(values=values[one.name]) for one in SWEEPS if one.name in values]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(robustness, "VariedEnv", Counted)
+        results = sweep(env, networks, params, report_keys(EPISODES), sweeps)
+    return env, results
+
+
+def test_one_program_serves_every_robot_and_controller(swept):
+    assert Counted.built == 1
+
+
+def test_every_value_has_its_figures_on_the_same_goals(swept):
+    _, (gain, delay) = swept
+    for one in (gain, delay):
+        assert len(one.policy) == len(one.scripted) == 2
+        assert {each.episodes for each in (*one.policy, *one.scripted)} == {EPISODES}
+    # The preset's robot is the same in every sweep.
+    assert gain.scripted[1] == delay.scripted[0]
+    assert gain.policy[1] == delay.policy[0]
+    assert gain.policy[1] != gain.scripted[1]
+
+
+def test_a_weak_robot_and_a_slow_answer_cost_success(swept):
+    _, (gain, delay) = swept
+    assert gain.scripted[1].success_rate == 1.0
+    assert gain.scripted[0].success_rate < 0.5  # 0.2 m/s do not last for the way
+    assert delay.scripted[1].success_rate < 0.8

@@ -1,0 +1,67 @@
+"""A robot that glides: it moves as it is told, and MJX, which takes long to compile, has no part.
+
+For tests of what does not ask how a robot moves: trainers, signals, kills, devices. All else of
+the environment stays as it is. As a program it is one of the package's commands on that robot:
+`python gliding.py train --config …`.
+"""
+
+import contextlib
+import importlib
+import sys
+from unittest import mock
+
+import jax.numpy as jnp
+
+from jetbot_mjx import cli
+from jetbot_mjx.envs import kinematics, program_key
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.robot_model import (
+    CONTROLLER_WHEEL_RADIUS,
+    CONTROLLER_WHEEL_SEPARATION,
+    QPOS_QUAT,
+    QPOS_XYZ,
+    QVEL_ANGULAR_B,
+    QVEL_LINEAR_W,
+)
+
+LAG = 0.1  # [s] of the motors, so that there is something to learn
+
+
+class Gliding(JetBotEnv):
+    def step_physics(self, physics, ctrl, mocap_pos=None):
+        wanted = kinematics.body_twist(
+            ctrl,
+            wheel_radius=CONTROLLER_WHEEL_RADIUS,
+            wheel_separation=CONTROLLER_WHEEL_SEPARATION,
+        )
+        heading = kinematics.yaw(physics.qpos[QPOS_QUAT])
+        ahead_w = jnp.stack([jnp.cos(heading), jnp.sin(heading), 0.0])
+        twist = jnp.stack([physics.qvel[QVEL_LINEAR_W] @ ahead_w, physics.qvel[QVEL_ANGULAR_B][2]])
+        speed, yaw_rate = twist + self.dt / LAG * (wanted - twist)
+        half = 0.5 * (heading + self.dt * yaw_rate)
+        quat = jnp.stack([jnp.cos(half), 0.0, 0.0, jnp.sin(half)])
+        qpos = physics.qpos.at[QPOS_XYZ].add(self.dt * speed * ahead_w).at[QPOS_QUAT].set(quat)
+        qvel = physics.qvel.at[QVEL_LINEAR_W].set(speed * ahead_w)
+        qvel = qvel.at[QVEL_ANGULAR_B].set(jnp.stack([0.0, 0.0, yaw_rate]))
+        return physics.replace(qpos=qpos, qvel=qvel, time=physics.time + self.dt)
+
+
+@contextlib.contextmanager
+def everywhere():
+    """A context within which every robot of this process glides, and no program is kept."""
+    with (
+        mock.patch.object(JetBotEnv, "step_physics", Gliding.step_physics),
+        mock.patch.object(program_key, "TRUSTED", frozenset()),
+    ):
+        yield
+
+
+def program(command):
+    """Arguments of Python for one of the package's commands, on a robot that glides."""
+    return [__file__, command]
+
+
+if __name__ == "__main__":
+    command = importlib.import_module(f"jetbot_mjx.{sys.argv.pop(1)}")
+    with everywhere():
+        cli.run_command(command.main, at_once=command.__name__.endswith(".train"))

@@ -1,0 +1,436 @@
+"""What the benchmarks say: of an earlier file, of a compiled program, of the files of results."""
+
+import importlib
+import json
+import re
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import scipy.stats
+
+ROOT = Path(__file__).parents[2]
+sys.path.append(str(ROOT / "benchmarks"))
+
+import adapters
+import compare
+import contenders
+import kernels
+import one_robot
+import randomization
+import randomization_cost
+import rate_plots
+import readme_table
+import regressions
+import results
+import steps_per_second
+from gliding import everywhere
+from measurements import Sizes
+from timing import make_row
+
+from jetbot_mjx.compiler import llvm_backend, ptx_backend
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.state import robot_state
+from jetbot_mjx.errors import UserError
+
+SMALL = Sizes(repeats=2, unroll=4, training_steps=1)
+
+COMMANDS = sorted(
+    path.stem
+    for path in (ROOT / "benchmarks").glob("*.py")
+    if "def main(" in path.read_text("utf-8")
+)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_help_says_what_was_meant(capsys, name):
+    with pytest.raises(SystemExit) as caught:
+        importlib.import_module(name).main(["--help"])
+    out, err = capsys.readouterr()
+    assert (caught.value.code, err) == (0, "")
+    assert "option_strings" not in out  # what a lone percent sign turns into
+
+
+def rate(name, num_envs, steps_per_second):
+    return make_row(name, 2, num_envs, 1.0, [steps_per_second], 64)
+
+
+@pytest.fixture
+def measured(world_config):
+    return results.conditions(world_config, SMALL)
+
+
+@pytest.fixture
+def old(measured, tmp_path):
+    """An earlier file of the same conditions, to be changed by a test."""
+
+    def save(**changed):
+        rows = [rate("physics", 64, 1000.0)._asdict(), rate("env", 64, 800.0)._asdict()]
+        path = tmp_path / "old.json"
+        path.write_text(json.dumps({**measured, "results": rows, **changed}))
+        return path
+
+    return save
+
+
+@pytest.mark.parametrize(("now", "slower"), [(951.0, False), (949.0, True), (2000.0, False)])
+def test_a_rate_that_lost_more_than_five_percent_is_slower(old, measured, now, slower):
+    baseline = regressions.read_baseline(old(), measured)
+    (change,) = regressions.changes([rate("physics", 64, now), rate("physics", 8, 1.0)], baseline)
+    assert (change.rate, change.num_envs, change.before, change.after) == ("physics", 64, 1e3, now)
+    assert change.is_slower is slower
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"device": "another"}, f"device = another, this is {jax.devices()[0].device_kind}:"),
+        ({"config": {}}, "seed = None, this is 0"),
+        ({"conditions": {}}, "unroll = None, this is 4"),
+        ({"results": [{"rate": "physics"}]}, "holds no rates"),
+    ],
+)
+def test_a_file_of_something_else_is_refused_in_one_line(old, measured, changed, said):
+    with pytest.raises(UserError, match=re.escape(said)) as refused:
+        regressions.read_baseline(old(**changed), measured)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_configuration_that_differs_is_named(old, measured, world_config):
+    config = parse_config({"physics": {"ls_iterations": 7}}).model_dump(mode="json")
+    said = rf"physics\.ls_iterations = 7, this is {world_config.physics.ls_iterations}:"
+    with pytest.raises(UserError, match=said):
+        regressions.read_baseline(old(config=config), measured)
+
+
+def test_a_slower_rate_ends_in_one_and_a_figure_lies_beside_the_file(monkeypatch, tmp_path, capsys):
+    def measure(now):
+        def physics(config, num_envs, sizes):
+            return rate("physics", num_envs, now * num_envs)
+
+        monkeypatch.setitem(steps_per_second.MEASUREMENTS, "physics", physics)
+        skipped = [f"--skip={name}" for name in steps_per_second.MEASUREMENTS if name != "physics"]
+        output = tmp_path / f"{now}.json"
+        compared = ["--compare", str(tmp_path / "1000.json")] if now != 1000 else []
+        arguments = ["--num-envs", "8,64", "--output", str(output), *skipped, *compared]
+        return steps_per_second.main(arguments)
+
+    assert measure(1000) == 0
+    assert measure(990) == 0
+    assert measure(900) == 1
+    assert capsys.readouterr().out.count("-10.0%, SLOWER") == 2
+    picture = tmp_path / "900.png"
+    drawn = picture.read_bytes()
+    picture.unlink()
+    assert rate_plots.main([str(tmp_path / "900.json")]) == 0
+    assert picture.read_bytes() == drawn
+
+
+def test_a_figure_shows_what_a_device_tells_of_its_memory():
+    values = json.loads((ROOT / "benchmarks" / "results" / "nvidia-h200-sweep.json").read_text())
+    _, _, memory = rate_plots.plot_rates(values).axes
+    (line,) = memory.lines
+    largest = max(row["num_envs"] for row in values["results"])
+    peak = max(row["peak_device_bytes"] for row in values["results"])
+    assert (line.get_xdata()[-1], line.get_ydata()[-1] * 2**30) == (largest, peak)
+
+
+def test_a_figure_has_a_line_for_every_rate():
+    values = json.loads((ROOT / "benchmarks" / "results" / "nvidia-h200.json").read_text())
+    # A CPU does not tell of its memory.
+    values["results"] = [{**row, "peak_device_bytes": None} for row in values["results"]]
+    steps, times = rate_plots.plot_rates(values).axes
+    found = list(dict.fromkeys(row["rate"] for row in values["results"]))
+    assert [line.get_label() for line in steps.lines] == found
+    assert len(times.lines) == len(found)
+    assert {axes.get_xscale() for axes in (steps, times)} == {"log"}
+    for line, name in zip(steps.lines, found, strict=True):
+        rows = [row for row in values["results"] if row["rate"] == name]
+        np.testing.assert_array_equal(
+            line.get_ydata(),
+            [row["env_steps_per_second"] for row in sorted(rows, key=lambda x: x["num_envs"])],
+        )
+
+
+def test_the_readmes_hold_what_the_results_say():
+    measured = readme_table.read_results(ROOT / "benchmarks" / "results")
+    for name in readme_table.BLOCKS:
+        text = (ROOT / name).read_text(encoding="utf-8")
+        assert readme_table.with_tables(text, name, measured) == text, (
+            "run python benchmarks/readme_table.py"
+        )
+
+
+def test_the_table_holds_the_median_time_and_the_worst_success_of_all_seeds():
+    values = json.loads((ROOT / "benchmarks" / "results" / "gpu-egocentric-stock.json").read_text())
+    runs = [{**values["runs"][0], "start": "warm"} for _ in range(3)]
+    for run, seconds, success in zip(runs, (50.0, 70.0, 300.0), (0.5, 1.0, 0.9), strict=True):
+        run |= {"process_seconds": seconds, "policy": {"success_rate": success}}
+    runs[2]["target_reached_seconds"] = None
+    row = readme_table.success_table({"one.json": {**values, "runs": runs}}).splitlines()[-1]
+    assert row == (
+        "| 1 NVIDIA H200, warm cache | egocentric | `gpu.yaml` | brax | 3 | 50.00% | 70 s | - |"
+        " not by all |"
+    )
+
+
+HLO = """\
+HloModule jit_f
+
+%fused (p: f32[4]) -> f32[4] {
+  %p = f32[4]{0} parameter(0)
+  ROOT %a = f32[4]{0} add(%p, %p)
+}
+
+%turn (t: (s32[], f32[4])) -> (s32[], f32[4]) {
+  %t = (s32[], /*index=1*/f32[4]{0}) parameter(0)
+  %x = f32[4]{0} get-tuple-element(%t), index=1
+  %once = f32[4]{0} fusion(%x), kind=kLoop, calls=%fused
+  %twice = f32[4]{0} fusion(%once), kind=kLoop, calls=%fused
+  ROOT %r = (s32[], f32[4]{0}) tuple(%twice)
+}
+
+%going (t: (s32[], f32[4])) -> pred[] {
+  %t = (s32[], f32[4]{0}) parameter(0)
+  ROOT %less = pred[] compare(%t, %t), direction=LT
+}
+
+ENTRY %main (x: f32[4]) -> f32[4] {
+  %x = f32[4]{0} parameter(0)
+  %c = f32[4]{0} copy(%x)
+  %w = (s32[], /*index=1*/f32[4]{0}) while(%c), condition=%going, body=%turn, LOOP
+  ROOT %out = f32[4]{0} custom-call(%w), custom_call_target="ptx"
+}
+"""
+
+
+@pytest.mark.parametrize(
+    ("loop", "launches", "unknown"),
+    [('backend_config={"known_trip_count":{"n":"5"}}', 2 + 3 * 5, 0), ("", 2 + 3, 1)],
+)
+def test_what_loops_do_is_counted_once_as_kernels_and_every_turn_as_launches(
+    loop, launches, unknown
+):
+    count = kernels.count_kernels(HLO.replace("LOOP", loop))
+    assert count.kernels == {"fusion": 2, "copy": 1, "custom-call": 1, "compare": 1}
+    assert (count.launches, count.unknown_loops) == (launches, unknown)
+
+
+def test_physics_stays_within_its_number_of_kernels_and_operations():
+    config = parse_config({"ppo": {"num_envs": 64}, "physics": {"impl": "xla"}})
+    count = kernels.count_kernels(kernels.compiled_text(config, "physics"))
+    found = sum(count.kernels.values())
+    print(f"\n{found} kernels, {count.launches} launches")
+    # Some 490 and 1,120 on a CPU, fewer on a GPU; the bounds leave room for another XLA, not for
+    # another loop.
+    assert 100 < found < 560
+    assert count.launches < 1_300
+    # Some 5,800, and 2,800 products.
+    scalars = kernels.count_scalars(config)
+    assert 4_000 < sum(scalars.values()) < 7_000
+    assert scalars["mul"] < 3_400
+
+
+@pytest.mark.skipif(
+    not (ptx_backend if jax.default_backend() == "gpu" else llvm_backend).is_available(),
+    reason="XLA takes no kernels here",
+)
+def test_physics_as_a_kernel_is_one_call():
+    config = parse_config({"ppo": {"num_envs": 64}})
+    count = kernels.count_kernels(kernels.compiled_text(config, "physics"))
+    assert count.kernels["custom-call"] == 1
+    assert sum(count.kernels.values()) < 10
+
+
+def test_one_robot_in_c_mujoco_has_the_same_task(world_config, world_env):
+    robot, rng, task = one_robot.OneRobot(world_config), np.random.default_rng(0), world_env.task
+
+    def seen():
+        physics = world_env.reset(jax.random.PRNGKey(0)).pipeline_state
+        qpos, qvel = (jnp.asarray(x, jnp.float32) for x in (robot.data.qpos, robot.data.qvel))
+        return robot_state(physics.replace(qpos=qpos, qvel=qvel))
+
+    obs = robot.reset(rng)
+    goal = jnp.asarray(robot.goal, jnp.float32)
+    state = seen()
+    np.testing.assert_allclose(obs, task.observe(state, goal), atol=1e-6)
+    for _ in range(10):
+        action = rng.uniform(-1.2, 1.2, 2).astype(np.float32)
+        obs, reward, terminated, truncated, _ = robot.step(action)
+        targets = world_env.wheel_targets(jnp.asarray(action))
+        np.testing.assert_allclose(robot.data.ctrl, targets, rtol=1e-5)
+        before, state = state, seen()
+        np.testing.assert_allclose(obs, task.observe(state, goal), atol=1e-5)
+        wanted = float(task.reward(before, state, goal, jnp.asarray(action))[0])
+        assert reward == pytest.approx(wanted, abs=1e-6)
+        assert (terminated, truncated) == (bool(task.terminated(state, goal)), False)
+    assert robot.data.time == pytest.approx(10 * world_env.dt)
+
+
+def test_one_robots_episode_ends_at_the_goal_or_at_the_time_limit(world_config):
+    robot = one_robot.OneRobot(world_config)
+    robot.reset(np.random.default_rng(0))
+    robot.goal[:] = 0.3, 0.0, 0.05
+    ahead = np.array([0.0, 0.0])
+    ends = [robot.step(ahead)[2:4] for _ in range(100)]
+    assert (True, False) in ends
+    robot.reset(np.random.default_rng(0))
+    robot.goal[:] = -3.0, 0.0, 0.05
+    ends = [robot.step(np.array([-1.0, 0.0]))[2:4] for _ in range(256)]
+    assert ends == [(False, False)] * 255 + [(False, True)]
+
+
+def test_goals_of_one_robot_are_the_tasks(world_config, world_env):
+    rng = np.random.default_rng(0)
+    robot = one_robot.OneRobot(world_config)
+    drawn = []
+    for _ in range(2000):
+        robot.reset(rng)
+        drawn.append(robot.goal.copy())
+    keys = jax.random.split(jax.random.PRNGKey(0), 2000)
+    wanted = np.asarray(jax.vmap(world_env.task.sample)(keys))
+    drawn = np.array(drawn)
+    for of in (lambda x: np.arctan2(x[:, 1], x[:, 0]), lambda x: np.linalg.norm(x, axis=1)):
+        assert scipy.stats.ks_2samp(of(drawn), of(wanted)).pvalue > 1e-3
+
+
+def test_robots_of_mujocos_rollout_hold_their_actions_and_drive(world_config):
+    contender = contenders.MujocoRollout(world_config, 4, SMALL)
+    controls = contender._controls
+    np.testing.assert_array_equal(controls[:, ::2], controls[:, 1::2])
+    assert controls.shape == (4, SMALL.unroll * 2, 2)
+    rates = [contender.repeat(), contender.repeat()]
+    row = contender.row(rates)
+    assert row.rate == "mujoco"
+    assert row.physics_steps_per_second == 2 * row.env_steps_per_second
+    start = contender._states[:, 1:3].copy()
+    contender.repeat()
+    assert (np.abs(contender._states[:, 1:3] - start).max(axis=1) > 1e-3).all()
+    contender._states[0, 3] = 1.0
+    with pytest.raises(UserError, match="no longer on the floor"):
+        contender.row(rates)
+
+
+class Fake:
+    """A contender whose rates are known."""
+
+    def __init__(self, rate, num_envs, rates, order):
+        self.rate, self.num_envs = rate, num_envs
+        self._rates, self._order = iter(rates), order
+
+    def repeat(self):
+        self._order.append((self.rate, self.num_envs))
+        return next(self._rates)
+
+    def row(self, repeats):
+        return make_row(self.rate, 2, self.num_envs, 0.0, repeats, 1)
+
+
+def test_physics_and_mujoco_take_turns_and_are_compared_at_their_best(world_config, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    order = []
+    ours = {64: [1.0, 1.0, 1.0], 128: [30.0, 60.0, 20.0]}
+    monkeypatch.setattr(
+        compare,
+        "prepare_physics",
+        lambda _, count, sizes: Fake("physics", count, ours[count], order),
+    )
+    monkeypatch.setattr(
+        compare,
+        "MujocoRollout",
+        lambda _, count, sizes: Fake("mujoco", count, [20.0, 10.0, 10.0], order),
+    )
+    found = []
+    compare.run(
+        world_config,
+        [64, 128],
+        SMALL._replace(repeats=3),
+        contenders=["physics", "mujoco"],
+        report=found.extend,
+    )
+    assert order[: len(order) // 3] * 3 == order
+    assert compare.ratios(found, "mujoco") == [1.5, 6.0, 2.0]
+    assert "per second: 2.00 (1.50 .. 6.00 over 3 rounds)" in compare.ratio_lines(found)[0]
+    # As if physics had had two cores and mujoco one.
+    busy = [(row, [2.0 if row.rate == "physics" else 1.0] * 3) for row, _ in found]
+    assert compare.ratios(busy, "mujoco", per_core=True) == [0.75, 3.0, 1.0]
+    assert [line.split(":")[0] for line in compare.ratio_lines(found)] == [
+        "physics over mujoco, steps per second",
+        "physics over mujoco, steps per second of processor time",
+    ]
+    # A GPU's steps take next to no processor time.
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert len(compare.ratio_lines(found)) == 1
+    assert compare.ratios(found[:2], "mujoco") == compare.ratios(found, "warp") == []
+
+
+def test_a_contender_without_its_package_is_left_out_in_one_line(monkeypatch):
+    monkeypatch.setattr(compare.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(compare.jax, "default_backend", lambda: "gpu")
+    for name in ("sb3", "playground", "warp"):
+        line = compare.missing(name)
+        assert "pip install" in line
+        assert "\n" not in line
+    assert compare.missing("physics") is None
+    monkeypatch.setattr(compare.jax, "default_backend", lambda: "cpu")
+    assert compare.missing("warp") == "warp left out: MJX-Warp needs an NVIDIA GPU"
+
+
+def test_every_adapter_is_timed_in_turn(world_config, monkeypatch, tmp_path, capsys):
+    for name in ("torch", "stable_baselines3", "gymnasium"):
+        pytest.importorskip(name)
+    monkeypatch.setattr(adapters, "REPEAT_SECONDS", 0.01)
+    monkeypatch.setattr(adapters, "WARM_UP_CALLS", 1)
+    monkeypatch.setattr(contenders, "_SB3_STEPS", 64)
+    output = tmp_path / "a.json"
+    with everywhere():
+        arguments = ["--num-envs", "2", "--repeats", "2", "--output", str(output)]
+        assert adapters.main(arguments) == 0
+    rows = json.loads(output.read_text())["adapters"]
+    assert [(row["rate"], row["num_envs"]) for row in rows] == [
+        ("numpy", 1),
+        ("gym", 1),
+        ("vector", 2),
+        ("vecenv", 2),
+        ("sb3", 1),
+        ("sb3-gym", 1),
+        ("sb3-vec", 2),
+    ]
+    assert all(row["env_steps_per_second"] > 0 and len(row["repeats"]) == 2 for row in rows)
+    assert capsys.readouterr().out.count("| sb3") == 3
+
+
+def test_the_cost_of_randomisation_is_told_round_by_round():
+    rates = {"off": [100.0, 50.0, 90.0], "on": [80.0, 40.0, 90.0]}
+    assert randomization_cost.cost(rates) == pytest.approx(0.25)
+
+
+def judged(way, seed, rates):
+    sweep = [
+        {
+            "label": "friction",
+            "unit": "1",
+            "values": [0.4, 1.0],
+            "nominal": 1.0,
+            "policy": [{"success_rate": rate} for rate in rates],
+            "scripted": [{"success_rate": 1.0}] * 2,
+        }
+    ]
+    one = {"success_rate": rates[-1]}
+    return {"way": way, "seed": seed, "preset": one, "ranges": one, "sweep": sweep}
+
+
+def test_both_ways_stand_side_by_side_with_mean_and_worst_seed():
+    rows = [judged("nominal", "0", (0.5, 1.0)), judged("nominal", "1", (0.7, 1.0))]
+    table = randomization.table(rows)
+    assert "| the full ranges | 100.00% (100.00%) | - |" in table
+    assert "| friction, its hardest value | 60.00% (50.00%) at 0.4 | - |" in table
+    rows.append(judged("randomised", "0", (0.9, 1.0)))
+    assert "| 90.00% (90.00%) at 0.4 |" in randomization.table(rows)
+    (axes,) = randomization.plot(rows).axes
+    lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}
+    assert lines["nominal"] == pytest.approx([0.6, 1.0])
+    assert lines["randomised"] == pytest.approx([0.9, 1.0])

@@ -1,0 +1,603 @@
+"""The documentation: complete, in step with the code, and every command and example of it works."""
+
+import argparse
+import contextlib
+import importlib.util
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import pytest
+from ruamel.yaml import YAML
+
+from jetbot_mjx import (
+    check_env,
+    cli,
+    evaluate,
+    export,
+    new_task,
+    plan,
+    play,
+    pretrained,
+    render,
+    replay,
+    sim2real,
+    train,
+)
+from jetbot_mjx.agents.ppo import LOSSES
+from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.runs import metrics
+from jetbot_mjx.runs.sb3_tags import aliases
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+PAGES = {str(path.relative_to(DOCS)): path.read_text("utf-8") for path in DOCS.rglob("*.md")}
+GENERATED = "configuration.md"
+
+
+def load(path):
+    """A module by its path, such as the one that writes the reference."""
+    spec = importlib.util.spec_from_file_location(path.stem, path)
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+reference = load(DOCS / "reference.py")
+ALL_PAGES = {**PAGES, GENERATED: reference.page(), **reference.room_pages()}
+
+
+def nav():
+    def pages(entry):
+        match entry:
+            case str():
+                yield entry
+            case dict():
+                for value in entry.values():
+                    yield from pages(value)
+            case list():
+                for value in entry:
+                    yield from pages(value)
+
+    return list(pages(YAML(typ="safe").load(ROOT / "mkdocs.yml")["nav"]))
+
+
+def blocks(text, language):
+    """Fenced blocks, those inside lists too, as they would be written at the margin."""
+    for indent, body in re.findall(
+        rf"^( *)```{language}\n(.*?)^ *```$", text, flags=re.DOTALL | re.MULTILINE
+    ):
+        yield "".join(line.removeprefix(indent) for line in body.splitlines(keepends=True))
+
+
+# Pages and links.
+
+
+def test_every_page_is_in_the_navigation():
+    assert sorted(nav()) == sorted(ALL_PAGES)
+
+
+def test_every_module_has_its_place_in_the_reference():
+    told = re.findall(r"^::: jetbot_mjx\.([\w.]+)$", "\n".join(ALL_PAGES.values()), flags=re.M)
+    package = ROOT / "jetbot_mjx"
+    paths = [path.relative_to(package) for path in package.rglob("*.py")]
+    modules = {
+        ".".join(path.with_suffix("").parts)
+        for path in paths
+        if path.name != "__init__.py" and path.parts[0] != "assets"
+    }
+    assert sorted(told) == sorted(modules)
+
+
+def test_every_public_name_is_listed(root):
+    for name in re.findall(r" as (\w+)$", (root / "jetbot_mjx/__init__.py").read_text(), re.M):
+        if not name.startswith("_"):
+            assert f"[`{name}`][jetbot_mjx." in PAGES["api/index.md"]
+
+
+@pytest.mark.parametrize("page", ALL_PAGES)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]*)(?:#[^)]*)?\)", ALL_PAGES[page]):
+        if target:
+            path = os.path.normpath(Path(page).parent / target)
+            assert path in ALL_PAGES or (DOCS / path).is_file(), target
+
+
+@pytest.mark.parametrize("page", ALL_PAGES)
+def test_files_that_are_named_exist(page):
+    named = re.findall(
+        r"\b(?:configs|examples|benchmarks|deploy|jetbot_mjx|tests|notebooks)/[\w/.-]+\.\w+",
+        ALL_PAGES[page],
+    )
+    assert [name for name in named if not (ROOT / name).is_file()] == []
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_lines_are_short(page):
+    long = [
+        line
+        for line in PAGES[page].splitlines()
+        if len(line) > 120 and not line.lstrip().startswith(("|", "!["))
+    ]
+    assert long == []
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    for name in ("mkdocs", "material", "mkdocstrings_handlers.python"):
+        pytest.importorskip(name)
+    folder = tmp_path_factory.mktemp("site")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)]
+    environment = {**os.environ, "NO_MKDOCS_2_WARNING": "1", "NO_COLOR": "1"}
+    built = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True)
+    assert built.returncode == 0, built.stderr
+    assert "WARNING" not in built.stderr
+    return folder
+
+
+def test_the_site_builds_without_a_warning(site):
+    assert all((site / page.replace(".md", ".html")).is_file() for page in ALL_PAGES)
+    assert not list(site.rglob("*.py"))
+    html = (site / "api/envs.html").read_text("utf-8")
+    assert 'id="jetbot_mjx.envs.jetbot_env.JetBotEnv.step"' in html
+    # What docstrings.py mends.
+    assert "Tilt in [0, π] [rad]" in html
+    assert "seed-&lt;n&gt;" in (site / "api/runs.html").read_text("utf-8")
+    assert "<code>eval/episodes  " in re.sub(
+        r"<pre><span></span>", "", (site / "api/runs.html").read_text("utf-8")
+    )
+
+
+def test_the_site_loads_nothing_from_elsewhere(site):
+    for path in site.rglob("*.html"):
+        loaded = re.findall(
+            r'<(?:script|link|img)[^>]*(?:src|href)="(https?:[^"]*)"', path.read_text()
+        )
+        assert loaded == [], path
+
+
+# The configuration.
+
+
+def rows(text):
+    """Cells of every row of every table."""
+    for line in text.splitlines():
+        if line.startswith("| ") and not line.startswith("|--"):
+            yield [cell.strip() for cell in re.split(r"(?<!\\)\|", line)[1:-1]]
+
+
+def leaves(values, prefix=""):
+    """Keys with their sections, and values; of the free options one key."""
+    for key, value in values.items():
+        if isinstance(value, dict) and value:
+            yield from leaves(value, f"{prefix}{key}.")
+        else:
+            yield prefix + key, value
+
+
+DEFAULTS = dict(leaves(Config().model_dump(mode="json")))
+SETTINGS = {
+    cells[0].split("`")[1]: cells
+    for cells in rows(ALL_PAGES[GENERATED].partition("{ #shipped }")[0])
+    if cells[0].startswith("`")
+}
+
+
+def test_every_setting_is_in_the_reference():
+    assert sorted(SETTINGS) == sorted(DEFAULTS)
+
+
+@pytest.mark.parametrize("key", DEFAULTS)
+def test_a_setting_has_its_default_and_its_meaning(key):
+    name, kind, default, meaning = SETTINGS[key]
+    assert YAML(typ="safe", pure=True).load(default.split("`")[1]) == DEFAULTS[key]
+    assert ("↻" in name) == (key in CHANGEABLE_ON_RESUME)
+    assert kind
+    assert len(meaning) > 10
+
+
+def with_value(key, value):
+    for part in reversed(key.split(".")):
+        value = {part: value}
+    return parse_config(value)
+
+
+@pytest.mark.parametrize("key", [key for key in DEFAULTS if " least " in SETTINGS[key][1]])
+def test_a_lower_bound_is_the_one_that_holds(key):
+    kind = SETTINGS[key][1]
+    bound = float(re.findall(r"at least ([\d.e-]+)", kind)[-1])
+    below = int(bound) - 1 if "whole" in kind else bound - 1e-7
+    with pytest.raises(ConfigError, match=r"greater than or equal|at least"):
+        with_value(key, [below] if "list" in kind else below)
+    # Where the bound itself is refused, it is for another reason.
+    with contextlib.suppress(ConfigError):
+        with_value(
+            key, [int(bound)] if "list" in kind else int(bound) if "whole" in kind else bound
+        )
+
+
+@pytest.mark.parametrize(
+    ("word", "message"),
+    [("above 0", "greater than 0"), ("at most 1", "less than or equal"), ("below 2^", "less than")],
+)
+def test_other_bounds_are_those_that_hold(word, message):
+    keys = [key for key, cells in SETTINGS.items() if word in cells[1]]
+    assert keys
+    for key in keys:
+        kind = SETTINGS[key][1]
+        if word == "above 0":
+            value = 0.0
+        elif "below 2^" in word:
+            value = 2 ** int(re.findall(r"below 2\^(\d+)\^", kind)[0])
+        else:
+            value = 1 + float(re.findall(r"at most (\d+)", kind)[0])
+            value = int(value) if "whole" in kind else value
+        with pytest.raises(ConfigError, match=message):
+            with_value(key, [value] if "list" in kind else value)
+
+
+def test_the_shipped_files_are_told(root):
+    table = list(rows(ALL_PAGES[GENERATED].partition("{ #shipped }")[2].partition("\n## ")[0]))
+    names = [name.strip("`") for name in table[0][1:]]
+    assert names == sorted(path.stem for path in (root / "configs").glob("*.yaml"))
+    told = {cells[0].strip("`"): dict(zip(names, cells[1:], strict=True)) for cells in table[1:]}
+    assert told["ppo.num_envs"]["gpu"] == "`4096`"
+    assert told["ppo.entropy_cost"]["gpu"] == ""
+
+
+def table_after(page, heading):
+    """Rows of the first table below some words."""
+    return list(rows(PAGES[page].partition(heading)[2].partition("\n\n")[2].partition("\n\n")[0]))
+
+
+def values_in(cell):
+    """Settings and values that a cell tells, such as `num_envs` 16, `activation: tanh`."""
+    for name, value in re.findall(r"`(\w+)` ([\d_.e-]+)", cell):
+        yield name, YAML(typ="safe", pure=True).load(value)
+    for text in re.findall(r"`(\w+: [^`]+)`", cell):
+        yield from YAML(typ="safe", pure=True).load(text).items()
+
+
+def test_the_tutorials_hyperparameters_are_those_of_its_file(root):
+    told = load_config(root / "configs" / "isaac_sb3.yaml").ppo.model_dump()
+    told |= told.pop("network")
+    cells = [row[1] for row in table_after("from-the-tutorial.md", "translated:") if row]
+    found = [pair for cell in cells for pair in values_in(cell)]
+    assert len(found) > 15
+    assert [(name, told[name]) for name, _ in found] == found
+
+
+def test_the_differences_to_the_tutorial_are_those_of_the_files(root):
+    theirs, ours = (
+        load_config(root / "configs" / name).ppo.model_dump()
+        for name in ("isaac_sb3.yaml", "jetbot.yaml")
+    )
+    theirs |= theirs.pop("network")
+    ours |= ours.pop("network")
+    found = table_after("from-the-tutorial.md", "for these reasons:")[1:]
+    assert len(found) > 5
+    for name, before, here, _ in found:
+        key = name.strip("`")
+        if before != "constant":
+            parse = YAML(typ="safe", pure=True).load
+            values = (parse(before.strip("`")), parse(here.strip("`")))
+            assert values == (theirs[key], ours[key])
+    schedules = (theirs["learning_rate_schedule"], ours["learning_rate_schedule"])
+    assert schedules[0] == "NONE" != schedules[1]
+
+
+def test_settings_that_may_change_are_listed():
+    text = PAGES["stop-and-resume.md"].partition("## What may change")[2].partition("\n## ")[0]
+    assert tuple(re.findall(r"`([\w.]+)`", text.partition(". Anything")[0])) == CHANGEABLE_ON_RESUME
+
+
+# Metrics.
+
+
+def documented_names():
+    """Of the list in `metrics.py`: `a/b, c` and `with c, d` and `likewise c` mean `a/c`, `a/d`."""
+    names = set()
+    for left, right in re.findall(r"^  (\w+/\w+(?:, \w+)*) +(.*)$", metrics.__doc__, re.MULTILINE):
+        first, *others = left.split(", ")
+        group = first.partition("/")[0]
+        others += re.findall(r"(?<=with )\w+_low|success_high", right)
+        others += [
+            one.rpartition("/")[2]
+            for one in re.findall(r"\b[\w/]*_\w+", right.partition("likewise ")[2])
+        ]
+        names |= {first, *(f"{group}/{other}" for other in others)}
+    return names
+
+
+OURS, THEIRS = PAGES["metrics.md"].split("\n## Stable-Baselines3's names\n")
+EXPLAINED = {cells[0].strip("`"): cells[1:] for cells in rows(OURS) if cells[0].startswith("`")}
+
+
+def test_every_metric_of_the_list_is_explained():
+    names = documented_names()
+    assert {"eval/success_high", "loss/entropy", "rollout/episode_length"} <= names
+    assert names - set(EXPLAINED) == set()
+    assert all(unit and len(meaning) > 10 for unit, meaning in EXPLAINED.values())
+
+
+def test_every_metric_that_is_written_is_explained(smoke_run):
+    lines = (smoke_run / "metrics.jsonl").read_text().splitlines()
+    written = set().union(*(json.loads(line) for line in lines))
+    assert written == set(EXPLAINED)
+
+
+def test_names_that_other_modules_give_are_explained():
+    assert {f"eval/{name}" for name in Summary._fields} < set(EXPLAINED)
+    assert set(LOSSES.values()) < set(EXPLAINED)
+
+
+def test_every_name_of_stable_baselines3_is_explained():
+    told = {
+        cells[0].strip("`"): re.findall("`([^`]+)`", cells[1])
+        for cells in rows(THEIRS)
+        if cells[0].startswith("`")
+    }
+    names = aliases(Config().ppo)
+    assert {tag for tag, ours in told.items() if ours != [tag]} == set(names)
+    for tag, (figure, _, over) in names.items():
+        assert figure in told[tag]
+        assert not isinstance(over, str) or over in told[tag]
+        assert figure in EXPLAINED
+
+
+# Commands.
+
+
+class Parsed(Exception):
+    """Raised in place of the work, with what was asked for."""
+
+
+KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
+PLAIN = {"[", "break", "tensorboard", "apt-get", "scp"}
+EXPORTED = "policy/policy.py"
+"""Where an export lies, in a run folder or on a robot; it takes no arguments."""
+VARIABLES = {
+    *("PYTHONPATH", "JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"),
+    *("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
+}
+COMMANDS = {
+    "new_task": new_task,
+    "check_env": check_env,
+    "plan": plan,
+    "train": train,
+    "evaluate": evaluate,
+    "render": render,
+    "replay": replay,
+    "play": play,
+    "export": export,
+    "sim2real": sim2real,
+    "pretrained": pretrained,
+}
+
+
+def commands(block):
+    """The simple commands of a block, as lists of words."""
+    for line in block.replace("\\\n", " ").splitlines():
+        words = []
+        lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
+        lexer.wordchars += "$,:[]{}"
+        for word in [*lexer, ";"]:
+            if set(word) <= set(";&|"):
+                if words:
+                    yield words
+                words = []
+            elif words or word not in KEYWORDS:
+                words.append(word)
+
+
+SHELL = [
+    pytest.param(page, words, id=f"{page}-{' '.join(words)[:60]}")
+    for page, text in PAGES.items()
+    for block in blocks(text, "sh")
+    for words in commands(block)
+]
+
+
+def own_files(page):
+    """Files that a page has its reader write: blocks that begin with a file's name."""
+    found = {}
+    for language in ("python", "yaml"):
+        for block in blocks(PAGES[page], language):
+            if name := re.match(r"# ([\w-]+\.\w+)\n", block):
+                found[name[1]] = block
+    return found
+
+
+@pytest.fixture
+def reader(tmp_path, monkeypatch):
+    """Sits in a folder with all of the checkout, and the files that a page tells to write."""
+
+    def sit(page):
+        for name in (
+            "configs",
+            "examples",
+            "benchmarks",
+            "deploy",
+            "tests",
+            "Makefile",
+            "pyproject.toml",
+        ):
+            (tmp_path / name).symlink_to(ROOT / name)
+        for name, text in own_files(page).items():
+            (tmp_path / name).write_text(text, encoding="utf-8")
+        monkeypatch.chdir(tmp_path)
+
+    # A page's own modules belong to its test alone.
+    before = set(sys.modules)
+    yield sit
+    for name in set(sys.modules) - before:
+        if name in {"my_task", "obstacle_task", "pillars_task", "gates_task"}:
+            del sys.modules[name]
+
+
+def test_there_are_commands_on_the_pages():
+    assert len(SHELL) > 30
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_shell_blocks_are_shell(page):
+    for block in blocks(PAGES[page], "sh"):
+        subprocess.run(["bash", "-n", "-c", block], check=True)
+
+
+@pytest.mark.parametrize(("page", "words"), SHELL)
+def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
+    reader(page)
+    while re.fullmatch(r"\w+=.*", words[0]):
+        name, _, value = words[0].partition("=")
+        assert name in VARIABLES
+        if name == "PYTHONPATH":
+            assert Path(value).is_dir()
+            monkeypatch.syspath_prepend(value)
+        words = words[1:]
+    if words[0] == "srun":
+        words = words[words.index("python") :]
+    match words:
+        case ["python", "-m", "pytest", *arguments]:
+            assert all(Path(one).is_file() for one in arguments if one[0] != "-")
+        case ["python", "-m", module, *arguments]:
+            check_arguments(COMMANDS[module.removeprefix("jetbot_mjx.")], arguments, monkeypatch)
+        case ["python", script, *arguments] if script.startswith("examples/"):
+            pytest.importorskip("stable_baselines3")
+            check_arguments(load(Path(script)), arguments, monkeypatch)
+        case ["python", "-c", source]:
+            compile(source, page, "exec")
+        case ["python" | "python3", script, *arguments]:
+            check_script(script, arguments, monkeypatch)
+        case ["make", *targets]:
+            known = re.findall(r"^([\w-]+):", Path("Makefile").read_text(), re.MULTILINE)
+            assert set(targets) <= set(known)
+        case ["pip", "install", *arguments]:
+            check_install(arguments)
+        case [first, *_]:
+            assert first in PLAIN
+
+
+def check_script(script, arguments, monkeypatch):
+    """It is one of the checkout, or an export's, and takes the arguments."""
+    if script.endswith(EXPORTED):
+        assert arguments == []
+        return
+    monkeypatch.syspath_prepend(str((ROOT / script).parent))
+
+    def stop_after_parsing(parser, given=None):
+        raise Parsed(parse(parser, given))
+
+    parse = argparse.ArgumentParser.parse_args
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop_after_parsing)
+    with pytest.raises(Parsed):
+        load(ROOT / script).main(arguments)
+
+
+def check_arguments(command, arguments, monkeypatch):
+    """The parser takes the arguments, and the configuration the settings."""
+    parse = cli.Parser.parse_args
+
+    def stop_after_parsing(parser, given=None):
+        raise Parsed(parse(parser, given))
+
+    monkeypatch.setattr(cli.Parser, "parse_args", stop_after_parsing)
+    with pytest.raises(Parsed) as asked:
+        command.main(arguments)
+    options = vars(asked.value.args[0])
+    if "overrides" in options:
+        make_sense = load_config(options["config"] or "configs/jetbot.yaml", options["overrides"])
+        assert make_sense.of_each_seed()
+
+
+def check_install(arguments):
+    extras = tomllib.loads(Path("pyproject.toml").read_text())["project"]["optional-dependencies"]
+    if arguments[0] == "-c":
+        assert (ROOT / arguments[1]).is_file()
+        arguments = arguments[2:]
+    found = re.match(r"\.(?:\[([\w,]+)\])?$", arguments[0])
+    assert found
+    assert set((found[1] or "dev").split(",")) <= set(extras)
+
+
+@pytest.mark.parametrize(
+    ("page", "block"),
+    [
+        ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --sed 1"),
+        ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --set ppo.num_env=1"),
+        ("a.md", "python -m jetbot_mjx.train --config configs/nothing.yaml"),
+        ("a.md", "python -m jetbot_mjx.dance runs/mine"),
+        ("a.md", "python3 deploy/drive.py policy --gaol 1 0"),
+        ("a.md", "python deploy/dance.py policy"),
+        ("a.md", "make everything"),
+        ("a.md", "pip install '.[gpu]'"),
+        ("a.md", "rm -rf runs"),
+    ],
+)
+def test_a_command_that_is_none_is_seen(page, block, reader, monkeypatch):
+    monkeypatch.setitem(PAGES, "a.md", f"```sh\n{block}\n```\n")
+    ((found,),) = [list(commands(one)) for one in blocks(PAGES[page], "sh")]
+    with pytest.raises((AssertionError, ConfigError, FileNotFoundError, KeyError, SystemExit)):
+        test_a_command_of_the_pages_is_one(page, found, reader, monkeypatch)
+
+
+# Examples.
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_python_blocks_compile(page):
+    for block in blocks(PAGES[page], "python"):
+        compile(block, page, "exec")
+
+
+RUNNABLE = [page for page in PAGES if "```python\n# runs\n" in PAGES[page]]
+
+
+@pytest.mark.parametrize("page", RUNNABLE)
+def test_blocks_that_are_said_to_run_do(page, reader, monkeypatch, capsys):
+    reader(page)
+    monkeypatch.syspath_prepend(".")
+    namespace = {}
+    for block in blocks(PAGES[page], "python"):
+        if block.startswith("# runs\n"):
+            exec(compile(block, page, "exec"), namespace)
+    assert capsys.readouterr().out
+
+
+def test_the_steps_to_a_task_are_those_of_the_whole_file():
+    page = PAGES["own-task.md"]
+    whole = own_files("own-task.md")["my_task.py"]
+    lines = {line.strip() for line in whole.splitlines()}
+    steps = page.partition("## 3.")[2].partition("## 7.")[0]
+    shown = [line.strip() for block in blocks(steps, "python") for line in block.splitlines()]
+    assert [line for line in shown if line not in lines] == []
+    assert len(shown) > 40
+
+
+def test_the_task_of_the_page_does_what_it_says(reader, monkeypatch):
+    reader("own-task.md")
+    monkeypatch.syspath_prepend(".")
+    env = make_env(load_config("my_task.yaml"))
+    goal = env.task.sample(jax.random.PRNGKey(0))
+    robot = env.reset(jax.random.PRNGKey(0))
+    assert env.observation_size == robot.obs.size == 9
+    assert set(robot.metrics) == {"success", "reward/progress", "reward/collision"}
+    assert set(env.task.markers(goal)) == {"goal", "pillar"}
+    between = jnp.linalg.norm(goal.goal_w[:2] / 2 - goal.pillar_w[:2])
+    assert between < 0.1
+
+
+def test_every_part_of_the_contract_is_on_the_page(root):
+    from jetbot_mjx.envs.task import METHODS
+
+    for name in (*METHODS, "layout"):
+        assert f"| `{name}" in PAGES["own-task.md"]

@@ -1,0 +1,139 @@
+"""The notebooks run from top to bottom, as a reader would, on the smallest configuration."""
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("ipykernel")
+pytest.importorskip("nbclient")
+
+import nbformat
+from ipykernel.kernelspec import write_kernel_spec
+from nbclient import NotebookClient
+
+NAMES = ("01_environment", "02_train", "03_evaluate_and_render", "04_own_task")
+
+SHORT = (
+    "checkpoint_interval=16384",
+    "ppo.num_timesteps=32768",
+    "ppo.network.policy_hidden_layer_sizes=[32]",
+    "ppo.network.value_hidden_layer_sizes=[32]",
+    "evaluation.episodes=32",
+)
+"""For the task of one's own, whose configuration is part of the notebook."""
+
+IMAGES = {"image/png", "image/jpeg", "image/gif"}
+
+
+@pytest.fixture(scope="module")
+def execute(root, tmp_path_factory):
+    """Runs a notebook with this interpreter; the runs share one folder, hence the module."""
+    folder = tmp_path_factory.mktemp("notebooks")
+    write_kernel_spec(folder / "jupyter" / "kernels" / "this")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
+        patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
+        # As many as the film of an evaluation shows, whose program is the same.
+        patch.setenv("JETBOT_EPISODES", "4")
+        patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
+        patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
+        # Nothing of the user's own Jupyter, and nothing left in it.
+        patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
+        patch.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))
+        patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
+        # The kernel sets its own back end, which puts figures into the notebook.
+        patch.delenv("MPLBACKEND", raising=False)
+
+        def run(name, profile="ipython"):
+            patch.setenv("IPYTHONDIR", str(folder / profile))
+            notebook = nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4)
+            client = NotebookClient(
+                notebook,
+                kernel_name="this",
+                timeout=300,
+                resources={"metadata": {"path": str(root / "notebooks")}},
+            )
+            return client.execute()
+
+        yield run
+
+
+@pytest.fixture(scope="module")
+def gliding_profile(tmp_path_factory):
+    """A folder of IPython's from which every kernel begins with a robot that glides."""
+    profile = tmp_path_factory.mktemp("gliding")
+    startup = profile / "profile_default" / "startup" / "glide.py"
+    startup.parent.mkdir(parents=True)
+    tests = str(Path(__file__).parents[1] / "helpers")
+    startup.write_text(
+        f"import sys\nsys.path.append({tests!r})\nimport gliding\n"
+        "everywhere = gliding.everywhere()\neverywhere.__enter__()\n"
+    )
+    return profile
+
+
+@pytest.fixture(scope="module")
+def trained(execute):
+    return execute("02_train")
+
+
+@pytest.fixture(scope="module")
+def read(root):
+    return {
+        name: nbformat.read(root / "notebooks" / f"{name}.ipynb", as_version=4) for name in NAMES
+    }
+
+
+def images(notebook):
+    """MIME types of the images in the outputs."""
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    assert not [output for output in outputs if output.output_type == "error"]
+    return [mime for output in outputs for mime in output.get("data", {}) if mime in IMAGES]
+
+
+def text(notebook):
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "".join(output.get("text", "") for output in outputs)
+
+
+def html(notebook):
+    outputs = [output for cell in notebook.cells for output in cell.get("outputs", [])]
+    return "".join(output.get("data", {}).get("text/html", "") for output in outputs)
+
+
+def test_environment_notebook_runs(execute):
+    notebook = execute("01_environment")
+    assert images(notebook) == ["image/png"] * 2
+    assert "<video" in html(notebook)
+    assert "20 different goals in 20 episodes" in text(notebook)
+
+
+def test_training_notebook_runs(trained):
+    assert images(trained) == ["image/png"]
+    assert "best policy" in text(trained)
+
+
+def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, trained):
+    notebook = execute("03_evaluate_and_render")
+    assert images(notebook) == ["image/png", "image/png", "image/gif"]
+    assert "scripted" in text(notebook)
+
+
+def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, gliding_profile):
+    notebook = execute("04_own_task", gliding_profile)
+    assert images(notebook) == ["image/png", "image/gif"]
+    assert "blank_task:BlankTask sees" in text(notebook)
+    assert "training parking_task:ParkingTask" in text(notebook)
+    assert "reward/parked" in text(notebook)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_committed_notebooks_hold_no_outputs(read, name):
+    nbformat.validate(read[name])
+    code = [cell for cell in read[name].cells if cell.cell_type == "code"]
+    assert code
+    assert all(cell.outputs == [] and cell.execution_count is None for cell in code)
+
+
+def test_every_notebook_is_tested(root):
+    assert sorted(path.stem for path in (root / "notebooks").glob("*.ipynb")) == list(NAMES)

@@ -1,0 +1,229 @@
+import shutil
+import subprocess
+import sys
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import orbax.checkpoint as ocp
+import pytest
+
+from jetbot_mjx import load_policy
+from jetbot_mjx.runs.checkpoint import (
+    FORMAT,
+    POLICY,
+    CheckpointError,
+    explanation,
+    find_checkpoint,
+    load_checkpoint,
+)
+from jetbot_mjx.runs.checkpoint_store import Store, checkpoint_steps, digest
+from jetbot_mjx.runs.resume import TRAINING
+
+
+@pytest.fixture
+def run_copy(smoke_run, tmp_path):
+    return shutil.copytree(smoke_run, tmp_path / "run")
+
+
+def test_a_checkpoint_explains_itself(smoke_run):
+    checkpoint = load_checkpoint(smoke_run, "last")
+    assert checkpoint.env_steps == 65_536
+    assert checkpoint.config.task.observation == "egocentric"
+    names = [field["name"] for field in checkpoint.about["layout"]]
+    assert names[0] == "goal_position"
+    assert checkpoint.about["versions"]["packages"]["brax"]
+    assert checkpoint.about["figures"]["success_rate"] >= 0.0
+    assert checkpoint.run_dir == smoke_run
+
+
+def test_checkpoints_stand_at_the_stated_interval(smoke_run):
+    assert checkpoint_steps(smoke_run) == [0, 16_384, 32_768, 49_152, 65_536]
+
+
+@pytest.fixture
+def write(smoke_run, tmp_path):
+    """Writes checkpoints with the parameters of the smoke run, and what else a test changes."""
+    checkpoint = load_checkpoint(smoke_run)
+    run_dir = tmp_path / "run"
+    run_dir.mkdir()
+
+    def write(*steps, trees=None, without=(), **changes):
+        about = {**checkpoint.about, **changes}
+        for key in without:
+            del about[key]
+        with Store(run_dir, keep=50) as store:
+            for env_steps, success_rate in steps:
+                judged = {} if success_rate is None else {"success_rate": success_rate}
+                explained = {**about, "figures": judged}
+                store.save(env_steps, trees or {POLICY: checkpoint.params}, explained, success_rate)
+        return run_dir
+
+    return write
+
+
+def test_the_best_is_the_one_with_the_highest_success_and_of_equals_the_latest(tmp_path, write):
+    write((0, 0.1), (10, 0.9), (20, 0.9), (30, 0.5))
+    assert load_checkpoint(tmp_path / "run", "best").env_steps == 20
+    assert load_checkpoint(tmp_path / "run", "last").env_steps == 30
+    assert load_checkpoint(tmp_path / "run", 10).env_steps == 10
+
+
+def test_one_that_was_not_judged_is_not_the_best(write):
+    run_dir = write((0, 0.0), (10, None))
+    assert load_checkpoint(run_dir, "best").env_steps == 0
+    assert load_checkpoint(run_dir, "last").env_steps == 10
+
+
+def test_what_is_read_is_what_was_written(smoke_run, write):
+    checkpoint = load_checkpoint(smoke_run)
+    again = load_checkpoint(write((1, 1.0))).params
+    assert jax.tree.structure(again) == jax.tree.structure(checkpoint.params)
+    jax.tree.map(np.testing.assert_array_equal, again, checkpoint.params)
+    assert digest(again) == digest(checkpoint.params) == checkpoint.about["sha256"][POLICY]
+    assert np.any(np.asarray(again.normalizer.mean) != 0)
+
+
+_ACT = """
+import sys, numpy as np
+from jetbot_mjx import load_policy
+obs = np.load(sys.argv[2])
+np.save(sys.argv[3], np.asarray(load_policy(sys.argv[1])(obs)))
+"""
+
+
+def test_a_fresh_process_gives_identical_actions(smoke_run, tmp_path):
+    obs = np.asarray(jax.random.normal(jax.random.PRNGKey(5), (257, 7)))
+    np.save(tmp_path / "obs.npy", obs)
+    subprocess.run(
+        [sys.executable, "-c", _ACT, smoke_run, tmp_path / "obs.npy", tmp_path / "out.npy"],
+        check=True,
+    )
+    here = np.asarray(load_policy(smoke_run)(obs))
+    np.testing.assert_array_equal(here, np.load(tmp_path / "out.npy"))
+    assert np.ptp(here, axis=0).min() > 0.1
+
+
+def test_a_policy_is_deterministic_without_a_key_and_samples_with_one(smoke_run):
+    policy = load_policy(smoke_run)
+    obs = jnp.ones(7)
+    one, two = (policy(obs, jax.random.PRNGKey(i)) for i in (0, 1))
+    assert policy(obs).shape == one.shape == (2,)
+    np.testing.assert_array_equal(policy(obs), policy(obs))
+    assert not np.allclose(one, two)
+    batched = jnp.stack([obs, 2 * obs])
+    # A GPU multiplies matrices of a batch in TF32 unless told otherwise, and a vector in float32.
+    with jax.default_matmul_precision("highest"):
+        np.testing.assert_allclose(policy(batched)[0], policy(obs), rtol=1e-5)
+    assert np.all(np.abs(policy(100.0 * batched)) <= 1.0)
+
+
+def test_one_checkpoint_folder_stands_for_itself(smoke_run):
+    folder = find_checkpoint(smoke_run, 16_384)
+    assert load_checkpoint(folder).env_steps == 16_384
+
+
+def refused(path, which="best"):
+    with pytest.raises(CheckpointError) as caught:
+        load_checkpoint(path, which)
+    message = str(caught.value)
+    assert "\n" not in message
+    return message
+
+
+def test_what_is_not_there_is_refused(smoke_run, tmp_path):
+    assert "no such folder" in refused(tmp_path / "nothing")
+    assert "neither" in refused(tmp_path)
+    (tmp_path / "run" / "checkpoints").mkdir(parents=True)
+    assert "saved none" in refused(tmp_path / "run")
+    assert "16384" in refused(smoke_run, 123)
+
+
+def test_a_foreign_checkpoint_is_refused(tmp_path):
+    with ocp.StandardCheckpointer() as writer:
+        writer.save(tmp_path / "000000000001" / "policy", {"weights": np.ones(3)})
+    assert "not one of jetbot_mjx" in refused(tmp_path / "000000000001")
+
+
+def test_another_shape_is_refused(smoke_run, write):
+    config = load_checkpoint(smoke_run).about["config"]
+    config["ppo"]["network"]["policy_hidden_layer_sizes"] = [32, 48]
+    said = refused(write((1, 0.5), config=config))
+    assert "cannot be read: policy.params.hidden_1." in said
+    assert "is float32[32], and should be float32[48]" in said
+
+
+@pytest.mark.parametrize("key", ["config", "observation_size", "format", "layout"])
+def test_an_incomplete_explanation_is_refused(write, key):
+    assert f"does not explain itself: no {key}" in refused(write((1, 0.5), without=[key]), 1)
+
+
+@pytest.mark.parametrize("key", ["config", "layout", "env_steps"])
+def test_an_explanation_that_was_changed_is_refused(run_copy, key):
+    folder = find_checkpoint(run_copy, "last")
+    path = folder / "about" / "metadata"
+    path.write_text(path.read_text().replace(f'"{key}"', f'"{key}s"', 1))
+    for use in (lambda: refused(folder), lambda: refused(run_copy, "last")):
+        assert "about/metadata is not as it was written" in use()
+
+
+@pytest.mark.parametrize("number", ["jetbot_mjx/1", "jetbot_mjx/3", None, 2])
+def test_another_format_is_refused_by_name(write, number):
+    said = refused(write((1, 0.5), format=number))
+    assert f"in the format {number!r}, and only {FORMAT!r} can be read" in said
+
+
+@pytest.mark.parametrize("config", [{}, {"seed": -1}, {"sede": 0}, 3, None])
+def test_a_configuration_that_cannot_run_is_refused(write, config):
+    assert "checkpoint" in refused(write((1, 0.5), config=config))
+
+
+def test_a_checkpoint_without_a_policy_is_refused(smoke_run, write):
+    trees = {TRAINING: {"key": np.zeros(2, np.uint32)}}
+    run_dir = write((1, 0.5), trees=trees)
+    assert "holds no policy" in refused(run_dir)
+    assert explanation(find_checkpoint(run_dir, 1))["env_steps"] == 1
+
+
+def test_a_policy_from_another_checkpoint_is_refused(run_copy):
+    folder = find_checkpoint(run_copy, 65_536)
+    shutil.rmtree(folder / POLICY)
+    shutil.copytree(find_checkpoint(run_copy, 49_152) / POLICY, folder / POLICY)
+    assert "policy is not as it was written" in refused(folder)
+
+
+def test_what_acting_does_not_need_may_be_damaged(run_copy):
+    folder = find_checkpoint(run_copy, "best")
+    before = load_checkpoint(folder)
+    shutil.rmtree(folder / TRAINING)
+    assert digest(load_checkpoint(run_copy).params) == digest(before.params)
+
+
+def stored_bytes(folder):
+    return [path for path in folder.rglob("*") if path.is_file() and path.parent.name == "d"]
+
+
+@pytest.mark.parametrize("harm", ["empty", "cut", "flip", "gone"])
+def test_a_damaged_checkpoint_is_refused(run_copy, harm, capfd):
+    folder = find_checkpoint(run_copy, "best")
+    for path in stored_bytes(folder / POLICY):
+        match harm:
+            case "empty":
+                path.write_bytes(b"")
+            case "cut":
+                path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+            case "flip":
+                data = bytearray(path.read_bytes())
+                data[::50] = (byte ^ 4 for byte in data[::50])
+                path.write_bytes(data)
+            case "gone":
+                path.unlink()
+    assert "cannot be read" in refused(folder)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_the_best_is_found_beside_one_that_cannot_be_read(run_copy):
+    best = find_checkpoint(run_copy, "best")
+    other = next(path for path in best.parent.iterdir() if path.name.isdecimal() and path != best)
+    shutil.rmtree(other / "about")
+    assert find_checkpoint(run_copy, "best") == best

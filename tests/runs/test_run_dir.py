@@ -1,0 +1,231 @@
+"""The run folder: one training at a time, nothing but a run, every file whole."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import run_dir
+from jetbot_mjx.runs.run_dir import (
+    changed_versions,
+    make_folder,
+    occupied,
+    seed_dirs,
+    seed_folders,
+    stored_config,
+    versions,
+    write_json,
+    write_run,
+    write_text,
+)
+
+
+def refused(use, *arguments):
+    with pytest.raises(UserError) as caught:
+        use(*arguments)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def occupy(path):
+    with occupied(path):
+        pass
+
+
+def test_a_folder_is_made_held_and_free_again(tmp_path):
+    run_dir = tmp_path / "some" / "run"
+    for _ in range(2):
+        with occupied(run_dir):
+            assert (run_dir / ".lock").read_text() == f"{os.getpid()}\n"
+
+
+def test_a_folder_that_another_training_holds_is_refused_and_the_process_named(tmp_path):
+    with occupied(tmp_path):
+        said = refused(occupy, tmp_path)
+        assert f"--run-dir {tmp_path} is held by another training (process {os.getpid()})" in said
+        assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+    occupy(tmp_path)
+
+
+_HOLD = """
+import fcntl, os, sys
+file = open(sys.argv[1], "w")
+fcntl.flock(file, fcntl.LOCK_EX)
+print(os.getpid(), file=file, flush=True)
+print("held", flush=True)
+sys.stdin.read()
+"""
+
+
+def test_a_folder_is_free_when_the_process_that_held_it_was_killed(tmp_path):
+    process = subprocess.Popen(
+        [sys.executable, "-c", _HOLD, tmp_path / ".lock"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    with process:
+        assert process.stdout.readline() == b"held\n"
+        assert f"(process {process.pid})" in refused(occupy, tmp_path)
+        process.kill()
+        process.wait()
+        with occupied(tmp_path):
+            assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
+
+
+def test_a_file_system_without_locks_refuses_nothing(tmp_path, monkeypatch):
+    def fail(*arguments):
+        raise OSError(95, "Operation not supported")
+
+    monkeypatch.setattr(run_dir.fcntl, "flock", fail)
+    occupy(tmp_path)
+
+
+@pytest.mark.parametrize("use", [occupy, lambda path: write_run(path, parse_config({}))])
+def test_a_folder_below_a_file_cannot_be_written(tmp_path, use):
+    (tmp_path / "file").write_text("")
+    assert "cannot be written: Not a directory" in refused(use, tmp_path / "file" / "run")
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write everywhere")
+def test_a_read_only_folder_cannot_be_written(tmp_path):
+    tmp_path.chmod(0o500)
+    assert "cannot be written: Permission denied" in refused(occupy, tmp_path)
+
+
+def test_a_run_is_known_by_its_resolved_configuration(tmp_path):
+    config = parse_config({"seed": 7, "ppo": {"learning_rate": 3e-4}})
+    assert stored_config(tmp_path / "nothing") is None
+    assert stored_config(tmp_path) is None
+    occupy(tmp_path)
+    assert stored_config(tmp_path) is None
+    write_run(tmp_path, config)
+    assert stored_config(tmp_path) == config
+
+
+@pytest.mark.parametrize(
+    "occupant", ["notes.txt", "checkpoints/", "config.yaml/", "metrics.jsonl", "checkpoints/5/"]
+)
+def test_a_folder_with_anything_else_in_it_is_refused(tmp_path, occupant):
+    if occupant.endswith("/"):
+        (tmp_path / occupant).mkdir(parents=True)
+    else:
+        (tmp_path / occupant).write_text("")
+    assert "is in use, and holds no run (no config.yaml)" in refused(stored_config, tmp_path)
+
+
+def test_a_file_is_no_run_folder(tmp_path):
+    path = tmp_path / "file"
+    path.write_text("")
+    assert "is in use" in refused(stored_config, path)
+
+
+@pytest.mark.parametrize("text", ["ppo: [", "- 1", "sede: 3", "\udcff"])
+def test_a_damaged_configuration_is_refused(tmp_path, text):
+    (tmp_path / "config.yaml").write_text(text, errors="surrogateescape")
+    assert str(tmp_path / "config.yaml") in refused(stored_config, tmp_path)
+
+
+def test_each_seed_has_a_folder_of_its_own(tmp_path):
+    one, many = parse_config({"seed": 9}), parse_config({"seed": 9, "seeds": 3})
+    assert seed_dirs(tmp_path, one) == [tmp_path]
+    folders = [tmp_path / f"seed-{seed}" for seed in (9, 10, 11)]
+    assert seed_dirs(tmp_path, many) == folders
+    assert seed_folders(tmp_path) == []
+    for folder, config in zip(folders, many.of_each_seed(), strict=True):
+        folder.mkdir()
+        write_run(folder, config)
+    (tmp_path / "seed-none").mkdir()
+    assert seed_folders(tmp_path) == folders
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+@pytest.mark.parametrize("method", ["write_bytes", "replace"])
+def test_a_file_is_whole_or_as_it_was_whenever_the_process_ends(tmp_path, monkeypatch, method):
+    path = tmp_path / "config.yaml"
+    write_text(path, "before\n")
+    original = getattr(Path, method)
+
+    def die(self, argument, **keywords):
+        if method == "write_bytes":
+            original(self, argument[: len(argument) // 2], **keywords)
+        raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, method, die)
+        with pytest.raises(Killed):
+            write_text(path, "after, and longer than before\n")
+    assert path.read_text() == "before\n"
+    write_text(path, "after\n")
+    assert path.read_text() == "after\n"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_a_killed_process_left_half_written_does_not_make_a_folder_used(tmp_path, monkeypatch):
+    def die(self, target):
+        raise Killed
+
+    monkeypatch.setattr(Path, "replace", die)
+    with pytest.raises(Killed):
+        write_run(tmp_path, parse_config({}))
+    assert stored_config(tmp_path) is None
+
+
+def test_json_has_no_numbers_that_are_none(tmp_path):
+    with pytest.raises(ValueError):
+        write_json(tmp_path / "file.json", {"x": float("nan")})
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_for_results_is_made_once_and_may_be_there(tmp_path):
+    for _ in range(2):
+        make_folder(tmp_path / "videos")
+    (tmp_path / "file").write_text("")
+    assert "cannot be written: File exists" in refused(make_folder, tmp_path / "file")
+
+
+def store_versions(run_dir, change):
+    values = versions()
+    change(values)
+    write_json(run_dir / "versions.json", values)
+
+
+def test_nothing_has_changed_where_all_is_as_it_was(tmp_path):
+    write_run(tmp_path, parse_config({}))
+    assert changed_versions(tmp_path) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda found: found["packages"].update(jax="0.1.2"), "jax 0.1.2, now "),
+        (lambda found: found["packages"].update(brax=None), "brax None, now "),
+        (lambda found: found["packages"].pop("mujoco"), "mujoco None, now "),
+        (lambda found: found.update(device="abacus"), "device abacus, now "),
+        (lambda found: found.update(device_count=8), "device_count 8, now 1"),
+    ],
+    ids=["other", "not there", "not told", "device", "device count"],
+)
+def test_what_has_changed_since_is_named(tmp_path, change, said):
+    store_versions(tmp_path, change)
+    (found,) = changed_versions(tmp_path)
+    assert found.startswith(said)
+
+
+@pytest.mark.parametrize("text", [None, "", "{", "{}", "[]", "3", '{"packages": 3}', "\udcff"])
+def test_versions_that_cannot_be_read_say_nothing(tmp_path, text):
+    if text is not None:
+        (tmp_path / "versions.json").write_text(text, errors="surrogateescape")
+    assert changed_versions(tmp_path) == []
+
+
+def test_versions_are_json(tmp_path):
+    found = json.loads(json.dumps(versions()))
+    assert {"python", "packages", "device", "device_count", "git"} <= found.keys()

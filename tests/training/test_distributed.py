@@ -1,0 +1,314 @@
+"""Two processes on one host train one policy, as two hosts would: by gloo, over localhost."""
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from jetbot_mjx import cli, train
+from jetbot_mjx.config import load_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
+from jetbot_mjx.training import distributed, ppo_trainer
+from jetbot_mjx.training.callbacks import Recorder
+from jetbot_mjx.training.preemption import STOPPED
+
+ROOT = Path(__file__).parents[2]
+SMOKE = str(ROOT / "configs" / "smoke.yaml")
+SIZE = load_config(SMOKE).ppo.steps_per_training_step
+STEPS = 4
+SETTINGS = [
+    "--set",
+    f"ppo.num_timesteps={STEPS * SIZE}",
+    "--set",
+    f"checkpoint_interval={2 * SIZE}",
+    "--set",
+    "evaluation.episodes=8",
+]
+STOCK = ["--set", "trainer=brax", "--set", "ppo.normalizer=brax"]
+VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
+
+
+# The other processes: the training command, one training step a call, telling what it holds.
+
+
+def tell(interrupted, *arguments):
+    ppo_trainer._Pace.learn = lambda self, steps, seconds: None
+    report = ppo_trainer._report
+
+    def reported(config, program, recorder, state, seconds):
+        own = jax.tree.map(lambda x: np.asarray(x.addressable_data(0)), state)
+        told = {
+            "parameters": digest(own.params),
+            "keys": own.env_state.key.reshape(-1, 2).tolist(),
+            "goals": own.env_state.goal.reshape(-1, 3).tolist(),
+            "devices": [jax.local_device_count(), jax.device_count()],
+        }
+        print("told:", json.dumps(told), flush=True)
+        return report(config, program, recorder, state, seconds)
+
+    def interrupt(self, env_steps, figures, seconds):
+        os.kill(os.getpid(), signal.SIGTERM)
+        time.sleep(0.5)
+
+    ppo_trainer._report = reported
+    if interrupted == "interrupted":
+        Recorder.tell = interrupt
+    cli.run_command(lambda _: train.main(arguments))
+
+
+def start(arguments, *, interrupted=False, **variables):
+    environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
+    flag = "interrupted" if interrupted else "-"
+    return subprocess.Popen(
+        [sys.executable, __file__, flag, *map(str, arguments)],
+        env={**environment, "JAX_PLATFORMS": "cpu", **variables},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+
+
+def lines(run_dir):
+    return [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
+
+
+class Ended:
+    def __init__(self, process):
+        try:
+            self.out, self.err = process.communicate(timeout=240)
+        finally:
+            process.kill()
+        self.code = process.returncode
+        self.told = [json.loads(line) for line in re.findall(r"^told: (.*)$", self.out, re.M)]
+        # The collectives of a CPU tell of themselves.
+        self.said = re.sub(r"^(told: |\[Gloo\]).*\n", "", self.out, flags=re.M)
+        self.complained = re.sub(r"^\[Gloo\].*\n", "", self.err, flags=re.M)
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The same training by one process with two devices, and the folder it left."""
+    run_dir = tmp_path_factory.mktemp("distributed") / "alone"
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
+    ended = Ended(start(["--config", SMOKE, "--run-dir", run_dir, *SETTINGS], XLA_FLAGS=flags))
+    assert ended.code == 0, ended.err
+    return ended, run_dir
+
+
+@pytest.fixture(scope="module")
+def stopped(alone, unused_port):
+    """Two processes, of which the second is asked to stop after the first training step."""
+    _, run_dir = alone
+    together = run_dir.with_name("together")
+    port = unused_port()
+    begun = [
+        start(
+            ["--config", SMOKE, "--distributed", *SETTINGS, "--run-dir", folder],
+            interrupted=index == 1,
+            JAX_COORDINATOR_ADDRESS=f"127.0.0.1:{port}",
+            JAX_NUM_PROCESSES="2",
+            JAX_PROCESS_ID=str(index),
+        )
+        # The second needs no folder, and makes none.
+        for index, folder in enumerate([together, run_dir.with_name("nothing")])
+    ]
+    ended = [Ended(process) for process in begun]
+    return ended, together, checkpoint_steps(together)
+
+
+@pytest.fixture(scope="module")
+def finished(stopped, unused_port):
+    """Two processes, as Slurm would start them, that go on from there to the end."""
+    _, run_dir, _ = stopped
+    port = unused_port()
+    begun = [
+        start(
+            ["--resume", run_dir, "--distributed"],
+            SLURM_JOB_ID="1",
+            SLURM_STEP_NODELIST="localhost",
+            SLURM_NTASKS="2",
+            SLURM_PROCID=str(index),
+            SLURM_LOCALID=str(index),
+            JAX_COORDINATOR_PORT=str(port),
+        )
+        for index in range(2)
+    ]
+    return [Ended(process) for process in begun], run_dir
+
+
+def test_a_signal_to_one_stops_all_at_the_same_step(stopped):
+    (first, second), _, saved = stopped
+    assert [first.code, second.code] == [STOPPED, STOPPED], first.err + second.err
+    assert saved == [0, SIZE]
+    assert "stopped; to go on: python -m jetbot_mjx.train --resume" in first.said
+    assert "SIGTERM: finishing this step" in second.complained
+
+
+def test_only_the_first_prints_and_writes(stopped, finished):
+    (first, second), run_dir, _ = stopped
+    assert "on 2 x cpu of 2 processes" in first.said
+    assert (second.said, first.complained) == ("", "")
+    (first, second), _ = finished
+    assert "last parameters: sha256" in first.said
+    assert (second.said, second.complained, first.complained) == ("", "", "")
+    assert not run_dir.with_name("nothing").exists()
+    assert len(list((run_dir / "tensorboard").iterdir())) == 1
+    assert {path.name for path in run_dir.iterdir()} == {
+        *(".lock", "config.yaml", "versions.json"),
+        *("metrics.jsonl", "tensorboard", "checkpoints"),
+    }
+
+
+def test_they_go_on_where_they_were_stopped(finished):
+    (first, second), run_dir = finished
+    assert (first.code, second.code) == (0, 0), first.err + second.err
+    assert f"going on after {SIZE:,} steps" in first.said
+    assert checkpoint_steps(run_dir) == [0, SIZE, 2 * SIZE, 4 * SIZE]
+    assert [line["env_steps"] for line in lines(run_dir)] == [0, 2 * SIZE, 4 * SIZE]
+
+
+def test_all_hold_the_same_parameters_and_environments_of_their_own(stopped, finished):
+    for first, second in (stopped[0], finished[0]):
+        assert len(first.told) == len(second.told) > 0
+        for one, other in zip(first.told, second.told, strict=True):
+            assert one["devices"] == other["devices"] == [1, 2]
+            assert one["parameters"] == other["parameters"]
+            for name in ("keys", "goals"):
+                assert len({tuple(x) for x in one[name] + other[name]}) == 128
+
+
+def test_they_end_with_the_bits_of_one_process_on_two_devices(alone, finished):
+    (first, _), run_dir = finished
+    ended, run_dir_alone = alone
+    assert first.told[-1] != ended.told[0]
+    assert first.told[-1]["parameters"] == ended.told[-1]["parameters"]
+    sums = [re.search(r"sha256 (\w+)", one.said)[1] for one in (first, ended)]
+    assert sums[0] == sums[1]
+    for ours, theirs in zip(lines(run_dir), lines(run_dir_alone), strict=True):
+        assert {k: v for k, v in ours.items() if not k.startswith("time")} == {
+            k: v for k, v in theirs.items() if not k.startswith("time")
+        }
+
+
+# One process by itself: nothing to wait for, and mistakes that cost one line.
+
+
+def test_alone_nothing_is_exchanged():
+    assert distributed.is_first()
+    assert distributed.exchange(3, 4).tolist() == [[3, 4]]
+    assert distributed.led(lambda: 5) == 5
+
+
+def heard(monkeypatch, index, said=0):
+    """Plays one of two processes, the other of which says a number; returns what this one says."""
+    told = []
+
+    def gathered(values):
+        told.append(values.tolist())
+        other = np.full_like(values, said)
+        return np.stack([values, other] if index == 0 else [other, values])
+
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "process_index", lambda: index)
+    monkeypatch.setattr(distributed.multihost_utils, "process_allgather", gathered)
+    return told
+
+
+def test_the_others_do_what_the_first_came_to(monkeypatch):
+    heard(monkeypatch, 1, said=1)
+    assert distributed.led(lambda: pytest.fail("only the first does it")) == 1
+
+
+def test_where_the_first_fails_all_leave(monkeypatch):
+    told = heard(monkeypatch, 0)
+    with pytest.raises(ZeroDivisionError):
+        distributed.led(lambda: 1 // 0)
+    assert told == [[distributed._FAILED]]
+    heard(monkeypatch, 1, said=distributed._FAILED)
+    with pytest.raises(UserError, match="process 0 could not go on"):
+        distributed.led(lambda: 0)
+
+
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        (
+            ("localhost", "2", "0"),
+            "JAX_COORDINATOR_ADDRESS = 'localhost' is wrong: write host:port",
+        ),
+        (("host:port", "2", "0"), "JAX_COORDINATOR_ADDRESS = 'host:port' is wrong"),
+        (("host:70000", "2", "0"), "JAX_COORDINATOR_ADDRESS = 'host:70000' is wrong"),
+        (("host:1234", "two", "0"), "JAX_NUM_PROCESSES = 'two' is wrong: it should be a whole"),
+        (("host:1234", "0", "0"), "JAX_NUM_PROCESSES = 0 is wrong: there is at least one"),
+        (("host:1234", "2", "-1"), "JAX_PROCESS_ID = '-1' is wrong: it should be a whole number"),
+        (("host:1234", "2", "2"), "JAX_PROCESS_ID = 2 is wrong: 2 processes count from 0 to 1"),
+        (("host:1234", "2", None), "JAX_PROCESS_ID is missing"),
+        (("host:1234", None, "1"), "JAX_NUM_PROCESSES is missing"),
+        ((None, "2", "1"), "JAX_COORDINATOR_ADDRESS is missing: give host:port of process 0"),
+    ],
+)
+def test_a_mistaken_variable_costs_one_line(monkeypatch, values, said):
+    for name, value in zip(VARIABLES, values, strict=True):
+        monkeypatch.delenv(name, raising=False)
+        if value is not None:
+            monkeypatch.setenv(name, value)
+    with pytest.raises(UserError) as caught:
+        train.main(["--config", SMOKE, "--distributed"])
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--seeds", "2"], "--distributed trains one policy, not seeds = 2"),
+        (STOCK, "--distributed is not known to trainer = 'brax'"),
+    ],
+)
+def test_what_several_processes_cannot_do_is_refused_before_they_meet(arguments, said):
+    with pytest.raises(UserError, match=said):
+        train.main(["--config", SMOKE, "--distributed", *arguments])
+
+
+def test_without_a_launcher_the_variables_are_named(monkeypatch):
+    def initialize(*args, **kwargs):
+        raise ValueError("coordinator_address should be defined.")
+
+    for name in VARIABLES:
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(jax.distributed, "initialize", initialize)
+    with pytest.raises(UserError, match=", ".join(VARIABLES[:1])) as caught:
+        train.main(["--config", SMOKE, "--distributed"])
+    assert all(name in str(caught.value) for name in VARIABLES)
+
+
+def test_processes_that_do_not_come_are_not_waited_for_without_end(tmp_path, unused_port):
+    program = "from jetbot_mjx.training import distributed as d; d.JOIN_SECONDS = 1; d.join()"
+    process = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=tmp_path,
+        env={
+            **os.environ,
+            **dict(zip(VARIABLES, (f"127.0.0.1:{unused_port()}", "2", "1"), strict=True)),
+        },
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert process.returncode == 2
+    assert len(process.stderr.splitlines()) == 1
+    assert "not all processes have met at 127.0.0.1" in process.stderr
+    assert "within 1 s" in process.stderr
+
+
+if __name__ == "__main__":
+    tell(*sys.argv[1:])

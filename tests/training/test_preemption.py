@@ -1,0 +1,345 @@
+"""Asked to stop in any phase, a training saves in time, and the same command goes on."""
+
+import contextlib
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import gliding
+import pytest
+
+sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
+
+import torture
+
+from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
+from jetbot_mjx.training import preemption
+from jetbot_mjx.training.preemption import STOPPED, Preemption
+
+LONG = 3_600
+PATIENCE = 300
+
+INTERVAL = 8_192
+"""Environment steps between two checkpoints: two training steps."""
+SETTINGS = (*torture.SETTINGS, f"checkpoint_interval={INTERVAL}")
+
+TRAINER = gliding.program("train")
+
+# The same trainer, which tells when it comes to a moment, and stays there for a while.
+DRIVER = """
+import sys, time
+
+sys.path.append({tests})
+
+def now(moment, seconds):
+    print("now:", moment, flush=True)
+    time.sleep(seconds)
+
+def dwell(owner, name, seconds):
+    original = getattr(owner, name)
+    def wrapper(*args, **kwargs):
+        now(name, seconds)
+        return original(*args, **kwargs)
+    setattr(owner, name, wrapper)
+
+def dwell_in_calls(seconds):
+    def compile(self, original=Program.compile):
+        self.call = original(self)
+        dwell(self, "call", seconds)
+        return self.call
+    Program.compile = compile
+
+{before_imports}
+import gliding
+from jetbot_mjx import cli, train
+from jetbot_mjx.training import session as training
+from jetbot_mjx.evaluation.evaluator import Evaluator
+from jetbot_mjx.training.ppo_trainer import Program
+from jetbot_mjx.runs.checkpoint_store import Store
+{before_training}
+with gliding.everywhere():
+    cli.run_command(train.main, at_once=True)
+"""
+
+
+def training(run_dir, before_training="", before_imports="", notice=300):
+    program = DRIVER.replace("{tests}", repr(str(Path(__file__).parents[1] / "helpers")))
+    program = program.replace("{before_training}", before_training)
+    program = program.replace("{before_imports}", before_imports)
+    return torture.Process(run_dir, [*SETTINGS, f"preemption_notice={notice}"], ["-c", program])
+
+
+def finish(run_dir):
+    return torture.finish(run_dir, SETTINGS, TRAINER)
+
+
+def stop(process, moment, number=signal.SIGTERM):
+    """Sends the signal at that moment, and gives the exit code."""
+    process.until(lambda: f"now: {moment}\n" in process.stdout)
+    process.send(number)
+    return process.wait()
+
+
+def assert_saved_and_gone(process, code, number=signal.SIGTERM):
+    assert code == STOPPED, process.stderr
+    assert process.stderr == (
+        f"\n{number.name}: finishing this step and saving (once more to leave without saving)\n"
+    )
+    last = process.stdout.splitlines()[-1]
+    assert last == f"stopped; to go on: python -m jetbot_mjx.train --resume {process.run_dir}"
+    assert process.unfinished == set()
+
+
+@pytest.fixture(scope="module")
+def undisturbed_run(tmp_path_factory):
+    return tmp_path_factory.mktemp("preemption") / "undisturbed"
+
+
+@pytest.fixture(scope="module")
+def undisturbed(undisturbed_run):
+    return finish(undisturbed_run)
+
+
+@pytest.fixture
+def begun(undisturbed, undisturbed_run, tmp_path):
+    """The folder of a training that was stopped after its first interval."""
+    run_dir = shutil.copytree(undisturbed_run, tmp_path / "begun")
+    for steps in checkpoint_steps(run_dir):
+        if steps > INTERVAL:
+            shutil.rmtree(checkpoint_path(run_dir, steps))
+    return run_dir
+
+
+def test_while_importing_the_signal_ends_the_process_and_nothing_is_written(tmp_path):
+    with training(tmp_path / "run", before_imports=f"now('imports', {LONG})") as process:
+        assert stop(process, "imports") == -signal.SIGTERM
+    assert not (tmp_path / "run").exists()
+
+
+def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
+    with training(tmp_path / "run", f"dwell(training, 'make_env', {LONG})") as process:
+        assert stop(process, "make_env") == -signal.SIGTERM
+    assert not (tmp_path / "run").exists()
+
+
+def test_compiling_before_the_first_checkpoint_it_writes_that_and_goes_on(undisturbed, tmp_path):
+    with training(tmp_path / "run", f"dwell(Program, 'compile', {LONG})") as process:
+        code = stop(process, "compile")
+    assert_saved_and_gone(process, code)
+    assert checkpoint_steps(tmp_path / "run") == [0]
+    assert torture.differences(undisturbed, finish(tmp_path / "run")) == []
+
+
+def test_compiling_after_a_checkpoint_it_does_not_wait_for_the_compiler(begun):
+    with training(begun, f"dwell(Program, 'compile', {LONG})") as process:
+        code = stop(process, "compile")
+    assert_saved_and_gone(process, code)
+    assert checkpoint_steps(begun) == [0, INTERVAL]
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+def test_between_two_reports_it_saves_where_it_is_and_goes_on(number, begun, undisturbed):
+    with training(begun, "dwell_in_calls(1)") as process:
+        code = stop(process, "call", number)
+    assert_saved_and_gone(process, code, number)
+    assert checkpoint_steps(begun) == [0, INTERVAL, INTERVAL + INTERVAL // 2]
+    if number == signal.SIGTERM:
+        assert torture.differences(undisturbed, finish(begun)) == []
+
+
+def test_while_evaluating_it_finishes_that_and_saves(begun):
+    with training(begun, "dwell(Evaluator, 'run', 1)") as process:
+        code = stop(process, "run")
+    assert_saved_and_gone(process, code)
+    assert checkpoint_steps(begun) == [0, INTERVAL, 2 * INTERVAL]
+
+
+def test_while_saving_it_finishes_that(begun):
+    with training(begun) as process:
+        process.until(lambda: process.unfinished)
+        process.send(signal.SIGTERM)
+        code = process.wait()
+    assert_saved_and_gone(process, code)
+    assert 2 * INTERVAL in checkpoint_steps(begun)
+
+
+def test_what_takes_longer_than_the_notice_is_cut_off(begun):
+    notice = 10
+    with training(begun, f"dwell(Evaluator, 'run', {LONG})", notice=notice) as process:
+        process.until(lambda: "now: run\n" in process.stdout)
+        began = time.monotonic()
+        process.send(signal.SIGTERM)
+        assert process.wait() == STOPPED
+    assert time.monotonic() - began < notice
+    assert "8 s after SIGTERM: leaving without another save" in process.stderr
+    assert "Traceback" not in process.stderr
+    assert checkpoint_steps(begun) == [0, INTERVAL]
+    with torture.Process(begun, SETTINGS, TRAINER) as process:
+        process.until(lambda: "run folder: " in process.stdout)
+    torture.check_start(process, [0, INTERVAL])
+
+
+# What follows needs the module alone, and no training.
+
+LISTENER = f"""
+import hashlib, importlib.util, os, signal, time
+spec = importlib.util.spec_from_file_location("preemption", {preemption.__file__!r})
+preemption = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(preemption)
+
+def send(number=signal.SIGTERM):
+    os.kill(os.getpid(), number)
+
+"""
+
+
+def listen(program, notice=300):
+    """Runs lines of Python under `Preemption`; gives the exit code, the seconds and stderr."""
+    lines = [f"with preemption.Preemption({notice}) as asked:", *program.splitlines()]
+    process = subprocess.Popen(
+        [sys.executable, "-c", LISTENER + "\n    ".join(lines)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    with process:
+        try:
+            assert process.stdout.readline() == "listening\n"
+            began = time.monotonic()
+            _, stderr = process.communicate(timeout=PATIENCE)
+        finally:
+            process.kill()
+    return process.returncode, time.monotonic() - began, stderr
+
+
+def test_a_second_signal_leaves_at_once():
+    code, _, stderr = listen(
+        f"print('listening', flush=True)\nsend()\ntime.sleep(1)\nsend()\ntime.sleep({LONG})"
+    )
+    assert code == STOPPED
+    assert stderr.splitlines()[-1].startswith("second SIGTERM: leaving without another save")
+
+
+def test_the_same_signal_twice_over_is_one():
+    code, _, stderr = listen(
+        "print('listening', flush=True)\nsend()\nsend()\nsend(signal.SIGINT)\n"
+        "asked.wait(60)\ntime.sleep(1)\nos._exit(3)"
+    )
+    assert code == 3
+    assert len(re.findall("finishing this step", stderr)) == 1
+
+
+def test_the_clock_runs_while_the_main_thread_is_inside_a_c_function():
+    notice = 5
+    code, seconds, stderr = listen(
+        """\
+import threading
+threading.Timer(0.5, send).start()
+print('listening', flush=True)
+hashlib.pbkdf2_hmac('sha256', b'', b'salt', 2**31 - 1)""",
+        notice,
+    )
+    assert code == STOPPED
+    assert seconds < notice + 0.5
+    assert "4 s after SIGTERM: leaving" in stderr
+
+
+def test_a_notice_of_ages_is_no_error():
+    code, _, stderr = listen(
+        "print('listening', flush=True)\nsend()\nasked.wait(60)\ntime.sleep(0.5)\nos._exit(3)",
+        notice=1e308,
+    )
+    assert code == 3
+    assert len(stderr.strip().splitlines()) == 1
+
+
+def test_another_signal_with_a_handler_is_no_wish_to_stop():
+    code, _, stderr = listen(
+        """\
+signal.signal(signal.SIGUSR1, lambda *_: None)
+print('listening', flush=True)
+send(signal.SIGUSR1)
+os._exit(3 if not asked.wait(1) else 4)"""
+    )
+    assert (code, stderr) == (3, "")
+
+
+def test_no_clock_outlives_the_training():
+    code, _, _ = listen(
+        """\
+import threading
+class Late(threading.Timer):
+    def __init__(self, *args):
+        time.sleep(0.5)
+        super().__init__(*args)
+threading.Timer = Late
+print('listening', flush=True)
+with preemption.Preemption(2) as inner:
+    send()
+    inner.wait(60)
+time.sleep(4)
+os._exit(3)"""
+    )
+    assert code == 3
+
+
+def handlers():
+    wakeup = signal.set_wakeup_fd(-1)
+    signal.set_wakeup_fd(wakeup)
+    return [signal.getsignal(signal.SIGTERM), signal.getsignal(signal.SIGINT), wakeup]
+
+
+@pytest.fixture
+def former():
+    """A handler and a wakeup file of somebody else's, put in place; gives what `handlers` says."""
+    reader, writer = os.pipe()
+    os.set_blocking(writer, False)
+    handler = signal.signal(signal.SIGTERM, lambda number, frame: None)
+    wakeup = signal.set_wakeup_fd(writer)
+    yield handlers()
+    signal.set_wakeup_fd(wakeup)
+    signal.signal(signal.SIGTERM, handler)
+    os.close(reader)
+    os.close(writer)
+
+
+@pytest.mark.parametrize("error", [None, ValueError])
+def test_former_handlers_are_put_back(error, former):
+    threads = threading.active_count()
+    with pytest.raises(error) if error else contextlib.nullcontext(), Preemption(60) as asked:
+        assert all(now != then for now, then in zip(handlers(), former, strict=True))
+        signal.raise_signal(signal.SIGTERM)
+        assert asked.wait(PATIENCE)
+        assert asked.requested
+        if error:
+            raise error
+    assert handlers() == former
+    deadline = time.monotonic() + PATIENCE
+    while threading.active_count() > threads:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_outside_the_main_thread_it_does_nothing():
+    seen = []
+
+    def work():
+        before = handlers_by_name()
+        with Preemption(60) as asked:
+            seen.append(handlers_by_name() == before)
+            seen.append(asked.requested)
+        seen.append(handlers_by_name() == before)
+
+    def handlers_by_name():
+        return [signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)]
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert seen == [True, False, True]

@@ -1,0 +1,181 @@
+"""Films of the evaluations: what they must not touch, and what they must not cost."""
+
+import json
+import time
+
+import imageio.v3 as iio
+import numpy as np
+import pytest
+
+from jetbot_mjx import load_config, make_env
+from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps, read_about
+from jetbot_mjx.runs.metrics import CompileClock
+from jetbot_mjx.training import run_recorder, session
+from jetbot_mjx.training.callbacks import Progress
+from jetbot_mjx.viewers import offscreen, video
+
+PARAMS = PolicyParams(normalizer=np.zeros(1), policy=np.ones(2), value=np.zeros(1))
+
+
+@pytest.fixture
+def recorder(root, tmp_path, monkeypatch):
+    """Makes recorders that judge by heart."""
+
+    class Evaluator:
+        def __init__(self, env, networks, **_):
+            pass
+
+        def run(self, params, keys):
+            one, place = np.ones(len(keys)), np.zeros((len(keys), 2))
+            return Episodes(
+                success=one,
+                steps=one,
+                episode_return=one,
+                terminated=one,
+                nonfinite=0 * one,
+                path_length=one,
+                start_w=place,
+                start_yaw=0 * one,
+                end_w=place,
+                goal_w=np.zeros((1, 3)),
+                goal=None,
+                qpos=None,
+            )
+
+    monkeypatch.setattr(run_recorder, "Evaluator", Evaluator)
+    clocks = []
+
+    def recorder(*settings):
+        config = load_config(root / "configs" / "smoke.yaml", settings)
+        folders = [tmp_path / f"seed-{index}" for index in range(config.seeds)]
+        for folder in folders:
+            folder.mkdir(exist_ok=True)
+        clocks.append(CompileClock())
+        return run_recorder.RunRecorder(config, make_env(config), folders, clocks[-1])
+
+    yield recorder
+    for clock in clocks:
+        clock.__exit__()
+
+
+@pytest.fixture
+def events(monkeypatch, tmp_path):
+    """What is saved and what is filmed, in their order, and how long the log is then."""
+    found = []
+
+    def lines(run_dir):
+        return len((run_dir / "metrics.jsonl").read_text().splitlines())
+
+    class Film:
+        def __init__(self, env, networks, **_):
+            pass
+
+        def write(self, path, params, env_steps):
+            time.sleep(0.2)
+            run_dir = path.parents[2]
+            found.append(("film", str(path.relative_to(run_dir)), run_dir.name, lines(run_dir)))
+
+    class Store(run_recorder.Store):
+        def save(self, env_steps, *arguments):
+            run_dir = self._folder.parent
+            found.append(("save", env_steps, run_dir.name, lines(run_dir)))
+            super().save(env_steps, *arguments)
+
+    monkeypatch.setattr(run_recorder, "EvaluationFilm", Film)
+    monkeypatch.setattr(run_recorder, "Store", Store)
+    monkeypatch.setattr(run_recorder, "find_backend", lambda: "egl")
+    return found
+
+
+def report(recorder, *env_steps, seeds=1):
+    for steps in env_steps:
+        assert recorder.report([Progress(steps, PARAMS, {}, 1.0)] * seeds)
+
+
+def times(folder):
+    lines = (folder / "metrics.jsonl").read_text().splitlines()
+    return [json.loads(line)["time/recording_seconds"] for line in lines]
+
+
+def test_every_seed_is_filmed_after_all_are_logged_and_saved(recorder, events, tmp_path):
+    with recorder("evaluation.video=true", "seeds=2") as it:
+        report(it, 0, 4096, seeds=2)
+    assert events == [
+        (what, name, f"seed-{seed}", line)
+        for line, steps in enumerate((0, 4096), start=1)
+        for what, name in (("save", steps), ("film", f"videos/{steps:012}/evaluation.mp4"))
+        for seed in (0, 1)
+    ]
+    # The time that films take is told, with the next line.
+    before, after = times(tmp_path / "seed-0")
+    assert before == 0
+    assert after > 0.4
+
+
+def test_nothing_is_prepared_where_nothing_is_asked_for(recorder, tmp_path, monkeypatch):
+    def refuse(*arguments):
+        raise AssertionError("this was not asked for")
+
+    for name in ("EvaluationFilm", "find_backend"):
+        monkeypatch.setattr(run_recorder, name, refuse)
+    with recorder() as it:
+        report(it, 0)
+    assert not (tmp_path / "seed-0" / "videos").exists()
+
+
+def test_without_opengl_training_goes_on_after_one_line(recorder, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit(1) # {backend}")
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    offscreen.find_backend.cache_clear()
+    try:
+        with recorder("evaluation.video=true") as it:
+            report(it, 0, 4096, 8192)
+    finally:
+        offscreen.find_backend.cache_clear()
+    told = [line for line in capsys.readouterr().out.splitlines() if "OpenGL" in line]
+    assert len(told) == 1
+    assert "evaluation.video: nothing is filmed" in told[0]
+    assert "apt-get install" in told[0]
+    assert not (tmp_path / "seed-0" / "videos").exists()
+    assert checkpoint_steps(tmp_path / "seed-0") == [0, 4096, 8192]
+
+
+def test_a_full_disk_costs_one_line_and_no_checkpoint(recorder, events, tmp_path):
+    (tmp_path / "seed-0").mkdir()
+    (tmp_path / "seed-0" / "videos").write_text("a file where a folder should be")
+    with recorder("evaluation.video=true") as it, pytest.raises(UserError, match="cannot be writ"):
+        report(it, 0)
+    assert checkpoint_steps(tmp_path / "seed-0") == [0]
+
+
+def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
+    root, smoke_run, tmp_path, monkeypatch
+):
+    try:
+        offscreen.find_backend()
+    except UserError as error:
+        pytest.skip(str(error))
+    monkeypatch.setattr(video.EvaluationFilm, "_SIDE", 64)
+    monkeypatch.setattr(video.EvaluationFilm, "_FPS", 2.0)
+    settings = ["evaluation.video=true", "ppo.num_timesteps=16384"]
+    config = load_config(root / "configs" / "smoke.yaml", settings)
+    session.run(config, tmp_path / "run")
+    assert checkpoint_steps(tmp_path / "run") == [0, 16_384]
+    for steps in (0, 16_384):
+        ours, theirs = (
+            read_about(checkpoint_path(folder, steps)) for folder in (tmp_path / "run", smoke_run)
+        )
+        for tree in ("policy", "training"):
+            assert ours["sha256"][tree] == theirs["sha256"][tree]
+        assert ours["figures"] == theirs["figures"]
+        path = tmp_path / "run" / "videos" / f"{steps:012}" / "evaluation.mp4"
+        pictures = iio.imread(path, plugin="pyav")
+        assert pictures.shape[1:] == (64, video.EvaluationFilm.GOALS * 64, 3)
+        assert len(pictures) > 4
+    lines = [
+        json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    ]
+    assert lines[1]["time/recording_seconds"] > 0.5

@@ -1,0 +1,469 @@
+"""The page's server, scene and panel, without a browser: `test_page.py` has one."""
+
+import io
+import math
+import re
+import socket
+import types
+import urllib.error
+import urllib.request
+
+import mujoco
+import numpy as np
+import pytest
+
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.viewers.player import Player
+
+pytest.importorskip("viser")
+
+import trimesh
+import viser
+import websockets.exceptions
+import websockets.sync.client
+
+from jetbot_mjx.viewers import viser_server as module
+from jetbot_mjx.viewers.viser_panel import Panel
+from jetbot_mjx.viewers.viser_scene import Scene
+from jetbot_mjx.viewers.viser_server import FIRST_PORT, Browser, free_port
+
+
+@pytest.fixture(scope="module")
+def player(smoke_run):
+    return Player(smoke_run)
+
+
+@pytest.fixture(scope="module")
+def browser(player, unused_port):
+    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
+        yield browser
+
+
+@pytest.fixture(autouse=True)
+def as_new(player):
+    player.paused = True  # so that a test alone decides about steps
+    player.reset()
+
+
+def answer(browser):
+    """Lets the loop do what was asked for, and show it."""
+    browser.work()
+    browser.scene.show()
+    browser.panel.tell()
+
+
+# The server.
+
+
+def test_the_page_and_its_data_come_from_one_port(browser):
+    address = f"127.0.0.1:{browser.server.get_port()}"
+    with urllib.request.urlopen(f"http://{address}/", timeout=10) as answer:
+        assert answer.headers["Content-Type"].startswith("text/html")
+        assert b"<html" in answer.read()
+    protocol = f"viser-v{viser.__version__}"
+    with websockets.sync.client.connect(f"ws://{address}", subprotocols=[protocol]) as page:
+        assert len(page.recv(timeout=10)) > 1000
+
+
+def knock(browser, origin, host=None):
+    """Whether a page from somewhere is sent anything, as a real client sees it."""
+    here = ("127.0.0.1", browser.server.get_port())
+    try:
+        with websockets.sync.client.connect(
+            f"ws://{host or f'127.0.0.1:{here[1]}'}",
+            sock=socket.create_connection(here),
+            origin=origin,
+            subprotocols=[f"viser-v{viser.__version__}"],
+        ) as page:
+            return len(page.recv(timeout=10)) > 1000
+    except websockets.exceptions.InvalidStatus as error:
+        return {403: False}[error.response.status_code]
+
+
+def test_a_page_from_elsewhere_is_refused_and_our_own_let_in(player, unused_port):
+    port = unused_port()
+    told = []
+    with Browser(
+        player,
+        host="127.0.0.1",
+        port=port,
+        allow=["https://hub.example.org"],
+        tell=told.append,
+    ) as browser:
+        for origin in (f"http://127.0.0.1:{port}", None, "https://hub.example.org"):
+            assert knock(browser, origin)
+        # Through a tunnel, from another port of another machine.
+        assert knock(browser, "http://localhost:9999", host="localhost:9999")
+        assert told == []
+        for origin in ("http://evil.example", "null", f"http://localhost:{port}"):
+            assert not knock(browser, origin)
+            assert not knock(browser, origin)
+        # A name that was pointed at this machine after the page had been served.
+        assert not knock(browser, f"http://evil.example:{port}", host=f"evil.example:{port}")
+        assert len(told) == 4
+        assert "'http://evil.example' asked to connect; to let it in, --allow-origin" in told[0]
+        for number in range(20):
+            assert not knock(browser, f"http://evil.example:{number + 1}")
+        assert len(told) == 10
+
+
+@pytest.mark.parametrize(
+    ("listening", "origin", "host", "lets_in"),
+    [
+        ("127.0.0.1", "http://[::1]:8080", "[::1]:8080", True),
+        ("0.0.0.0", "http://192.0.2.7:8080", "192.0.2.7:8080", True),
+        ("0.0.0.0", "http://this-machine:8080", "this-machine:8080", True),
+        ("0.0.0.0", "http://this-machine.local:8080", "This-Machine.local:8080", True),
+        ("0.0.0.0", "http://this-machine.evil.example", "this-machine.evil.example", False),
+        ("robots.example", "https://robots.example", "robots.example", True),
+        ("robots.example", "http://evil.example", "evil.example", False),
+        ("127.0.0.1", "http://127.0.0.1:3000", "127.0.0.1:8080", False),
+        ("127.0.0.1", "http://127.0.0.1:8080", "", False),
+        ("127.0.0.1", "http://", "", False),
+        ("127.0.0.1", "", "", False),
+        ("127.0.0.1", "http://[", "[", False),
+        ("127.0.0.1", "file://localhost", "localhost", False),
+        ("127.0.0.1", "http://localhost@evil.example", "evil.example", False),
+    ],
+)
+def test_a_page_is_let_in_from_where_the_player_is(listening, origin, host, lets_in, monkeypatch):
+    monkeypatch.setattr(socket, "gethostname", lambda: "This-Machine")
+    assert module._Door(listening, [], print).lets_in(origin, host) is lets_in
+
+
+def test_a_viser_that_lets_all_pages_in_is_refused(player, unused_port, monkeypatch):
+    elsewhere = types.SimpleNamespace(serve=None)
+    monkeypatch.setattr(module.websockets.asyncio, "server", elsewhere)
+    monkeypatch.setattr(module, "_Server", lambda host, port, **options: Served(port))
+    with pytest.raises(UserError, match="lets in pages from anywhere: pip install viser=="):
+        Browser(player, host="127.0.0.1", port=unused_port(), tell=print)
+    assert Served.stopped
+
+
+class Served:
+    stopped = False
+
+    def __init__(self, port):
+        self.get_port = lambda: port
+
+    def stop(self):
+        Served.stopped = True
+
+
+def test_only_this_machine_is_listened_to(browser):
+    # Another address of the same loopback: served only where all addresses are.
+    with pytest.raises(urllib.error.URLError, match="refused"):
+        urllib.request.urlopen(f"http://127.0.0.2:{browser.server.get_port()}/", timeout=10)
+
+
+def test_nothing_is_shared_through_other_machines(browser):
+    assert browser.server.request_share_url() is None
+
+
+def test_starting_and_stopping_say_nothing(player, capfd, unused_port):
+    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print):
+        pass
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_busy_port_is_refused_where_it_was_asked_for():
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"--port {port} cannot be had") as caught:
+            free_port("127.0.0.1", port)
+    assert "\n" not in str(caught.value)
+    assert free_port("127.0.0.1", port) == port
+
+
+def test_without_a_wish_the_next_free_port_is_taken(monkeypatch):
+    assert free_port("127.0.0.1", None) >= FIRST_PORT
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        monkeypatch.setattr(module, "FIRST_PORT", port)
+        assert port < free_port("127.0.0.1", None) < port + 10
+
+
+def test_a_port_that_is_taken_meanwhile_is_refused(player):
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        with pytest.raises(UserError, match=f"--port {port} was taken meanwhile"):
+            Browser(player, host="127.0.0.1", port=port, tell=print)
+
+
+@pytest.mark.parametrize(
+    "host", ["nowhere.invalid", "203.0.113.1", "", "a..b", "x" * 300, "\udcff"]
+)
+def test_an_address_of_no_machine_or_another_is_refused(host):
+    with pytest.raises(UserError, match=f"--host {re.escape(repr(host))} is no address"):
+        free_port(host, None)
+
+
+# The scene.
+
+
+def node(browser, body, geom):
+    return browser.server.scene.get_handle_by_name(f"/{body}/{geom}")
+
+
+def test_every_visual_geom_stands_where_mujoco_puts_it(browser, player):
+    player.agent = "keyboard"
+    player.drive(0.6, 1.5)
+    for _ in range(40):
+        player.tick()
+    browser.scene.show()
+    model = player.env.mj_model
+    data = mujoco.MjData(model)
+    data.qpos[:] = player.shown.qpos
+    data.mocap_pos[0] = player.shown.goal_w
+    mujoco.mj_kinematics(model, data)
+    seen = 0
+    for index in range(model.ngeom):
+        geom = model.geom(index)
+        if geom.group[0] == 3 or geom.name == "floor":
+            continue
+        body = model.body(geom.bodyid[0]).name
+        frame = browser.server.scene.get_handle_by_name(f"/{body}")
+        part = node(browser, body, geom.name)
+        place, turn = np.zeros(3), np.zeros(4)
+        mujoco.mju_mulPose(
+            place, turn, frame.position, frame.wxyz, np.array(part.position), np.array(part.wxyz)
+        )
+        np.testing.assert_allclose(place, data.geom_xpos[index], atol=1e-9)
+        matrix = np.zeros(9)
+        mujoco.mju_quat2Mat(matrix, turn)
+        np.testing.assert_allclose(matrix, data.geom_xmat[index], atol=1e-6)
+        seen += 1
+    assert seen == 27  # the robot's 26 and the goal
+    assert np.linalg.norm(player.shown.qpos[QPOS_XYZ][:2]) > 0.2
+
+
+def test_the_goal_is_red_and_has_its_size(browser):
+    cube = node(browser, "goal", "goal")
+    red, green, blue = cube.color
+    assert red > 3 * max(green, blue)
+    np.testing.assert_allclose(np.ptp(cube.vertices, axis=0), 0.1, rtol=1e-6)
+
+
+def test_only_shadows_need_a_floor_that_fills_the_page(browser):
+    plane, lines = map(browser.server.scene.get_handle_by_name, ("/floor", "/lines"))
+    assert (plane.visible, lines.visible) == (False, True)
+    floor = trimesh.load_scene(io.BytesIO(lines.glb_data), file_type="glb")
+    assert floor.area < 0.1 * plane.width * plane.height
+    np.testing.assert_allclose(floor.extents, (plane.width, plane.height, 0.0), atol=0.01)
+    browser.scene.cast_shadows(True)
+    assert (plane.visible, lines.visible) == (True, False)
+    browser.scene.cast_shadows(False)
+    assert (plane.visible, lines.visible) == (False, True)
+
+
+def test_a_ray_from_above_moves_the_goal_to_where_it_meets_the_floor(browser, player):
+    browser.scene.point((1.0, 0.0, 2.0), (-0.1, 0.3, -1.0))
+    answer(browser)
+    np.testing.assert_allclose(player.shown.goal_w, [0.8, 0.6, 0.05], atol=1e-6)
+
+
+def test_a_goal_that_is_dragged_keeps_under_the_pointer(browser, player):
+    player.move_goal(0.5, 0.5)
+    # Grabbed at the top of its edge, 0.1 m above the floor.
+    browser.scene.point((0.0, 0.0, 1.1), (0.3, 0.4, -1.0), (0.05, 0.0, 0.1))
+    answer(browser)
+    np.testing.assert_allclose(player.shown.goal_w, [0.25, 0.4, 0.05], atol=1e-6)
+
+
+@pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, -0.01)])
+def test_a_ray_that_misses_the_floor_moves_nothing(browser, player, direction):
+    before = player.shown.goal_w
+    browser.scene.point((0.0, 0.0, 1.0), direction)
+    answer(browser)
+    np.testing.assert_array_equal(player.shown.goal_w, before)
+
+
+class Client:
+    def __init__(self):
+        self.camera = types.SimpleNamespace(position=None, look_at=None)
+        self.notifications = []
+
+    def add_notification(self, title, body, **_):
+        self.notifications.append(body)
+
+
+@pytest.fixture
+def client(browser, monkeypatch):
+    """A page's camera, as viser would hand it out."""
+    client = Client()
+    monkeypatch.setattr(browser.server, "get_clients", lambda: {0: client})
+    yield client
+    browser.panel.camera.value = "free"
+    answer(browser)
+
+
+def test_the_camera_looks_at_the_robot_from_where_the_user_put_it(browser, player, client):
+    browser.panel.camera.value = "looks at the robot"
+    answer(browser)
+    np.testing.assert_allclose(client.camera.look_at, player.shown.qpos[QPOS_XYZ])
+    assert client.camera.position is None
+
+
+def test_the_camera_drives_behind_the_robot(browser, player, client):
+    browser.panel.camera.value = "behind the robot"
+    player.agent = "keyboard"
+    player.drive(0.3, -1.2)
+    for _ in range(60):
+        player.tick()
+    for _ in range(120):
+        answer(browser)
+    robot_w = player.shown.qpos[QPOS_XYZ]
+    w, _, _, z = player.shown.qpos[QPOS_QUAT]
+    heading = 2 * math.atan2(z, w)
+    behind = client.camera.position - robot_w
+    assert math.atan2(-behind[1], -behind[0]) == pytest.approx(heading, abs=0.02)
+    assert behind[2] > 0.3
+    ahead = client.camera.look_at - robot_w
+    assert math.atan2(ahead[1], ahead[0]) == pytest.approx(heading, abs=0.02)
+
+
+def test_a_free_camera_is_left_alone(browser, client):
+    answer(browser)
+    assert client.camera.look_at is None
+
+
+# The panel.
+
+
+def test_the_panel_reads_what_the_player_does(browser, player):
+    panel = browser.panel
+    player.successes, player.episodes, player.outcome = 2, 3, "reached"
+    player.move_goal(0.3, 0.4)
+    player.tick()
+    answer(browser)
+    assert panel.goals.value == "2 of 3 reached"
+    assert panel.episode.value == "0.0 of 4.3 s"
+    assert panel.distance.value == "0.50 m"
+    assert "steps/s" in panel.pace.value
+    player.shown = player.shown._replace(done=np.float32(1))
+    panel.tell()
+    assert panel.episode.value == "0.0 of 4.3 s, reached"
+
+
+def test_the_panel_changes_who_drives(browser, player):
+    panel = browser.panel
+    panel.agent.value = "keyboard"
+    answer(browser)
+    assert player.agent == "keyboard"
+    assert panel.wheel.visible
+    panel.agent.value = "scripted"
+    answer(browser)
+    assert player.agent == "scripted"
+    assert not panel.wheel.visible
+
+
+def test_the_panel_switches_the_checkpoint(browser, player):
+    first, last = player.checkpoints[0], player.checkpoints[-1]
+    for steps in (first, last):
+        browser.panel.checkpoint.value = f"{steps:,} steps"
+        answer(browser)
+        assert player.checkpoint == steps
+
+
+def test_a_checkpoint_that_cannot_be_used_is_told_on_the_page(browser, player, client, tmp_path):
+    panel, before, run_dir = browser.panel, player.checkpoint, player.run_dir
+    other = next(steps for steps in player.checkpoints if steps != before)
+    player.run_dir = tmp_path
+    try:
+        panel.checkpoint.value = f"{other:,} steps"
+        browser.work()
+    finally:
+        player.run_dir = run_dir
+    assert len(client.notifications) == 1
+    assert "no checkpoint at" in client.notifications[0]
+    assert panel.checkpoint.value == f"{before:,} steps"
+    assert player.checkpoint == before
+    answer(browser)
+
+
+def press(browser, button):
+    browser.panel.buttons.value = button
+    answer(browser)
+
+
+def test_the_buttons_pause_step_and_begin_anew(browser, player):
+    player.agent = "scripted"
+    player.paused = False
+    press(browser, "Pause")
+    assert player.paused
+    assert browser.panel.buttons.options[0] == "Go on"
+    before = player.time
+    press(browser, "Step")
+    assert player.time == pytest.approx(before + 1 / 60)
+    goal_w = player.shown.goal_w
+    press(browser, "New episode")
+    assert player.time == 0
+    assert not np.allclose(player.shown.goal_w, goal_w)
+    press(browser, "Go on")
+    assert not player.paused
+    assert browser.panel.buttons.options[0] == "Pause"
+
+
+def test_the_pace_is_the_users(browser, player):
+    browser.panel.speed.value = 2.5
+    answer(browser)
+    assert player.speed == 2.5
+    browser.panel.speed.value = 1.0
+    answer(browser)
+
+
+def test_sliders_and_keys_ask_for_the_same(browser, player):
+    panel = browser.panel
+    panel.agent.value = "keyboard"
+    panel.ahead.value, panel.left.value = 0.5, -90
+    answer(browser)
+    assert player.asked == pytest.approx((0.5, -math.pi / 2))
+    keys = {command.hotkey: command for command in panel._keys}
+    assert not any(command.disabled for command in keys.values())
+    for key in "IL":
+        for call in keys[key]._impl.trigger_cb:
+            call(None)
+    answer(browser)
+    answer(browser)  # what the sliders called back
+    assert player.asked == pytest.approx((0.625, -math.radians(112)), abs=0.01)
+    assert panel.ahead.value == pytest.approx(0.625)
+    for call in keys["H"]._impl.trigger_cb:
+        call(None)
+    answer(browser)
+    answer(browser)
+    assert player.asked == (0.0, 0.0)
+    panel.agent.value = "policy"
+    answer(browser)
+    assert all(command.disabled for command in keys.values())
+
+
+def test_a_checkpoint_written_meanwhile_can_be_chosen(browser, player, monkeypatch):
+    steps = [*player.checkpoints, 999_424]
+    monkeypatch.setattr(Player, "checkpoints", steps)
+    browser.panel.tell()
+    assert browser.panel.checkpoint.options[-1] == "999,424 steps"
+
+
+def test_a_task_whose_goals_stay_says_so_and_plays_on(player, monkeypatch):
+    monkeypatch.setattr(player, "cannot_move_goal", "the goal stays: because")
+    said = []
+    monkeypatch.setattr(viser.GuiApi, "add_markdown", lambda _, content: said.append(content))
+    asked = []
+
+    def ask(do, *given):
+        asked.append((do, given))
+
+    server = viser.ViserServer("127.0.0.1", 0, verbose=False)
+    try:
+        scene = Scene(server, player, ask)
+        Panel(server, player, scene, ask)
+        assert "the goal stays: because" in said
+        before = player.shown.goal_w
+        scene.point((0.0, 0.0, 1.0), (0.1, 0.1, -1.0))
+        for do, given in asked:
+            do(*given)
+        np.testing.assert_array_equal(player.shown.goal_w, before)
+        player.tick()
+    finally:
+        server.stop()
