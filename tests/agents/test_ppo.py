@@ -1,5 +1,6 @@
 """The training step: stock Brax's, number by number, and what it does where a number is none."""
 
+import contextlib
 import functools
 import json
 import os
@@ -40,10 +41,22 @@ def smoke(root):
     return load_config(root / "configs" / "smoke.yaml")
 
 
+@contextlib.contextmanager
+def full_precision():
+    """No TF32 on a GPU, in all threads: a training compiles in one of its own."""
+    name = "jax_default_matmul_precision"
+    before = jax.config.values[name]
+    jax.config.update(name, "highest")
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
+
+
 @pytest.fixture
 def glide():
     """What a training builds glides, in full precision."""
-    with gliding.everywhere(), jax.default_matmul_precision("highest"):
+    with gliding.everywhere(), full_precision():
         yield
 
 
@@ -634,7 +647,7 @@ SEEDS = 3
 def several(smoke, tmp_path_factory):
     """Three seeds from 5 on, trained at once over two checkpoints, and their result."""
     config = with_ppo(smoke, num_timesteps=2 * SIZE, checkpoint_interval=SIZE, seed=5, seeds=SEEDS)
-    with gliding.everywhere(), jax.default_matmul_precision("highest"):
+    with gliding.everywhere(), full_precision():
         return config, session.run(config, tmp_path_factory.mktemp("seeds") / "run")
 
 
