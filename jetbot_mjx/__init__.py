@@ -1,6 +1,6 @@
 """Train a JetBot to drive to goals, thousands at a time: MuJoCo MJX and Brax's PPO.
 
-The rooms of this package, each importing only from those before it:
+The subpackages, each of which imports only from those before it:
 
 - `compiler`: one kernel for all robots from a JAX function of one
 - `envs`: robot, task, physics, episodes
@@ -12,9 +12,9 @@ The rooms of this package, each importing only from those before it:
 - `deployment`: a policy without JAX
 - `adapters`: Gymnasium and Stable-Baselines3, for other people's programs
 
-At the root stand what all rooms know (`config`, `errors`) and the commands, which meet only in the
-run folder: `python -m jetbot_mjx` lists them. A public name is imported at its first use, so that a
-command that is mistyped says so at once and a GPU wakes while the rest loads.
+The root holds the modules that all subpackages use (`config`, `errors`) and the commands, which
+share only the run folder: `python -m jetbot_mjx` lists them. A public name is imported at its first
+use, so that a mistyped command fails at once and a GPU initialises while the rest is imported.
 """
 
 from typing import TYPE_CHECKING
@@ -39,7 +39,7 @@ __version__ = "0.1.0"
 _leave_at_once()
 _lighten()
 
-# Configurations and runs name tasks by these names alone, whatever module they live in.
+# Configurations and runs refer to tasks by these names, independently of the module they are in.
 __getattr__, __dir__ = _load_lazily(
     __name__,
     {

@@ -23,17 +23,17 @@ COMMANDS = (
     "new_task",
     "check_env",
 )
-"""In the order in which a user comes to them."""
+"""Names of the commands, in the order in which a user needs them."""
 
 _ALONE = "python -m jetbot_mjx"
 _WHAT_AND_HOW = re.compile(r"(?P<what>.+?): `(?P<how>python -m jetbot_mjx\.[^`]+)`")
 
 
 def run() -> dict[str, str]:
-    """What each command does, from its own first line; none of them is imported.
+    """Return the description of each command from its module's first line, without importing it.
 
     Returns:
-      Sentences by what is to be typed, in the order of `COMMANDS`.
+      The descriptions by command line, in the order of `COMMANDS`.
     """
     found = {}
     for name in COMMANDS:
@@ -45,17 +45,17 @@ def run() -> dict[str, str]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command that is named, or print the list.
+    """Run the given command, or print the list of commands.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
-      0, or 2 where there is no such command. A command that runs ends the process with its own.
+      0, or 2 if there is no such command. A command that runs ends the process with its own code.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words and words[0] in COMMANDS:
-        # As `python -m jetbot_mjx.COMMAND` does, exit code and all.
+        # Behave like `python -m jetbot_mjx.COMMAND`, including the exit code.
         sys.argv[1:] = words[1:]
         runpy.run_module(f"jetbot_mjx.{words[0]}", run_name="__main__", alter_sys=True)
     if words == ["--version"]:

@@ -13,34 +13,34 @@ from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.envs.checks.runner import CHECKS, MEANINGS, Finding, check_task
 
 BROKEN = 1
-"""Exit code: something is wrong with the task."""
+"""Exit code for a task that has an error."""
 
 _BUILT_IN = "jetbot_mjx"
 
 
 def run(config: Config) -> Iterator[tuple[str, list[Finding]]]:
-    """Checks the task of a configuration.
+    """Check the task of a configuration.
 
     Args:
-      config: the run.
+      config: the configuration of the run.
 
     Returns:
-      Each check's name and what it found, as they come.
+      An iterator over each check's name and findings, as the checks finish.
 
     Raises:
-      UserError: there is no such task, or it refuses the configuration.
+      UserError: there is no such task, or it rejects the configuration.
     """
     return check_task(config)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and checks.
+    """Parse the command line and check the task.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
-      0, or 1 where something is wrong with the task.
+      0, or 1 if the task has an error.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.check_env", description=__doc__)
     parser.add_argument(

@@ -1,8 +1,8 @@
-"""What the commands share: one line for a user's mistake, and exit codes that mean something.
+"""Provide what all commands share: argument types, one-line error messages and exit codes.
 
-0 done · 1 done, and below what was asked for (`--min-success`), or a plan that does not fit ·
-2 the user can mend it · 75 a training was asked to stop, is saved, and goes on by the same
-command · 130 interrupted.
+The exit codes are: 0 success · 1 finished, but below the requested `--min-success`, or a plan that
+does not fit · 2 an error that the user can correct · 75 a training that was asked to stop, is
+saved, and continues with the same command · 130 interrupted.
 """
 
 import argparse
@@ -24,10 +24,10 @@ INTERRUPTED = 130
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that states a mistake in one line."""
+    """An argument parser that reports an error in one line."""
 
     def error(self, message: str) -> NoReturn:
-        """Prints the line and exits with 2."""
+        """Print the error in one line and exit with code 2."""
         message = " ".join(message.splitlines())
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
@@ -35,19 +35,21 @@ class Parser(argparse.ArgumentParser):
 def run_command(
     command: Callable[[Sequence[str] | None], int], *, at_once: bool = False
 ) -> NoReturn:
-    """Runs a command's `main` and exits.
+    """Run a command's `main` and exit the process.
 
     Args:
-      command: takes the arguments and returns the exit code.
-      at_once: whether to leave the rest to the system, for a command that has closed all that it
-        opened: JAX takes a second to give a GPU back, and a compiler's thread, which cannot be
+      command: a function that takes the arguments and returns the exit code.
+      at_once: whether to exit without Python's clean-up, for a command that has closed everything
+        it opened: JAX takes a second to release a GPU, and a compiler's thread, which cannot be
         interrupted, may abort the process.
     """
+    # Prepare output and signals.
     for stream in (sys.stdout, sys.stderr):
-        # What a terminal has no letters for must not end a command that has done its work.
+        # A character that the terminal cannot show must not fail a command that has finished.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
     raise_again()
+    # Run the command and convert known errors to an exit code.
     try:
         code = command(None)
     except UserError as error:
@@ -65,7 +67,7 @@ def run_command(
         print("interrupted", file=sys.stderr)
         code = INTERRUPTED
     except BrokenPipeError:
-        # Whoever read our output has gone: nothing is left to say.
+        # The reader of the output has closed the pipe, so nothing more can be printed.
         sys.stderr.close()
         code = USER_ERROR
     if at_once:
@@ -77,10 +79,10 @@ def run_command(
 
 
 def require_device() -> None:
-    """Refuses to go on where JAX has no device to run on.
+    """Raise an error if JAX has no usable device.
 
     Raises:
-      UserError: `JAX_PLATFORMS` names what is not there, or JAX computes in 64 bits.
+      UserError: `JAX_PLATFORMS` names a missing platform, or JAX is set to 64 bits.
     """
     if jax.config.values["jax_enable_x64"]:
         raise UserError("all is computed in float32, and JAX_ENABLE_X64 is set: unset it")
@@ -95,15 +97,16 @@ def require_device() -> None:
 
 
 def wake_device() -> None:
-    """Lets a GPU make itself ready while the host does something else.
+    """Start to initialise the device in a thread, while the host continues.
 
-    It takes memory as it needs it, unless `XLA_PYTHON_CLIENT_PREALLOCATE` asks for JAX's habit of
-    taking three quarters of it at once: that lasts two seconds, and leaves others none.
+    JAX then allocates GPU memory as needed, unless `XLA_PYTHON_CLIENT_PREALLOCATE` requests its
+    default of allocating three quarters at once, which takes two seconds and leaves little memory
+    for other processes.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
     def touch() -> None:
-        # Whoever needs the device hears of what is wrong with it.
+        # The first code that needs the device will report the error.
         with contextlib.suppress(RuntimeError, AssertionError):
             jax.block_until_ready(jax.device_put(0.0, jax.local_devices()[0]))
 
@@ -114,14 +117,14 @@ _LARGEST = 2**31 - 1
 
 
 def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
-    """An argument that counts or numbers something.
+    """Return an argument type for integers within bounds.
 
     Args:
-      least: the smallest that is taken.
-      most: the largest that is taken.
+      least: the smallest accepted value.
+      most: the largest accepted value.
 
     Returns:
-      What an argument parser calls a type.
+      A function to pass as `type` to an argument parser.
     """
 
     def parse(text: str) -> int:
@@ -142,7 +145,7 @@ positive_int = whole_number(1)
 
 
 def fraction(text: str) -> float:
-    """An argument between 0 and 1."""
+    """Parse an argument between 0 and 1."""
     try:
         value = float(text)
     except ValueError:
@@ -153,7 +156,7 @@ def fraction(text: str) -> float:
 
 
 def positive_float(text: str) -> float:
-    """An argument above 0."""
+    """Parse an argument above 0."""
     try:
         value = float(text)
     except ValueError:
@@ -164,12 +167,12 @@ def positive_float(text: str) -> float:
 
 
 def which_checkpoint(text: str) -> Literal["best", "last"] | int:
-    """An argument that names a checkpoint of a run."""
+    """Parse an argument that names a checkpoint of a run."""
     if text == "best":
         return "best"
     if text == "last":
         return "last"
-    # More digits than any number of steps has, Python would refuse to read.
+    # Limit the digits, because Python raises an error for integers with too many of them.
     if text.isdecimal() and len(text) < 100:
         return int(text)
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
@@ -178,13 +181,13 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
 def add_checkpoint_arguments(
     parser: argparse.ArgumentParser, *, several: bool = False, default: str | None = None
 ) -> None:
-    """Adds `run` and `--checkpoint`, by which a command finds its policy.
+    """Add the arguments `run` and `--checkpoint`, which select a policy.
 
     Args:
-      parser: of the command.
-      several: whether it takes more than one run; `run` is then a list.
-      default: what is taken where no run is named, in words; `run` is then None. None: one has to
-        be named.
+      parser: the parser of the command.
+      several: whether the command accepts more than one run; `run` is then a list.
+      default: description of the policy that is used if no run is given; `run` is then None. None:
+        a run must be given.
     """
     what = "a run folder, or one checkpoint folder of it"
     if several:

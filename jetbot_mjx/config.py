@@ -1,11 +1,12 @@
-"""The whole configuration of a run: frozen, typed, bounded, and written back resolved.
+"""Define, read and check the configuration of a run.
 
-A YAML file names only what differs from the defaults below. Every key, type and bound is
-checked before anything else happens; what is wrong is said in one line. Knows nothing of JAX.
+A YAML file contains only the settings that differ from the defaults below. Every key, type and
+bound is checked before anything else happens, and an error is reported in one line. A configuration
+is immutable, and a run stores it with all defaults filled in. This module does not import JAX.
 
-Pydantic does the checking (strict types, bounds, unknown keys, and a schema from which the
-reference can be generated); ruamel.yaml does the reading, because it speaks YAML 1.2, where
-`1e-3` is a number, and refuses a key that is given twice.
+Pydantic checks strict types, bounds and unknown keys, and provides a schema from which the
+reference can be generated. ruamel.yaml reads the files, because it supports YAML 1.2, where `1e-3`
+is a number, and rejects a key that is given twice.
 """
 
 import difflib
@@ -34,18 +35,18 @@ from jetbot_mjx.errors import UserError
 
 
 class ConfigError(UserError):
-    """A configuration that cannot run; the message names the key, the value and the remedy."""
+    """Raised when a configuration is invalid; states the key, the value and the remedy."""
 
 
 def _integral(value: object) -> object:
-    """Lets `3e7` stand for a count: YAML reads it as a float."""
+    """Convert a float with an integral value to an int, because YAML reads `3e7` as a float."""
     if isinstance(value, float) and value.is_integer():
         return int(value)
     return value
 
 
 def _wandb_project(name: str) -> str:
-    """Refuses what Weights & Biases would refuse after the training has begun."""
+    """Reject a project name that Weights & Biases would reject after the training has started."""
     if not 0 < len(name) <= 128 or set(name) & set("/\\#?%:") or not name.isprintable():
         raise ValueError(
             f"{name!r} is no project's name: it should have 1 to 128 characters, none of /\\#?%:"
@@ -54,14 +55,14 @@ def _wandb_project(name: str) -> str:
 
 
 def _float32(value: float) -> float:
-    """Refuse what would be infinite where everything is computed."""
+    """Reject a value that would be infinite in float32."""
     if value > _LARGEST_FLOAT32:
         raise ValueError(f"{value:g} is too large: make it at most {_LARGEST_FLOAT32:.2g}")
     return value
 
 
 def _utf8(text: str) -> str:
-    """Refuse what cannot be written to a file: half of a surrogate pair."""
+    """Reject text that cannot be written as UTF-8, such as half of a surrogate pair."""
     text.encode()
     return text
 
@@ -83,7 +84,7 @@ Range = tuple[float, float] | None
 
 
 def _range(low: float, high: float, *, whole: bool = False) -> Any:
-    """A field that holds a range [low, high] within bounds, or null."""
+    """Return a field for a range [low, high] within bounds, or null."""
     return Field(None, json_schema_extra={"low": low, "high": high, "whole": whole})
 
 
@@ -91,7 +92,7 @@ _MOST_SUBSTEPS = 10_000
 
 
 class _Section(BaseModel):
-    """What every section shares: frozen, strict, and without unknown keys."""
+    """Base class of all sections: immutable, with strict types and without unknown keys."""
 
     model_config = ConfigDict(
         frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
@@ -99,14 +100,14 @@ class _Section(BaseModel):
 
 
 class RobotConfig(_Section):
-    """Which robot drives."""
+    """The robot."""
 
     preset: Literal["isaac", "real"] = "isaac"
     """`isaac`: the tutorial's heavy robot, reaches 1 m/s; `real`: 0.69 kg, 0.41 m/s."""
 
 
 class TaskConfig(_Section):
-    """What is to be done, and what the policy sees and commands."""
+    """The task, and the observations and actions of the policy."""
 
     name: str = "jetbot_mjx:GoalTask"
     """The task class, as `package.module:Class`, built as `Class(task_config)`; this package's own
@@ -155,7 +156,7 @@ class PhysicsConfig(_Section):
 
     @property
     def n_substeps(self) -> int:
-        """Physics steps per environment step."""
+        """Return the number of physics steps per environment step."""
         return round(self.ctrl_dt / self.sim_dt)
 
     @model_validator(mode="after")
@@ -177,9 +178,10 @@ class PhysicsConfig(_Section):
 
 
 class RandomizationConfig(_Section):
-    """What is drawn anew for every episode of a training, uniformly from [low, high].
+    """Domain randomization: parameters drawn uniformly from [low, high] for every episode.
 
-    Each quantity and each robot by itself. null: as the preset has it; all null: nothing is drawn.
+    Each parameter is drawn independently for each robot of a training. null: the preset's value;
+    all null: nothing is drawn.
     """
 
     friction: Range = _range(0.05, 5)
@@ -259,7 +261,7 @@ class RandomizationConfig(_Section):
 
     @property
     def drawn(self) -> dict[str, tuple[float, float]]:
-        """The ranges of what is drawn, by name."""
+        """Return the ranges of the parameters that are drawn, by name."""
         ranges = {name: getattr(self, name) for name in type(self).model_fields}
         return {name: span for name, span in ranges.items() if span is not None}
 
@@ -331,12 +333,12 @@ class PPOConfig(_Section):
 
     @property
     def steps_per_training_step(self) -> int:
-        """Environment steps that one training step collects."""
+        """Return the number of environment steps that one training step collects."""
         return self.batch_size * self.num_minibatches * self.unroll_length
 
     @property
     def training_steps(self) -> int:
-        """Training steps in which `num_timesteps` are reached."""
+        """Return the number of training steps that reach `num_timesteps`."""
         return -(-self.num_timesteps // self.steps_per_training_step)
 
     @model_validator(mode="after")
@@ -365,12 +367,12 @@ class EvaluationConfig(_Section):
     episodes: Count = 256
     """Deterministic episodes per evaluation, on goals set apart from the final test's."""
     video: bool = False
-    """Whether every evaluation also films the first four goals of the report, into
-    `videos/<env_steps>/`; without OpenGL a line says so, and training goes on."""
+    """Whether every evaluation also renders the first four goals of the report, into
+    `videos/<env_steps>/`; without OpenGL a line says so, and the training continues."""
 
 
 class Config(_Section):
-    """Everything that decides a run."""
+    """All settings of a run."""
 
     seed: Annotated[int, BeforeValidator(_integral), Field(ge=0, lt=2**32)] = 0
     """Seed of networks, environments and exploration."""
@@ -444,33 +446,33 @@ class Config(_Section):
         return self
 
     def for_any_device(self) -> "Config":
-        """The same with physics stepped by whoever can, if not by XLA.
+        """Return a copy with `physics.impl = "auto"`, unless it is `xla`.
 
-        A run that asked for a kernel on one kind of device is evaluated on others too.
+        A run that requested a kernel for one kind of device can then be evaluated on others too.
         """
         if self.physics.impl == "xla":
             return self
         return self.model_copy(update={"physics": self.physics.model_copy(update={"impl": "auto"})})
 
     def of_each_seed(self) -> list["Config"]:
-        """The configurations of single runs that this one stands for."""
+        """Return one configuration for each seed, with `seeds = 1`."""
         return [
             self.model_copy(update={"seed": self.seed + index, "seeds": 1})
             for index in range(self.seeds)
         ]
 
     def flat(self) -> dict[str, Any]:
-        """Every setting by its key, such as `ppo.num_envs`."""
+        """Return every setting by its full key, such as `ppo.num_envs`."""
         return _flat(self.model_dump(mode="json"))
 
     def check_resume(self, changed: "Config") -> None:
-        """Refuses a change that a run cannot take on half-way.
+        """Raise an error if a setting changed that must not change on resume.
 
         Args:
-          changed: what the run is to go on with.
+          changed: the configuration to resume the run with.
 
         Raises:
-          ConfigError: it differs in more than `CHANGEABLE_ON_RESUME`.
+          ConfigError: it differs in settings other than `CHANGEABLE_ON_RESUME`.
         """
         now, then = changed.flat(), self.flat()
         for key in then.keys() | now.keys():
@@ -481,7 +483,7 @@ class Config(_Section):
                 )
 
     def check_devices(self, device_count: int) -> None:
-        """Refuses a number of environments that the devices cannot share evenly.
+        """Raise an error if the environments cannot be divided evenly among the devices.
 
         Args:
           device_count: devices that training will use, over all hosts.
@@ -499,7 +501,7 @@ class Config(_Section):
                 )
 
     def to_yaml(self) -> str:
-        """The resolved configuration, every key written out, as YAML."""
+        """Return the resolved configuration with every key as YAML."""
         stream = io.StringIO()
         yaml = YAML(typ="safe", pure=True)
         yaml.default_flow_style = False
@@ -518,7 +520,7 @@ CHANGEABLE_ON_RESUME = (
     "wandb",
     "evaluation.video",
 )
-"""What a resumed run may do differently: how far it goes, and what it writes on the way."""
+"""Settings that may change on resume: the length of the training, and what it writes."""
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
@@ -532,10 +534,10 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Config:
-    """Reads a YAML file, applies overrides, and checks the whole.
+    """Read a YAML file, apply overrides, and check the result.
 
     Args:
-      path: the YAML file; it names only what differs from the defaults. None: nothing does.
+      path: the YAML file with the settings that differ from the defaults. None: only defaults.
       overrides: `section.key=value`, the value read as YAML; the last one wins.
 
     Returns:
@@ -554,11 +556,11 @@ def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Confi
 
 
 def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
-    """Checks a nested mapping of settings.
+    """Check a nested mapping of settings.
 
     Args:
       values: the settings, nested as in YAML.
-      source: where they come from, for the message.
+      source: description of their origin for error messages.
 
     Returns:
       The resolved configuration.
@@ -596,7 +598,7 @@ def _parse_yaml(text: str, source: str) -> object:
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}" if mark else ""
         raise ConfigError(f"{source}{place} is not valid YAML: {problem}") from None
-    # What ruamel.yaml lets through: `!!int x`, `!!bool x`, integers and nestings without end.
+    # Errors that ruamel.yaml does not convert: `!!int x`, `!!bool x`, endless integers or nesting.
     except (ValueError, LookupError, RecursionError) as error:
         raise ConfigError(f"{source} is not valid YAML: {error}") from None
 
@@ -613,7 +615,7 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
             raise ConfigError(f"--set {override}: {part} is a value, not a section")
     value = _parse_yaml(text, f"--set {override}")
     if isinstance(value, dict):
-        # Else what the file says of the other keys would be lost without a word.
+        # A whole section would silently discard the file's values of its other keys.
         inner = next(iter(value.items()), ("key", "value"))
         raise ConfigError(
             f"--set {override}: set single keys, as in --set {key.strip()}.{inner[0]}={inner[1]}"
@@ -622,8 +624,8 @@ def _apply_override(values: dict[str, Any], override: str) -> None:
 
 
 def _explain(error: ErrorDetails) -> str:
-    """One line from pydantic's first finding: the key, the value, and what would be right."""
-    # Pydantic adds the name of the union's branch or of a tuple's place; keep keys only.
+    """Return one line about pydantic's first error: the key, the value, and what is expected."""
+    # Pydantic adds the name of a union's branch or the index in a tuple; keep only the keys.
     location = [str(part) for part in error["loc"]]
     key = ".".join(location)
     value = error["input"]

@@ -1,14 +1,14 @@
-"""The one exception that means: the user can mend this, and one line says how."""
+"""Define the exception for errors that the user can correct, with a message of one line."""
 
 
 class UserError(Exception):
-    """A mistake that the user can mend; its message is one line, shown without a traceback."""
+    """Raised when the user can correct the error; its one-line message needs no traceback."""
 
     def __init__(self, message: str) -> None:
-        """Keeps to one line what quotes a key, a path or another library's message."""
+        """Join the lines of a message that quotes a key, a path or another library's message."""
         super().__init__(" ".join(message.splitlines()))
 
 
 def ran_out(error: Exception) -> bool:
-    """Whether JAX failed because a device's memory did not suffice."""
+    """Return whether JAX failed because a device ran out of memory."""
     return "RESOURCE_EXHAUSTED" in str(error)

@@ -57,7 +57,7 @@ from jetbot_mjx.runs.run_dir import seed_folders, versions
 BELOW_TARGET = 1
 
 Simulator = Literal["mujoco"]
-"""Another simulator than the one that policies are trained in."""
+"""A simulator other than the one that policies are trained in."""
 
 
 def run(
@@ -70,14 +70,14 @@ def run(
     ranges: str | Path | None = None,
     simulator: Simulator | None = None,
 ) -> Report:
-    """Judges one policy and writes its report.
+    """Evaluate one policy and write its report.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder.
       output: the folder to write; None: `evaluations/<env_steps>/` of the run folder.
-      robustness: whether to judge it on robots that differ from the preset as well, and in C
+      robustness: whether to evaluate it also on robots that differ from the preset, and in C
         MuJoCo.
       ranges: a configuration file by whose `randomization` a robot is drawn for each goal, beside
         the preset's; None: the run's own, if it has any.
@@ -146,14 +146,14 @@ def run_comparison(
     ranges: str | Path | None = None,
     simulator: Simulator | None = None,
 ) -> Comparison:
-    """Judges the policies of several runs or seeds, reports on each, and compares them.
+    """Evaluate the policies of several runs or seeds, write a report on each, and compare them.
 
     Args:
       runs: run folders, of one seed or several, or checkpoint folders.
       episodes: how many of the fixed goals, from the first on.
       which: the checkpoint of a run folder, of each seed.
       output: the folder for the comparison; None: `evaluations/comparison/` of the first run.
-      robustness: whether each report judges its policy on other robots, and in C MuJoCo, as well.
+      robustness: whether each policy is also evaluated on other robots and in C MuJoCo.
       ranges: as for `run`.
       simulator: as for `run`.
 
@@ -161,11 +161,13 @@ def run_comparison(
       The comparison, which knows its folder; each report knows its own.
 
     Raises:
-      UserError: a checkpoint cannot be used or is named twice, the runs did not have the same to
-        do, or a folder cannot be written.
+      UserError: a checkpoint cannot be used or is named twice, the runs have different tasks, or a
+        folder cannot be written.
     """
+    # Load all policies and check that they can be compared.
     entrants = _load([Path(path) for path in runs], which)
     check_comparable({name: entrant.config for name, entrant in entrants.items()})
+    # Evaluate each policy and write its report.
     checkpoints = [one for entrant in entrants.values() for one in entrant.seeds.values()]
     reports = _judge(
         [(one, _report_folder(one)) for one in checkpoints],
@@ -178,6 +180,7 @@ def run_comparison(
         name: {seed: _without_paths(next(reports)) for seed in entrant.seeds}
         for name, entrant in entrants.items()
     }
+    # Compare the reports and write the comparison.
     home = next(iter(entrants.values())).folder
     folder = home / "evaluations" / "comparison" if output is None else Path(output)
     comparison = compare(folder.absolute(), judged)
@@ -186,7 +189,7 @@ def run_comparison(
 
 
 class _Ranges(NamedTuple):
-    """What robots are drawn from, for whatever run."""
+    """A `_Ranges` holds the ranges of `--ranges`, from which robots are drawn for every run."""
 
     file: Path
     ranges: RandomizationConfig
@@ -205,7 +208,7 @@ class _Ranges(NamedTuple):
 
 
 class _Entrant(NamedTuple):
-    """A run that takes part in a comparison."""
+    """An `_Entrant` is a run that takes part in a comparison."""
 
     folder: Path
     seeds: Mapping[str, Checkpoint]
@@ -216,7 +219,7 @@ class _Entrant(NamedTuple):
 
 
 def _load(paths: Sequence[Path], which: Which) -> dict[str, _Entrant]:
-    """The runs by a name that tells them apart."""
+    """Load the runs and return them by a unique name."""
     entrants: list[_Entrant] = []
     owners: dict[Path, Path] = {}
     for path in paths:
@@ -236,7 +239,7 @@ def _load(paths: Sequence[Path], which: Which) -> dict[str, _Entrant]:
 
 
 def _names(entrants: Sequence[_Entrant]) -> list[str]:
-    """As much of the end of each folder's path as tells them apart, or else the steps too."""
+    """Return the shortest unique end of each folder's path, with the steps if needed."""
     folders = [entrant.folder for entrant in entrants]
     different = set(folders)
     length = 1
@@ -256,7 +259,7 @@ def _report_folder(checkpoint: Checkpoint) -> Path:
 
 
 def _without_paths(report: Report) -> Report:
-    """Trajectories are drawn by now, and are all that is large."""
+    """Return a report without trajectories, which are large and already plotted."""
     return report._replace(episodes=report.episodes._replace(qpos=None))
 
 
@@ -268,13 +271,14 @@ def _judge(
     elsewhere: bool,
     drawn: _Ranges | None,
 ) -> Iterator[Report]:
-    """Judges policies and writes their reports; what is compiled serves all it fits."""
+    """Evaluate policies and write their reports, reusing compiled programs where they fit."""
     keys, about = report_keys(episodes), versions()
-    # All of them first: what does not fit its task is refused before anything is written.
+    # Build all environments first, so that an unsuitable policy is rejected before any writing.
     envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
     evaluator, varied, mujoco, baselines, fits = None, None, None, {}, None
     for (checkpoint, folder), env in zip(checkpoints, envs, strict=True):
         ranges = drawn.ranges if drawn else checkpoint.config.randomization
+        # Build new evaluators only if the compiled programs do not fit this policy.
         if evaluator is None or (_program(checkpoint.config), ranges) != fits:
             evaluator = Evaluator(env, checkpoint.networks, baselines=True, record=True)
             if ranges.drawn:
@@ -284,6 +288,7 @@ def _judge(
             fits = _program(checkpoint.config), ranges
             beside = evaluator.run_baselines(checkpoint.params, keys)
             baselines = {name: summarize(each, env.dt) for name, each in beside.items()}
+        # Evaluate the policy and write its report.
         driven = jax.device_get(evaluator.run(checkpoint.params, keys))
         run_dir = _shown(checkpoint.run_dir)
         best_known, missing = compare_with_best_known(checkpoint.config, driven)
@@ -321,7 +326,7 @@ def _sweep(checkpoint: Checkpoint, env: JetBotEnv, goals: int) -> tuple[SweepRes
 
 
 def _program(config: Config) -> tuple[Any, ...]:
-    """All of a configuration that the compiled episodes depend on."""
+    """Return the parts of a configuration that the compiled episodes depend on."""
     ppo = config.ppo
     return (
         config.task,
@@ -334,7 +339,7 @@ def _program(config: Config) -> tuple[Any, ...]:
 
 
 def _shown(path: Path) -> Path:
-    """As a command names it: from here where it lies below."""
+    """Return the path relative to the current folder if it is inside of it."""
     here = Path.cwd()
     return path.relative_to(here) if path.is_relative_to(here) else path
 
@@ -349,10 +354,10 @@ def _learning_curve(run_dir: Path) -> tuple[CurvePoint, ...]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and judges.
+    """Parse the command line and evaluate.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       0, or 1 where a success rate is below `--min-success`.

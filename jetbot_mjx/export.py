@@ -30,20 +30,20 @@ from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
 from jetbot_mjx.runs.run_dir import write_json, writing_to
 
 FOLDER = "policy"
-"""Where an export goes, in the run folder."""
+"""Name of the folder of an export in the run folder."""
 
 RECORDING = "recording.npz"
 
 
 class Exported(NamedTuple):
-    """The files made of one policy."""
+    """An `Exported` holds the result of exporting one policy."""
 
     folder: Path
     env_steps: int
     differences: Mapping[str, float]
     """The largest difference to JAX, by format."""
     observations: int
-    """On which."""
+    """Number of observations on which the formats were compared."""
 
 
 def run(
@@ -53,24 +53,25 @@ def run(
     which: Which = "best",
     output: str | Path | None = None,
 ) -> Exported:
-    """Exports one policy.
+    """Export one policy.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
-      formats: of `FORMATS`.
+      formats: names of formats from `FORMATS`.
       which: the checkpoint of a run folder.
       output: the folder to write, in place of an earlier export there; None: `policy/` of the
         run folder.
 
     Returns:
-      The files, which are whole, or not there.
+      The result; the files are complete, or absent if an error is raised.
 
     Raises:
       UserError: there is no usable checkpoint, a package is missing, the folder holds something
-        else or cannot be written, or a file does not do as JAX does.
+        else or cannot be written, or the output of a file differs from JAX by too much.
     """
     for name in formats:
         require(name)
+    # Load the policy.
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
     env = checkpoint.make_env()
@@ -78,6 +79,7 @@ def run(
     with _written_whole(folder) as unfinished:
         recording = record(checkpoint, env)
         differences = {}
+        # Write each format and check its output against JAX.
         for name in formats:
             path = unfinished / FORMATS[name].file
             FORMATS[name].write(Source(policy, act), path)
@@ -90,6 +92,7 @@ def run(
                     f" on {len(recording.obs):,} observations, and {TOLERANCE:.0e} is allowed"
                 )
             differences[name] = found
+        # Write the observations and the description of all files.
         np.savez_compressed(unfinished / RECORDING, **recording._asdict())
         files = {
             name: {"file": FORMATS[name].file, "largest_difference": found}
@@ -104,7 +107,7 @@ def run(
 
 @contextlib.contextmanager
 def _written_whole(folder: Path) -> Iterator[Path]:
-    """A folder under another name, which gets its own when all is in it."""
+    """Yield a temporary folder, and rename it to `folder` when it is complete."""
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     earlier = folder.with_name(f".{folder.name}.earlier")
     with writing_to(folder):
@@ -132,10 +135,10 @@ def _formats(text: str) -> tuple[str, ...]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and exports.
+    """Parse the command line and export.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       0.

@@ -1,10 +1,10 @@
-"""Imports that leave out, or put off, what another library would load and nobody here needs.
+"""Import other libraries lazily, without the modules that this package does not need.
 
-MuJoCo loads GLFW before anyone asks for a window; MJX trimesh and SciPy's geometry for meshes that
-no robot here has, and it prints two lines when its optional Warp part is absent; Brax JAXopt for an
-engine that is not used here; tensorboardX a service that nobody logs to. On a slow machine that is
-the better part of two seconds, before anything has begun. And a training needs no OpenGL, so that
-MuJoCo has to do without what `MUJOCO_GL` asks for in vain.
+MuJoCo loads GLFW before a window is requested. MJX loads trimesh and SciPy's geometry for meshes,
+which no robot here has, and prints two lines if its optional Warp part is absent. Brax loads JAXopt
+for an engine that is not used here, and tensorboardX loads a logging service that is not used. On a
+slow machine these imports take almost two seconds at every start. A training also needs no OpenGL,
+so that MuJoCo must be importable even if the backend that `MUJOCO_GL` names is unavailable.
 """
 
 import contextlib
@@ -39,7 +39,7 @@ def load_lazily(
 
 
 class PutOff(types.ModuleType):
-    """Stands for a module that is imported when something in it is first asked for."""
+    """A `PutOff` is a lazy module, which is imported at the first access to an attribute."""
 
     def __getattr__(self, name: str) -> Any:
         if sys.modules.get(self.__name__) is self:
@@ -48,7 +48,7 @@ class PutOff(types.ModuleType):
 
 
 class _Trimesh(PutOff):
-    """MJX's annotations name a class of it as soon as they are read."""
+    """A lazy trimesh with its class `Trimesh`, which MJX's annotations use at import time."""
 
     @staticmethod
     def Trimesh(*arguments: Any, **options: Any) -> Any:
@@ -56,7 +56,7 @@ class _Trimesh(PutOff):
 
 
 class _Comet(types.ModuleType):
-    """What tensorboardX's own writer, which nobody here uses, would log to."""
+    """A placeholder for the logging service of tensorboardX's own writer, which is not used."""
 
     CometLogger = None
 
@@ -66,27 +66,27 @@ class _Comet(types.ModuleType):
 
 @contextlib.contextmanager
 def standing_in(name: str, module: types.ModuleType | None) -> Iterator[None]:
-    """Lets what is imported inside find something else under a module's name.
+    """Replace a module for the imports inside the context.
 
     Args:
-      name: of a module; where it is already loaded, nothing is changed.
-      module: what is found; None: there is no such module.
+      name: name of the module; if it is already loaded, nothing is changed.
+      module: the replacement; None: the import fails as if the module did not exist.
     """
     if name in sys.modules:
         yield
         return
-    # Not `mock.patch.dict`, which would take back all other modules that were loaded, too.
+    # Do not use `mock.patch.dict`, which would also remove all other modules that were loaded.
     sys.modules[name] = module  # pyright: ignore[reportArgumentType]
     try:
         yield
     finally:
-        # One that was put off may have been needed inside.
+        # A lazy module may have been replaced by the real one inside the context.
         if sys.modules.get(name) is module:
             del sys.modules[name]
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Finds modules where they are, and has something done around their execution."""
+    """An import finder that runs a context manager around the execution of some modules."""
 
     def __init__(self, around: Mapping[str, _Around]) -> None:
         self._around = around
@@ -103,7 +103,7 @@ class _Finder(importlib.abc.MetaPathFinder):
 
 
 class _Loader(importlib.abc.Loader):
-    """Another loader, and something done around it."""
+    """A loader that runs a context manager around another loader's execution of a module."""
 
     def __init__(self, loader: importlib.abc.Loader, around: _Around) -> None:
         self._loader = loader
@@ -117,7 +117,7 @@ class _Loader(importlib.abc.Loader):
             self._loader.exec_module(module)
 
     def __getattr__(self, name: str) -> Any:
-        # Whatever else one may ask a loader, such as the source of its module.
+        # Forward everything else, such as requests for the source of the module.
         return getattr(self._loader, name)
 
 
@@ -133,8 +133,8 @@ def _mjx() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _opengl() -> Iterator[None]:
-    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`; who needs pictures is told why by
-    # `offscreen.find_backend`. PyOpenGL fails by an AttributeError where the library is missing.
+    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `offscreen.find_backend` reports
+    # the reason if images are needed. PyOpenGL raises an AttributeError if the library is missing.
     with contextlib.suppress(ImportError, AttributeError, OSError, RuntimeError):
         yield
 
@@ -146,9 +146,9 @@ _AROUND: Mapping[str, _Around] = {
     "mujoco.rendering.classic.gl_context": _opengl,
     "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _Comet()),
 }
-"""By the module that imports them."""
+"""Context managers by the name of the module that they surround."""
 
 
 def lighten() -> None:
-    """Makes these libraries light to import, from now on and whoever imports them."""
+    """Install the lazy imports for the whole process from now on."""
     sys.meta_path.insert(0, _Finder(_AROUND))

@@ -17,23 +17,23 @@ from jetbot_mjx.errors import UserError
 
 
 class Written(NamedTuple):
-    """The two files."""
+    """A `Written` holds the paths of the two files."""
 
     module: Path
     config: Path
 
 
 def run(path: Path) -> Written:
-    """Writes a task and its settings.
+    """Write a task and its settings.
 
     Args:
-      path: of the module; the class is named after it, and the settings lie beside it.
+      path: path of the module; the class is named after it, and the settings are in its folder.
 
     Returns:
       The files.
 
     Raises:
-      UserError: the name is no module's or another module's, or a file is there already.
+      UserError: the name is not valid or belongs to another module, or a file exists already.
     """
     name = path.stem
     if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name):
@@ -53,7 +53,7 @@ def run(path: Path) -> Written:
         path.parent.mkdir(parents=True, exist_ok=True)
         for file, kind in zip(files, ("task.py", "task.yaml"), strict=True):
             template = resources.files("jetbot_mjx").joinpath(f"assets/{kind}.template")
-            # "x": a file that came to be meanwhile stays as it is.
+            # Mode "x" does not overwrite a file that was created in the meantime.
             with file.open("x", encoding="utf-8") as out:
                 out.write(string.Template(template.read_text("utf-8")).substitute(words))
     except OSError as error:
@@ -62,10 +62,10 @@ def run(path: Path) -> Written:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and writes.
+    """Parse the command line and write the files.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       0.

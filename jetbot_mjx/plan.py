@@ -19,33 +19,33 @@ from jetbot_mjx.training.memory import GIB, Footprint, device_memory, ladder, si
 
 
 class Plan(NamedTuple):
-    """What a configuration takes, and what there is."""
+    """A `Plan` holds the memory that a configuration needs and the memory of each device."""
 
     config: Config
     device_count: int
     limit: int
     """Memory of each device [bytes]."""
     footprints: list[Footprint]
-    """By the number of environments, ascending."""
+    """Memory footprints in ascending order of the number of environments."""
 
     @property
     def largest(self) -> Footprint | None:
-        """The largest that fits."""
+        """Return the largest footprint that fits, or None."""
         return max((one for one in self.footprints if one.total <= self.limit), default=None)
 
 
 def run(config: Config, memory: float | None = None) -> Plan:
-    """Predicts the memory of a training.
+    """Predict the memory of a training.
 
     Args:
-      config: the run.
-      memory: of each device [GiB]; None: what the first one says.
+      config: the configuration of the run.
+      memory: memory of each device [GiB]; None: as the first device reports it.
 
     Returns:
-      What it takes, by the number of environments.
+      The needed memory by the number of environments.
 
     Raises:
-      UserError: the devices cannot share the environments, or do not tell their memory.
+      UserError: the devices cannot share the environments, or do not report their memory.
     """
     device_count = jax.device_count()
     config.check_devices(device_count)
@@ -57,7 +57,7 @@ def run(config: Config, memory: float | None = None) -> Plan:
 
 
 def table(plan: Plan) -> str:
-    """What the terminal shows."""
+    """Return a plan as a table for the terminal."""
     parts = ("parameters", "environments", "collecting", "learning", "evaluation")
     lines = [
         f"GiB on each of {plan.device_count} x {jax.devices()[0].device_kind},"
@@ -83,10 +83,10 @@ def table(plan: Plan) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and predicts.
+    """Parse the command line and predict the memory.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       0, or 1 where the configuration does not fit as it is.

@@ -26,7 +26,7 @@ _SHOWN = "jetbot_egocentric"
 
 
 class Played(NamedTuple):
-    """What happened while it was looked at."""
+    """A `Played` holds the number of successes and episodes while the viewer was open."""
 
     successes: int
     episodes: int
@@ -44,18 +44,18 @@ def run(
     allow: Sequence[str] = (),
     tell: Callable[[str], None] = print,
 ) -> Played:
-    """Drives in real time until it is interrupted or the window is closed.
+    """Drive in real time until the user interrupts or closes the window.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
       viewer: a page in the browser, or MuJoCo's own window.
-      agent: who drives at first, one of `AGENTS`.
+      agent: the controller at the start, one of `AGENTS`.
       which: the checkpoint of a run folder.
       seed: of goals and of the random agent.
       host: the address that the page is served at.
       port: the port of it; None: the first from 8080 on that is free.
       allow: origins of other pages that may connect, such as `https://hub.example.org`.
-      tell: is given what the user has to know, line by line.
+      tell: a function that receives messages for the user, line by line.
 
     Returns:
       How many goals were reached.
@@ -63,7 +63,7 @@ def run(
     Raises:
       UserError: there is no usable checkpoint, no viewer, no display, or the port is taken.
     """
-    # What can fail at once comes before what takes time.
+    # Check first what can fail quickly, before the slow steps.
     if viewer == "browser":
         server = _server()
         free: int = server.free_port(host, port)
@@ -80,13 +80,13 @@ def run(
         else:
             mujoco_window.run(player)
     except KeyboardInterrupt:
-        # The way to end it.
+        # Ctrl-C is the normal way to end the viewer.
         pass
     return Played(player.successes, player.episodes)
 
 
 def addresses(host: str, port: int) -> list[str]:
-    """Where the page is, on this machine and through ssh.
+    """Return the addresses of the page, on this machine and through ssh.
 
     Args:
       host: the address that is listened on.
@@ -123,7 +123,7 @@ def _server() -> types.ModuleType:
 
 
 def _origin(text: str) -> str:
-    """An argument that is a page's origin, as browsers write it."""
+    """Parse an argument that is a page's origin, as browsers write it."""
     try:
         parts = urllib.parse.urlsplit(text.lower())
         port, name = parts.port, parts.hostname
@@ -142,10 +142,10 @@ def _origin(text: str) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and drives.
+    """Parse the command line and drive.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       The exit code.

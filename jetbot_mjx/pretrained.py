@@ -17,13 +17,13 @@ FOLDER = Path("runs/pretrained")
 
 
 def run(folder: Path = FOLDER) -> tuple[Path, ...]:
-    """Copies the runs that come with the package; nothing is overwritten.
+    """Copy the runs that come with the package, without overwriting anything.
 
     Args:
-      folder: where each gets a folder of its own.
+      folder: the folder in which each run gets its own folder.
 
     Returns:
-      The run folders, named after their configurations; each is whole, or not there.
+      The run folders, named after their configurations; each is complete or absent.
 
     Raises:
       UserError: one of them is there already, or cannot be written.
@@ -45,10 +45,10 @@ def run(folder: Path = FOLDER) -> tuple[Path, ...]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and copies.
+    """Parse the command line and copy the runs.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       0.

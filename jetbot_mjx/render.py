@@ -34,7 +34,7 @@ _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # of the film's
 
 
 class Pictures(NamedTuple):
-    """The files made of one policy."""
+    """A `Pictures` tuple holds the files rendered for one policy."""
 
     mp4: Path
     gif: Path
@@ -44,7 +44,7 @@ class Pictures(NamedTuple):
 
 
 class Gallery(NamedTuple):
-    """The files made of several policies of one run."""
+    """A `Gallery` holds the files rendered for several policies of one run."""
 
     mp4: Path
     gif: Path
@@ -63,7 +63,7 @@ def run(
     goals: Sequence[int] | None = None,
     which: Which = "best",
 ) -> Pictures:
-    """Draws deterministic episodes of one policy on some of the report's fixed goals.
+    """Render deterministic episodes of one policy on some of the report's fixed goals.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
@@ -77,12 +77,14 @@ def run(
     Raises:
       UserError: there is no usable checkpoint, no such goal, no OpenGL, or no room.
     """
+    # Choose the goals and the names of the files.
     names = ("episodes", "trajectories")
     if goals is None:
         goals = range(episodes)
     else:
         check_goals(goals)
         names = (f"goals-{_spans(goals)}",) * 2
+    # Run the episodes.
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
     driven = _drive([checkpoint], env, goals)[0]
@@ -95,6 +97,7 @@ def run(
         successes=int(driven.success.sum()),
         episodes=len(goals),
     )
+    # Plot the trajectories and render the videos.
     with writing_to(pictures.trajectories):
         _plan(checkpoint, env, driven, goals).save(pictures.trajectories)
     with Studio(env) as studio:
@@ -104,7 +107,7 @@ def run(
 
 
 def run_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
-    """Draws the first, the middle and the last checkpoint of a run driving to the same goals.
+    """Render the first, the middle and the last checkpoint of a run driving to the same goals.
 
     Goals are the report's, from the first on, so that nothing is chosen by its outcome.
 
@@ -121,6 +124,7 @@ def run_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
     path = Path(run_dir).absolute()
     if find_checkpoint(path, "last") == path:
         raise UserError(f"--gallery {run_dir} is one checkpoint: give the run folder it lies in")
+    # Run all chosen checkpoints on the same goals.
     chosen = early_middle_final(checkpoint_steps(path))
     checkpoints = [load_checkpoint(path, one) for one in chosen]
     env = checkpoints[0].make_env()
@@ -137,12 +141,14 @@ def run_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
         },
         episodes=episodes,
     )
+    # Plot the trajectories side by side.
     plans = [
         np.asarray(_plan(checkpoint, env, each, goals))
         for checkpoint, each in zip(checkpoints, driven, strict=True)
     ]
     with writing_to(gallery.plans):
         Image.fromarray(np.hstack(plans)).save(gallery.plans)
+    # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
     by_goal = zip(*(drives(env, each, goals) for each in driven), strict=True)
     with Studio(env) as studio:
@@ -155,10 +161,12 @@ def run_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
 
 
 def early_middle_final(steps: Sequence[int]) -> list[int]:
-    """The first, the middle and the last, of two middle ones the earlier; of fewer than three all.
+    """Return the first, the middle and the last step, or all of them if there are at most two.
+
+    Of two middle steps, the earlier one is returned.
 
     Args:
-      steps: of the checkpoints there are, in order, at least one.
+      steps: environment steps of the checkpoints, in ascending order, at least one.
     """
     return sorted({steps[0], steps[(len(steps) - 1) // 2], steps[-1]})
 
@@ -166,7 +174,7 @@ def early_middle_final(steps: Sequence[int]) -> list[int]:
 def _drive(
     checkpoints: Sequence[Checkpoint], env: JetBotEnv, goals: Sequence[int]
 ) -> list[Episodes]:
-    """Recorded episodes of policies of one run, all by one compiled program."""
+    """Run recorded episodes of several policies of one run with one compiled program."""
     evaluator = Evaluator(env, checkpoints[0].networks, record=True)
     keys = report_keys(max(goals) + 1)[np.asarray(goals)]
     return [jax.device_get(evaluator.run(each.params, keys)) for each in checkpoints]
@@ -175,7 +183,7 @@ def _drive(
 def _plan(
     checkpoint: Checkpoint, env: JetBotEnv, episodes: Episodes, goals: Sequence[int]
 ) -> Image.Image:
-    """Trajectories from above, each goal with its number."""
+    """Draw the trajectories from above, each goal with its number."""
     markers = jax.vmap(env.task.markers)(episodes.goal)
     others = [np.asarray(place) for name, place in markers.items() if name != "goal"]
     title = (
@@ -191,7 +199,7 @@ def _plan(
 
 
 def _write(mp4: Path, gif: Path, films: Sequence[Iterable[Frame]], size: float) -> None:
-    """Writes all films as one, and the first ones as an animation."""
+    """Write all videos to one mp4 file, and the first ones to a gif."""
     kept: list[Frame] = []
 
     def frames() -> Iterator[Frame]:
@@ -208,13 +216,13 @@ def _write(mp4: Path, gif: Path, films: Sequence[Iterable[Frame]], size: float) 
 
 
 def check_goals(goals: Sequence[int]) -> None:
-    """Refuses indices that name no goal of the fixed set, or one twice.
+    """Raise an error if an index is outside of the fixed goal set or occurs twice.
 
     Args:
       goals: the indices.
 
     Raises:
-      UserError: as said.
+      UserError: an index is invalid or occurs twice, or there is none.
     """
     if not goals:
         raise UserError("goals = [] names none: give at least one index")
@@ -229,7 +237,7 @@ def check_goals(goals: Sequence[int]) -> None:
 
 
 def _spans(goals: Sequence[int]) -> str:
-    """Indices as one would write them: `3,17`, or `0-7` for neighbours."""
+    """Format indices as `3,17`, or `0-7` for consecutive ones."""
     runs = [
         [goal for _, goal in run] for _, run in groupby(enumerate(goals), lambda p: p[1] - p[0])
     ]
@@ -237,7 +245,7 @@ def _spans(goals: Sequence[int]) -> str:
 
 
 def _goals(text: str) -> list[int]:
-    """An argument that names goals: indices and ranges of them."""
+    """Parse an argument that lists goals by indices and ranges."""
     goals: list[int] = []
     for part in text.split(","):
         found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", part.strip(), re.ASCII)
@@ -248,7 +256,7 @@ def _goals(text: str) -> list[int]:
         first, last = int(found[1]), int(found[2] or found[1])
         if last < first:
             raise argparse.ArgumentTypeError(f"{part} runs backwards: write {last}-{first}")
-        # More than there are need not be listed to be refused.
+        # Limit the length: an index beyond the last goal is rejected below anyway.
         goals += range(first, min(last, first + REPORT_GOALS) + 1)
     try:
         check_goals(goals)
@@ -258,10 +266,10 @@ def _goals(text: str) -> list[int]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and draws.
+    """Parse the command line and render.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       The exit code.

@@ -23,24 +23,24 @@ NOT_REPRODUCED = 1
 
 
 class Moment(NamedTuple):
-    """One step of the replay."""
+    """A `Moment` holds one step of the replay."""
 
     action: np.ndarray
     state: State
-    """After the step, as physics left it: not yet reset."""
+    """State after the step and before any reset."""
     odd: list[str]
     """Names of the arrays that are not finite."""
 
 
 def run(stored: StoredFault, env: JetBotEnv) -> Iterator[Moment]:
-    """Steps from where the unroll began, with the actions that were taken.
+    """Replay the recorded actions from the state in which the unroll began.
 
     Args:
-      stored: the fault.
-      env: its environment.
+      stored: the stored fault.
+      env: the environment of the fault.
 
     Yields:
-      Every step up to the one that blew up.
+      Every step up to the one with the non-finite state.
     """
     wrapped = wrap_for_training(env, stored.config.task.episode_length)
     step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(as_trained(env).step))
@@ -54,7 +54,7 @@ def run(stored: StoredFault, env: JetBotEnv) -> Iterator[Moment]:
 
 
 def line(index: int, moment: Moment) -> str:
-    """One step as a line of the table."""
+    """Format one step as a line of the table."""
     robot = robot_state(jax.tree.map(jnp.asarray, moment.state.pipeline_state))
     x, y, z = np.asarray(robot.position_w)
     fastest = np.abs(moment.state.pipeline_state.qvel).max()
@@ -66,13 +66,13 @@ def line(index: int, moment: Moment) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and replays.
+    """Parse the command line and replay.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
-      0, or 1 where the world stayed finite this time.
+      0, or 1 if the state stayed finite this time.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.replay", description=__doc__)
     parser.add_argument("file", type=Path, help="a file in a run's faults/")

@@ -16,7 +16,7 @@ from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, writin
 
 
 class Compared(NamedTuple):
-    """What was made of a log."""
+    """A `Compared` holds the files and metrics computed from a log."""
 
     picture: Path
     json: Path
@@ -30,19 +30,19 @@ def run(
     lag: float | None = None,
     output: str | Path | None = None,
 ) -> Compared:
-    """Compares one drive with its simulation.
+    """Compare one drive with its simulation.
 
     Args:
-      log: of `deploy/drive.py`.
-      delay: of the simulated motors [s].
-      lag: their time constant [s]; None: the calibration's, as the log has it.
+      log: a log of `deploy/drive.py`.
+      delay: delay of the simulated motors [s].
+      lag: time constant of the simulated motors [s]; None: that of the calibration in the log.
       output: the folder for the files; None: that of the log.
 
     Returns:
-      The files, and what is in the JSON.
+      The files, and the content of the JSON file.
 
     Raises:
-      UserError: it is no log, or the files cannot be written.
+      UserError: the file is not a log, or the files cannot be written.
     """
     path = Path(log)
     compared = replay(read_log(path), delay=delay, lag=lag)
@@ -66,10 +66,10 @@ def _seconds(text: str) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and compares.
+    """Parse the command line and compare.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
       0.

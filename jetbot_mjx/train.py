@@ -19,13 +19,13 @@ from jetbot_mjx.training.preemption import STOPPED
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and trains.
+    """Parse the command line and train.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: arguments without the program's name; None: those of the process.
 
     Returns:
-      0, or 75 where the training was asked to stop and can go on.
+      0, or 75 if the training was asked to stop and can be resumed.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.train", description=__doc__)
     source = parser.add_mutually_exclusive_group(required=True)
@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         distributed.check(config)
         distributed.join()
     cli.wake_device()
-    # What is heavy loads while the GPU wakes, and the programs while the rest of it loads.
+    # Import the large modules while the GPU initialises, and load the programs during the rest.
     from jetbot_mjx.training import ppo_trainer  # noqa: F401
 
     cli.require_device()

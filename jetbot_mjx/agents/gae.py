@@ -1,8 +1,14 @@
-"""Generalised advantage estimation without a loop, in the place of Brax's.
+"""Compute generalised advantage estimation (GAE) without a loop, as a replacement for Brax's.
 
-Brax runs back through an unroll by `jax.lax.scan`, in every minibatch: on a GPU each of its steps
-is a handful of launches of next to nothing, a third of all that a minibatch launches. Written out,
-the same operations in the same order are one or two kernels.
+Motivation: Brax runs backwards through an unroll with `jax.lax.scan` in every minibatch. On a GPU
+each iteration launches several very small kernels, a third of all launches of a minibatch.
+Unrolled, the same operations in the same order are one or two kernels.
+
+Equation, backwards in time:
+
+    δₜ = rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ,  Aₜ = δₜ + γ λ (1 - dₜ) Aₜ₊₁
+
+where δₜ and Aₜ are 0 at a truncated step. The value targets are Aₜ + Vₜ.
 
 Source: J. Schulman et al., High-Dimensional Continuous Control Using Generalized Advantage
 Estimation, arXiv:1506.02438.
@@ -19,7 +25,7 @@ from brax.training.agents.ppo import losses
 from jaxtyping import Array, Float
 
 _LONGEST = 64
-"""Unrolls beyond which Brax's loop is the better choice: the program grows with their length."""
+"""Longest unroll to write out; beyond it Brax's loop is better, for the program grows."""
 
 _brax = losses.compute_gae
 _lock = threading.Lock()
@@ -27,8 +33,8 @@ _lock = threading.Lock()
 
 @contextlib.contextmanager
 def unrolled() -> Iterator[None]:
-    """Lets what is traced inside estimate advantages by this module instead of Brax."""
-    # One thread at a time: of two that replace and restore, the second would keep the first's.
+    """Use this module's `compute_gae` instead of Brax's in all code that is traced inside."""
+    # One thread at a time: otherwise a second one would restore the first one's replacement.
     with _lock, mock.patch.object(losses, "compute_gae", compute_gae):
         yield
 
@@ -42,15 +48,15 @@ def compute_gae(
     lambda_: float = 1.0,
     discount: float = 0.99,
 ) -> tuple[Float[Array, "time batch"], Float[Array, "time batch"]]:
-    """Targets of the value function, and advantages.
+    """Compute the targets of the value function, and the advantages.
 
         δₜ = rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ,  Aₜ = δₜ + γ λ (1 - dₜ) Aₜ₊₁
 
-    and both are 0 where an episode was cut off.
+    where δₜ and Aₜ are 0 at a truncated step.
 
     Args:
-      truncation: 1 where an episode was cut off.
-      termination: dₜ, 1 where the task ended one.
+      truncation: 1 where an episode was truncated.
+      termination: dₜ, 1 where the task terminated an episode.
       rewards: rₜ.
       values: Vₜ.
       bootstrap_value: V after the last step.
@@ -58,7 +64,8 @@ def compute_gae(
       discount: γ.
 
     Returns:
-      The targets, and the advantages over the values of those targets; no gradient passes.
+      The targets Aₜ + Vₜ, and one-step advantages that use the next target in place of Vₜ₊₁; no
+      gradient passes through either.
     """
     if len(rewards) > _LONGEST:
         return _brax(truncation, termination, rewards, values, bootstrap_value, lambda_, discount)

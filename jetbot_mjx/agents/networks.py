@@ -1,4 +1,4 @@
-"""The policy: Brax's networks, their parameters by name, and inference."""
+"""Build Brax's policy and value networks, name their parameters, and run inference."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -24,7 +24,7 @@ _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 
 
 class PolicyParams(NamedTuple):
-    """Brax's positional triple, by name."""
+    """A `PolicyParams` holds Brax's positional triple of parameters by name."""
 
     normalizer: Any
     """Running mean and deviation of the observation."""
@@ -36,17 +36,17 @@ class PolicyParams(NamedTuple):
 
 @runtime_checkable
 class Policy(Protocol):
-    """A policy as users call it."""
+    """A policy as a callable of observations."""
 
     def __call__(
         self, obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
-        """Acts: the distribution's mode without a key, a sample with one."""
+        """Return an action: the distribution's mode without a key, a sample with one."""
         ...
 
 
 def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetworks]:
-    """Brax's `network_factory` argument for a network configuration.
+    """Return Brax's `network_factory` argument for a network configuration.
 
     Args:
       config: layer sizes, activation, distribution.
@@ -76,7 +76,7 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
 def make_networks(
     config: NetworkConfig, observation_size: int, action_size: int, *, normalize: bool
 ) -> ppo_networks.PPONetworks:
-    """Builds policy and value networks.
+    """Build policy and value networks.
 
     Args:
       config: layer sizes, activation, distribution.
@@ -96,7 +96,7 @@ def make_networks(
 
 
 def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Policy:
-    """Binds networks and parameters.
+    """Bind networks and parameters into a policy.
 
     Args:
       networks: as built by `make_networks`.

@@ -1,14 +1,24 @@
-"""Proximal policy optimisation as one pure step, put together from Brax's parts.
+"""Train with proximal policy optimisation (PPO) as one pure step, built from Brax's parts.
+
+Motivation: `brax.training.agents.ppo.train` keeps its training state in local variables. Here that
+state is one value, `TrainState`, that can be saved and restored, and non-finite environment states
+and gradients are stopped and counted.
+
+Equation: each minibatch minimises Brax's loss
+
+    L = -mean(min(ρ A, clip(ρ, 1 - ε, 1 + ε) A)) + ½ c_v mean((V_target - V)²) - c_e mean(H)
+
+with ρ = π(a|s) / π_old(a|s), A and V_target from `gae`, A normalised over the minibatch if
+`normalize_advantage`, ε = `clipping_epsilon`, c_v = `vf_loss_coefficient`, c_e = `entropy_cost`
+and H the entropy of the policy.
 
 Networks, action distribution, loss, running statistics, unrolls, gradients and the ADAPTIVE_KL
 rule are Brax's; so is the order of the random keys: on one device, step for step and with
-`normalizer: brax`, this is `brax.training.agents.ppo.train`. What that function keeps in local
-variables is one value here, `TrainState`, that can be stored and put back; whatever is not finite
-is stopped and counted.
+`normalizer: brax`, this is `brax.training.agents.ppo.train`.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`
 each device steps and shuffles its own environments; only gradients, the normaliser's sums and
-the figures cross.
+the metrics are exchanged between devices.
 
 Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.06347;
 google/brax v0.14.2, brax/training/agents/ppo.
@@ -46,7 +56,7 @@ LOSSES = {
     "policy_dist_mean_std": "policy/std",
     "learning_rate": "policy/learning_rate",
 }
-"""Brax's names of a minibatch's figures, and ours."""
+"""Brax's names of a minibatch's metrics, and ours."""
 
 _EPISODE_SUMS = {
     "sum_reward": "rollout/return",
@@ -54,11 +64,11 @@ _EPISODE_SUMS = {
     "success": "rollout/successes",
     "nonfinite_worlds": "nonfinite_worlds",
 }
-"""What is added up over the episodes that end, by its name in `info["episode_metrics"]`."""
+"""Metrics summed over the episodes that end, by their name in `info["episode_metrics"]`."""
 
 
 class TrainState(struct.PyTreeNode):
-    """All that a training is: with it, training goes on as if it had never stopped.
+    """The complete training state: a training that is restored from it continues exactly.
 
     Its leaves are `Any`: they also travel stacked, on the host, and as bare shapes.
     """
@@ -80,34 +90,34 @@ class TrainState(struct.PyTreeNode):
 
     @property
     def policy_params(self) -> PolicyParams:
-        """What acting needs."""
+        """Return the parameters that inference needs."""
         return PolicyParams(self.normalizer, self.params.policy, self.params.value)
 
 
 class Fault(struct.PyTreeNode):
-    """A world that stopped being finite, and how it got there."""
+    """The first non-finite state of an unroll, and the actions that led to it."""
 
     found: Any
-    """Whether there is one; otherwise the rest means nothing."""
+    """Whether there is one; otherwise the other fields have no meaning."""
     env_state: Any
     """The environment's state where the unroll began."""
     actions: Any
-    """What it did from there on, (time, action)."""
+    """The actions from there on, shape (time, action)."""
     step: Any
-    """Index of the action under which it blew up."""
+    """Index of the action that led to the non-finite state."""
 
 
 class Metrics(NamedTuple):
-    """What one training step tells."""
+    """The metrics of one training step."""
 
     figures: dict[str, Float[Array, ""]]
     """Means over the minibatches, and counts over the collected steps."""
     fault: Fault
-    """The first world of this shard that blew up."""
+    """The first non-finite state of this shard."""
 
 
 class PPO:
-    """The algorithm for one configuration and one environment; it holds no state."""
+    """PPO for one configuration and one environment; the object itself holds no state."""
 
     def __init__(
         self,
@@ -118,13 +128,13 @@ class PPO:
         axis_name: str | None = None,
         device_count: int = 1,
     ) -> None:
-        """Prepares networks and optimizer.
+        """Build the networks and the optimizer.
 
         Args:
           config: the hyperparameters.
           env: wrapped for training: batched, resets itself, keeps `episode_metrics`.
           num_envs: environments, all devices together; `config.num_envs` by default.
-          axis_name: of the mesh axis that the environments are sharded over; None: no sharding.
+          axis_name: mesh axis that the environments are sharded over; None: no sharding.
           device_count: its size.
         """
         self.config = config
@@ -151,7 +161,7 @@ class PPO:
         )
 
     def init(self, key: UInt32[Array, "2"]) -> TrainState:
-        """The state before the first step.
+        """Return the training state before the first step.
 
         Args:
           key: `jax.random.PRNGKey(seed)`.
@@ -188,7 +198,7 @@ class PPO:
     def advance(
         self, state: TrainState, num_steps: Int[Array, ""], restart: Bool[Array, ""]
     ) -> tuple[TrainState, Fault]:
-        """Several training steps; how many is an argument, so that one program serves all.
+        """Run several training steps; their number is an argument, so that one program serves all.
 
         Args:
           state: where to start.
@@ -217,10 +227,10 @@ class PPO:
         return jax.lax.fori_loop(0, num_steps, body, (state.replace(tally=tally), none))
 
     def train_step(self, state: TrainState) -> tuple[TrainState, Metrics]:
-        """Collects experience with the policy as it is, and improves the policy by it.
+        """Collect experience with the current policy, and update the policy with it.
 
         Args:
-          state: of this shard.
+          state: the state of this shard.
 
         Returns:
           The next state and what happened on the way.
@@ -254,7 +264,7 @@ class PPO:
     def _with_floor(
         self, normalizer: running_statistics.RunningStatisticsState
     ) -> running_statistics.RunningStatisticsState:
-        """Raise each deviation to the observation's physical scale.
+        """Raise each standard deviation to at least the observation's physical scale.
 
         A robot that never leaves its floor sees heights and tilts that differ by micrometres.
         Divided by such a deviation, another simulator's contact is far outside of all that was
@@ -268,15 +278,15 @@ class PPO:
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]
     ) -> tuple[PyTree, Transition, Fault]:
-        """Unrolls, one after the other, until there are enough for all minibatches.
+        """Collect unrolls, one after the other, until there are enough for all minibatches.
 
         Args:
-          state: of this shard.
-          key: for the actions' noise.
+          state: the state of this shard.
+          key: random key for the actions' noise.
 
         Returns:
           The environments' states after it, the unrolls of shape (unrolls, time, ...), of whose
-          `next_observation` only the last is kept, and the first world that blew up.
+          `next_observation` only the last is kept, and the first non-finite state.
         """
         policy = self._make_policy(tuple(state.policy_params))
 
@@ -292,7 +302,7 @@ class PPO:
                 extra_fields=("truncation", "episode_metrics", "episode_done"),
             )
             fault = _find_fault(env_state, data)
-            # The loss looks at what came next only where an unroll ends.
+            # The loss needs the next observation only at the end of an unroll.
             data = data._replace(next_observation=data.next_observation[-1:])
             return (after, next_key), (data, fault)
 
@@ -312,19 +322,19 @@ class PPO:
         data: Transition,
         key: UInt32[Array, "2"],
     ) -> tuple[PyTree, PyTree, dict[str, Float[Array, ""]]]:
-        """Several passes over the collected data, in minibatches.
+        """Update the networks in several passes over the collected data, in minibatches.
 
         Args:
-          params: of the networks.
-          optimizer_state: of `make_optimizer`.
-          normalizer: under which the data is seen.
+          params: parameters of the networks.
+          optimizer_state: state of the optimizer of `make_optimizer`.
+          normalizer: statistics that normalise the observations.
           data: unrolls, shape (unrolls, time, ...); `next_observation` may hold the last only.
-          key: for the shuffles and the entropy's samples.
+          key: random key for the shuffles and the entropy's samples.
 
         Returns:
-          Parameters, optimizer state, and the mean figures of the minibatches.
+          Parameters, optimizer state, and the mean metrics of the minibatches.
         """
-        # What only the books need is not shuffled.
+        # Episode statistics are not shuffled.
         extras = {
             "policy_extras": data.extras["policy_extras"],
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
@@ -366,7 +376,7 @@ class PPO:
         batch: Transition,
         normalizer: running_statistics.RunningStatisticsState,
     ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
-        """One gradient step, or none where the gradient is not finite."""
+        """Apply one gradient step, or skip it where the gradient is not finite."""
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
         (_, figures), gradient = self._loss_and_gradient(params, normalizer, batch, loss_key)
@@ -375,7 +385,7 @@ class PPO:
         if self.config.learning_rate_schedule == "ADAPTIVE_KL":
             kl = figures["kl_mean"]
             optimizer_state, _ = optimizer.adaptive_kl_learning_rate(
-                # It writes into the state that it is given.
+                # It modifies the state that it is given.
                 jax.tree.map(lambda x: x, optimizer_state),
                 kl if self._axis is None else jax.lax.pmean(kl, self._axis),
                 self.config.desired_kl,
@@ -401,7 +411,7 @@ class PPO:
         batch: Transition,
         key: UInt32[Array, "2"],
     ) -> tuple[Array, Mapping[str, Array]]:
-        """Brax's loss under this configuration."""
+        """Compute Brax's PPO loss under this configuration; the module states the equation."""
         with gae.unrolled():
             return losses.compute_ppo_loss(
                 params,
@@ -419,7 +429,7 @@ class PPO:
             )
 
     def _episode_sums(self, data: Transition) -> dict[str, Float[Array, ""]]:
-        """Sums over the episodes that ended while collecting, all devices together."""
+        """Sum the metrics of the episodes that ended during collection, over all devices."""
         ended = data.extras["state_extras"]["episode_done"]
         books: Any = data.extras["state_extras"]["episode_metrics"]
         sums = {
@@ -441,7 +451,7 @@ TALLIED = (
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
-    """Adam, behind clipping by the global norm where that is wanted.
+    """Return Adam, preceded by clipping of the global gradient norm if configured.
 
     Args:
       config: step size, its schedule, and the norm.
@@ -461,7 +471,7 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
 
 
 def _find_fault(start: PyTree, data: Transition) -> Fault:
-    """The first world of an unroll that stopped being finite, from data of (time, world)."""
+    """Return the first non-finite state of an unroll, from data of shape (time, world)."""
     books: Any = data.extras["state_extras"]["episode_metrics"]
     ended = data.extras["state_extras"]["episode_done"]
     blown = ended * books.get("nonfinite_worlds", jnp.zeros(())) > 0
@@ -477,5 +487,5 @@ def _find_fault(start: PyTree, data: Transition) -> Fault:
 
 
 def _first(one: Fault, other: Fault) -> Fault:
-    """The earlier of two, if there is one."""
+    """Return the earlier of two non-finite states, if there is one."""
     return jax.tree.map(lambda a, b: jnp.where(one.found, a, b), one, other)

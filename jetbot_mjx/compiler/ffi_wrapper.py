@@ -1,4 +1,4 @@
-"""A kernel as a function that XLA calls on a CPU, in LLVM's intermediate representation.
+"""Wrap a kernel as a function that XLA calls on a CPU, in LLVM's intermediate representation.
 
 XLA hands over one address, of a call frame. Around a `step` of as many robots as a vector register
 has lanes, what is written here reads the frame, deals blocks of robots to XLA's own threads, and
@@ -16,18 +16,18 @@ from string import Template
 from jetbot_mjx.compiler.llvm_codegen import STEP
 
 VERSION = (0, 3)
-"""Of the interface."""
+"""Version of the foreign function interface."""
 
 SYMBOLS = ("malloc", "free", "sched_yield")
-"""What a kernel calls of the C library."""
+"""Functions of the C library that a kernel calls."""
 
 _BLOCKS_PER_THREAD = 4
-"""Fewer are done sooner than another thread wakes."""
+"""With fewer blocks, one thread finishes before another wakes up."""
 
 _PATIENCE = 1000
-"""Looks at what other threads have still to do, some 20 µs, before the core is given away."""
+"""Polls for the other threads to finish, about 20 µs, before the thread yields its core."""
 
-# Subnormal numbers are zeros: on whichever thread, for XLA's own have it so and others may not.
+# Flush subnormal numbers to zero on every thread: XLA's threads do so, and others may not.
 _PROCESSORS = {
     "x86_64": """
 declare void @llvm.x86.sse.stmxcsr(ptr)
@@ -79,7 +79,7 @@ MACHINES = tuple(_PROCESSORS)
 """Processors that a kernel can be written for."""
 
 TEXT = resources.files("jetbot_mjx").joinpath("assets/xla_call.ll").read_text("utf-8")
-"""Of all kernels, with gaps."""
+"""Template of all kernels."""
 
 
 def kernel_text(
@@ -92,17 +92,17 @@ def kernel_text(
     name: str,
     machine: str,
 ) -> str:
-    """Writes what XLA calls.
+    """Write the LLVM module whose function XLA calls.
 
     It takes float32 arrays of (robots, ...) and returns as many as are carried.
 
     Args:
-      step: the text of what `lanes` robots do once.
-      sizes: of each argument, how many numbers one robot has.
+      step: the text of one step of `lanes` robots.
+      sizes: how many numbers of each argument one robot has.
       carried: how many of the arguments change, and are the results.
       lanes: robots in a block.
       steps: how often each robot makes the step.
-      name: of the function, a C identifier.
+      name: name of the function, a C identifier.
       machine: the processor, of `MACHINES`.
 
     Returns:
@@ -131,7 +131,7 @@ def kernel_text(
 
 
 def _address(i: int) -> str:
-    """Array `i` of a job."""
+    """Return the lines that load the address of array `i` of a job."""
     return (
         f"%a{i}.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 {i}\n"
         f"  %a{i} = load ptr, ptr %a{i}.at"
@@ -139,7 +139,7 @@ def _address(i: int) -> str:
 
 
 def _pointer(i: int, arguments: int) -> str:
-    """Copies the address of an argument, or of a result, from the call frame into a job."""
+    """Return the lines that copy an argument's or result's address from the call frame to a job."""
     source, place = ("buffers", i) if i < arguments else ("outputs", i - arguments)
     return (
         f"%b{i}.at = getelementptr ptr, ptr %{source}, i64 {place}\n"

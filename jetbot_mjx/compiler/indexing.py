@@ -1,4 +1,4 @@
-"""Arrays of single numbers, and what only moves such numbers about: slices, gathers and the like.
+"""Arrays of scalars, and the JAX operations that only move them: slices, gathers and the like.
 
 None of it is arithmetic: where a number goes is known before the program runs.
 """
@@ -15,7 +15,7 @@ Numbers = np.ndarray
 
 
 def filled(shape: Sequence[int], make: Callable[[], Scalar]) -> Numbers:
-    """An array of this shape, each number made in turn."""
+    """Return an array of this shape, with one call of `make` for each element."""
     numbers = np.empty(shape, object)
     for place in np.ndindex(*shape):
         numbers[place] = make()
@@ -23,23 +23,23 @@ def filled(shape: Sequence[int], make: Callable[[], Scalar]) -> Numbers:
 
 
 def numbers_of(scalars: Iterable[Scalar], shape: Sequence[int]) -> Numbers:
-    """An array of this shape from its numbers, the last axis running first."""
+    """Return an array of this shape from its elements in row-major order."""
     numbers = iter(list(scalars))
     return filled(shape, lambda: next(numbers))
 
 
 def known_array(array: Any) -> Numbers:
-    """An array of which all numbers are known."""
+    """Return an array of constants as an array of scalars."""
     array = np.asarray(array)
     return numbers_of(array.ravel(), array.shape)
 
 
 def known_values(numbers: Numbers, dtype: Any) -> np.ndarray:
-    """A plain array of numbers that are all known.
+    """Convert scalars that are all constants to a plain NumPy array.
 
     Args:
-      numbers: what is to be known.
-      dtype: of the array.
+      numbers: the scalars.
+      dtype: dtype of the array.
 
     Returns:
       The array.
@@ -53,7 +53,7 @@ def known_values(numbers: Numbers, dtype: Any) -> np.ndarray:
 
 
 def shape_of(variable: Any) -> tuple[int, ...]:
-    """The shape of a variable in JAX's description of a function."""
+    """Return the shape of a jaxpr variable."""
     return tuple(variable.aval.shape)
 
 
@@ -69,19 +69,19 @@ def windows(
     sizes: Sequence[int],
     clip: bool,
 ) -> np.ndarray:
-    """Where in a flat operand a gather reads, or a scatter writes; -1: nowhere.
+    """Return the flat operand indices that a gather reads or a scatter writes; -1 means none.
 
     Source: the semantics of gather and scatter in the StableHLO specification.
 
     Args:
-      shape: of the operand.
+      shape: shape of the operand.
       indices: where windows begin, along the last axis.
       offset_dims: axes of the result, or of the updates, that lie within a window.
       collapsed: axes of the operand that a window has not.
       index_map: the operand's axis for each number of an index.
       batching: axes of the operand that go along with axes of the indices.
       indices_batching: those axes of the indices.
-      sizes: of a window, along each axis of the operand.
+      sizes: size of a window, along each axis of the operand.
       clip: moves windows inside that reach beyond.
 
     Returns:
@@ -199,7 +199,7 @@ def _gather(equation: Any, params: Any, x: Numbers, indices: Numbers) -> Numbers
         batching=numbers.operand_batching_dims,
         indices_batching=numbers.start_indices_batching_dims,
         sizes=params["slice_sizes"],
-        # What is promised to be in bounds XLA moves there all the same.
+        # XLA also clips indices that are promised to be in bounds.
         clip="FILL" not in str(params["mode"]),
     )
     fill = equation.outvars[0].aval.dtype.type(_fill_value(equation))

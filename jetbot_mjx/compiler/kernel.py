@@ -1,13 +1,19 @@
-"""A step of one robot as one kernel for all of them.
+"""Run a step of one robot as one kernel for all robots.
 
-What `jax.vmap` and XLA make of MJX's step is hundreds of kernels, and every number that passes from
-one to the next goes through memory. Written out number by number (`scalarize`) the same step is
-one kernel that reads a robot's state, makes all physics steps of an environment step, and writes
-the state back. Who compiles and launches it is a back end's affair: `gpu` and `cpu`.
+Motivation: `jax.vmap` and XLA compile MJX's step to hundreds of kernels, and every value that
+passes from one kernel to the next goes through memory. Lowered to scalars (`scalarize`), the same
+step is one kernel that reads a robot's state, runs all physics steps of an environment step, and
+writes the state back.
 
-For JAX the kernel is a primitive. Its batching rule puts any number of batch axes into one launch,
-and it is lowered for the platform that a program is compiled for, whatever the process's default
-is: programs for CPUs and GPUs can live side by side.
+Protocol: for JAX the kernel is a primitive.
+
+1. `as_step` binds the primitive to the leaves of (carry, consts) of one robot, all float32.
+2. The batching rule of `jax.vmap` puts any number of batch axes into one launch.
+3. The primitive is lowered for the platform that a program is compiled for, whatever the
+   process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
+   (`ptx_backend` or `llvm_backend`) compiles and launches the kernel; without one, `auto` runs the
+   fallback in JAX, and any other `physics.impl` raises a `UserError`.
+4. Differentiation raises a `UserError`.
 """
 
 import contextlib
@@ -32,11 +38,11 @@ from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
 from jetbot_mjx.errors import UserError
 
 Step = Callable[[PyTree, PyTree], PyTree]
-"""Of (carry, consts): the carry, some steps later."""
+"""A function of (carry, consts) that returns the carry some steps later."""
 
 
 class Kernel:
-    """A step of one robot that a back end can run for many; compared by identity."""
+    """A step of one robot that a back end can run for many; kernels are compared by identity."""
 
     def __init__(
         self,
@@ -75,25 +81,25 @@ class Kernel:
 
 
 class Backend(Protocol):
-    """Who compiles and launches kernels; the modules `gpu` and `cpu` are."""
+    """The interface of a back end, which compiles and launches kernels."""
 
     @property
     def IMPL(self) -> str:
-        """Its name in `physics.impl`."""
+        """Return the back end's name in `physics.impl`."""
         ...
 
     @property
     def PLATFORM(self) -> str:
-        """The platform that JAX's programs run on."""
+        """Return the JAX platform that the back end serves."""
         ...
 
     @property
     def NEEDS(self) -> str:
-        """What there must be, in words."""
+        """Return a description of what must be installed or present."""
         ...
 
     def is_available(self) -> bool:
-        """Whether JAX knows the platform, and all that the back end needs is there."""
+        """Return whether JAX knows the platform and all requirements of the back end are met."""
         ...
 
     def launch(self, kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
@@ -104,16 +110,16 @@ class Backend(Protocol):
           leaves: its arguments, float32 of (robots, ...).
 
         Returns:
-          What became of those that are carried.
+          The new values of the carried arguments.
         """
         ...
 
 
 def as_step(kernel: Kernel) -> Step:
-    """A kernel as a function of one robot, to be batched by `jax.vmap`.
+    """Return a kernel as a JAX function of one robot, which `jax.vmap` can batch.
 
     Args:
-      kernel: of a step.
+      kernel: the kernel of a step.
 
     Returns:
       A function of (carry, consts), pytrees with the leaves of the kernel's arguments, which must
@@ -132,7 +138,7 @@ _kernel_p.multiple_results = True
 
 
 def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
-    """The batch axes that all arguments have in front of what one robot has.
+    """Return the batch axes that all arguments have in front of the axes of one robot.
 
     Raises:
       UserError: an argument is not float32.
@@ -195,7 +201,7 @@ ad.primitive_jvps[_kernel_p] = _differentiate
 
 
 def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
-    """What a program for one platform, or for any other, does."""
+    """Return the function that is lowered for a platform; None stands for any other platform."""
 
     def lowered(*leaves: Array, kernel: Kernel) -> list[Array]:
         batch = _batch_shape(kernel, leaves)
@@ -230,12 +236,12 @@ def register(*backends: Backend) -> None:
 
 
 def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
-    """What was made before, from the folder of compiled programs, or what is made now.
+    """Return cached bytes from the folder of compiled programs, or make and cache them.
 
     Args:
-      kind: with what its file's name begins.
-      key: all that it depends on.
-      make: makes it.
+      kind: the prefix of the file's name.
+      key: everything that the content depends on.
+      make: returns the content when it is not cached.
 
     Returns:
       The content.
@@ -248,7 +254,7 @@ def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     if digest == _digest(content):
         return content
     content = make()
-    # As with compiled programs: a folder that cannot be written costs time, nothing else.
+    # As with compiled programs, a folder that cannot be written only costs time.
     with contextlib.suppress(OSError):
         write_private(path, _digest(content) + b"\n" + content)
     return content

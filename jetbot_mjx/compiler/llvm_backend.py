@@ -47,7 +47,7 @@ _loaded: dict[str, _Loaded] = {}
 
 
 class _Host(NamedTuple):
-    """The processor, in LLVM's words."""
+    """The processor, as LLVM describes it."""
 
     machine: str
     name: str
@@ -60,7 +60,7 @@ class _Host(NamedTuple):
 
 @functools.cache
 def is_available() -> bool:
-    """Whether llvmlite is here, and XLA calls a kernel of it on CPUs."""
+    """Return whether llvmlite is installed and XLA can call a kernel compiled by it on CPUs."""
     try:
         device = jax.local_devices(backend=PLATFORM)[0]
         host = _host()
@@ -111,7 +111,7 @@ def kernel_text(kernel: Kernel) -> str:
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
-    """Run a kernel, as `jetbot_mjx.compiler.kernel.Backend` has it."""
+    """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     text = kernel.text(IMPL, lambda: kernel_text(kernel))
     results = leaves[: kernel.carried]
     shapes = [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
@@ -119,7 +119,7 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 
 
 def _registered(text: str) -> str:
-    """The name by which XLA knows a kernel; compiles it when it is first asked for."""
+    """Return the name by which XLA knows a kernel, and compile the kernel on first use."""
     name = f"jetbot_mjx_{hashlib.sha256(_key(text)).hexdigest()}"
     # Programs are traced in several threads.
     with _lock:
@@ -136,7 +136,7 @@ def _register(name: str, code: bytes) -> None:
 
 
 def kernels_in(lowered: str) -> dict[str, bytes]:
-    """The kernels that a program calls.
+    """Return the kernels that a program calls.
 
     Args:
       lowered: the program's text.
@@ -148,7 +148,7 @@ def kernels_in(lowered: str) -> dict[str, bytes]:
 
 
 def register(kernels: Mapping[str, bytes]) -> None:
-    """Makes kernels known to XLA, before it loads a program that calls them.
+    """Register kernels with XLA, before XLA loads a program that calls them.
 
     Args:
       kernels: of `kernels_in`, from this processor and these versions of all libraries.
@@ -160,13 +160,13 @@ def register(kernels: Mapping[str, bytes]) -> None:
 
 
 def _key(text: str) -> bytes:
-    """All that a kernel's machine code depends on."""
+    """Return the cache key: everything that a kernel's machine code depends on."""
     host = _host()
     return "\n".join([host.version, host.name, host.features, str(_LEVEL), text]).encode()
 
 
 def _machine_code(text: str) -> bytes:
-    """An object file, from the folder of compiled programs if it was compiled before."""
+    """Return a kernel's object file, from the folder of compiled programs if it is cached there."""
     return kept_bytes("object", _key(text), lambda: _compile(text))
 
 
@@ -196,7 +196,7 @@ def _target_machine() -> Any:
 
 @functools.cache
 def _binding() -> Any:
-    """LLVM, which takes a while to load."""
+    """Return the LLVM binding, which is imported late because it takes a while to load."""
     binding = importlib.import_module("llvmlite.binding")
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()

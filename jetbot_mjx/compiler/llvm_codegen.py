@@ -1,10 +1,10 @@
-"""A program of single numbers in LLVM's intermediate representation, for CPUs and GPUs.
+"""Write a scalar program in LLVM's intermediate representation, for CPUs and GPUs.
 
 On a CPU every number is a vector register wide: each lane does the whole program for one robot. On
-a GPU each thread does. A loop ends when it has for all lanes, or for the thread: a lane that is
-done keeps its numbers, so that they are the same whoever its neighbours are. A side of a branch is
-skipped if no lane takes it. Lanes that are done with a loop around, or that took the other side of
-a branch around, hold up neither.
+a GPU each thread does. A loop ends when it has ended for all lanes, or for the thread: a finished
+lane keeps its values, so that they do not depend on the other lanes. A side of a branch is skipped
+if no lane takes it. Lanes that have left an enclosing loop, or that took the other side of an
+enclosing branch, delay neither.
 
 Source: LLVM Language Reference Manual.
 """
@@ -29,7 +29,7 @@ _INTRINSICS = {"abs": "fabs", "floor": "floor", "sqrt": "sqrt"}
 
 
 def step_text(program: Program, *, carried: int, lanes: int) -> str:
-    """Write a function that does a program once, its results taking the first arguments' place.
+    """Write a function that runs a program once and stores the results in the first arguments.
 
     The function's parameter is the address of a tile: a row for each number of the arguments, of
     as many float32 as there are lanes, aligned to the length of a row.
@@ -79,7 +79,7 @@ def require(program: Program) -> None:
 
 
 class Writer:
-    """The lines of a function that does a program, and the names of its numbers."""
+    """A `Writer` holds the lines of a function that runs a program, and the names of its values."""
 
     def __init__(self, program: Program, lanes: int, label: str = "entry") -> None:
         """Begin with no lines.
@@ -104,7 +104,7 @@ class Writer:
         self._mask = ""
 
     def step(self, arguments: Sequence[str]) -> list[str]:
-        """Do the program once.
+        """Write one run of the program.
 
         Args:
           arguments: the names of its arguments' numbers.
@@ -118,7 +118,7 @@ class Writer:
         return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
 
     def declarations(self) -> list[str]:
-        """Lines outside of any function that the program needs."""
+        """Return the lines outside of any function that the program needs."""
         number, whole, truth = self.type("f"), self.type("i"), self.type("b")
         lines = [f"declare {number} {self._function(x)}({number})" for x in _INTRINSICS.values()]
         lines.append(f"declare {whole} {self._function('fptosi.sat')}({number})")
@@ -131,7 +131,7 @@ class Writer:
         return lines
 
     def type(self, kind: str) -> str:
-        """LLVM's type of a number by the kind of its dtype."""
+        """Return LLVM's type of a number by the kind of its dtype."""
         element = _ELEMENTS[kind]
         return element if self._lanes == 1 else f"<{self._lanes} x {element}>"
 
@@ -173,7 +173,7 @@ class Writer:
         return self._splat(kind, _float(x) if kind == "f" else str(int(x)))
 
     def _any(self, which: str) -> str:
-        """Whether any lane has a condition."""
+        """Return a value that is true if a condition holds in any lane."""
         if self._lanes == 1:
             return which
         function = f"@llvm.vector.reduce.or.v{self._lanes}i1"
@@ -189,7 +189,7 @@ class Writer:
                 self._operation(item)
 
     def _masked_block(self, block: Block, mask: str) -> None:
-        """A block in which only the numbers of some lanes matter, of those that did around it."""
+        """Open a block in which only some of the enclosing block's active lanes matter."""
         around = self._mask
         # The only lane is there, or the block is not.
         self._mask = mask if self._lanes > 1 else ""
@@ -246,7 +246,7 @@ class Writer:
             self._names[result.index] = self.do(self._chosen(which, result.dtype.kind, a, b))
 
     def _side(self, block: Block, which: str, numbers: Sequence[Scalar]) -> list[str]:
-        """What a side of a branch computes, if any lane takes it; else anything."""
+        """Write one side of a branch; its values are arbitrary if no lane takes that side."""
         if not block.items:
             return [self._operand(x) for x in numbers]
         if self._mask:
@@ -356,7 +356,7 @@ def _plain(instruction: str, kind: str) -> _Writer:
 
 
 def _float(x: float) -> str:
-    """A constant by its bits: of a double, as LLVM has it."""
+    """Return a constant by its bits, which LLVM writes as those of a double."""
     return f"0x{struct.pack('>d', float(x)).hex().upper()}"
 
 

@@ -1,9 +1,9 @@
-"""A JAX function of one robot as arithmetic on single numbers.
+"""Lower a JAX function of one robot to arithmetic on scalars.
 
-JAX describes a function by operations on arrays; here every array is taken apart into its numbers.
-Slices, gathers, transposes and the like then cost nothing, and what a model's constants decide is
-decided. What is left can be done for thousands of robots side by side, each by one thread of a GPU,
-without any number in between going through memory.
+JAX describes a function by operations on arrays; here every array is split into its scalars.
+Slices, gathers, transposes and the like then cost nothing, and everything that depends only on the
+model's constants is evaluated. The rest can run for thousands of robots in parallel, each in one
+thread of a GPU, and no intermediate value goes through memory.
 
 Small loops of known length are written out, and small branches become selections. The others stay
 loops and branches. What a loop carries is first taken to be as constant as it begins, and only what
@@ -62,7 +62,7 @@ LEAST_IN_BRANCH = 24
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What a function does, number by number."""
+    """A `Program` holds a function's operations on scalars."""
 
     inputs: list[Numbers]
     """The numbers of each leaf of the arguments, in their shapes."""
@@ -73,14 +73,14 @@ class Program:
 
     @property
     def size(self) -> int:
-        """How many operations are written down."""
+        """Return the number of recorded operations."""
         return sum(1 for _ in self.block.values())
 
     def evaluate(self, leaves: Sequence[np.ndarray]) -> list[np.ndarray]:
         """Run the program in NumPy.
 
         Args:
-          leaves: of the arguments, each with the same leading batch axes.
+          leaves: the leaves of the arguments, each with the same leading batch axes.
 
         Returns:
           The leaves of the result, with the same batch axes.
@@ -99,7 +99,7 @@ class Program:
 
 
 class _Evaluation:
-    """The numbers of a program that runs in NumPy, of all robots."""
+    """The values of a program that runs in NumPy, for all robots."""
 
     def __init__(self, batch: tuple[int, ...]) -> None:
         self._batch = batch
@@ -160,17 +160,17 @@ class _Evaluation:
 
 
 def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
-    """Write a function down as arithmetic on single numbers.
+    """Lower a function to arithmetic on scalars.
 
     Args:
-      function: what `jax.jit` takes; its shapes and indices must not depend on its arguments.
-      *arguments: pytrees of arrays, or of what has their shape and dtype.
+      function: a jittable function; its shapes and indices must not depend on its arguments.
+      *arguments: pytrees of arrays, or of objects with their shape and dtype.
 
     Returns:
       The program.
 
     Raises:
-      UnsupportedError: the function does what cannot be written down so.
+      UnsupportedError: the function has an operation that cannot be lowered.
     """
     closed = jax.make_jaxpr(function)(*arguments)
     graph = Graph()
@@ -187,7 +187,7 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
 
 
 class _Writer:
-    """Goes through a function's operations and records what they do to numbers."""
+    """A `_Writer` walks a function's jaxpr and records its operations on scalars."""
 
     def __init__(self, graph: Graph) -> None:
         self._graph = graph
@@ -229,12 +229,12 @@ class _Writer:
         return numbers_of((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
 
     def _choose(self, which: Scalar, no: Numbers, yes: Numbers) -> Numbers:
-        """One of two arrays, all numbers by the same choice."""
+        """Select one of two arrays by one condition for all elements."""
         pairs = zip(no.ravel(), yes.ravel(), strict=True)
         return numbers_of((self._graph.select(which, a, b) for a, b in pairs), no.shape)
 
     def _choose_rows(self, which: Numbers, no: Numbers, yes: Numbers) -> Numbers:
-        """The same by a choice for each place of the leading axes."""
+        """Select between two arrays by one condition for each index of the leading axes."""
         which = which.reshape(*which.shape, *[1] * (no.ndim - which.ndim))
         rows = zip(np.broadcast_to(which, no.shape).ravel(), no.ravel(), yes.ravel(), strict=True)
         return numbers_of((self._graph.select(*row) for row in rows), no.shape)
@@ -283,7 +283,7 @@ class _Writer:
     def _counted_loop(
         self, body: ClosedJaxpr, length: int, constants: Sequence[Numbers], carry: list[Numbers]
     ) -> list[Numbers] | None:
-        """A scan over nothing; None where it must be written out, however long."""
+        """Lower a scan without inputs; return None if it must be unrolled, however long it is."""
 
         def going(state: list[Numbers]) -> Scalar:
             return self._graph.apply("lt", state[0].item(), np.int32(length))
@@ -326,7 +326,7 @@ class _Writer:
     def _short_or_loop(
         self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
     ) -> list[Numbers]:
-        """A loop that is written out where it is small and of known length, and else stays one."""
+        """Unroll a loop if it is small and its length is known, and else keep it as a loop."""
         with contextlib.suppress(UnsupportedError):
             return self._written_out(state, going, trip, is_short=True)
         return self._loop(state, going, trip)
@@ -338,12 +338,12 @@ class _Writer:
         trip: Callable[..., list[Numbers]],
         is_short: bool = False,
     ) -> list[Numbers]:
-        """A loop as all trips that it may make.
+        """Unroll a loop into all iterations that it may make.
 
         Args:
-          state: what the first trip begins with.
-          going: of a state: whether there is a trip.
-          trip: of a state: the next one.
+          state: the carry of the first iteration.
+          going: a function of a state that returns whether there is another iteration.
+          trip: a function of a state that returns the next state.
           is_short: refuses one that makes more operations than can be written out, or of which is
             not known how often it runs.
 
@@ -368,12 +368,12 @@ class _Writer:
     def _loop(
         self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
     ) -> list[Numbers]:
-        """A loop that stays one.
+        """Record a loop that is not unrolled.
 
         Args:
-          state: what the first trip begins with.
-          going: of a state: whether there is a trip.
-          trip: of a state: the next one.
+          state: the carry of the first iteration.
+          going: a function of a state that returns whether there is another iteration.
+          trip: a function of a state that returns the next state.
 
         Returns:
           The state at the end.
@@ -492,7 +492,7 @@ class _Writer:
         return result
 
     def _is_after(self, which: Scalar, case: int) -> Scalar:
-        """Whether a choice, bool or whole, is of a later case."""
+        """Return whether a branch index, bool or integer, selects a later case."""
         if which.dtype == bool:
             return which
         return self._graph.apply("gt", which, which.dtype.type(case))
@@ -589,7 +589,7 @@ class _Writer:
 
 
 class _Derivation:
-    """What a loop carries that follows from the other numbers that it carries.
+    """The carried values of a loop that are functions of its other carried values.
 
     A carried number follows from others if it is the same function of them before the first trip
     and after every one. The two are compared operation by operation.
@@ -603,7 +603,7 @@ class _Derivation:
         self._known: dict[Any, Scalar] = {}
 
     def derived(self) -> dict[int, Scalar]:
-        """Of those that follow: which, and how they are computed from the others."""
+        """Return which carried values are derived, and how each is computed from the others."""
         result: dict[int, Scalar] = {}
         for place in self._places:
             ends = self._loop.first[place], self._loop.following[place]
@@ -616,7 +616,7 @@ class _Derivation:
         return result
 
     def _matched(self, before: Scalar, after: Scalar) -> Scalar | None:
-        """What is `before` at first and `after` later, of carried numbers; None: nothing is."""
+        """Return one expression for both `before` and `after`; None if there is none."""
         pending = [(before, after)]
         found: dict[Any, Scalar | None] = {}
         while pending:
@@ -647,7 +647,7 @@ class _Derivation:
 
 
 def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
-    """The operands of two operations that are alike, in pairs."""
+    """Return the operands of two matching operations, in pairs."""
     if is_known(before) or is_known(after) or not before.operands:
         return None
     if before.op != after.op or before.dtype != after.dtype or before.op == "input":
@@ -668,13 +668,13 @@ def _flat(arrays: Sequence[Numbers]) -> list[Scalar]:
 
 
 def _like(arrays: Sequence[Numbers], flat: Sequence[Scalar]) -> list[Numbers]:
-    """Numbers in the shapes of arrays."""
+    """Return scalars in the shapes of the given arrays."""
     numbers = iter(flat)
     return [filled(array.shape, lambda: next(numbers)) for array in arrays]
 
 
 def _at(numbers: Numbers, i: int) -> Numbers:
-    """One of the leading axis, as an array even where it is a single number."""
+    """Return one entry along the leading axis, as an array even if it is a single number."""
     return numbers[i : i + 1].reshape(numbers.shape[1:])
 
 
@@ -686,7 +686,7 @@ def _lowest(equation: Any) -> Any:
 
 
 def _grouped(x: Numbers, batch: Sequence[int], summed: Sequence[int]) -> Numbers:
-    """As (batch, free, summed)."""
+    """Return an array with its axes grouped as (batch, free, summed)."""
     free = [axis for axis in range(x.ndim) if axis not in batch and axis not in summed]
     sizes = [
         int(np.prod([x.shape[axis] for axis in axes], dtype=int)) for axes in (batch, free, summed)

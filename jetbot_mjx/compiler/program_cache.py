@@ -34,12 +34,12 @@ class Programs:
     """The compiled programs of one configuration, by name."""
 
     def __init__(self, options: Options, folder: Path | None = None, key: str = "") -> None:
-        """Names the place where they are kept.
+        """Set the options, folder and key of the cache.
 
         Args:
-          options: what they are compiled with.
-          folder: is there; None: they are not kept.
-          key: all that the programs depend on.
+          options: the compiler options of the programs.
+          folder: an existing folder; None: programs are not cached.
+          key: everything that the programs depend on.
         """
         self._options = options
         self._folder = folder
@@ -47,7 +47,7 @@ class Programs:
         self._coming: dict[str, Future[jax.stages.Compiled | None]] = {}
 
     def prefetch(self, *names: str) -> None:
-        """Begins to load programs, in threads, and returns at once."""
+        """Start to load programs in threads, and return at once."""
         with_folder = names if self._folder else ()
         for name in with_folder:
             pool = ThreadPoolExecutor(1)
@@ -55,10 +55,10 @@ class Programs:
             pool.shutdown(wait=False)
 
     def find(self, name: str) -> jax.stages.Compiled | None:
-        """A program if it was compiled before.
+        """Return a program if it was compiled before.
 
         Args:
-          name: of the program, one of its own within the configuration.
+          name: name of the program, unique within the configuration.
 
         Returns:
           The program, or None.
@@ -69,10 +69,10 @@ class Programs:
         return coming.result() if coming else _load(self._path(name))
 
     def compile(self, name: str, trace: Callable[[], jax.stages.Traced]) -> jax.stages.Compiled:
-        """A program, compiled unless it was before.
+        """Return a program, and compile it if it is not cached.
 
         Args:
-          name: of the program.
+          name: name of the program.
           trace: traces it.
 
         Returns:
@@ -98,7 +98,7 @@ class Programs:
 
 
 def processor() -> str:
-    """A short name for this processor's instruction set."""
+    """Return a short name for this processor's instruction set."""
     try:
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
@@ -108,7 +108,7 @@ def processor() -> str:
 
 
 def use_compilation_cache() -> None:
-    """Lets JAX keep what it compiles in the user's cache folder, for the next process.
+    """Enable JAX's compilation cache in the user's cache folder, for later processes.
 
     `JAX_COMPILATION_CACHE_DIR` names another folder, and `JAX_ENABLE_COMPILATION_CACHE=false`
     turns it off. What is compiled for one kind of processor does not run on every other: each
@@ -126,7 +126,7 @@ def use_compilation_cache() -> None:
 
 
 def _cache_folder(given: str | None) -> Path | None:
-    """Return the folder of compiled programs, made where it is missing; None: there is no such."""
+    """Return the folder of compiled programs, created if missing; None if it cannot be used."""
     try:
         if given:
             folder = Path(given)
@@ -148,7 +148,7 @@ def _cache_folder(given: str | None) -> Path | None:
 
 
 class _CacheHits:
-    """How many programs this thread finds in JAX's own cache."""
+    """A counter of the programs that this thread finds in JAX's own cache."""
 
     def __enter__(self) -> Self:
         self.count = 0
@@ -165,7 +165,7 @@ class _CacheHits:
 
 
 def _load(path: Path) -> jax.stages.Compiled | None:
-    """The program in a file; None where there is none, none that is trusted or can be loaded."""
+    """Load the program in a file; return None if it is missing, not trusted or cannot be loaded."""
     began = time.perf_counter()
     content = read_trusted(path)
     if content is None:
@@ -201,9 +201,9 @@ def _load(path: Path) -> jax.stages.Compiled | None:
 def _keep(
     path: Path, program: jax.stages.Compiled, kernels: dict[str, bytes], seconds: float
 ) -> None:
-    """Writes a program, the kernels that it calls and the time that it took.
+    """Write a program, the kernels that it calls and its compile time to a file.
 
-    A folder without room costs time, no more.
+    A full folder only costs time.
     """
     try:
         kept = serialize_executable.serialize(program)

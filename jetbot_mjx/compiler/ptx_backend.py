@@ -45,7 +45,7 @@ _ARCHITECTURES = (70, 80, 90)
 
 @functools.cache
 def is_available() -> bool:
-    """Whether JAX knows an NVIDIA GPU, and its XLA launches a kernel that LLVM compiled."""
+    """Return whether JAX knows an NVIDIA GPU and its XLA launches a kernel that LLVM compiled."""
     try:
         device = jax.local_devices(backend=PLATFORM)[0]
         _binding()
@@ -67,7 +67,7 @@ def is_available() -> bool:
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
-    """Run a kernel, as `jetbot_mjx.compiler.kernel.Backend` has it."""
+    """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     robots = leaves[0].shape[0]
     threads = threads_in_block(robots)
     architecture = _architecture()
@@ -95,13 +95,13 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 
 
 def threads_in_block(robots: int) -> int:
-    """How many robots share a block: a power of two, so few that all multiprocessors have some."""
+    """Return the robots per block: a power of two that leaves some for every multiprocessor."""
     wanted = 2 ** math.ceil(math.log2(max(1, robots / _BLOCKS)))
     return min(max(wanted, _LEAST_THREADS), _MOST_THREADS)
 
 
 def compiled(kernel: Kernel, architecture: int) -> str:
-    """The PTX of a kernel, with a gap for the number of robots.
+    """Return the PTX of a kernel, with a placeholder for the number of robots.
 
     Args:
       kernel: the kernel.
@@ -202,7 +202,7 @@ def kernel_text(program: Program, *, carried: int, steps: int) -> str:
 def _transfers(
     sizes: Sequence[int], do: str, first: int = 0, results: Sequence[str] = ()
 ) -> list[str]:
-    """Lines that load a robot's rows of several arrays, or store results there."""
+    """Return the lines that load a robot's rows of several arrays, or store results there."""
     lines, names = [], iter(results)
     for i, size in enumerate(sizes):
         array = f"%a{i + first}"
@@ -221,7 +221,7 @@ def _transfers(
 
 @functools.cache
 def _architecture() -> int:
-    """What PTX is written for, of the GPUs that are here."""
+    """Return the architecture to write PTX for, from the GPUs that are present."""
     capability = min(
         round(10 * float(device.compute_capability))
         for device in jax.local_devices(backend=PLATFORM)
@@ -231,7 +231,7 @@ def _architecture() -> int:
 
 @functools.cache
 def _binding() -> Any:
-    """LLVM with its target for NVIDIA's GPUs.
+    """Return the LLVM binding with its target for NVIDIA's GPUs.
 
     Raises:
       RuntimeError: this LLVM has none.

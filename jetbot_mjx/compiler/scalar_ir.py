@@ -1,8 +1,8 @@
-"""Arithmetic on single numbers, written down rather than done.
+"""Record arithmetic on scalars as a graph of operations.
 
-A `Graph` records operations on scalars. What is known when it is recorded is computed at once,
-what was recorded before is not recorded again, and what a zero multiplies is gone: of the matrices
-of a robot's physics most entries are zeros, and most of the arithmetic goes with them. A `Loop` and
+A `Graph` records operations on scalars. Operations on constants are computed at once, an operation
+that was recorded before is not recorded again, and products with zero are removed: most entries of
+the matrices of a robot's physics are zeros, so most of the arithmetic disappears. A `Loop` and
 a `Branch` are recorded as wholes; where each operation is done, `schedule` decides.
 
 Two rules hold for finite numbers only: 0·x is 0, and x - x is 0.
@@ -16,7 +16,7 @@ import numpy as np
 
 
 class UnsupportedError(Exception):
-    """What a JAX function does cannot be written as arithmetic on single numbers here."""
+    """Raised when a JAX function cannot be written as arithmetic on scalars."""
 
 
 Scalar = Any
@@ -24,7 +24,7 @@ Scalar = Any
 
 
 class Value:
-    """A number that is known only when the program runs."""
+    """A scalar that is known only when the program runs."""
 
     __slots__ = ("dtype", "index", "op", "operands", "owner", "place")
 
@@ -43,7 +43,7 @@ class Value:
           op: its name, as in `jax.lax`; `input` for what the program is given, `carry` for what a
             loop hands from trip to trip, `result` for what a loop or a branch ends with.
           operands: numbers that it takes.
-          dtype: of the result: float32, int32 or bool.
+          dtype: dtype of the result: float32, int32 or bool.
           index: place in the order of recording; operands have smaller ones.
           owner: of a `carry` or a `result`: the loop or branch.
           place: of a `carry` or a `result`: which of them it is.
@@ -58,25 +58,25 @@ class Value:
 
 @dataclasses.dataclass(eq=False)
 class Loop:
-    """Numbers that are computed anew as long as a condition on them holds."""
+    """A loop over scalars that are computed again as long as a condition on them holds."""
 
     index: int
     """Place in the order of recording, after all that a trip computes."""
     carries: list[Value]
-    """What a trip begins with."""
+    """The values that an iteration begins with."""
     first: list[Scalar]
-    """What the first trip begins with."""
+    """The values that the first iteration begins with."""
     following: list[Scalar] = dataclasses.field(default_factory=list)
-    """What the next trip begins with."""
+    """The values that the next iteration begins with."""
     going: Scalar = None
-    """Whether there is a trip, of `carries`."""
+    """Whether there is another iteration, as a function of `carries`."""
     outcomes: list[Scalar] = dataclasses.field(default_factory=list)
     """What the loop ends with, of the `carries` for which there is no trip."""
 
 
 @dataclasses.dataclass(eq=False)
 class Branch:
-    """Numbers of which only one of two kinds is computed."""
+    """A branch of which only one side is computed."""
 
     index: int
     """Place in the order of recording, after all that either side computes."""
@@ -87,7 +87,7 @@ class Branch:
 
 
 def is_known(x: Scalar) -> bool:
-    """Whether a number is known already."""
+    """Return whether a scalar is a constant."""
     return not isinstance(x, Value)
 
 
@@ -103,7 +103,7 @@ def _divide(a: Any, b: Any) -> Any:
 
 
 def converted(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
-    """Numbers in another dtype: what is beyond the whole numbers is the last of them, NaN is 0."""
+    """Convert to another dtype; integers saturate at their limits, and NaN becomes 0."""
     if x.dtype.kind == "f" and np.dtype(dtype).kind in "iu":
         ends = np.iinfo(dtype)
         finite = np.nan_to_num(x.astype(np.float64), posinf=np.inf, neginf=-np.inf)
@@ -152,23 +152,23 @@ _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 
 
 class Graph:
-    """Operations on scalars, each recorded once."""
+    """A `Graph` records operations on scalars, each of them once."""
 
     def __init__(self) -> None:
-        """Begins with none."""
+        """Start with an empty graph."""
         self._values: dict[tuple[Any, ...], Value] = {}
         self._count = 0
 
     def input(self, dtype: np.dtype) -> Value:
-        """A number that the program will be given."""
+        """Add an input of the program."""
         return self._record("input", (np.int32(self._count),), np.dtype(dtype))
 
     def apply(self, op: str, *operands: Scalar) -> Scalar:
-        """One operation, or its result.
+        """Record one operation, or return its result if all operands are constants.
 
         Args:
           op: a name in `EVALUATE`.
-          *operands: of one dtype.
+          *operands: scalars of one dtype.
 
         Returns:
           The number.
@@ -191,7 +191,7 @@ class Graph:
         return self._record(op, operands, dtype)
 
     def select(self, which: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
-        """One of two numbers of one dtype, by a third that is bool."""
+        """Select one of two scalars of one dtype by a bool scalar."""
         if is_known(which):
             return on_true if which else on_false
         if on_false is on_true or (_known_and(on_true, on_false) and on_false == on_true):
@@ -206,7 +206,7 @@ class Graph:
         return self._record("select", (which, on_false, on_true), dtype)
 
     def convert(self, x: Scalar, dtype: np.dtype) -> Scalar:
-        """A number in another dtype."""
+        """Convert a scalar to another dtype."""
         if is_known(x):
             return converted(np.asarray(x), dtype)[()]
         # Without 64-bit types, as JAX has them by default, only these are met.
@@ -219,18 +219,18 @@ class Graph:
         return self._record("convert", (x,), dtype)
 
     def repeat(self, value: Value, operands: Sequence[Scalar]) -> Value:
-        """An operation that was recorded, on other operands and as it stands."""
+        """Record an operation again with other operands, without simplifying it."""
         return self._record(value.op, tuple(operands), value.dtype)
 
     def begin_loop(self, first: Sequence[Scalar]) -> Loop:
-        """Begin a loop: what its trips compute is recorded before `end_loop`."""
+        """Begin a loop; the operations of its iterations are recorded before `end_loop`."""
         loop = Loop(-1, [], list(first))
         for place, number in enumerate(first):
             loop.carries.append(self._new("carry", (), number.dtype, loop, place))
         return loop
 
     def end_loop(self, loop: Loop) -> list[Value]:
-        """End a loop of which all attributes but `index` are known, and return its results."""
+        """End a loop whose attributes are all set except `index`, and return its results."""
         loop.index = self._next()
         return [
             self._new("result", (), number.dtype, loop, place)
@@ -238,7 +238,7 @@ class Graph:
         ]
 
     def branch(self, which: Value, no: Sequence[Scalar], yes: Sequence[Scalar]) -> list[Scalar]:
-        """The numbers of one of two sides, of which only that one is computed."""
+        """Record a branch, of which only the selected side is computed, and return its results."""
         branch = Branch(self._next(), which, list(no), list(yes))
         return [
             b if is_same(a, b) else self._new("result", (), b.dtype, branch, place)
@@ -247,7 +247,7 @@ class Graph:
 
     @property
     def count(self) -> int:
-        """How many operations have been recorded."""
+        """Return the number of recorded operations."""
         return self._count
 
     def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Value:
@@ -270,7 +270,7 @@ class Graph:
 
 
 def is_same(x: Scalar, y: Scalar) -> bool:
-    """Whether two numbers are the same operation, or known and alike bit by bit."""
+    """Return whether two scalars are the same operation, or constants with equal bits."""
     return x is y or (_known_and(x, y) and _identity(x) == _identity(y))
 
 
@@ -385,7 +385,7 @@ _QUARTER_TURN = [np.float32(part) for part in (_COARSE, _FINE, np.pi / 2 - _COAR
 
 
 def _polynomial(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[np.float32]:
-    """Coefficients in s = r², lowest first, that give a function of r up to an eighth of a turn."""
+    """Return a function's coefficients in s = r², lowest first, for r up to an eighth of a turn."""
     end = (np.pi / 4) ** 2
     fit = np.polynomial.Chebyshev.interpolate(
         lambda s: function(np.sqrt(s)), degree, domain=[0.0, end]
@@ -399,7 +399,7 @@ _COSINE = _polynomial(np.cos, 5)
 
 
 def _shorter_sine(graph: Graph, kind: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
-    """In basic arithmetic, so that every machine does the same; for |x| up to some 10⁴."""
+    """Expand a sine to basic arithmetic, equal on every machine; for |x| up to some 10⁴."""
     do = graph.apply
     turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
     r = x

@@ -1,4 +1,4 @@
-"""Where in a program each recorded operation is done.
+"""Place each recorded operation in a block of the program.
 
 A `Graph` says what depends on what, not when it is computed. Here every operation gets a place: out
 of all loops that it does not depend on, and into a branch if nothing outside the branch needs it.
@@ -19,7 +19,7 @@ _Node: TypeAlias = Value | Loop | Branch
 
 @dataclasses.dataclass(eq=False)
 class Block:
-    """Operations that are done one after the other."""
+    """A `Block` holds operations that are executed one after the other."""
 
     parent: "Block | None" = None
     """The block that this one lies in, whose numbers it can use."""
@@ -46,7 +46,7 @@ class Block:
 
 @dataclasses.dataclass(eq=False)
 class PlacedLoop:
-    """A loop: `head` computes whether there is a trip, `body` the trip."""
+    """A loop: `head` computes the condition of an iteration, `body` the iteration."""
 
     loop: Loop
     places: list[int]
@@ -58,13 +58,13 @@ class PlacedLoop:
 
     @property
     def blocks(self) -> tuple[Block, Block]:
-        """The blocks inside."""
+        """Return the blocks inside."""
         return self.head, self.body
 
 
 @dataclasses.dataclass(eq=False)
 class PlacedBranch:
-    """A branch and what each side computes."""
+    """A branch and the block of each side."""
 
     branch: Branch
     results: list[Value]
@@ -74,15 +74,15 @@ class PlacedBranch:
 
     @property
     def blocks(self) -> tuple[Block, Block]:
-        """The blocks inside."""
+        """Return the blocks inside."""
         return self.no, self.yes
 
 
 def schedule(outputs: Iterable[Scalar]) -> Block:
-    """Place all operations that numbers depend on.
+    """Place all operations that the outputs depend on.
 
     Args:
-      outputs: the numbers; the known ones need nothing.
+      outputs: the scalars that the program returns; constants need no place.
 
     Returns:
       The outermost block. Every operand of an item stands before it or in a block around it.
@@ -152,7 +152,7 @@ class _Scheduler:
         return value.owner
 
     def _inputs(self, node: _Node) -> list[_Node]:
-        """All that a node depends on, but for what a carry of the same loop will be."""
+        """Return all dependencies of a node, except the next value of a carry of the same loop."""
         if isinstance(node, Value):
             if node.op == "carry":
                 return []
@@ -196,7 +196,7 @@ class _Scheduler:
         return head, body
 
     def _place(self, node: _Node) -> Block:
-        """The innermost block that serves all users, but outside loops that do not matter."""
+        """Return the innermost block that serves all users, outside of independent loops."""
         block = self._use[node.index]
         for head in [x for x in block.ancestors() if x.loop is not None]:
             assert head.loop is not None
@@ -221,6 +221,6 @@ def _op(node: _Node) -> str:
 
 
 def _common(one: Block, other: Block) -> Block:
-    """The innermost block around both."""
+    """Return the innermost block that contains both."""
     around = set(map(id, one.ancestors()))
     return next(block for block in other.ancestors() if id(block) in around)

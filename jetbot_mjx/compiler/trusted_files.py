@@ -1,4 +1,4 @@
-"""Files that hold code to be run: read only where nobody else can have written them.
+"""Read and write files of executable code that no other user can have written.
 
 A compiled program is machine code, and the folder that it is kept in may be shared. As ssh does
 with its keys, a file is trusted where it and its folder belong to this user or to root, and nobody
@@ -41,7 +41,7 @@ def read_trusted(path: Path) -> bytes | None:
 
 
 def write_private(path: Path, content: bytes) -> None:
-    """Write a file that `read_trusted` trusts, whole or not at all.
+    """Write a file that `read_trusted` trusts, atomically.
 
     Args:
       path: the file. Nothing is written where its folder is not trusted: nobody would read it.

@@ -1,4 +1,4 @@
-"""What XLA is told when it compiles, and only what the installed one knows.
+"""Choose XLA's compiler options, and pass only those that the installed version knows.
 
 Before the first step of a training a CPU does little else than compile, and at optimisation level 1
 that takes less. Do not turn the fusion emitters off as well, which saves still more: at level 2
@@ -23,16 +23,16 @@ _DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_
 
 
 def compiler_options(config: Config) -> Options:
-    """What the programs of a run are compiled with.
+    """Return the compiler options for the programs of a run.
 
     Args:
       config: the run.
 
     Returns:
-      As `jax.jit` takes it; what the installed XLA does not know is left out.
+      The options as `jax.jit` takes them, without those that the installed XLA does not know.
 
     Raises:
-      JaxRuntimeError: `deterministic` asks for what it does not know.
+      JaxRuntimeError: `deterministic` needs an option that XLA does not know.
     """
     wanted = dict(_DETERMINISTIC) if config.deterministic else {}
     if jax.default_backend() == "cpu":
@@ -42,7 +42,7 @@ def compiler_options(config: Config) -> Options:
 
 @functools.cache
 def _is_known(name: str, value: Any) -> bool:
-    """Asks XLA, which refuses to compile with an option that it does not know."""
+    """Return whether XLA knows an option; XLA refuses to compile with an unknown one."""
     try:
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
     except jax.errors.JaxRuntimeError as error:
@@ -54,7 +54,7 @@ def _is_known(name: str, value: Any) -> bool:
 
 @contextlib.contextmanager
 def on_host() -> Iterator[Any]:
-    """Lets what is computed inside be computed on the host, where small programs compile at once.
+    """Run the computations inside on the host CPU, where small programs compile at once.
 
     Yields:
       The device that stands for the host.

@@ -1,4 +1,4 @@
-"""What `deploy/drive.py` logged of a drive, and the same motor values in the simulator."""
+"""Read the log of a drive by `deploy/drive.py`, and replay its motor values in the simulator."""
 
 import json
 from collections.abc import Mapping
@@ -19,18 +19,18 @@ _LEAST_POSES = 2
 
 
 class Calibration(NamedTuple):
-    """The motors as the driver took them to be, (left, right)."""
+    """The motor calibration that the driver assumed, as pairs (left, right)."""
 
     dead_band: tuple[float, float]
     """Motor value up to which a wheel stands."""
     full_speed: tuple[float, float]
-    """Of the wheel's rim at a motor value of 1 [m/s]."""
+    """Speed of the wheel's rim at a motor value of 1 [m/s]."""
     lag: float
     """[s]"""
 
 
 class DriveLog(NamedTuple):
-    """One drive."""
+    """A `DriveLog` holds the log of one drive."""
 
     path: Path
     header: Mapping[str, Any]
@@ -41,21 +41,21 @@ class DriveLog(NamedTuple):
     outcome: str
     """`reached`, `timed out`, or `interrupted` where the log has no end."""
     times: Float[np.ndarray, " n"]
-    """Of each control period [s], since the start."""
+    """Start of each control period [s], since the start of the drive."""
     motors: Float[np.ndarray, "n 2"]
     """Motor values (left, right)."""
     pose_times: Float[np.ndarray, " m"]
-    """Of each pose, no two the same [s]."""
+    """Time of each pose [s]; all are different."""
     poses: Float[np.ndarray, "m 3"]
     """(x, y, yaw) [m, m, rad]; yaw without jumps."""
     latencies: Float[np.ndarray, " k"]
-    """From the start of a period to the motors [s]."""
+    """Time from the start of a period to the motor command [s]."""
     stale_ticks: int
     """Periods without a fresh pose."""
 
 
 class Replay(NamedTuple):
-    """A drive and its simulation, at the times of its poses."""
+    """A `Replay` holds a drive and its simulation, at the times of the logged poses."""
 
     log: DriveLog
     motors: MotorModel
@@ -65,26 +65,26 @@ class Replay(NamedTuple):
 
     @property
     def distances(self) -> Float[np.ndarray, " m"]:
-        """From the logged to the simulated place [m]."""
+        """Return the distance from the logged to the simulated position [m]."""
         return np.linalg.norm(self.simulated[:, :2] - self.log.poses[:, :2], axis=-1)
 
     @property
     def turns(self) -> Float[np.ndarray, " m"]:
-        """Simulated less logged heading [rad], to the nearest turn at the start."""
+        """Return simulated minus logged heading [rad], to the nearest turn at the start."""
         return self.simulated[:, 2] - self.log.poses[:, 2]
 
 
 def read_log(path: Path) -> DriveLog:
-    """Reads a log.
+    """Read a log.
 
     Args:
-      path: what `drive.py --log` wrote.
+      path: the file that `drive.py --log` wrote.
 
     Returns:
       The drive.
 
     Raises:
-      UserError: there is none, it is none, or no pose is in it.
+      UserError: the file is missing, is not a log, or has no pose.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -147,15 +147,15 @@ def read_log(path: Path) -> DriveLog:
 
 
 def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Replay:
-    """Gives a simulated robot the motor values of a log, at the same times.
+    """Replay the motor values of a log on a simulated robot, at the same times.
 
     Args:
       log: the drive.
-      delay: of the simulated motors [s].
+      delay: delay of the simulated motors [s].
       lag: their time constant [s]; None: the calibration's.
 
     Returns:
-      The two drives, beside each other.
+      The logged and the simulated drive.
     """
     calibration = log.calibration
     left, right = calibration.full_speed
@@ -173,7 +173,7 @@ def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Re
 
 
 def figures(replay: Replay) -> dict[str, Any]:
-    """The comparison in numbers, as JSON."""
+    """Return the metrics of the comparison, as JSON."""
     log, distances = replay.log, replay.distances
     periods = np.diff(log.times)
 
@@ -208,7 +208,7 @@ def figures(replay: Replay) -> dict[str, Any]:
 
 
 def plot(replay: Replay) -> Figure:
-    """Both drives from above, and their differences over time.
+    """Plot both drives from above, and their differences over time.
 
     Args:
       replay: the two drives.

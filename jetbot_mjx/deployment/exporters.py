@@ -1,4 +1,4 @@
-"""The files that a policy is exported to, each read back by what will run it.
+"""Export a policy to files, and read each file back with the library that will run it.
 
 `numpy` is one file of Python, `stablehlo` what `jax.export` serialises. `onnx` is built here node
 by node: the exporter that is kept, jax2onnx 0.17, asks for an Orbax older than ours and pulls a
@@ -35,14 +35,14 @@ Act = Callable[[Float[np.ndarray, "n obs"]], Outputs]
 
 
 class Source(NamedTuple):
-    """What is written."""
+    """A `Source` holds everything that is exported."""
 
     policy: PortablePolicy
     as_jax: Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]
 
 
 class Format(NamedTuple):
-    """One kind of file."""
+    """A `Format` describes one kind of exported file."""
 
     file: str
     write: Callable[[Source, Path], None]
@@ -53,10 +53,10 @@ class Format(NamedTuple):
 
 
 def require(name: str) -> None:
-    """Looks whether a format can be written and checked here.
+    """Check that a format can be written and verified on this machine.
 
     Args:
-      name: of `FORMATS`.
+      name: a key of `FORMATS`.
 
     Raises:
       UserError: a package is missing.
@@ -185,4 +185,4 @@ FORMATS = {
     "onnx": Format("policy.onnx", _write_onnx, _read_onnx, ("onnx", "onnxruntime")),
     "stablehlo": Format("policy.stablehlo", _write_stablehlo, _read_stablehlo),
 }
-"""By the name that `--format` takes."""
+"""Export formats by the name that `--format` takes."""

@@ -1,4 +1,4 @@
-"""A policy as plain numbers, as one function of JAX, and observations to hold the two together.
+"""Convert a policy to NumPy arrays and to a pure JAX function, and compare implementations.
 
 What leaves this package is one function of a batch of observations, with all inside that lies
 between them and the motors: normaliser, network, the distribution's mode, the environment's clip
@@ -31,7 +31,7 @@ Outputs = tuple[Float[Array | np.ndarray, "n 2"], Float[Array | np.ndarray, "n 2
 
 
 class Controller(NamedTuple):
-    """What turns an action into wheel speeds; `kinematics` has the formulas."""
+    """The controller that converts an action to wheel speeds; `kinematics` has the formulas."""
 
     max_speed: float
     """Forward speed of a₀ = 1 [m/s]."""
@@ -44,36 +44,36 @@ class Controller(NamedTuple):
 
     @property
     def fastest(self) -> float:
-        """The largest wheel speed that an action can command [rad/s]."""
+        """Return the largest wheel speed that an action can command [rad/s]."""
         turn = 0.5 * self.max_yaw_rate * self.wheel_separation
         return (self.max_speed + turn) / self.wheel_radius
 
 
 class Layer(NamedTuple):
-    """x ↦ x · kernel + bias."""
+    """A dense layer: x ↦ x · kernel + bias."""
 
     kernel: Float[np.ndarray, "inputs outputs"]
     bias: Float[np.ndarray, " outputs"]
 
 
 class PortablePolicy(NamedTuple):
-    """A deterministic policy as numbers."""
+    """A `PortablePolicy` holds a deterministic policy as arrays."""
 
     mean: Float[np.ndarray, " obs"]
-    """Of the observation's normaliser; zeros without one."""
+    """Mean of the observation's normaliser; zeros without one."""
     std: Float[np.ndarray, " obs"]
-    """Likewise; ones without one."""
+    """Standard deviation of the normaliser; ones without one."""
     layers: tuple[Layer, ...]
     """The last gives the distribution's location alone."""
     activation: Literal["tanh", "relu", "elu", "swish"]
-    """Between the layers."""
+    """Activation between the layers."""
     squash: bool
     """Whether tanh follows the last layer; the clip to [-1, 1] follows in any case."""
     controller: Controller
 
 
 class Recording(NamedTuple):
-    """What a policy saw while it drove, and what JAX made of it. On the host, float32."""
+    """Observations from a drive, and JAX's outputs for them; on the host, float32."""
 
     obs: Float[np.ndarray, "n obs"]
     action: Float[np.ndarray, "n 2"]
@@ -82,10 +82,10 @@ class Recording(NamedTuple):
 
 
 def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
-    """Takes a policy out of a checkpoint.
+    """Extract a policy from a checkpoint.
 
     Args:
-      checkpoint: of a network as `make_networks` builds it.
+      checkpoint: a checkpoint of a network as `make_networks` builds it.
 
     Returns:
       Its numbers. Nothing here knows whether they are used as Brax does: compare with `as_jax`.
@@ -125,7 +125,7 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
 def as_jax(
     checkpoint: Checkpoint, env: JetBotEnv
 ) -> Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]:
-    """The same policy as training and judging use it: what every export is measured by.
+    """Return the policy as used in training and evaluation, the reference for every export.
 
     Args:
       checkpoint: the policy's.
@@ -145,14 +145,14 @@ def as_jax(
 
 
 def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Recording:
-    """Drives to the report's fixed goals, one after the other, and keeps what the policy sees.
+    """Drive to the report's fixed goals, one after the other, and record the observations.
 
-    In C MuJoCo, which needs no program compiled for it and is the same robot.
+    The drive runs in C MuJoCo, which needs no compilation and simulates the same robot.
 
     Args:
       checkpoint: the policy's.
       env: its environment.
-      count: how many observations.
+      count: number of observations.
 
     Returns:
       The recording, the same for the same checkpoint on the same machine.
@@ -176,11 +176,11 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Rec
 
 
 def difference(recording: Recording, outputs: Outputs, controller: Controller) -> float:
-    """How far another implementation's results are from JAX's.
+    """Return the largest difference of another implementation's results from JAX's.
 
     Args:
       recording: observations, and what JAX makes of them.
-      outputs: what the other makes of them.
+      outputs: the other implementation's outputs.
       controller: tells the range of wheel speeds.
 
     Returns:

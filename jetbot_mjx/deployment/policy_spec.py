@@ -1,4 +1,4 @@
-"""What a policy has to be told to someone who has only its file: `policy.json`."""
+"""Describe an exported policy in `policy.json`, for users who have only its file."""
 
 import json
 from collections.abc import Mapping
@@ -33,7 +33,7 @@ _COMPONENTS = {
 
 
 def contract(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> dict[str, Any]:
-    """Explains a policy, whatever format it is exported to.
+    """Return the description of a policy, which is the same for every export format.
 
     Args:
       checkpoint: the policy's.
@@ -106,7 +106,7 @@ def _observations(layout: Layout) -> list[dict[str, Any]]:
 
 
 def _evaluation(checkpoint: Checkpoint) -> Mapping[str, Any] | None:
-    """The summary of this checkpoint's report, where `evaluate` wrote one."""
+    """Return the summary of this checkpoint's report, if `evaluate` wrote one."""
     path = checkpoint.run_dir / "evaluations" / checkpoint.path.name / "report.json"
     try:
         report = json.loads(path.read_text(encoding="utf-8"))

@@ -1,4 +1,4 @@
-"""A stand-in for a JetBot: motor values in, a pose out, in the time of its own simulation.
+"""Simulate a JetBot for a driver: motor values in, a pose out, in simulation time.
 
 It has the two methods of NVIDIA's `jetbot.Robot` that a driver calls, and a clock that a driver
 can wait on: waiting is what moves it. Physics is the preset `real` in C MuJoCo. Between motor
@@ -26,7 +26,7 @@ ROLLING_RADIUS = 0.0321
 
 
 class MotorModel(NamedTuple):
-    """What lies between a motor value and a wheel. Pairs are (left, right)."""
+    """The actuator model between a motor value and a wheel. Pairs are (left, right)."""
 
     dead_band: tuple[float, float] = (0.12, 0.12)
     """Motor value up to which the wheel stands. PICOBOT: 0.11; others up to 0.25."""
@@ -35,11 +35,11 @@ class MotorModel(NamedTuple):
     lag: float = 0.1
     """Time constant [s]. PICOBOT: 0.085."""
     delay: float = 0.05
-    """From a motor value to the motor [s]."""
+    """Delay from a motor value to the motor [s]."""
 
 
 class Pose(NamedTuple):
-    """Where the axle midpoint is, and where it heads; world frame."""
+    """Position and heading of the axle midpoint, in the world frame."""
 
     x: float
     """[m]"""
@@ -50,10 +50,10 @@ class Pose(NamedTuple):
 
 
 class StandIn:
-    """One simulated JetBot, its motors and its clock."""
+    """One simulated JetBot with its motors and its clock."""
 
     def __init__(self, motors: MotorModel | None = None) -> None:
-        """Builds the robot, at rest at the origin.
+        """Build the robot, at rest at the origin.
 
         Args:
           motors: None: a dead-band of 0.12, a lag of 0.1 s and a delay of 0.05 s.
@@ -67,7 +67,7 @@ class StandIn:
         self.place(Pose(0.0, 0.0, 0.0))
 
     def place(self, pose: Pose) -> None:
-        """Puts the robot down, at rest and with no command on its way. The clock goes on."""
+        """Place the robot at rest and drop all pending commands. The clock goes on."""
         mujoco.mj_resetData(self._model, self._data)
         qpos = self._data.qpos
         qpos[QPOS_XYZ][:2] = pose.x, pose.y
@@ -80,29 +80,29 @@ class StandIn:
         """The motor values that were set last (left, right)."""
 
     def set_motors(self, left_speed: float, right_speed: float) -> None:
-        """Sets both motor values, as `jetbot.Robot` does.
+        """Set both motor values, as `jetbot.Robot` does.
 
         Args:
-          left_speed: in [-1, 1]; what is beyond is clipped.
-          right_speed: likewise.
+          left_speed: motor value in [-1, 1]; values beyond are clipped.
+          right_speed: the same for the right motor.
         """
         self.motors = (float(left_speed), float(right_speed))
         values = np.clip(self.motors, -1.0, 1.0)
         self._under_way.append((self._time + self.motor_model.delay, values))
 
     def stop(self) -> None:
-        """Sets both motor values to zero."""
+        """Set both motor values to zero."""
         self.set_motors(0.0, 0.0)
 
     def now(self) -> float:
-        """Time of the simulation [s], since it was built."""
+        """Return the simulation time [s] since the robot was built."""
         return self._time
 
     def sleep(self, seconds: float) -> None:
-        """Lets time pass, in whole physics steps.
+        """Advance the simulation in whole physics steps.
 
         Args:
-          seconds: how long; what is left of a step passes with the next call.
+          seconds: how long; the remainder of a step is added to the next call.
         """
         dt = self._model.opt.timestep
         end = self._time + seconds
@@ -111,14 +111,14 @@ class StandIn:
             self._tick(dt)
 
     def pose(self) -> Pose:
-        """Where it is."""
+        """Return the robot's pose."""
         x, y, _ = self._data.qpos[QPOS_XYZ]
         w, i, j, k = self._data.qpos[QPOS_QUAT]
         yaw = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
         return Pose(float(x), float(y), yaw)
 
     def speed(self) -> float:
-        """Of the axle midpoint over the floor [m/s]."""
+        """Return the speed of the axle midpoint over the floor [m/s]."""
         return float(np.hypot(*self._data.qvel[:2]))
 
     def _tick(self, dt: float) -> None:
@@ -141,7 +141,7 @@ def _wheel_speed(value: float, dead_band: float, full_speed: float) -> float:
 def replayed(
     motors: MotorModel, start: Pose, times: Sequence[float], values: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n 3"]:
-    """Drives a stand-in by motor values that were logged.
+    """Drive a simulated JetBot by logged motor values, and return its path.
 
     Args:
       motors: its motors.

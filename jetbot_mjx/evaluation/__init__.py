@@ -1,4 +1,4 @@
-"""Score policies on fixed goals, compare them and write reports."""
+"""Evaluate policies on fixed goals, compare them and write reports."""
 
 from typing import TYPE_CHECKING
 

@@ -1,8 +1,9 @@
-"""The best-known time to each of the report's goals, to read a policy's time against.
+"""Look up the best-known time to each of the report's goals, as a reference for a policy's time.
 
-The file in the package holds what `benchmarks/best_known.py` found: commands of one goal, searched
-with the true model and driven without looking, are an upper bound of the shortest time. Each search
-states the settings that it holds for; of any other task, robot or time step nothing is known.
+The file in the package holds the results of `benchmarks/best_known.py`. It searched commands for
+each goal with the true model and drove them open-loop, so their time is an upper bound of the
+shortest time. Each search states the settings that it is valid for; there are no times for any
+other task, robot or time step.
 """
 
 import json
@@ -19,7 +20,7 @@ from jetbot_mjx.evaluation.rollout import Episodes
 FILE = Path(__file__).parents[1] / "assets" / "best_known.json"
 
 FORMAT = "jetbot_mjx-best-known/1"
-"""Of that file."""
+"""Format of that file."""
 
 SETTINGS = (
     "robot.preset",
@@ -32,13 +33,13 @@ SETTINGS = (
     "physics.ctrl_dt",
     "physics.sim_dt",
 )
-"""What the goals and the times to them depend on."""
+"""Settings that the goals and the times to them depend on."""
 
-_SAME_GOAL = 1.5e-3  # [m] the file holds whole millimetres
+_SAME_GOAL = 1.5e-3  # [m] The file holds whole millimetres.
 
 
 class Known(NamedTuple):
-    """The best-known times of a report's goals, or why there are none."""
+    """A `Known` holds the best-known times of a report's goals, or why there are none."""
 
     steps: Float[np.ndarray, " n"] | None
     """Environment steps to each goal."""
@@ -47,7 +48,7 @@ class Known(NamedTuple):
 
 
 def settings_of(config: Config) -> dict[str, Any]:
-    """Return what the times of a configuration depend on, by key."""
+    """Return the settings of a configuration that the times depend on, by key."""
     flat = config.flat()
     return {name: flat[name] for name in SETTINGS}
 
@@ -56,12 +57,13 @@ def find(config: Config, episodes: Episodes) -> Known:
     """Find the best-known times of the goals that a policy was driven to.
 
     Args:
-      config: of its run.
-      episodes: on the host, to the first of the report's goals.
+      config: the configuration of the policy's run.
+      episodes: episodes on the host, driven to the first of the report's goals.
 
     Returns:
       The times, or why there are none.
     """
+    # Choose the search whose settings differ least from this configuration's.
     searches = [
         one
         for one in json.loads(FILE.read_text(encoding="utf-8"))["searches"]
@@ -79,6 +81,7 @@ def find(config: Config, episodes: Episodes) -> Known:
         told = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
         own = ", ".join(str(ours[name]) for name in names)
         return Known(None, f"it was searched for {told}, and this is {own}")
+    # Check that the search covers exactly these goals.
     count = episodes.steps.size
     goals, steps = np.asarray(search["goals"], float) / 1e3, np.asarray(search["steps"], float)
     if len(steps) < count:

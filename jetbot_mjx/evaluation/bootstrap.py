@@ -1,7 +1,7 @@
-"""Figures of several seeds with 95 % intervals, by a bootstrap that draws whole seeds.
+"""Compute statistics over several seeds with 95 % intervals, by a bootstrap over whole seeds.
 
-The bootstrap is stratified: where a figure is made of two samples, each is drawn from by itself.
-Its random numbers are fixed, so the same values always give the same interval.
+The bootstrap is stratified: if a statistic depends on two samples, each sample is resampled
+separately. Its random seed is fixed, so the same values always give the same interval.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,32 +17,34 @@ _TRIMMED = 0.25
 
 
 class Estimate(NamedTuple):
-    """A figure with its 95 % interval."""
+    """An `Estimate` holds a value with its 95 % interval."""
 
     value: float | None
     low: float | None = None
-    """None where no interval can be given, like `high`."""
+    """Lower end of the interval; None, like `high`, if no interval can be given."""
     high: float | None = None
 
 
 def mean(values: Float[np.ndarray, "*n"], axis: int = -1) -> Float[np.ndarray, "*m"]:
-    """Mean along an axis."""
+    """Return the mean along an axis."""
     return np.mean(values, axis=axis)
 
 
 def mean_difference(
     a: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*m"], axis: int = -1
 ) -> Float[np.ndarray, "*k"]:
-    """Mean of a minus mean of b along an axis."""
+    """Return the mean of `a` minus the mean of `b` along an axis."""
     return np.mean(a, axis=axis) - np.mean(b, axis=axis)
 
 
 def interquartile_mean(values: Float[np.ndarray, "*n"], axis: int = -1) -> Float[np.ndarray, "*m"]:
-    """Mean without the lowest and the highest quarter; of fewer than four values, their mean.
+    """Compute the mean without the lowest and the highest quarter of the values.
+
+    For fewer than four values it is their plain mean.
 
     Args:
-      values: any number of them, along an axis.
-      axis: which.
+      values: any number of values along an axis.
+      axis: the axis.
 
     Returns:
       The means.
@@ -55,14 +57,14 @@ def interquartile_mean(values: Float[np.ndarray, "*n"], axis: int = -1) -> Float
 def probability_of_improvement(
     a: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*m"], axis: int = -1
 ) -> Float[np.ndarray, "*k"]:
-    """Probability that a value of a is larger than one of b; of equals, half.
+    """Compute the probability that a value of `a` exceeds one of `b`; equal values count half.
 
         P(X > Y) = 1/nm Σᵢ Σⱼ s(xᵢ, yⱼ),  s = 1 where xᵢ > yⱼ, ½ where they are equal, else 0
 
     Args:
-      a: the x.
-      b: the y.
-      axis: along which they lie: the last.
+      a: the values x.
+      b: the values y.
+      axis: the axis of the values, which must be the last.
 
     Returns:
       The probabilities.
@@ -75,15 +77,15 @@ def probability_of_improvement(
 
 
 def bootstrap(statistic: Callable[..., Any], *samples: Sequence[float]) -> Estimate:
-    """A statistic with its percentile interval.
+    """Compute a statistic with its percentile interval.
 
     Args:
-      statistic: takes the samples and an axis.
-      samples: one value for each seed.
+      statistic: a function of the samples and an axis.
+      samples: samples with one value for each seed.
 
     Returns:
-      The figure: without a value where a sample is empty, without an interval where one has a
-      single value.
+      The estimate. It has no value if a sample is empty, and no interval if a sample has a single
+      value.
     """
     if not all(samples):
         return Estimate(None)
@@ -98,13 +100,13 @@ def bootstrap(statistic: Callable[..., Any], *samples: Sequence[float]) -> Estim
 def mean_band(
     values: Float[np.ndarray, "seeds n"],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Intervals of the means over at least two seeds, for each of n figures.
+    """Compute the intervals of the means over at least two seeds, for each of n quantities.
 
     Args:
-      values: of every seed.
+      values: the quantities of every seed.
 
     Returns:
-      Lower and upper ends.
+      The lower and the upper ends.
     """
     low, high = _interval(mean, [values], 0)
     return low, high
@@ -123,21 +125,21 @@ def _interval(statistic: Callable[..., Any], samples: Sequence[np.ndarray], axis
 
 
 def median_estimate(values: Float[np.ndarray, " n"]) -> Estimate:
-    """A median with the interval that its order statistics give, whatever the distribution.
+    """Compute a median with its distribution-free interval from order statistics.
 
     Args:
-      values: independent ones.
+      values: independent values.
 
     Returns:
-      The figure: without a value where there are none, without an interval where they are too
-      few for one, fewer than six.
+      The estimate. It has no value if there are no values, and no interval if there are fewer
+      than six.
 
     Source: W. R. Thompson, Ann. Math. Stat. 7 (1936), 122-128; `scipy.stats.quantile_test`.
     """
     if not values.size:
         return Estimate(None)
     value = float(np.median(values))
-    # Its stub knows whole numbers alone.
+    # The type stub of this function accepts only integers.
     test: Any = scipy.stats.quantile_test
     interval = test(values, q=value, p=0.5).confidence_interval(0.95)
     if not np.isfinite(interval).all():

@@ -1,10 +1,10 @@
-"""Several policies judged on the same goals: what trainings reach, and which is better.
+"""Compare several policies or trainings on the same goals, with intervals over seeds or episodes.
 
-Two kinds of chance are kept apart. How a training turns out depends on its seed: where a run has
-two seeds or more, intervals come from a bootstrap that draws whole seeds, each run from its own.
-A run of one seed can only tell how one policy does on other goals: there the interval is over
-episodes. Runs are also compared goal by goal, since all policies drive to the same goals; that
-is about these very policies.
+Two kinds of randomness are kept apart. The result of a training depends on its seed: if a run has
+two seeds or more, intervals come from a bootstrap that resamples whole seeds within each run. A run
+of one seed only shows how one policy performs on other goals: its interval is over episodes. Runs
+are also compared goal by goal, since all policies drive to the same goals; that comparison holds
+only for these policies, not for other trainings.
 """
 
 import itertools
@@ -33,20 +33,20 @@ from jetbot_mjx.evaluation.report import Report
 
 
 class Aggregate(NamedTuple):
-    """One quantity of one run."""
+    """An `Aggregate` holds one quantity of one run."""
 
     over: Literal["seeds", "episodes"]
-    """What the intervals are over."""
+    """Whether the intervals are over seeds or over episodes."""
     count: int
-    """How many of those had a figure."""
+    """Number of seeds or episodes that have a value."""
     mean: Estimate
-    """Over seeds; of one seed, its own figure."""
+    """Mean over seeds; for a single seed, its own value."""
     iqm: Estimate
-    """Interquartile mean over seeds: without the best and the worst quarter. Of one seed, none."""
+    """Interquartile mean over seeds, without the best and the worst quarter; none for one seed."""
 
 
 class BandPoint(NamedTuple):
-    """One evaluation during the training of all seeds of a run."""
+    """A `BandPoint` holds one evaluation during the training of all seeds of a run."""
 
     env_steps: int
     success_rate: float
@@ -56,64 +56,67 @@ class BandPoint(NamedTuple):
 
 
 class Run(NamedTuple):
-    """The seeds of one training."""
+    """A `Run` holds the results of all seeds of one training."""
 
     name: str
     seeds: Mapping[str, Report]
     success_rate: Aggregate
     time_to_goal: Aggregate
-    """[s] of the seeds' medians."""
+    """[s] Aggregate of the medians of the seeds."""
     learning_curve: tuple[BandPoint, ...]
-    """At the steps at which every seed was judged; its band is over seeds where there are two."""
+    """Evaluations at the steps at which every seed was evaluated.
+
+    The band is over seeds if there are at least two.
+    """
 
 
 class Duel(NamedTuple):
-    """Two runs, `a` and `b`, in one quantity."""
+    """A `Duel` compares two runs, `a` and `b`, in one quantity."""
 
     difference: Estimate
-    """Mean of a minus mean of b."""
+    """Mean of `a` minus mean of `b`."""
     improvement: Estimate
-    """Probability that a seed of a does better than one of b; of equals, half counts."""
+    """Probability that a seed of `a` does better than one of `b`; equal seeds count half."""
     wins: int
-    """Goals on which a did better."""
+    """Number of goals on which `a` did better."""
     losses: int
-    """Goals on which b did better."""
+    """Number of goals on which `b` did better."""
     ties: int
     p: float
-    """Exact two-sided binomial test that wins and losses are equally likely."""
+    """p-value of the exact two-sided binomial test that wins and losses are equally likely."""
 
 
 class Pair(NamedTuple):
-    """Two runs against each other."""
+    """A `Pair` compares two runs with each other."""
 
     a: str
     b: str
     seeds: int
-    """How many of each are compared goal by goal, the first ones: more of the one than of the
-    other would not be fair."""
+    """Number of seeds of each run that are compared goal by goal. It is the same for both runs,
+    counted from the first seed, because more seeds of one run would bias the comparison."""
     success_rate: Duel
-    """Goal by goal: which run reached it with more of its seeds."""
+    """Success rate; goal by goal, the run that reached the goal with more of its seeds wins."""
     time_to_goal: Duel
-    """[s], less is better; goal by goal where both runs reached it."""
+    """[s] Time to the goal, less is better; goal by goal for goals that both runs reached."""
 
 
 class Comparison(NamedTuple):
-    """All that is told of several policies."""
+    """A `Comparison` holds everything that is reported about several policies."""
 
     folder: Path
-    """Where its files lie."""
+    """Folder of the comparison's files."""
     episodes: int
     settings: Mapping[str, Any]
-    """What all of them had to do: the settings of task, robot and time that they share."""
+    """Settings of task, robot and time step, which all runs share."""
     runs: tuple[Run, ...]
     pairs: tuple[Pair, ...]
     differences: Mapping[str, Sequence[Any]]
-    """Settings in which the runs differ, besides the seed: the value of each run by the key."""
+    """Values of each run, by key, for the settings in which runs differ besides the seed."""
     baselines: Mapping[str, Summary]
     versions: Mapping[str, Any]
 
     def to_json(self) -> dict[str, Any]:
-        """All but the episodes."""
+        """Return everything except the episodes as JSON values."""
         return {
             "goal_set_version": GOAL_SET_VERSION,
             "episodes": self.episodes,
@@ -141,22 +144,22 @@ def _run_json(run: Run) -> dict[str, Any]:
 
 
 def _nested(value: Any) -> Any:
-    """Named tuples within named tuples as objects."""
+    """Convert nested named tuples to nested dictionaries."""
     if hasattr(value, "_asdict"):
         return {name: _nested(one) for name, one in value._asdict().items()}
     return [_nested(one) for one in value] if isinstance(value, tuple) else value
 
 
 def check_comparable(configs: Mapping[str, Config]) -> None:
-    """Refuses runs that did not have the same to do.
+    """Raise an error if runs did not train for the same task.
 
-    What they see, how their networks look and how they were trained may differ.
+    Their observations, networks and training may differ.
 
     Args:
-      configs: of each run, by what the user calls it.
+      configs: the configuration of each run, by the name that the user gave.
 
     Raises:
-      UserError: they differ in the task, the robot, or how long an episode takes.
+      UserError: the runs differ in the task, the robot, or the duration of an episode.
     """
     (first, wanted), *others = ((name, _to_do(config)) for name, config in configs.items())
     for name, found in others:
@@ -184,17 +187,17 @@ def _differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
 
 
 def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Comparison:
-    """Compares runs on the goals that all of them drove to.
+    """Compare runs on the goals that all of them drove to.
 
     Args:
-      folder: where the files of the comparison are to lie.
-      runs: the seeds' reports by their names, by the run's name; all of the same goals.
+      folder: the folder for the files of the comparison.
+      runs: for each run by name, the report of each seed by name; all on the same goals.
 
     Returns:
       The comparison.
 
     Raises:
-      UserError: their tasks drew other goals under the same keys.
+      UserError: their tasks sampled different goals from the same keys.
     """
     _check_goals(runs)
     rows = tuple(_run(name, seeds) for name, seeds in runs.items())
@@ -216,7 +219,7 @@ def _check_goals(runs: Mapping[str, Mapping[str, Report]]) -> None:
         (name, report.episodes.goal_w) for name, seeds in runs.items() for report in seeds.values()
     )
     for name, found in others:
-        # Other programs round differently.
+        # Allow for a tolerance, because different compiled programs round differently.
         if not np.allclose(found, wanted, atol=1e-3):
             raise UserError(
                 f"{name} cannot be compared with {first}: its task drew other goals from the same"
@@ -235,13 +238,13 @@ def _run(name: str, seeds: Mapping[str, Report]) -> Run:
 
 
 def _times(reports: Sequence[Report]) -> list[float]:
-    """Median times to the goal, of the seeds that reached any."""
+    """Return the median times to the goal of the seeds that reached any goal."""
     medians = (one.policy.time_to_goal_median for one in reports)
     return [median for median in medians if median is not None]
 
 
 def _of_one_seed(report: Report) -> tuple[Aggregate, Aggregate]:
-    """Over its episodes: success with its Wilson interval, and the median time."""
+    """Return the success rate with its Wilson interval and the median time, over the episodes."""
     policy, episodes = report.policy, report.episodes
     success = Estimate(policy.success_rate, policy.success_low, policy.success_high)
     steps = np.asarray(episodes.steps)[np.asarray(episodes.success) > 0]
@@ -299,9 +302,9 @@ def _pair(a: Run, b: Run) -> Pair:
 def _goal_by_goal(
     reports: Sequence[Report],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Which part of the seeds reached a goal, and in how many steps, of those that did."""
+    """Return for each goal the fraction of seeds that reached it, and their mean steps."""
     won = np.stack([one.episodes.success > 0 for one in reports])
-    # Whole numbers, so that equals stay equal in whatever order they are added.
+    # Add integers, so that equal values stay equal in whatever order they are added.
     steps = np.stack([np.asarray(one.episodes.steps, int) for one in reports])
     reached = won.sum(axis=0)
     return reached / len(reports), (won * steps).sum(axis=0) / np.maximum(reached, 1)
@@ -320,7 +323,7 @@ def _duel(
     order = (b, a) if less_is_better else (a, b)
     return Duel(
         difference=bootstrap(mean_difference, a, b),
-        # One seed against another says nothing of the next two.
+        # With a single seed the comparison says nothing about other seeds.
         improvement=bootstrap(probability_of_improvement, *order) if several else Estimate(None),
         wins=wins,
         losses=losses,

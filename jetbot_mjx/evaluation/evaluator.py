@@ -1,8 +1,8 @@
-"""The one protocol by which a policy is judged: fixed goals, baselines, honest intervals.
+"""Evaluate policies and baselines on fixed goals and compute metrics with confidence intervals.
 
-Goals come from the task's own sampler under fixed keys, one key an episode, so that episode
-i has the same goal however many are run. Two sets that share no key: one for the evaluations
-during training, by which the best checkpoint is chosen, and one for the report.
+Goals come from the task's own sampler under fixed keys, with one key for each episode, so that
+episode i has the same goal however many episodes are run. There are two sets that share no key: one
+for the evaluations during training, by which the best checkpoint is chosen, and one for the report.
 """
 
 import math
@@ -24,25 +24,25 @@ from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 
 GOAL_SET_VERSION = 1
-"""Raised whenever the goals or the rules of the report change."""
+"""Version number that increases whenever the goals or the rules of the report change."""
 
 REPORT_GOALS = 1024
-"""How many of its fixed goals a report takes, unless told otherwise."""
+"""Default number of fixed goals in a report."""
 
 MOST_GOALS = 1_048_576
-"""As many can be asked for."""
+"""Largest number of goals that the user can ask for."""
 
 _REPORT_SEED = 20_251
 _TRAINING_SEED = 20_252
 
 
 def report_keys(episodes: int) -> UInt32[Array, "n 2"]:
-    """Reset keys of the report's fixed goal set."""
+    """Return the reset keys of the report's fixed goal set."""
     return _fixed_keys(_REPORT_SEED, episodes)
 
 
 def training_keys(episodes: int) -> UInt32[Array, "n 2"]:
-    """Reset keys of the evaluations during training, none of them in `report_keys`."""
+    """Return the reset keys of evaluations during training, none of which is in `report_keys`."""
     return _fixed_keys(_TRAINING_SEED, episodes)
 
 
@@ -52,7 +52,10 @@ def _fixed_keys(seed: int, episodes: int) -> UInt32[Array, "n 2"]:
 
 
 class Summary(NamedTuple):
-    """The figures of a set of episodes. Times and paths are those of the successes."""
+    """A `Summary` holds the metrics of a set of episodes.
+
+    Times and path efficiencies are computed over the successes only.
+    """
 
     episodes: int
     successes: int
@@ -60,29 +63,29 @@ class Summary(NamedTuple):
     success_low: float
     """Lower end of the 95 % Wilson interval."""
     success_high: float
-    """Upper end of it."""
+    """Upper end of the interval."""
     time_to_goal_median: float | None
-    """[s]; None without a success, like the next two."""
+    """[s] Median over the successes; None without a success, like the next two."""
     time_to_goal_p95: float | None
-    """[s]"""
+    """[s] 95th percentile over the successes."""
     path_efficiency: float | None
-    """Mean of straight line over way travelled, at most 1."""
+    """Mean ratio of straight-line distance to distance travelled, at most 1."""
     episode_return: float
-    """Mean over all episodes; it ends near the mean distance covered, whoever drives well."""
+    """Mean over all episodes, which is near the mean distance covered for every good policy."""
     final_distance_median: float
-    """[m] on the floor, over all episodes."""
+    """[m] Median over all episodes of the distance to the goal at the end, on the floor."""
     nonfinite_worlds: int
 
 
 def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
-    """Reduces episodes to the figures of a report.
+    """Compute the metrics of a set of episodes.
 
     Args:
-      episodes: of one controller.
+      episodes: the episodes of one controller.
       ctrl_dt: duration of one environment step [s].
 
     Returns:
-      The figures.
+      The metrics.
     """
     host = jax.device_get(episodes._replace(qpos=None, goal=None))
     won = host.success > 0
@@ -105,36 +108,36 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
 
 
 def path_efficiencies(episodes: Episodes) -> Float[np.ndarray, " n"]:
-    """Straight line from start to end over the way travelled, at most 1.
+    """Compute the ratio of straight-line distance to distance travelled, at most 1.
 
     Args:
-      episodes: on the host.
+      episodes: episodes on the host.
     """
     straight = np.linalg.norm(episodes.end_w - episodes.start_w, axis=-1)
     return np.minimum(straight / np.maximum(episodes.path_length, 1e-9), 1.0)
 
 
 def final_distances(episodes: Episodes) -> Float[np.ndarray, " n"]:
-    """From where the robots ended to their goals, on the floor [m].
+    """Compute the distance on the floor from each robot's final position to its goal [m].
 
     Args:
-      episodes: on the host.
+      episodes: episodes on the host.
     """
     return np.linalg.norm(episodes.goal_w[:, :2] - episodes.end_w, axis=-1)
 
 
 def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval of a proportion.
+    """Compute Wilson's score interval of a proportion.
 
         (p̂ + z²/2n ± z √(p̂(1-p̂)/n + z²/4n²)) / (1 + z²/n)
 
     Args:
-      successes: how many.
-      trials: out of how many, at least 1.
-      z: quantile of the normal distribution; the default gives 95 %.
+      successes: number of successes.
+      trials: number of trials, at least 1.
+      z: quantile of the normal distribution; the default gives a 95 % interval.
 
     Returns:
-      Lower and upper end, within [0, 1].
+      The lower and the upper end, within [0, 1].
 
     Source: E. B. Wilson, JASA 22 (1927), 209-212, doi:10.1080/01621459.1927.10502953.
     """
@@ -146,10 +149,10 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
 
 
 def policy_controller(networks: ppo_networks.PPONetworks) -> Controller:
-    """The controller that acts as a policy does, without exploring.
+    """Return a controller that applies a policy deterministically.
 
     Args:
-      networks: of the policy; its parameters are the controller's.
+      networks: the networks of the policy, whose parameters are the controller's parameters.
 
     Returns:
       The controller.
@@ -163,7 +166,7 @@ def policy_controller(networks: ppo_networks.PPONetworks) -> Controller:
 
 
 class Evaluator:
-    """Judges policies, and baselines beside them, in one compiled program."""
+    """An `Evaluator` evaluates policies, and optionally baselines, with one compiled program."""
 
     def __init__(
         self,
@@ -174,14 +177,14 @@ class Evaluator:
         record: bool = False,
         programs: Programs | None = None,
     ) -> None:
-        """Prepares the program; it compiles at its first use.
+        """Prepare the program, which compiles at its first use.
 
         Args:
-          env: one environment, unwrapped, or one whose robots differ.
-          networks: of the policies to judge.
-          baselines: whether `run_baselines` will be wanted.
-          record: whether to keep trajectories.
-          programs: of the environment's configuration; None: they are not kept.
+          env: one unwrapped environment, or one with domain randomization.
+          networks: the networks of the policies to evaluate.
+          baselines: whether `run_baselines` will be called.
+          record: whether to record trajectories.
+          programs: cache for the programs of the environment's configuration; None: no cache.
         """
         self._env = env
         self._names = ["policy", *(BASELINES if baselines else ())]
@@ -196,11 +199,11 @@ class Evaluator:
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
-        """Deterministic episodes of a policy.
+        """Run deterministic episodes of a policy.
 
         Args:
-          params: the policy's.
-          keys: one reset key an episode.
+          params: parameters of the policy.
+          keys: one reset key for each episode.
 
         Returns:
           The episodes.
@@ -210,14 +213,14 @@ class Evaluator:
     def run_baselines(
         self, params: PolicyParams, keys: UInt32[Array, "n 2"]
     ) -> dict[str, Episodes]:
-        """The same episodes under each baseline.
+        """Run the same episodes under each baseline.
 
         Args:
-          params: of any policy; the program takes them, the baselines do not use them.
-          keys: one reset key an episode.
+          params: parameters of any policy, which the program needs but the baselines do not use.
+          keys: one reset key for each episode.
 
         Returns:
-          The episodes by the baseline's name.
+          The episodes by the name of the baseline.
         """
         return {
             name: self._episodes(index, params, keys)
@@ -226,8 +229,8 @@ class Evaluator:
         }
 
     def _episodes(self, index: int, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
-        # On the host: parameters straight from a trainer carry its sharding, and what is compiled
-        # takes one alone.
+        # Move the parameters to the host: those from a trainer carry its sharding, and a compiled
+        # program accepts only the sharding that it was compiled for.
         arguments = np.int32(index), jax.device_get(params), np.asarray(keys)
         count = len(keys)
         if count not in self._compiled:
@@ -246,7 +249,7 @@ def _random(env: JetBotEnv | VariedEnv) -> Controller:
 
 
 def _constant(env: JetBotEnv | VariedEnv) -> Controller:
-    """The middle of the action range: half speed straight ahead."""
+    """Return a controller that holds the middle of the action range: half speed straight ahead."""
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
         del params, state, key
@@ -256,9 +259,12 @@ def _constant(env: JetBotEnv | VariedEnv) -> Controller:
 
 
 def _turn_then_go(env: JetBotEnv | VariedEnv) -> Controller:
-    """Turns until the goal lies ahead, and drives the faster the better it is aligned."""
+    """Return a controller that turns towards the goal and drives faster the better it is aligned.
+
+    It turns in place until the goal lies ahead.
+    """
     steering = 4.0  # [1/s] yaw rate per heading error
-    damping = 0.3  # yaw rate taken back per yaw rate: the motors lag, and it would swing
+    damping = 0.3  # yaw rate taken back per yaw rate, because the motors' lag would cause swinging
     cone = 0.6  # [rad] heading error within which it drives
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
@@ -280,4 +286,4 @@ def _turn_then_go(env: JetBotEnv | VariedEnv) -> Controller:
 
 
 BASELINES = {"scripted": _turn_then_go, "random": _random, "constant": _constant}
-"""Controllers to read a success rate against: turn-then-go, uniform noise, straight ahead."""
+"""Baselines to compare a success rate with: turn-then-go, uniform noise, straight ahead."""

@@ -1,7 +1,7 @@
-"""Reports as files: JSON with everything, figures, and a page of HTML and one of Markdown.
+"""Write reports as files: JSON with all values, figures, one HTML page and one Markdown page.
 
-A page is made from the values of its JSON file, each number of it by its place in there, so that
-they cannot tell two things. It holds its figures and asks no network for anything.
+A page takes each number from the values of its JSON file by key, so that the page and the file
+cannot differ. The HTML page embeds its figures and needs no network access.
 """
 
 import base64
@@ -35,12 +35,12 @@ from jetbot_mjx.evaluation.report import Report, replay_command
 from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, write_text, writing_to
 
 LISTED_FAILURES = 50
-"""As many stand on a page; all stand in the JSON file."""
+"""Largest number of failures on a page; the JSON file lists all of them."""
 
 _REPLAYED = 8
 
 _NOT_ALWAYS = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
-"""Figures that a page may be without."""
+"""Figures that a page may lack."""
 
 _FORMS = {
     "percent": "{:.2%}",
@@ -65,16 +65,16 @@ _PAGES = jinja2.Environment(
     trim_blocks=True,
     lstrip_blocks=True,
     keep_trailing_newline=True,
-    # Settings: as many digits as a reader wants.
+    # Show floating-point settings with six significant digits, which are enough for a reader.
     finalize=lambda value: f"{value:.6g}" if isinstance(value, float) else value,
 )
 
-# A bar would begin the next cell of a Markdown table.
+# Escape vertical bars, which would start the next cell of a Markdown table.
 _PAGES.filters["cell"] = lambda text: text.replace("|", "\\|")
 
 
 class _Picture(NamedTuple):
-    """A figure within a page."""
+    """A `_Picture` holds one figure of a page: its file and data URIs of both themes."""
 
     file: str
     light: str
@@ -82,17 +82,18 @@ class _Picture(NamedTuple):
 
 
 def write_report(report: Report) -> Path:
-    """Writes a report into its folder.
+    """Write a report into its folder.
 
     Args:
-      report: of one policy.
+      report: the report of one policy.
 
     Returns:
-      The page: `report.html`; beside it `report.md`, `report.json` and the figures.
+      The path of `report.html`; `report.md`, `report.json` and the figures are in the same folder.
 
     Raises:
       UserError: the folder cannot be written.
     """
+    # Choose the figures.
     episodes = report.episodes
     shown = shown_trajectories(episodes)
     successes = sum(bool(episodes.success[index] > 0) for index in shown)
@@ -105,6 +106,7 @@ def write_report(report: Report) -> Path:
         figures["learning_curve"] = lambda: plot_learning_curve(report)
     if report.robustness:
         figures["robustness"] = lambda: plot_robustness(report.robustness)
+    # Write them with the commands that reproduce the report and show its failures.
     goals = [failure.goal for failure in report.failures if failure.replay][:_REPLAYED]
     return _write(
         report.folder,
@@ -122,13 +124,14 @@ def write_report(report: Report) -> Path:
 
 
 def write_comparison(comparison: Comparison) -> Path:
-    """Writes a comparison into its folder.
+    """Write a comparison into its folder.
 
     Args:
-      comparison: of runs whose own reports are written.
+      comparison: a comparison of runs whose own reports are already written.
 
     Returns:
-      The page: `comparison.html`; beside it `comparison.md`, `comparison.json` and the figures.
+      The path of `comparison.html`; `comparison.md`, `comparison.json` and the figures are in the
+      same folder.
 
     Raises:
       UserError: the folder cannot be written.
@@ -150,7 +153,7 @@ def _write(
     figures: Mapping[str, Callable[[], Figure]],
     more: Mapping[str, Any],
 ) -> Path:
-    """Draws all before anything is written; the page comes last."""
+    """Draw all figures and render all pages, then write the files, the HTML page last."""
     drawn = {figure: _draw(draw) for figure, draw in figures.items()}
     pictures = {
         figure: _Picture(f"{figure}.png", *(_data_uri(png) for png in pngs))
@@ -164,7 +167,7 @@ def _write(
     }
     make_folder(folder)
     with writing_to(folder):
-        # Of an earlier report that had more.
+        # Remove figures of an earlier report that this one does not have.
         for figure in sorted(_NOT_ALWAYS[name] - drawn.keys()):
             (folder / f"{figure}.png").unlink(missing_ok=True)
         for figure, (light, _) in drawn.items():
@@ -176,7 +179,7 @@ def _write(
 
 
 def _draw(draw: Callable[[], Figure]) -> list[bytes]:
-    """A figure in every theme."""
+    """Draw a figure in every theme and return the PNG files."""
     pngs = []
     for name in THEMES:
         with theme(name):
@@ -189,7 +192,7 @@ def _data_uri(png: bytes) -> str:
 
 
 def _numbers(values: Mapping[str, Any], suffix: str) -> Callable[[str, str], str]:
-    """What shows a number of the JSON file by its place, such as `policy.success_rate`."""
+    """Return a function that formats a JSON value by its path, such as `policy.success_rate`."""
 
     def number(place: str, form: str) -> str:
         value = _look_up(values, place)

@@ -1,4 +1,4 @@
-"""Figures of trainings: how they learn, and what they reach beside each other."""
+"""Plot the learning curves of trainings and the results that several of them reach."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -14,10 +14,10 @@ from jetbot_mjx.evaluation.report import Report
 
 
 def plot_learning_curve(report: Report) -> Figure:
-    """Success over the training, and where the reported policy stands.
+    """Plot the success rate over the training and the reported policy.
 
     Args:
-      report: of one policy, whose run has a learning curve.
+      report: the report of one policy, whose run has a learning curve.
 
     Returns:
       The figure.
@@ -47,17 +47,17 @@ def plot_learning_curve(report: Report) -> Figure:
 
 
 def plot_learning_curves(comparison: Comparison) -> Figure:
-    """Success over the training of every run, with a band.
+    """Plot the success rate over the training of every run, with a band.
 
     Args:
-      comparison: of runs, some of which have a learning curve.
+      comparison: a comparison of runs, some of which have a learning curve.
 
     Returns:
       The figure.
     """
     figure = Figure(figsize=(10.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
-    # Two checkpoints of one run have one curve.
+    # Draw the curve once for two checkpoints of the same run.
     named: dict[tuple[BandPoint, ...], list[str]] = {}
     for run in comparison.runs:
         seeds = f", {len(run.seeds)} seeds" if len(run.seeds) > 1 else ""
@@ -101,10 +101,10 @@ def _short(count: float) -> str:
 
 
 def plot_runs(comparison: Comparison) -> Figure:
-    """Success rate and time to the goal of every run, with intervals and every seed.
+    """Plot the success rate and time to the goal of every run, with intervals and every seed.
 
     Args:
-      comparison: of runs.
+      comparison: a comparison of runs.
 
     Returns:
       The figure.
@@ -129,7 +129,7 @@ def plot_runs(comparison: Comparison) -> Figure:
 
 
 def _forest(axes: Axes, row: int, aggregate: Aggregate, values: Sequence[float | None]) -> None:
-    """A run's seeds, its mean with interval, and below it the interquartile mean."""
+    """Draw a run's seeds, its mean with interval, and below it the interquartile mean."""
     colour = f"C{row}"
     kinds = [(aggregate.mean, 0.0, "o"), (aggregate.iqm, 0.22, "s")]
     if aggregate.over == "seeds":

@@ -1,6 +1,6 @@
-"""Figures of episodes and of judgements: each function returns one, and writes nothing.
+"""Plot episodes and evaluation results; each function returns a figure and writes no file.
 
-Their colours come from the theme in which they are drawn: `with theme("dark"): ...`.
+The colours come from the theme in which a figure is drawn: `with theme("dark"): ...`.
 """
 
 import contextlib
@@ -26,8 +26,8 @@ from jetbot_mjx.evaluation.rollout import Episodes
 Theme = Literal["light", "dark"]
 THEMES: tuple[Theme, ...] = ("light", "dark")
 
-# Paper, ink, faint lines, and colours that the colour-blind can tell apart, the first two for
-# goals that were reached and missed.
+# Background, text, grid lines, and line colours that colour-blind readers can tell apart. The first
+# two line colours are for goals that were reached and missed.
 _COLOURS = {
     "light": ("#ffffff", "#22272e", "#d5dae1", "#1f6fd0 #d9480f #2b8a3e #862e9c #b08900 #0b7285"),
     "dark": ("#161b22", "#d5dbe3", "#363e49", "#5aa2f5 #ff8a4c #5bbd6e #c98be0 #e0b73c #4dbfd0"),
@@ -42,7 +42,7 @@ _MOST_FAILURES = 200
 
 @contextlib.contextmanager
 def theme(name: Theme) -> Iterator[None]:
-    """Draws what is drawn meanwhile for light or for dark surroundings."""
+    """Set the colours of figures that are drawn inside the context to a light or dark theme."""
     paper, ink, faint, cycle = _COLOURS[name]
     style: Any = {
         "figure.facecolor": paper,
@@ -72,17 +72,20 @@ def theme(name: Theme) -> Iterator[None]:
 
 
 def to_png(figure: Figure) -> bytes:
-    """A figure as a file, the same bytes for the same figure whenever it is drawn."""
+    """Return a figure as PNG, with the same bytes for the same figure every time."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
 
 
 def shown_trajectories(episodes: Episodes) -> list[int]:
-    """Which episodes a readable plan view shows: failures before successes, the first of each.
+    """Return the indices of the episodes to show in a readable plan view.
+
+    They are the first successes and the first failures. The failures come last, so that they are
+    drawn on top.
 
     Args:
-      episodes: on the host.
+      episodes: episodes on the host.
     """
     won = np.asarray(episodes.success) > 0
     failures, successes = np.flatnonzero(~won), np.flatnonzero(won)
@@ -95,13 +98,13 @@ def plot_trajectories(
     others_w: Sequence[Float[np.ndarray, "n 3"]] = (),
     which: Sequence[int] | None = None,
 ) -> Figure:
-    """Plan view of recorded episodes: where the robot went and where it should have gone.
+    """Plot the trajectories and goals of recorded episodes as seen from above.
 
     Args:
-      episodes: recorded.
-      title: of the figure.
-      others_w: what else stood in each episode's world [m], drawn as grey dots.
-      which: the episodes to draw, the last on top; None: all.
+      episodes: recorded episodes.
+      title: title of the figure.
+      others_w: positions of other objects in each episode [m], world frame, drawn as grey dots.
+      which: indices of the episodes to draw, the last on top; None: all.
 
     Returns:
       The figure.
@@ -110,6 +113,7 @@ def plot_trajectories(
         raise ValueError("these episodes were not recorded: rollout_fn(..., record=True)")
     figure = Figure(figsize=(6.4, 6.4), layout="constrained")
     axes = figure.add_subplot()
+    # Draw each trajectory with its goal as a square and its end as a dot.
     for index in range(episodes.success.size) if which is None else which:
         colour = _REACHED if episodes.success[index] > 0 else _MISSED
         way = np.asarray(episodes.qpos[index, : int(episodes.steps[index]) + 1, :2])
@@ -121,6 +125,7 @@ def plot_trajectories(
         axes.plot(*way[-1], marker="o", color=colour, markersize=3)
     for places in others_w:
         axes.scatter(places[:, 0], places[:, 1], color="grey", alpha=0.5, zorder=0)
+    # Add the start, the legend and the limits.
     ink = matplotlib.rcParams["text.color"]
     axes.plot(0, 0, marker=(3, 0, -90), color=ink, ls="", ms=11, label="start, heading +x")
     axes.plot([], [], color=_REACHED, label="reached")
@@ -135,13 +140,13 @@ def plot_trajectories(
 
 
 def plot_by_goal(cells: Sequence[Cell]) -> Figure:
-    """Success and time to the goal by its distance and bearing, as seen from above the start.
+    """Plot success and time over the goal's distance and bearing, as seen from above the start.
 
     Args:
-      cells: of a report.
+      cells: the cells of a report.
 
     Returns:
-      The figure; cells without a goal, or without a time, are hatched.
+      The figure, in which cells without a goal or without a time are hatched.
     """
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     success, seconds = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
@@ -182,7 +187,8 @@ def _polar(
     colours: Colormap,
     scale: Normalize,
 ) -> None:
-    """Cells of rings and sectors; ahead is up, left is left."""
+    """Draw cells as rings and sectors, with straight ahead at the top and left on the left."""
+    # Fill each cell with its value and label it.
     ink, paper = (matplotlib.rcParams[key] for key in ("text.color", "figure.facecolor"))
     for cell, value, label in zip(cells, values, labels, strict=True):
         middle = np.radians(cell.bearing_low + cell.bearing_high) / 2
@@ -193,10 +199,11 @@ def _polar(
             continue
         fill = colours(scale(value))
         axes.bar(middle, height, **place, color=fill, edgecolor=paper, linewidth=1.5)
-        # Whichever of the two reads better on the colour.
+        # Choose the text colour that has more contrast with the fill.
         text = max((ink, paper), key=lambda colour, fill=fill: _contrast(colour, fill))
         radius = cell.distance_low + 0.5 * height
         axes.text(middle, radius, label, ha="center", va="center", color=text, fontsize=7)
+    # Label the rings with distances and the sectors with bearings.
     edges = sorted({cell.distance_low for cell in cells} | {cell.distance_high for cell in cells})
     axes.set_theta_zero_location("N")
     axes.set_ylim(0, edges[-1])
@@ -214,16 +221,16 @@ def _polar(
 
 
 def _contrast(one: Any, other: Any) -> float:
-    """Between two colours, as the eye sees it."""
+    """Return the difference in perceived brightness between two colours."""
     low, high = sorted(float(np.dot(to_rgb(c), (0.299, 0.587, 0.114))) for c in (one, other))
     return high - low
 
 
 def plot_distributions(report: Report) -> Figure:
-    """How far from its goal every episode ended, and how straight the successes went.
+    """Plot histograms of the final distances to the goal and of the successes' path efficiency.
 
     Args:
-      report: of one policy.
+      report: the report of one policy.
 
     Returns:
       The figure.
@@ -231,6 +238,7 @@ def plot_distributions(report: Report) -> Figure:
     episodes = report.episodes
     won = np.asarray(episodes.success) > 0
     remaining = final_distances(episodes)
+    # Left: final distance of all episodes.
     figure = Figure(figsize=(10.4, 3.4), layout="constrained")
     left, right = figure.subplots(1, 2)
     radius = report.config.task.success_radius
@@ -250,6 +258,7 @@ def plot_distributions(report: Report) -> Figure:
     left.yaxis.set_major_formatter(FuncFormatter(lambda count, _: f"{count:g}"))
     left.set_title("Final distance")
     left.legend(fontsize="small")
+    # Right: path efficiency of the successes.
     right.set_title("Path efficiency of the successes")
     if won.any():
         right.hist(path_efficiencies(episodes)[won], bins=40, color=_REACHED)
@@ -262,24 +271,26 @@ def plot_distributions(report: Report) -> Figure:
 
 
 def plot_robustness(results: Sequence[SweepResult]) -> Figure:
-    """How far a policy carries: success, and time to goal below it, over each quantity.
+    """Plot the robustness of a policy: success rate and time to goal over each parameter.
 
     Args:
-      results: of one policy, one for each quantity.
+      results: the results of one policy, one for each parameter.
 
     Returns:
-      The figure: bands are 95 % Wilson intervals, a dashed line stands at the preset's value.
+      The figure. Bands are 95 % Wilson intervals; a dashed line marks the preset's value.
     """
     medians = [
         summary.time_to_goal_median or 0.0
         for result in results
         for summary in (*result.policy, *result.scripted)
     ]
+    # Lay out a grid with two axes for each parameter: success above, time below.
     ink = matplotlib.rcParams["text.color"]
     columns = min(3 if len(results) <= 9 else 4, len(results))
     lines = -(-len(results) // columns)
     figure = Figure(figsize=(3.6 * columns, 3.6 * lines), layout="constrained")
     grid = figure.add_gridspec(2 * lines, columns, height_ratios=[3, 2] * lines)
+    # Plot each parameter for the policy and for the scripted controller.
     for index, result in enumerate(results):
         line, column = divmod(index, columns)
         success = figure.add_subplot(grid[2 * line, column])

@@ -1,6 +1,7 @@
-"""What a report of one policy holds: figures, where they come from, where it fails; and its JSON.
+"""Collect the content of a report on one policy (metrics, settings, failures) and its JSON.
 
-Bearings are seen from the robot as it starts: 0° ahead, positive to the left.
+Bearings are relative to the robot's heading at the start: 0° is straight ahead, positive is to the
+left.
 """
 
 import math
@@ -29,10 +30,11 @@ ENDED_BY_TASK = "ended by the task"
 NON_FINITE = "world not finite"
 
 SECTORS = 8
-"""Of the bearing; the first is centred straight ahead, the next lie to the left."""
+"""Number of sectors of the bearing. The first is centred straight ahead, the next are to the left
+of it."""
 
 _RINGS = 4
-_EDGE_STEP = 0.05  # [m] to which the rings' outer and inner edges are rounded
+_EDGE_STEP = 0.05  # [m] rounding of the rings' outer and inner edges
 
 _SETTINGS = (
     "seed",
@@ -42,14 +44,14 @@ _SETTINGS = (
     "ppo.num_timesteps",
     "ppo.network.policy_hidden_layer_sizes",
 )
-"""What a report tells of the configuration, besides the task."""
+"""Settings of the configuration that a report shows, besides those of the task."""
 
 
 class Cell(NamedTuple):
-    """The goals of one stretch of distances and bearings."""
+    """A `Cell` holds the results for the goals in one range of distances and bearings."""
 
     distance_low: float
-    """[m] on the floor, from the start; so is `distance_high`."""
+    """[m] on the floor, from the start, like `distance_high`."""
     distance_high: float
     bearing_low: float
     """[°]; the sector behind the robot ends above 180°."""
@@ -57,34 +59,35 @@ class Cell(NamedTuple):
     episodes: int
     successes: int
     success_rate: float | None
-    """None without a goal in the cell, like its interval."""
+    """None if the cell contains no goal, like its interval."""
     success_low: float | None
     """Lower end of the 95 % Wilson interval."""
     success_high: float | None
-    """Upper end of it."""
+    """Upper end of the interval."""
     time_to_goal_median: float | None
-    """[s] of the successes; None without one."""
+    """[s] Median over the successes; None without a success."""
 
 
 class Failure(NamedTuple):
-    """A goal that was not reached."""
+    """A `Failure` describes a goal that was not reached."""
 
     goal: int
-    """Its number in the fixed set, from 0."""
+    """Index of the goal in the fixed set, from 0."""
     distance: float
-    """[m] of the goal, on the floor, from the start."""
+    """[m] Distance from the start to the goal, on the floor."""
     bearing: float
-    """[°] of the goal, in (-180, 180]."""
+    """[°] Bearing of the goal, in (-180, 180]."""
     final_distance: float
-    """[m] to the goal at the end, on the floor."""
+    """[m] Distance to the goal at the end, on the floor."""
     ended: str
     """`time limit`, `ended by the task`, or `world not finite`."""
     replay: str | None
-    """The command that shows it; None past the goals that can be filmed."""
+    """The command that renders the episode; None if the goal is beyond those that can be rendered.
+    """
 
 
 class CurvePoint(NamedTuple):
-    """One evaluation during the training, on the goals that all of them use."""
+    """A `CurvePoint` holds one evaluation during the training, on goals common to all of them."""
 
     env_steps: int
     success_rate: float
@@ -94,39 +97,39 @@ class CurvePoint(NamedTuple):
 
 
 class Gap(NamedTuple):
-    """How much longer a policy takes than the best known, over the goals that it reached."""
+    """A `Gap` compares a policy's time with the best-known time, over the goals that it reached."""
 
     bearing_low: float
-    """[°] of the goals, like `bearing_high`."""
+    """[°] Lower limit of the goals' bearing; `bearing_high` is the upper limit."""
     bearing_high: float
     reached: int
-    """Goals that the policy reached; without one the rest is None."""
+    """Number of goals that the policy reached; if it is 0, the following fields are None."""
     policy_mean: float | None
-    """[s] mean time to these goals."""
+    """[s] Mean time of the policy to these goals."""
     best_mean: float | None
-    """[s] mean of the best-known times to the same goals."""
+    """[s] Mean of the best-known times to the same goals."""
     gap: float | None
     """`policy_mean` / `best_mean` - 1."""
 
 
 class BestKnown(NamedTuple):
-    """The best-known times to the report's goals, and a policy's gap to them."""
+    """A `BestKnown` holds the best-known times to the report's goals and a policy's gap to them."""
 
     time_to_goal_median: float
-    """[s] over all goals of the report, reached by the policy or not; so is the next."""
+    """[s] over all goals of the report, reached by the policy or not, like the next field."""
     time_to_goal_p95: float
     total: Gap
     by_direction: tuple[Gap, ...]
-    """Of each sector of the bearing, from straight ahead to the left and round."""
+    """The gap in each sector of the bearing, counter-clockwise from straight ahead."""
 
 
 class Report(NamedTuple):
-    """All that is told of one policy."""
+    """A `Report` holds everything that is reported about one policy."""
 
     folder: Path
-    """Where its files lie."""
+    """Folder of the report's files."""
     run: Path
-    """The run folder, as commands name it."""
+    """The run folder, as it is written in commands."""
     checkpoint: Path
     env_steps: int
     config: Config
@@ -135,34 +138,34 @@ class Report(NamedTuple):
     cells: tuple[Cell, ...]
     failures: tuple[Failure, ...]
     learning_curve: tuple[CurvePoint, ...]
-    """Empty where the run folder holds no metrics."""
+    """Evaluations during the training; empty if the run folder holds no metrics."""
     episodes: Episodes
-    """The policy's, on the host."""
+    """The policy's episodes, with arrays on the host."""
     versions: Mapping[str, Any]
     robustness: tuple[SweepResult, ...] = ()
-    """On robots that differ from the preset; empty where none were asked for."""
+    """Results on robots that differ from the preset; empty if they were not requested."""
     randomized: Summary | None = None
-    """On the same goals, with a robot drawn for each; None without ranges to draw from."""
+    """Metrics on the same goals with a robot sampled for each; None without ranges."""
     ranges: RandomizationConfig | None = None
-    """What those robots were drawn from."""
+    """The ranges that those robots were sampled from."""
     ranges_file: Path | None = None
-    """Where the ranges stand; None: in the run's own configuration."""
+    """The file that holds the ranges; None: the run's own configuration."""
     mujoco: InMujoco | None = None
-    """On the same goals in C MuJoCo; None where it was not asked for."""
+    """Metrics on the same goals in C MuJoCo; None if they were not requested."""
     best_known: BestKnown | None = None
-    """None where nothing is known for these goals and settings."""
+    """Best-known times; None if there are none for these goals and settings."""
     best_known_missing: str | None = None
-    """Why nothing is known."""
+    """Why there are no best-known times."""
 
     @property
     def name(self) -> str:
-        """Of the run, for people; a seed's with the folder that holds all seeds."""
+        """Return the readable name of the run; for a seed, with the folder that holds all seeds."""
         run_dir = self.checkpoint.parents[1]
         alone = not run_dir.name.startswith("seed-")
         return run_dir.name if alone else f"{run_dir.parent.name}/{run_dir.name}"
 
     def judge_command(self) -> str:
-        """The command line that makes this report."""
+        """Return the command line that creates this report."""
         return (
             f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
@@ -171,7 +174,7 @@ class Report(NamedTuple):
         )
 
     def to_json(self) -> dict[str, Any]:
-        """All but the episodes."""
+        """Return everything except the episodes as JSON values."""
         return {
             "goal_set_version": GOAL_SET_VERSION,
             "run": self.name,
@@ -200,13 +203,13 @@ class Report(NamedTuple):
 def goal_places(
     episodes: Episodes,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Where the goals lie as the robot sees them at the start.
+    """Compute the distance and bearing of each goal relative to the robot at the start.
 
     Args:
-      episodes: on the host.
+      episodes: episodes on the host.
 
     Returns:
-      Distance on the floor [m], and bearing in (-180, 180] [°].
+      The distance on the floor [m], and the bearing in (-180, 180] [°].
     """
     x, y = np.asarray(episodes.goal_w[:, :2] - episodes.start_w, float).T
     bearing = np.degrees(np.arctan2(y, x) - np.asarray(episodes.start_yaw, float))
@@ -214,15 +217,15 @@ def goal_places(
 
 
 def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[Cell, ...]:
-    """Success and time by the goal's distance and bearing.
+    """Compute success and time by the goal's distance and bearing.
 
     Args:
-      episodes: on the host.
+      episodes: episodes on the host.
       ctrl_dt: duration of one environment step [s].
 
     Returns:
-      Rings from the inner to the outer one, each from straight ahead to the left and round.
-      The rings are equally wide and together hold all goals.
+      Cells in rings from the inner to the outer one, each counter-clockwise from straight ahead.
+      The rings are equally wide and together contain all goals.
     """
     distance, bearing = goal_places(episodes)
     edges = _ring_edges(distance)
@@ -249,11 +252,11 @@ def _sectors(bearing: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
 def compare_with_best_known(
     config: Config, episodes: Episodes
 ) -> tuple[BestKnown | None, str | None]:
-    """Compare a policy's times with the best known.
+    """Compare a policy's times with the best-known times.
 
     Args:
-      config: of its run.
-      episodes: on the host, to the first of the report's goals.
+      config: the configuration of the policy's run.
+      episodes: episodes on the host, driven to the first of the report's goals.
 
     Returns:
       The comparison, or None and why there is none.
@@ -287,10 +290,10 @@ def _best_known_json(found: BestKnown | None) -> dict[str, Any] | None:
 
 
 def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
-    # What rounding has moved over an edge belongs to the ring beside it all the same.
+    # A goal that rounding moved across an edge still belongs to the adjacent ring.
     low = math.floor(distance.min() / _EDGE_STEP + 1e-4) * _EDGE_STEP
     high = math.ceil(distance.max() / _EDGE_STEP - 1e-4) * _EDGE_STEP
-    # Goals that are all as far need no rings.
+    # Goals at almost the same distance need only one ring.
     rings = _RINGS if high - low > _RINGS * _EDGE_STEP else 1
     return [
         round(float(edge), 4) for edge in np.linspace(low, max(high, low + _EDGE_STEP), rings + 1)
@@ -316,15 +319,15 @@ def _cell(
 
 
 def find_failures(episodes: Episodes, run: Path, env_steps: int) -> tuple[Failure, ...]:
-    """The goals that were not reached, in their order.
+    """Return the goals that were not reached, in ascending order.
 
     Args:
-      episodes: on the host.
-      run: the run folder, as a command names it.
-      env_steps: of the checkpoint.
+      episodes: episodes on the host.
+      run: the run folder, as it is written in commands.
+      env_steps: environment steps of the checkpoint.
 
     Returns:
-      One entry for each.
+      One entry for each of these goals.
     """
     distance, bearing = goal_places(episodes)
     remaining = final_distances(episodes)
@@ -348,7 +351,7 @@ def _how_it_ended(episodes: Episodes, goal: int) -> str:
 
 
 def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | None:
-    """The command line that films a policy on some of the goals; None where none can be filmed."""
+    """Return the command line that renders a policy on some goals; None if none can be rendered."""
     which = ",".join(str(goal) for goal in goals if goal < REPORT_GOALS)
     if not which:
         return None
@@ -359,10 +362,10 @@ def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | Non
 
 
 def learning_curve(history: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[CurvePoint, ...]:
-    """The evaluations among what a training has logged.
+    """Extract the evaluations from the metrics of a training.
 
     Args:
-      history: environment steps and figures, as in `metrics.jsonl`.
+      history: environment steps and metrics, as in `metrics.jsonl`.
 
     Returns:
       One point for each line that holds a success rate with its interval.

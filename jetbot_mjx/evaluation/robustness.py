@@ -1,11 +1,11 @@
-"""How far a policy carries: judged on robots that differ from the one it was trained on.
+"""Evaluate the robustness of a policy on changed robots and in another simulator, C MuJoCo.
 
-One quantity at a time leaves the preset's value; goals, rules and figures are those of the
-report. One compiled program serves all robots, and beside the policy the scripted controller.
-And on the same robot in another simulator: C MuJoCo, with numerics that no training uses.
+One parameter at a time differs from the preset's value. Goals, rules and metrics are those of the
+report. One compiled program evaluates all robots, and the scripted controller besides the policy.
+The evaluation in C MuJoCo uses the same robot, with numerics that no training uses.
 
 Sources, by tag; BOM, EST and SIM as in `model.py`:
-  CAD         the room that the battery has, and the clearance of the casters; see `model.py`.
+  CAD         the space for the battery, and the clearance of the casters; see `model.py`.
   CSE276A     gassajor000/cse276a_jetbot: a JetBot's motors, calibrated.
   DUCKIETOWN  gym-duckietown: the simulator of a robot with the same motors.
   ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: how that randomises Isaac's JetBot.
@@ -40,32 +40,32 @@ from jetbot_mjx.evaluation.evaluator import (
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
 
 SWEEP_GOALS = 128
-"""How many of the report's fixed goals a sweep takes for each robot."""
+"""Number of the report's fixed goals that a sweep uses for each robot."""
 
 CARRIES_AT = 0.95
-"""Success rate down to which a policy is said to carry."""
+"""Lowest success rate at which a policy counts as robust to a changed value."""
 
 
 class Sweep(NamedTuple):
-    """One quantity, and the values at which a policy is judged."""
+    """A `Sweep` holds one parameter and the values at which a policy is evaluated."""
 
     name: str
-    """Field of `Variation`."""
+    """Name of the parameter, a field of `Variation`."""
     label: str
     unit: str
     values: tuple[float, ...]
-    """Rising; the preset's among them."""
+    """Values in ascending order, which include the preset's value."""
     source: str
-    """What the range rests on."""
+    """Source of the range."""
 
     @property
     def nominal(self) -> float:
-        """The preset's value."""
+        """Return the preset's value."""
         return getattr(Variation(), self.name)
 
     @property
     def robots(self) -> list[Variation]:
-        """The robot of each value."""
+        """Return the robot for each value."""
         return [Variation()._replace(**{self.name: value}) for value in self.values]
 
 
@@ -212,16 +212,16 @@ SWEEPS = (
 
 
 class SweepResult(NamedTuple):
-    """A policy, and the scripted controller beside it, over one quantity."""
+    """A `SweepResult` holds the results of a policy and the scripted controller for one sweep."""
 
     sweep: Sweep
     policy: tuple[Summary, ...]
-    """One for each value."""
+    """Metrics of the policy, one summary for each value."""
     scripted: tuple[Summary, ...]
 
 
 class Sweeper:
-    """Judges policies over quantities, all of them in one compiled program."""
+    """A `Sweeper` evaluates policies over all parameters with one compiled program."""
 
     def __init__(
         self,
@@ -230,19 +230,20 @@ class Sweeper:
         keys: UInt32[Array, "n 2"],
         sweeps: Sequence[Sweep] = SWEEPS,
     ) -> None:
-        """Prepares the program; it compiles at its first use.
+        """Prepare the program, which compiles at its first use.
 
         Args:
-          env: one environment, unwrapped, with its preset's robot.
-          networks: of the policies.
-          keys: one reset key an episode, such as `report_keys(128)`.
-          sweeps: the quantities.
+          env: one unwrapped environment with its preset's robot.
+          networks: the networks of the policies.
+          keys: one reset key for each episode, such as `report_keys(128)`.
+          sweeps: the parameters with their values.
         """
         self._env, self._keys, self._sweeps = env, keys, tuple(sweeps)
-        # The preset's robot occurs in every sweep, and drives once.
+        # The preset's robot occurs in every sweep, but is evaluated only once.
         self._robots = list(dict.fromkeys(robot for one in sweeps for robot in one.robots))
-        # A CPU takes robots one after the other: the solver iterates until the last of a batch is
-        # done, and those that slide would hold up the rest. A GPU would have nothing to do.
+        # Run robots one after the other on a CPU: the solver iterates until the last robot of a
+        # batch has converged, so those that slide would slow down the rest. A GPU needs the whole
+        # batch to be busy.
         at_once = 1 if jax.default_backend() == "cpu" else len(self._robots)
         controllers = [policy_controller(networks), BASELINES["scripted"](env)]
         length = env.config.task.episode_length
@@ -263,13 +264,13 @@ class Sweeper:
         self._scripted: dict[Variation, Summary] = {}
 
     def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
-        """Judges a policy at every value of every quantity, on the same goals.
+        """Evaluate a policy at every value of every parameter, on the same goals.
 
         Args:
-          params: the policy's.
+          params: parameters of the policy.
 
         Returns:
-          One result for each quantity.
+          One result for each sweep.
         """
         host = jax.device_get(params)
         policy = self._judged(0, host)
@@ -298,29 +299,29 @@ def sweep(
     keys: UInt32[Array, "n 2"],
     sweeps: Sequence[Sweep] = SWEEPS,
 ) -> tuple[SweepResult, ...]:
-    """Judges one policy, as `Sweeper` does several.
+    """Evaluate one policy over all parameters; use `Sweeper` for several policies.
 
     Args:
-      env: one environment, unwrapped, with its preset's robot.
-      networks: of the policy.
-      params: the policy's.
-      keys: one reset key an episode, such as `report_keys(128)`.
-      sweeps: the quantities.
+      env: one unwrapped environment with its preset's robot.
+      networks: the networks of the policy.
+      params: parameters of the policy.
+      keys: one reset key for each episode, such as `report_keys(128)`.
+      sweeps: the parameters with their values.
 
     Returns:
-      One result for each quantity.
+      One result for each sweep.
     """
     return Sweeper(env, networks, keys, sweeps).run(params)
 
 
 class InMujoco(NamedTuple):
-    """A policy in C MuJoCo, on the same goals as in the simulator that it was trained in."""
+    """An `InMujoco` holds the metrics of a policy in C MuJoCo, on the goals of the report."""
 
     numerics: Numerics
     policy: Summary
-    """On the preset's robot."""
+    """Metrics with the preset's robot."""
     randomized: Summary | None
-    """With a robot drawn for each goal; None without ranges to draw from."""
+    """Metrics with a robot sampled for each goal; None without ranges to sample from."""
 
     def to_json(self) -> dict[str, Any]:
         """Return all of it as plain values, for a report's file."""
@@ -333,7 +334,7 @@ class InMujoco(NamedTuple):
 
 
 class MujocoEvaluator:
-    """Evaluates policies in C MuJoCo."""
+    """A `MujocoEvaluator` evaluates policies in C MuJoCo."""
 
     def __init__(
         self,
@@ -342,16 +343,17 @@ class MujocoEvaluator:
         ranges: RandomizationConfig | None = None,
         numerics: Numerics = OTHER_NUMERICS,
     ) -> None:
-        """Builds the simulator; its programs compile at their first use.
+        """Build the simulator, whose programs compile at their first use.
 
         Args:
-          env: one environment, unwrapped, with its preset's robot.
-          networks: of the policies.
-          ranges: what a robot is drawn from for each goal, beside the preset's; None: nothing.
-          numerics: how C MuJoCo computes.
+          env: one unwrapped environment with its preset's robot.
+          networks: the networks of the policies.
+          ranges: ranges from which a robot is sampled for each goal, in addition to the
+            evaluation with the preset's robot; None: no sampled robots.
+          numerics: numerical settings of C MuJoCo.
 
         Raises:
-          UserError: JAX was told to do without a CPU.
+          UserError: JAX is configured without a CPU.
         """
         self._numerics, self._dt = numerics, env.dt
         simulator = in_mujoco(env, numerics)
@@ -363,8 +365,8 @@ class MujocoEvaluator:
         """Evaluate a policy.
 
         Args:
-          params: the policy's.
-          keys: one reset key an episode, such as `report_keys(1024)`.
+          params: parameters of the policy.
+          keys: one reset key for each episode, such as `report_keys(1024)`.
         """
         with on_host():
             return InMujoco(
@@ -375,14 +377,14 @@ class MujocoEvaluator:
 
 
 def carries(result: SweepResult) -> tuple[float, float] | None:
-    """How far from the preset's value the policy's success stays at `CARRIES_AT` or above.
+    """Return the range of values over which the success rate stays at `CARRIES_AT` or above.
 
     Args:
-      result: over one quantity.
+      result: the result for one parameter.
 
     Returns:
-      Lowest and highest judged value, without a gap from the preset's on; None where the
-      policy fails at the preset's already.
+      The lowest and the highest evaluated value of the contiguous range around the preset's value;
+      None if the success rate is lower already at the preset's value.
     """
     values = result.sweep.values
     good = [summary.success_rate >= CARRIES_AT for summary in result.policy]
@@ -397,13 +399,13 @@ def carries(result: SweepResult) -> tuple[float, float] | None:
 
 
 def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
-    """The results as plain values, for a report's file.
+    """Return the results as JSON values for a report's file.
 
     Args:
-      results: of one policy.
+      results: the results of one policy.
 
     Returns:
-      The quantities with their values, figures and the range over which the policy carries.
+      The parameters with their values, metrics and the range over which the policy is robust.
     """
     return {
         "goal_set_version": GOAL_SET_VERSION,

@@ -1,7 +1,8 @@
-"""Whole episodes under a controller: one compiled program, shared by all who judge or draw.
+"""Run whole episodes under a controller in one compiled program, for evaluation and rendering.
 
-A controller sees the whole state, so that a scripted one can be judged beside a policy:
-`controller(params, state, key) -> action`. Here the batch axis is made, by `jax.vmap`.
+A controller is a function `controller(params, state, key) -> action`. It sees the whole state, so
+that a scripted controller can be evaluated like a policy. This module adds the batch axis by
+`jax.vmap`.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,43 +20,45 @@ from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.task import Goal
 from jetbot_mjx.envs.wrappers import EpisodeWrapper
 
-# Apart from what the first reset, the robot and later episodes draw from the same key.
+# Separates the actions' random numbers from those that the first reset, the robot and later
+# episodes draw from the same key.
 _ACTION_DRAWS = 0x61637473
 
 Controller = Callable[[Any, State, UInt32[Array, "2"]], Float[Array, "2"]]
 
 
 class Episodes(NamedTuple):
-    """One finished episode of each of n environments."""
+    """An `Episodes` tuple holds one finished episode of each of n environments."""
 
     success: Float[Array, " n"]
-    """1 where the task's success was reached."""
+    """1 if the episode ended in the task's success."""
     steps: Float[Array, " n"]
     """Environment steps until the end."""
     episode_return: Float[Array, " n"]
     """Sum of rewards."""
     terminated: Float[Array, " n"]
-    """1 where the task ended the episode, in success or failure."""
+    """1 if the task ended the episode, in success or failure."""
     nonfinite: Float[Array, " n"]
-    """1 where the episode was cut off because its world was no longer finite."""
+    """1 if the episode was cut off because of a non-finite state."""
     path_length: Float[Array, " n"]
-    """Way travelled by the axle midpoint [m], on the floor."""
+    """Distance travelled by the axle midpoint [m], on the floor."""
     start_w: Float[Array, "n 2"]
-    """Where the robot started [m]."""
+    """Start position of the robot [m], world frame."""
     start_yaw: Float[Array, " n"]
-    """Where it headed then [rad], counter-clockwise from the world's x axis."""
+    """Heading at the start [rad], counter-clockwise from the world's x axis."""
     end_w: Float[Array, "n 2"]
-    """Where it ended [m]."""
+    """Final position of the robot [m], world frame."""
     goal_w: Float[Array, "n 3"]
-    """Where it had to go [m], world frame."""
+    """Position of the goal [m], world frame."""
     goal: Goal
-    """The whole of what the task drew."""
+    """The complete goal that the task sampled."""
     qpos: Float[Array, "n time nq"] | None
-    """Trajectory, first state included; after the end it stands still. None: not recorded."""
+    """Trajectory with the first state, constant after the end of the episode. None: not recorded.
+    """
 
 
 Rollout = Callable[[int | Int[Array, ""], Any, UInt32[Array, "n 2"]], Episodes]
-"""Of (index of the controller, its parameters, reset keys)."""
+"""A function of (index of the controller, its parameters, reset keys)."""
 
 
 class _Tally(NamedTuple):
@@ -82,13 +85,13 @@ def rollout_fn(
     *,
     record: bool = False,
 ) -> Rollout:
-    """Makes episodes under any one of several controllers into one program.
+    """Return a function that runs episodes under any one of several controllers.
 
     Args:
-      env: one environment, or one in a wrapper that leaves its state a `State`.
-      controllers: what can drive.
+      env: one environment, or one in a wrapper whose state is still a `State`.
+      controllers: the controllers to choose from.
       episode_length: environment steps after which an episode is truncated.
-      record: whether to keep the trajectories.
+      record: whether to record the trajectories.
 
     Returns:
       A function of (index of the controller, its parameters, one reset key for each
@@ -97,6 +100,7 @@ def rollout_fn(
     """
     episode_env = EpisodeWrapper(env, episode_length)
 
+    # Step one environment and add to its episode statistics, unless its episode has ended.
     def one_step(state: State, tally: _Tally, action: Float[Array, "2"]) -> tuple[State, _Tally]:
         nstate = episode_env.step(state, action)
         moved = jnp.linalg.norm(
@@ -112,13 +116,14 @@ def rollout_fn(
             path_length=moved,
         )
         added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
-        # A finished robot stands where it finished.
+        # Keep the final state of an episode that has ended.
         nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
         return nstate, added
 
-    # `fold_in(key, 1)` alone is `split(key)[1]`, from which the goal is drawn.
+    # Fold in twice: `fold_in(key, 1)` alone equals `split(key)[1]`, from which the goal is drawn.
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
 
+    # Run a batch of environments until the episode of each has ended.
     def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = jax.vmap(episode_env.reset)(keys)
         zero = jnp.zeros(keys.shape[0])
@@ -129,7 +134,7 @@ def rollout_fn(
             return jax.lax.switch(index, branches, state, key)
 
         def goes_on(carry: _Carry) -> Bool[Array, ""]:
-            # Most policies are done long before the time is out.
+            # Stop early, because most policies reach all goals long before the time limit.
             return (carry.time < episode_length) & (carry.tally.alive > 0).any()
 
         def body(carry: _Carry) -> _Carry:

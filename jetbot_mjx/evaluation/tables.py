@@ -1,4 +1,4 @@
-"""Reports as text: what policies and runs reach, in tables for the terminal."""
+"""Format the results of policies and runs as tables for the terminal."""
 
 from collections.abc import Mapping
 
@@ -10,7 +10,7 @@ from jetbot_mjx.evaluation.robustness import CARRIES_AT, carries
 
 
 def policies_table(policies: Mapping[str, Report]) -> str:
-    """Policies by name, and the baselines below them, as a table for the terminal."""
+    """Return a table of policies by name, with the baselines below them."""
     baselines = next(iter(policies.values())).baselines
     rows: list[tuple[str, Summary]] = []
     for name, report in policies.items():
@@ -48,7 +48,7 @@ def _row(name: str, summary: Summary, width: int) -> str:
 
 
 def best_known_lines(report: Report) -> str:
-    """Return a policy's gap to the best-known times, or why none is told, as lines."""
+    """Return lines with a policy's gap to the best-known times, or why there is none."""
     best = report.best_known
     if best is None:
         return f"best known: not told, {report.best_known_missing}\n"
@@ -67,7 +67,7 @@ def best_known_lines(report: Report) -> str:
 
 
 def robustness_table(report: Report) -> str:
-    """How far a policy carries, a line for each quantity; nothing where it was not asked."""
+    """Return one line for each parameter with its robust range; empty if not evaluated."""
     lines = []
     for result in report.robustness:
         span = carries(result)
@@ -81,7 +81,7 @@ def robustness_table(report: Report) -> str:
 
 
 def runs_table(comparison: Comparison) -> str:
-    """What the runs reach over their seeds, as a table for the terminal."""
+    """Return a table of the results of each run over its seeds."""
     width = max(10, *(len(run.name) for run in comparison.runs))
     lines = [
         f"{'':{width}}  {'success, mean':>28}  {'interquartile mean':>28}"
@@ -98,7 +98,7 @@ def runs_table(comparison: Comparison) -> str:
 
 
 def pairs_table(comparison: Comparison) -> str:
-    """Every two runs against each other, as a table for the terminal."""
+    """Return a table that compares every two runs with each other."""
     lines = []
     for pair in comparison.pairs:
         lines.append(f"{pair.a} against {pair.b}")

@@ -1,4 +1,4 @@
-"""A policy read back from a run, with all that is needed to use it."""
+"""Load a policy from a run, together with everything that is needed to use it."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -32,17 +32,17 @@ POLICY = "policy"
 """The tree that holds a policy's parameters."""
 
 FORMAT = "jetbot_mjx/2"
-"""Of what lies in a checkpoint; another number means that it cannot be read here."""
+"""Format of a checkpoint's content; a checkpoint with another number cannot be read here."""
 
 _KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "figures")
 
 
 class Checkpoint(NamedTuple):
-    """A policy read back, with what explains it."""
+    """A `Checkpoint` holds a loaded policy and the metadata that describes it."""
 
     path: Path
     run_dir: Path
-    """Where reports and videos of this policy go."""
+    """The folder that reports and videos of this policy are written to."""
     env_steps: int
     config: Config
     params: PolicyParams
@@ -50,11 +50,11 @@ class Checkpoint(NamedTuple):
     about: Mapping[str, Any]
 
     def make_env(self) -> JetBotEnv:
-        """Build the environment that the policy was trained in, for the devices that are here.
+        """Build the environment that the policy was trained in, for the available devices.
 
         Raises:
           UserError: the task cannot be built.
-          CheckpointError: its observation is not the one that the policy knows.
+          CheckpointError: its observation differs from the one that the policy was trained on.
         """
         env = make_env(self.config.for_any_device())
         layout = layout_data(env.task.layout)
@@ -72,7 +72,7 @@ def _names(layout: Sequence[Mapping[str, Any]]) -> str:
 
 
 def about_policy(config: Config, env: JetBotEnv) -> dict[str, Any]:
-    """What explains every checkpoint of a run, as JSON."""
+    """Return the metadata that every checkpoint of a run carries, as JSON values."""
     return {
         "format": FORMAT,
         "config": config.model_dump(mode="json"),
@@ -84,17 +84,18 @@ def about_policy(config: Config, env: JetBotEnv) -> dict[str, Any]:
 
 
 def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
-    """Reads a policy and what explains it.
+    """Read a policy and its metadata.
 
     Args:
       path: a run folder, or one checkpoint folder of it.
-      which: the checkpoint of a run folder; one checkpoint folder stands for itself.
+      which: which checkpoint of a run folder to read; ignored if `path` is a checkpoint folder.
 
     Returns:
       The checkpoint.
 
     Raises:
-      CheckpointError: there is none, it is not one of ours, or it is not as it was written.
+      CheckpointError: there is no checkpoint, it was not written by jetbot_mjx, or it changed
+        after it was written.
     """
     folder = find_checkpoint(path, which)
     about = explanation(folder)
@@ -121,16 +122,16 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
 
 
 def explanation(folder: Path) -> dict[str, Any]:
-    """Reads what explains a checkpoint of this project.
+    """Read the metadata of a checkpoint that this project wrote.
 
     Args:
       folder: the checkpoint folder.
 
     Returns:
-      The JSON object, every key of `about_policy` and more in it.
+      The JSON object, which holds every key of `about_policy` and more.
 
     Raises:
-      CheckpointError: it is not one of ours, not whole, or of another format.
+      CheckpointError: it was not written by jetbot_mjx, is incomplete, or has another format.
     """
     about = read_about(folder, _KEYS)
     if about["format"] != FORMAT:
@@ -142,14 +143,14 @@ def explanation(folder: Path) -> dict[str, Any]:
 
 
 def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
-    """Reads a policy, ready to act.
+    """Read a policy and return it as a function of the observation.
 
     Args:
       run_or_checkpoint: a run folder, or one checkpoint folder of it.
       which: the checkpoint of a run folder.
 
     Returns:
-      `policy(obs, key=None) -> action`: deterministic without a key.
+      `policy(obs, key=None) -> action`, which is deterministic without a key.
 
     Raises:
       CheckpointError: as for `load_checkpoint`.
@@ -159,7 +160,7 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
 
 
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
-    """Finds a checkpoint folder.
+    """Find a checkpoint folder.
 
     Args:
       path: a run folder, or one checkpoint folder of it.
@@ -169,7 +170,7 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
       The checkpoint folder.
 
     Raises:
-      CheckpointError: there is none.
+      CheckpointError: there is no such checkpoint.
     """
     path = Path(path).absolute()
     try:
@@ -183,7 +184,7 @@ def _find(path: Path, which: Which) -> Path:
         raise CheckpointError(
             f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
         )
-    # A run folder may hold `policy/` too: what `export` made.
+    # A run folder may contain `policy/` too, which `export` writes.
     if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():
         return path
     if seeds := sorted(path.glob("seed-*")):
@@ -201,7 +202,7 @@ def _find(path: Path, which: Which) -> Path:
     if which == "last":
         step = steps[-1]
     elif which == "best":
-        # Of equals, the later: it has learnt for longer.
+        # Prefer the later of equally good ones, because it was trained for longer.
         step = max(steps, key=lambda step: (_success_rate(checkpoint_path(path, step)), step))
     elif which in steps:
         step = which
@@ -212,7 +213,7 @@ def _find(path: Path, which: Which) -> Path:
 
 
 def _success_rate(folder: Path) -> float:
-    """What a checkpoint was judged by; below 0 where it was not, or cannot be read."""
+    """Return a checkpoint's success rate, or -1 if it was not evaluated or cannot be read."""
     try:
         return float(explanation(folder)["figures"].get("success_rate", -1.0))
     except CheckpointError:
@@ -220,7 +221,7 @@ def _success_rate(folder: Path) -> float:
 
 
 def policy_template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:
-    """Shapes and dtypes of a policy's parameters; no numbers that could pass for a policy."""
+    """Return the shapes and dtypes of a policy's parameters, without any values."""
 
     def init() -> PolicyParams:
         key = jax.random.PRNGKey(0)

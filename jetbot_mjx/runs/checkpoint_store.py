@@ -1,9 +1,23 @@
-"""Checkpoints on disk, by Orbax: whole or absent, and nothing is taken for what it is not.
+"""Write checkpoints that are complete or absent, and detect damaged ones when reading.
 
-`<folder>/<env_steps>/` holds one or more trees of arrays and `about`, a JSON object. `about`
-also holds a SHA-256 of each tree and of itself: what was cut, flipped, exchanged or renamed
-since it was written is refused with the reason. Arrays are stored by name, as NumPy arrays
-from the host: what is on disk depends on no Python class and on no number of devices.
+Motivation: a training process can be killed at any moment, also while it writes a checkpoint, and
+files can be truncated, corrupted, exchanged or renamed later. Neither may cost an earlier
+checkpoint, and a damaged checkpoint must never be loaded as if it were a good one.
+
+Protocol:
+
+- Orbax writes each checkpoint under a temporary name and renames it to
+  `checkpoints/<env_steps>/` when it is complete.
+- The folder holds one or more trees of arrays and `about`, a JSON object. `about` also holds the
+  SHA-256 of each tree and of itself.
+- A reader recomputes the digests and compares the folder's name with the stored `env_steps`. It
+  refuses a checkpoint that does not match and states the reason.
+- A checkpoint that is removed is first moved to `.deleted`, so that a half-deleted one never
+  stands under a valid name.
+
+Arguments for this protocol: arrays are stored by name, as NumPy arrays from the host, so that the
+files depend neither on a Python class nor on the number of devices. The digests cover names,
+dtypes, shapes and bytes, so they reveal every change of the content.
 """
 
 import contextlib
@@ -27,7 +41,7 @@ from orbax.checkpoint import checkpoint_managers
 from jetbot_mjx.errors import UserError
 
 FOLDER = "checkpoints"
-"""In a run folder."""
+"""Name of the folder of checkpoints in a run folder."""
 
 _ABOUT = "about"
 _DIGESTS = "sha256"
@@ -37,30 +51,31 @@ _SPARE_BYTES = 1_000_000
 _DELETED = ".deleted"
 
 _PLACES = re.compile(r"\s*\[source locations='[^']*'\]")
-"""What some releases of TensorStore add to an error: file after file of its own source."""
+"""Matches the list of its own source files that some releases of TensorStore add to an error."""
 
-# Orbax tells of every step of its work at INFO, of what it would prefer at WARNING, and at ERROR,
-# by tracebacks from each of its threads, of what it raises as well.
+# Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
+# tracebacks from each of its threads for errors that it raises as well.
 logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 class CheckpointError(UserError):
-    """A checkpoint that is not there, or that cannot be used."""
+    """Raised when a checkpoint is missing or cannot be used."""
 
 
 class Store:
-    """The checkpoints of one run, for writing; a context manager that waits for the last write.
+    """A `Store` writes the checkpoints of one run.
 
-    Writing goes on in the background, one checkpoint at a time, under another name until it is
-    whole: a process that dies leaves the earlier ones as they were.
+    It is a context manager that waits for the last write. Writing runs in the background, one
+    checkpoint at a time. A checkpoint has a temporary name until it is complete, so a process that
+    dies leaves the earlier checkpoints unchanged.
     """
 
     def __init__(self, run_dir: Path, keep: int) -> None:
-        """Opens a run's checkpoint folder, and clears away what an earlier process left unfinished.
+        """Open a run's checkpoint folder and remove unfinished files of an earlier process.
 
         Args:
-          run_dir: the run folder, which exists.
-          keep: how many of the latest stay, besides the first and the best.
+          run_dir: the run folder, which must exist.
+          keep: how many of the latest checkpoints to keep, besides the first and the best.
         """
         self._success = {step: _success_rate(run_dir, step) for step in checkpoint_steps(run_dir)}
         options = ocp.CheckpointManagerOptions(
@@ -69,7 +84,8 @@ class Store:
             step_name_format=_step_names(),
             preservation_policy=_KeepSome(keep, self._success),
             cleanup_tmp_directories=True,
-            # Renamed first: one that is half deleted must not stand under its name.
+            # Orbax moves a checkpoint here before it deletes it, so that a half-deleted one never
+            # stands under a valid name.
             todelete_subdir=_DELETED,
         )
         self._folder = (run_dir / FOLDER).absolute()
@@ -85,27 +101,30 @@ class Store:
         about: Mapping[str, Any],
         success_rate: float | None,
     ) -> None:
-        """Begins to write one checkpoint.
+        """Start to write one checkpoint in the background.
 
         Args:
-          env_steps: environment steps so far; names the folder.
-          trees: arrays on the host, by name.
-          about: what explains them, as JSON.
-          success_rate: by which the best is kept; None where it was not judged.
+          env_steps: environment steps so far, which name the folder.
+          trees: trees of arrays on the host, by name.
+          about: metadata that describes them, as JSON values.
+          success_rate: success rate by which the best checkpoint is kept; None if the policy was
+            not evaluated.
 
         Raises:
-          CheckpointError: this one, or the one before, could not be written.
+          CheckpointError: this checkpoint, or the one before, could not be written.
         """
         self._clear_deleted()
-        # Brax's counters are JAX arrays wherever they are.
+        # Brax's counters stay JAX arrays even on the host, so convert every leaf to NumPy.
         flat = {
             name: {key: np.asarray(x) for key, x in flatten(tree).items()}
             for name, tree in trees.items()
         }
         self._check_space(sum(x.nbytes for tree in flat.values() for x in tree.values()))
+        # Add the digests by which a reader recognises damage.
         digests = {name: digest(tree) for name, tree in flat.items()}
         about = {**about, "env_steps": env_steps, _SUCCESS: success_rate, _DIGESTS: digests}
         about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
+        # Hand over to Orbax, which writes in the background.
         items = {name: ocp.args.StandardSave(tree) for name, tree in flat.items()}
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
@@ -117,31 +136,34 @@ class Store:
                 raise ValueError(f"there is one after {env_steps} steps or more")
 
     def wait(self) -> None:
-        """Waits until all is on disk.
+        """Wait until all checkpoints are on disk.
 
         Raises:
-          CheckpointError: something could not be written.
+          CheckpointError: a checkpoint could not be written.
         """
         with self._writing():
             self._manager.wait_until_finished()
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Return the store itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Waits until all is on disk."""
+        """Wait until all checkpoints are on disk, and close the store."""
         with self._writing():
             self._manager.close()
         shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
 
     def _clear_deleted(self) -> None:
-        # The folder itself stays: Orbax may be about to move the next one in.
+        # Keep the folder itself, because Orbax may be about to move the next checkpoint into it.
         for path in (self._folder / _DELETED).glob("*"):
             shutil.rmtree(path, ignore_errors=True)
 
     def _check_space(self, size: int) -> None:
-        """Refuses before anything is begun that could not be finished."""
+        """Raise a `CheckpointError` if the disk has no room for a checkpoint of this size [bytes].
+
+        The check comes before the write, so that no write starts that cannot finish.
+        """
         needed, free = size + _SPARE_BYTES, shutil.disk_usage(self._folder).free
         if free < needed:
             raise CheckpointError(
@@ -151,7 +173,7 @@ class Store:
 
     @contextlib.contextmanager
     def _writing(self) -> Iterator[None]:
-        """Turns the many ways in which Orbax reports a failed write into one line."""
+        """Convert every exception of a failed write by Orbax to a one-line `CheckpointError`."""
         try:
             yield
         except Exception as error:
@@ -162,7 +184,10 @@ class Store:
 
 
 class _KeepSome(checkpoint_managers.PreservationPolicy):
-    """The latest, the first, and the best; of equally good ones the later."""
+    """A policy that keeps the latest, the first and the best checkpoints.
+
+    Of equally good checkpoints the later one counts as the best.
+    """
 
     def __init__(self, latest: int, success: Mapping[int, float]) -> None:
         self._latest = latest
@@ -179,28 +204,28 @@ class _KeepSome(checkpoint_managers.PreservationPolicy):
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
-    """Environment steps of a run's checkpoints, ascending; unfinished ones are left out."""
+    """Return the environment steps of a run's complete checkpoints in ascending order."""
     folder = run_dir / FOLDER
     if not folder.is_dir():
         return []
     found = (int(path.name) for path in folder.iterdir() if path.name.isdecimal())
-    # Other spellings of a number are not ours.
+    # Skip folders that spell the number differently: this project did not write them.
     return sorted(step for step in set(found) if os.path.lexists(checkpoint_path(run_dir, step)))
 
 
 def checkpoint_path(run_dir: Path, env_steps: int) -> Path:
-    """Where the checkpoint at that many environment steps lies."""
+    """Return the path of the checkpoint at that many environment steps."""
     return run_dir / FOLDER / f"{env_steps:0{_STEP_DIGITS}d}"
 
 
 def set_aside(path: Path) -> Path:
-    """Moves a checkpoint out of the way of those that will be written, and keeps it.
+    """Move a checkpoint to `set_aside/`, so that it does not collide with those written later.
 
     Args:
       path: a checkpoint folder of a run.
 
     Returns:
-      Where it lies now: in the run's `set_aside/`.
+      Its new path, in the run's `set_aside/`.
 
     Raises:
       CheckpointError: it cannot be moved.
@@ -217,18 +242,19 @@ def set_aside(path: Path) -> Path:
 
 
 def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
-    """Reads what explains a checkpoint.
+    """Read the metadata of a checkpoint and verify its digest.
 
     Args:
       path: the checkpoint folder.
-      required: keys that must be there.
+      required: keys that must be present.
 
     Returns:
       The JSON object.
 
     Raises:
-      CheckpointError: it is not there, not whole, or not as it was written.
+      CheckpointError: the metadata is missing or incomplete, or changed after it was written.
     """
+    # Read the file and compare it with its own digest.
     file = path / _ABOUT / "metadata"
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
@@ -243,6 +269,7 @@ def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
         raise CheckpointError(
             f"checkpoint {path} is damaged: {file.relative_to(path)} is not as it was written"
         )
+    # Check the content: the required keys, and the step that the folder's name states.
     for key in required:
         if key not in about:
             raise CheckpointError(f"checkpoint {path} does not explain itself: no {key}")
@@ -254,19 +281,19 @@ def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
 
 
 def read_tree(path: Path, name: str, template: Any) -> Any:
-    """Reads one tree of arrays.
+    """Read one tree of arrays and verify its digest.
 
     Args:
       path: the checkpoint folder.
-      name: of the tree.
-      template: a tree of the same structure, whose leaves tell shape and dtype.
+      name: name of the tree.
+      template: a tree of the same structure, whose leaves have the expected shape and dtype.
 
     Returns:
-      A tree like the template, of NumPy arrays.
+      A tree of NumPy arrays with the structure of the template.
 
     Raises:
-      CheckpointError: it is not there, has other names, shapes or dtypes, cannot be read, or
-        is not what was written.
+      CheckpointError: the tree is missing, has other names, shapes or dtypes, cannot be read, or
+        changed after it was written.
     """
     about = read_about(path)
     if name not in about[_DIGESTS]:
@@ -283,7 +310,7 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
 
 
 def flatten(tree: Any) -> dict[str, Any]:
-    """Leaves by their path, such as `params.policy.hidden_0.bias`."""
+    """Return the leaves of a tree by their path, such as `params.policy.hidden_0.bias`."""
     return {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
         for path, leaf in jax.tree_util.tree_leaves_with_path(tree)
@@ -291,7 +318,7 @@ def flatten(tree: Any) -> dict[str, Any]:
 
 
 def digest(tree: Any) -> str:
-    """SHA-256 over names, dtypes, shapes and bytes of a tree's leaves, in hexadecimal."""
+    """Return the SHA-256 of names, dtypes, shapes and bytes of a tree's leaves, in hexadecimal."""
     total = hashlib.sha256()
     for name, leaf in sorted(flatten(tree).items()):
         array = np.ascontiguousarray(leaf)
@@ -301,7 +328,7 @@ def digest(tree: Any) -> str:
 
 
 def _success_rate(run_dir: Path, env_steps: int) -> float:
-    """By which a checkpoint is kept; below all others where it was not judged, or is damaged."""
+    """Return a checkpoint's success rate, or -1 if it was not evaluated or is damaged."""
     try:
         rate = read_about(checkpoint_path(run_dir, env_steps)).get(_SUCCESS)
     except CheckpointError:
@@ -315,10 +342,10 @@ def _digest_json(values: Mapping[str, Any]) -> str:
 
 
 def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarray]:
-    """Reads what Orbax wrote, one array after the other, and raises at the first that is wrong.
+    """Read the arrays that Orbax wrote, one after the other, and raise at the first wrong one.
 
-    Orbax itself reads in threads: where one fails, the others print tracebacks that nobody can
-    catch.
+    Orbax itself reads in threads. If one of them fails, the others print tracebacks that the
+    caller cannot catch.
     """
     if not folder.is_dir():
         raise ValueError(f"{folder.name} is missing")
@@ -334,7 +361,7 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
 
 
 def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raises where the stored arrays are not those that are wanted."""
+    """Raise a `ValueError` if names, shapes or dtypes of the stored arrays are not as wanted."""
     for name in sorted(wanted.keys() | stored.keys()):
         ours, theirs = (_describe(arrays.get(name)) for arrays in (wanted, stored))
         if ours != theirs:
@@ -342,10 +369,13 @@ def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
 
 
 def _reason(error: Exception) -> str:
-    """Return why, in one line of at most 305 characters, without places in another's source."""
+    """Return the reason of an error in one line of at most 305 characters.
+
+    Locations in the source of other libraries are left out.
+    """
     text = _PLACES.sub("", str(error))
     lines = text.strip().splitlines() or [type(error).__name__]
-    # What TensorStore says begins with what it did, and ends with why it failed.
+    # A message of TensorStore begins with the operation and ends with the cause: keep both ends.
     return lines[0] if len(lines[0]) <= 300 else f"{lines[0][:150]} ... {lines[0][-150:]}"
 
 
@@ -357,7 +387,7 @@ def _describe(array: Any) -> str:
 
 
 def _this_process_alone() -> Any:
-    """Orbax would wait for the other processes of a training, which do not write."""
+    """Return options by which Orbax does not wait for other processes, which do not write."""
     me = jax.process_index()
     return ocp.options.MultiprocessingOptions(
         primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"

@@ -1,14 +1,14 @@
-"""Where the figures of a training go: a file and TensorBoard, one `Sink` each.
+"""Log the metrics of a training to a file and to TensorBoard, with one `Sink` for each.
 
-Names, the same everywhere; a line of metrics.jsonl also holds env_steps and timestamp, and
-TensorBoard the names of Stable-Baselines3 (`aliases.py`):
+The names are the same everywhere. A line of metrics.jsonl also holds env_steps and timestamp, and
+TensorBoard also shows the metrics under the names of Stable-Baselines3 (`sb3_tags.py`):
   eval/episodes             of the deterministic policy, on fixed goals; likewise successes
   eval/success_rate         of those; with success_low, success_high
   eval/time_to_goal_median  [s] of the successes; likewise time_to_goal_p95
   eval/path_efficiency      straight line over way travelled, mean over the successes
   eval/episode_return       mean sum of rewards [m]: about the distance covered
   eval/final_distance_median    [m] to the goal at the end, on the floor
-  eval/nonfinite_worlds     episodes cut off because their world was no longer finite
+  eval/nonfinite_worlds     episodes that were cut off because of a non-finite state
   loss/total, policy, value, entropy    means over the interval, as Brax computes them
   policy/entropy            of the actions, after squashing where they are squashed [nat]
   policy/kl                 between the policy before and after an update, mean
@@ -16,12 +16,12 @@ TensorBoard the names of Stable-Baselines3 (`aliases.py`):
   policy/learning_rate      Adam's step size
   rollout/episodes          that ended while collecting, driven by the exploring policy
   rollout/success_rate      of those; likewise rollout/episode_return, rollout/episode_length
-  train/nonfinite_worlds    while collecting: each was reset, and its first one kept for replay
-  train/nonfinite_updates   gradients that were not finite, and not applied
-  time/env_steps_per_second environment steps over training seconds, compilation apart
+  train/nonfinite_worlds    while collecting: each was reset, and the first one saved for replay
+  train/nonfinite_updates   updates that were skipped because their gradient was not finite
+  time/env_steps_per_second environment steps per training second, without compilation
   time/training_seconds     spent on training since the last report
   time/evaluation_seconds   spent on this evaluation, its compilation included
-  time/recording_seconds    spent on logging, saving and filming after the last evaluation
+  time/recording_seconds    spent on logging, saving and rendering after the last evaluation
   time/compile_seconds      spent tracing and compiling in this interval, evaluation included
   time/wall_seconds         since training began, in all processes that worked on the run
 """
@@ -42,7 +42,8 @@ from jetbot_mjx.imports import standing_in
 from jetbot_mjx.runs.run_dir import write_text
 from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
 
-# It would load PyTorch where there is one, seconds, for pictures of networks.
+# Where PyTorch is installed, tensorboardX would load it to draw network graphs, which takes seconds
+# and is not needed here.
 with standing_in("torch", None):
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto import event_pb2, summary_pb2
@@ -51,49 +52,49 @@ Figures = Mapping[str, float | None]
 
 
 class Sink(Protocol):
-    """Something that takes figures."""
+    """A `Sink` receives metrics and writes them somewhere."""
 
     def write(self, env_steps: int, figures: Figures) -> None:
-        """Takes the figures at one moment; None stands for one that does not exist then."""
+        """Write the metrics of one moment; a metric that has no value then is None."""
         ...
 
     def close(self) -> None:
-        """Writes out what is left."""
+        """Write what is still buffered, and close."""
         ...
 
 
 class Sinks:
-    """Several sinks as one; a context manager that closes them all."""
+    """A `Sinks` object combines several sinks, and as a context manager closes them all."""
 
     def __init__(self, sinks: Sequence[Sink]) -> None:
-        """Joins sinks.
+        """Combine sinks.
 
         Args:
-          sinks: each gets every figure, in this order.
+          sinks: the sinks, each of which receives every metric, in this order.
         """
         self._sinks = sinks
 
     def write(self, env_steps: int, figures: Figures) -> None:
-        """Passes the figures on."""
+        """Write the metrics to every sink."""
         for sink in self._sinks:
             sink.write(env_steps, figures)
 
     def close(self) -> None:
-        """Closes each."""
+        """Close every sink."""
         for sink in self._sinks:
             sink.close()
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Return the object itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Closes each."""
+        """Close every sink."""
         self.close()
 
 
 def mean_of(figures: Sequence[Figures]) -> Figures:
-    """Of several seeds, figure by figure; a seed that has none is left out."""
+    """Compute the mean of each metric over several seeds, leaving out seeds without a value."""
     means: dict[str, float | None] = {}
     for name in figures[0]:
         values = [value for one in figures if (value := one.get(name)) is not None]
@@ -102,23 +103,23 @@ def mean_of(figures: Sequence[Figures]) -> Figures:
 
 
 class History(NamedTuple):
-    """One line of `metrics.jsonl`."""
+    """A `History` holds one line of `metrics.jsonl`."""
 
     env_steps: int
     timestamp: float
-    """When it was written [s since 1970]."""
+    """Time at which the line was written [s since 1970]."""
     figures: Figures
 
 
 def read_history(path: Path, last: int) -> list[History]:
-    """Reads the lines of an earlier training.
+    """Read the metrics that an earlier training wrote.
 
     Args:
-      path: of `metrics.jsonl`; it need not be there.
-      last: environment steps after which nothing is wanted.
+      path: path of `metrics.jsonl`; the file may be missing.
+      last: the last environment step to read.
 
     Returns:
-      What was written up to then; a line cut short is left out.
+      The lines up to that step, without those that are incomplete.
     """
     if not path.is_file():
         return []
@@ -133,14 +134,14 @@ def read_history(path: Path, last: int) -> list[History]:
 
 
 class JsonlSink:
-    """One JSON object a line, readable while training runs."""
+    """A sink that writes one JSON object per line, readable while training runs."""
 
     def __init__(self, path: Path, history: Sequence[History] = ()) -> None:
-        """Opens the file.
+        """Open the file.
 
         Args:
-          path: of the file.
-          history: what it begins with; anything else in it goes.
+          path: path of the file.
+          history: lines that the file begins with; all other content is removed.
         """
         text = "".join(_line(*entry) for entry in history)
         if not path.is_file() or path.read_text(encoding="utf-8", errors="replace") != text:
@@ -148,18 +149,18 @@ class JsonlSink:
         self._file = path.open("a", encoding="utf-8")
 
     def write(self, env_steps: int, figures: Figures) -> None:
-        """Appends a line and sees it onto the disk, so that no checkpoint is ahead of it."""
+        """Append a line and sync it to disk, so that no checkpoint is newer than the metrics."""
         self._file.write(_line(env_steps, time.time(), figures))
         self._file.flush()
         os.fsync(self._file.fileno())
 
     def close(self) -> None:
-        """Closes the file."""
+        """Close the file."""
         self._file.close()
 
 
 def _line(env_steps: int, timestamp: float, figures: Figures) -> str:
-    """What is not finite is written as null, since JSON has no NaN."""
+    """Return one line of JSON, with null for values that are not finite, as JSON has no NaN."""
     values = {
         name: value if value is not None and math.isfinite(value) else None
         for name, value in figures.items()
@@ -167,13 +168,13 @@ def _line(env_steps: int, timestamp: float, figures: Figures) -> str:
     return json.dumps({"env_steps": env_steps, "timestamp": timestamp, **values}) + "\n"
 
 
-# Protocol buffers make their classes while they are imported, unseen by pyright.
+# Protocol buffers create their classes at import time, so pyright does not know them.
 _SUMMARY: Any = vars(summary_pb2)["Summary"]
 _EVENT: Any = vars(event_pb2)["Event"]
 
 
 class TensorBoardSink:
-    """TensorBoard event files, written without TensorFlow."""
+    """A sink that writes TensorBoard event files without TensorFlow."""
 
     def __init__(
         self,
@@ -181,25 +182,25 @@ class TensorBoardSink:
         history: Sequence[History] = (),
         names: Mapping[str, Alias] | None = None,
     ) -> None:
-        """Opens an event file.
+        """Open an event file.
 
         Args:
-          folder: for `tensorboard --logdir`; events of an earlier training go.
-          history: is written first, in their place.
-          names: from `aliases.aliases`: what is written under further names.
+          folder: folder for `tensorboard --logdir`; event files of an earlier training are removed.
+          history: metrics that are written first, in place of the removed ones.
+          names: metrics that are also written under another tag, from `sb3_tags.aliases`.
         """
         self._names = names or {}
         folder.mkdir(exist_ok=True)
         for events in folder.glob("events.out.tfevents.*"):
             events.unlink()
-        # Its SummaryWriter writes from a thread, whose errors nobody hears.
+        # tensorboardX's SummaryWriter writes from a thread, whose errors would not be reported.
         self._writer = EventsWriter(str(folder / "events"))
         for entry in history:
             self._add(*entry)
         self._writer.flush()
 
     def write(self, env_steps: int, figures: Figures) -> None:
-        """Adds one scalar for each figure there is."""
+        """Write one scalar for each metric that has a value."""
         self._add(env_steps, time.time(), figures)
         self._writer.flush()
 
@@ -212,14 +213,15 @@ class TensorBoardSink:
         self._writer.write_event(event)
 
     def close(self) -> None:
-        """Closes the event file."""
+        """Close the event file."""
         self._writer.close()
 
 
 class CompileClock:
-    """What JAX spends on tracing, lowering and compiling, by its own account.
+    """A `CompileClock` measures the time that JAX reports for tracing, lowering and compiling.
 
-    A context manager that stops listening. Threads may compile side by side: a second counts once.
+    It is a context manager that unregisters its listeners at the end. Where threads compile in
+    parallel, each second counts once.
     """
 
     _EVENTS = (
@@ -231,16 +233,16 @@ class CompileClock:
     _SAVED = "/jax/compilation_cache/compile_time_saved_sec"
 
     def __init__(self) -> None:
-        """Starts to listen."""
+        """Register the listeners."""
         self._lock = threading.Lock()
         self._spans: list[tuple[float, float]] = []
         self._counted_until = -math.inf
         self.programs = 0
-        """Compiled, or found in the persistent cache."""
+        """Number of programs that were compiled or found in the persistent cache."""
         self.cached = 0
-        """Found in the persistent cache."""
+        """Number of programs that were found in the persistent cache."""
         self.saved_seconds = 0.0
-        """What compiling those would have taken."""
+        """Time that compiling the programs found in the cache would have taken [s]."""
         jax.monitoring.register_event_duration_secs_listener(self._listen)
         jax.monitoring.register_event_listener(self._count)
 
@@ -260,10 +262,10 @@ class CompileClock:
             self.cached += event == self._CACHE_HIT
 
     def lap(self) -> float:
-        """Seconds since the last call."""
+        """Return the time spent on compilation since the last call [s]."""
         with self._lock:
             spans, self._spans = sorted(self._spans), []
-        # What was still compiling at the last call counts from there on.
+        # Count a compilation that was running at the last call from that call on.
         seconds, until = 0.0, self._counted_until
         for start, end in spans:
             seconds += max(0.0, end - max(start, until))
@@ -272,11 +274,11 @@ class CompileClock:
         return seconds
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Return the object itself."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stops listening."""
+        """Unregister the listeners."""
         jax.monitoring.unregister_event_duration_listener(self._listen)
         jax.monitoring.unregister_event_listener(self._count)
 
@@ -285,7 +287,10 @@ _IMPORTED = time.perf_counter()
 
 
 def process_seconds() -> float:
-    """Since this process began [s]; where the system does not tell, since this module's import."""
+    """Return the time since this process started [s].
+
+    If the system does not provide it, return the time since this module was imported.
+    """
     try:
         after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         began = int(after_name[19]) / os.sysconf("SC_CLK_TCK")

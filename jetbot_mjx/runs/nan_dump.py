@@ -1,4 +1,4 @@
-"""Worlds that stopped being finite, kept in a file so that somebody can look into them."""
+"""Save non-finite states of a training to files and load them again for debugging."""
 
 import json
 from pathlib import Path
@@ -16,37 +16,37 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint_store import flatten
 
 FOLDER = "faults"
-"""In a run folder."""
+"""Name of the folder of dumps in a run folder."""
 
 MOST = 20
-"""Faults that a run keeps; more would say no more."""
+"""Largest number of dumps that a run keeps, as further ones would add no information."""
 
 _FORMAT = "jetbot_mjx.fault/1"
 
 
 class StoredFault(NamedTuple):
-    """A fault read back."""
+    """A `StoredFault` holds a dump that was loaded from a file."""
 
     config: Config
     env_steps: int
-    """Environment steps of the training at the end of the call in which it happened."""
+    """Environment steps of the training at the end of the call in which the fault happened."""
     fault: Fault
 
 
 def save_fault(run_dir: Path, config: Config, env_steps: int, fault: Fault) -> Path | None:
-    """Keeps a fault in `faults/<env_steps>.npz`, unless there are many already.
+    """Save a fault to `faults/<env_steps>.npz`, unless the run already holds `MOST` of them.
 
     Args:
       run_dir: the run folder.
-      config: of the run.
+      config: the configuration of the run.
       env_steps: environment steps so far.
-      fault: on the host.
+      fault: the fault, with arrays on the host.
 
     Returns:
-      Where it lies; None where it was not kept.
+      The path of the file; None if the fault was not saved.
 
     Raises:
-      OSError: it cannot be written.
+      OSError: the file cannot be written.
     """
     folder = run_dir / FOLDER
     folder.mkdir(exist_ok=True)
@@ -61,16 +61,16 @@ def save_fault(run_dir: Path, config: Config, env_steps: int, fault: Fault) -> P
 
 
 def load_fault(path: Path) -> StoredFault:
-    """Reads a fault.
+    """Load a fault.
 
     Args:
-      path: a file of `save_fault`.
+      path: a file that `save_fault` wrote.
 
     Returns:
-      It and what explains it.
+      The fault with its configuration and environment steps.
 
     Raises:
-      UserError: there is no such file, or it is not one of those.
+      UserError: there is no such file, or `save_fault` did not write it.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:

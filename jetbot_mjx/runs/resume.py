@@ -1,8 +1,8 @@
-"""Where a training was: its whole state in a checkpoint, and the newest one that is good.
+"""Save the whole state of a training in a checkpoint and restore the newest usable one.
 
-Beside the policy, a checkpoint of the resumable trainer holds the tree `training`, which is the
-rest of `ppo.TrainState`. Nothing is restored that differs in a name, a shape, a dtype or a bit
-from what was written, or that another configuration wrote.
+Besides the policy, a checkpoint of the resumable trainer holds the tree `training`, which is the
+rest of `ppo.TrainState`. A checkpoint is not restored if it differs in a name, a shape, a dtype or
+a bit from what was written, or if another configuration wrote it.
 """
 
 from collections.abc import Sequence
@@ -23,24 +23,24 @@ from jetbot_mjx.runs.checkpoint_store import (
 )
 
 TRAINING = "training"
-"""The tree that holds what acting does not need."""
+"""Name of the tree that holds the part of the state that acting does not need."""
 
 _REST = ("optimizer_state", "env_state", "key", "env_steps", "tally")
 
 
 class Resumption(NamedTuple):
-    """Where every seed of a run stands."""
+    """A `Resumption` holds the restored state of every seed of a run."""
 
     env_steps: int
     states: list[TrainState]
     progress: list[dict[str, Any]]
-    """What the recorder of each seed left in its checkpoint."""
+    """The progress that the recorder of each seed stored in its checkpoint."""
     passed_over: list[str]
-    """Newer checkpoints that could not be used, and why."""
+    """Error messages of newer checkpoints that were skipped because they cannot be used."""
 
 
 def to_trees(state: TrainState) -> dict[str, Any]:
-    """A state as the trees of a checkpoint."""
+    """Return a training state as the trees of a checkpoint."""
     return {
         POLICY: state.policy_params,
         TRAINING: {name: getattr(state, name) for name in _REST},
@@ -50,21 +50,22 @@ def to_trees(state: TrainState) -> dict[str, Any]:
 def resume(
     run_dirs: Sequence[Path], configs: Sequence[Config], template: TrainState
 ) -> Resumption | None:
-    """Finds the newest checkpoint that is good in every seed's folder, and reads it.
+    """Find the newest checkpoint that is usable in every seed's folder, and read it.
 
-    Newer ones are moved into the run's `set_aside/` once an older one proves good.
+    Newer checkpoints are moved to the run's `set_aside/` once an older one was read successfully.
 
     Args:
       run_dirs: the run folder of each seed.
-      configs: the configuration of each.
-      template: shapes and dtypes of a state.
+      configs: the configuration of each seed.
+      template: shapes and dtypes of a training state.
 
     Returns:
-      Where the seeds stand; None where not one checkpoint was begun.
+      The restored state of each seed; None if there is no checkpoint at all.
 
     Raises:
-      CheckpointError: there are checkpoints, and none of them can be used; all is left as it is.
+      CheckpointError: there are checkpoints, but none of them can be used. No file is changed.
     """
+    # Try the steps from the newest to the oldest, until all seeds can be read at one of them.
     known = sorted({step for run_dir in run_dirs for step in checkpoint_steps(run_dir)})
     passed_over: list[str] = []
     for step in reversed(known):
@@ -76,6 +77,7 @@ def resume(
         except CheckpointError as error:
             passed_over.append(str(error))
             continue
+        # Move newer checkpoints away, so that the resumed training can write its own.
         for run_dir in run_dirs:
             for newer in checkpoint_steps(run_dir):
                 if newer > step:

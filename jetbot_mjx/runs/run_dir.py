@@ -1,8 +1,8 @@
-"""A run is one folder, and everything after training needs only that folder.
+"""Create, lock and read run folders; everything after training needs only the run folder.
 
-config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/, checkpoints/<env_steps>/,
-evaluations/<env_steps>/, videos/, policy/, faults/; of several seeds trained at once, seed-<n>/
-with all of that in each.
+A run folder holds config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/,
+checkpoints/<env_steps>/, evaluations/<env_steps>/, videos/, policy/ and faults/. If several seeds
+are trained at once, it holds one folder seed-<n>/ for each of them, with all of that inside.
 """
 
 import contextlib
@@ -38,26 +38,26 @@ _PACKAGES = (
 
 
 CONFIG = "config.yaml"
-"""The resolved configuration, in a run folder."""
+"""Name of the file in a run folder that holds the resolved configuration."""
 
 _VERSIONS = "versions.json"
 
 
 def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
-    """`runs/<config>-<date>-<time>`, in local time."""
+    """Return `runs/<config>-<date>-<time>`, in local time."""
     now = datetime.datetime.now().astimezone()
     return root / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
 
 
 def seed_dirs(run_dir: Path, config: Config) -> list[Path]:
-    """Where the run of each seed lies: in the folder itself where there is one seed."""
+    """Return the run folder of each seed, which is `run_dir` itself if there is only one seed."""
     if config.seeds == 1:
         return [run_dir]
     return [run_dir / f"seed-{one.seed}" for one in config.of_each_seed()]
 
 
 def seed_folders(run_dir: Path) -> list[Path]:
-    """The folders of the seeds that were trained at once; none where it was one seed.
+    """Return the folders of the seeds that were trained at once; an empty list for a single seed.
 
     Raises:
       UserError: the folder cannot be read.
@@ -70,16 +70,16 @@ def seed_folders(run_dir: Path) -> list[Path]:
 
 
 def stored_config(run_dir: Path) -> Config | None:
-    """The configuration of the run that lies in a folder.
+    """Return the configuration of the run in a folder.
 
     Args:
-      run_dir: a run folder, or one that is to become one.
+      run_dir: a run folder, or a folder that will become one.
 
     Returns:
-      Its resolved configuration; None where there is no folder yet, or nothing in it.
+      The resolved configuration; None if the folder does not exist yet or is empty.
 
     Raises:
-      UserError: something else lies there, or it cannot be read.
+      UserError: the path holds something else, or cannot be read.
     """
     try:
         if run_dir.is_dir() and (run_dir / CONFIG).is_file():
@@ -98,12 +98,12 @@ def stored_config(run_dir: Path) -> Config | None:
 
 @contextlib.contextmanager
 def occupied(run_dir: Path) -> Iterator[None]:
-    """Makes a run folder unless it is there, and keeps every other training out of it.
+    """Create a run folder if needed, and lock it against every other training.
 
-    The lock belongs to the process: however that ends, the folder is free again.
+    The lock belongs to the process, so it is released however the process ends.
 
     Raises:
-      UserError: the folder cannot be written, or another training holds it.
+      UserError: the folder cannot be written, or another training has locked it.
     """
     path = run_dir / ".lock"
     try:
@@ -121,7 +121,7 @@ def occupied(run_dir: Path) -> Iterator[None]:
                 f" {file.read().strip() or 'unknown'}): wait for it, or name another folder"
             ) from None
         except OSError:
-            # A file system without locks: nothing can be promised, and nothing is refused.
+            # The file system has no locks: go on without one rather than refuse to train.
             pass
         file.truncate(0)
         print(os.getpid(), file=file, flush=True)
@@ -129,10 +129,10 @@ def occupied(run_dir: Path) -> Iterator[None]:
 
 
 def write_run(run_dir: Path, config: Config) -> None:
-    """Writes what is known before training: the configuration and the versions.
+    """Write the configuration and the versions, which are known before training.
 
     Args:
-      run_dir: the run folder, which exists.
+      run_dir: the run folder, which must exist.
       config: the resolved configuration.
 
     Raises:
@@ -144,7 +144,7 @@ def write_run(run_dir: Path, config: Config) -> None:
 
 
 def changed_versions(run_dir: Path) -> list[str]:
-    """What is not as it was when the run was last trained, such as `jax 0.10.2, now 0.11.2`."""
+    """Return the versions that changed since the last training, as `jax 0.10.2, now 0.11.2`."""
     try:
         then = json.loads((run_dir / _VERSIONS).read_text(encoding="utf-8"))
         packages = dict(then["packages"])
@@ -164,10 +164,10 @@ def changed_versions(run_dir: Path) -> list[str]:
 
 @contextlib.contextmanager
 def writing_to(path: Path) -> Iterator[None]:
-    """Turns what the file system refuses into one line.
+    """Convert an `OSError` to a one-line `UserError`.
 
     Raises:
-      UserError: in place of an `OSError`.
+      UserError: an `OSError` was raised inside the context.
     """
     try:
         yield
@@ -176,17 +176,17 @@ def writing_to(path: Path) -> Iterator[None]:
 
 
 def make_folder(path: Path) -> None:
-    """Makes a folder for results inside a run folder, unless it is there.
+    """Create a folder for results inside a run folder if it does not exist.
 
     Raises:
-      UserError: it cannot be made.
+      UserError: the folder cannot be created.
     """
     with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
 
 
 def versions() -> dict[str, Any]:
-    """Packages, Python, machine, devices and state of the source, as JSON."""
+    """Return the versions of packages and Python, the machine, the devices and the git state."""
     devices = jax.devices()
     return {
         "python": platform.python_version(),
@@ -200,17 +200,17 @@ def versions() -> dict[str, Any]:
 
 
 def write_json(path: Path, values: Any) -> None:
-    """Writes JSON for people: indented, with a final newline."""
+    """Write readable JSON, indented and with a final newline."""
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a file of text that is whole or as it was, whenever the process ends."""
+    """Write a text file atomically: it is complete or unchanged whenever the process ends."""
     write_bytes(path, text.encode())
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    """Writes a file that is whole or as it was, whenever the process ends."""
+    """Write a file atomically: it is complete or unchanged whenever the process ends."""
     unfinished = path.with_name(f".{path.name}.unfinished")
     unfinished.write_bytes(content)
     unfinished.replace(path)
@@ -224,7 +224,10 @@ def _version(name: str) -> str | None:
 
 
 def _git_state() -> dict[str, Any] | None:
-    """Commit of the package's source and whether it was changed; None outside a checkout."""
+    """Return the commit of the package's source and whether it was changed.
+
+    Return None outside of a git checkout.
+    """
     folder = Path(__file__).parent
 
     def git(*arguments: str) -> str:

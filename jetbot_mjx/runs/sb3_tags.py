@@ -1,4 +1,4 @@
-"""Our figures under the names that people bring along: those of Stable-Baselines3."""
+"""Log our metrics under the tags of Stable-Baselines3, which many users know."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -7,30 +7,31 @@ from jetbot_mjx.config import PPOConfig
 
 
 class Alias(NamedTuple):
-    """One of our figures under another's name."""
+    """An `Alias` computes the value of another library's tag from one of our metrics."""
 
     figure: str
-    """Ours; or `env_steps`."""
+    """Name of our metric, or `env_steps`."""
     times: float = 1.0
-    """What it is multiplied by,"""
+    """Factor that the metric is multiplied by."""
     over: float | str = 1.0
-    """and divided by: a number, or another of our figures."""
+    """Divisor of the metric: a number, or the name of another of our metrics."""
 
 
 def aliases(ppo: PPOConfig) -> dict[str, Alias]:
-    """Our figures by the names that Stable-Baselines3's PPO gives them, in its units.
+    """Return aliases of our metrics under the tags of Stable-Baselines3's PPO, in its units.
 
-    Only what means the same is here. Figures that both call alike need no alias.
+    Only metrics with the same meaning have an alias. Metrics that have the same name in both need
+    none.
 
     Args:
-      ppo: of the run; nothing of it that is used here may change when a run goes on.
+      ppo: the run's settings of PPO; those that are used here must not change on resume.
 
     Returns:
-      By Stable-Baselines3's tag.
+      The aliases by Stable-Baselines3's tag.
 
     Source: DLR-RM/stable-baselines3, stable_baselines3/ppo/ppo.py, common/on_policy_algorithm.py.
     """
-    # Brax halves the squared error, and sees scaled rewards.
+    # Brax halves the squared error and computes it on scaled rewards.
     value_loss = ppo.vf_loss_coefficient * ppo.reward_scaling**2 / 2
     return {
         "rollout/ep_rew_mean": Alias("rollout/episode_return"),
@@ -56,15 +57,15 @@ def aliases(ppo: PPOConfig) -> dict[str, Alias]:
 def with_aliases(
     env_steps: int, figures: Mapping[str, float | None], names: Mapping[str, Alias]
 ) -> dict[str, float]:
-    """Adds what is known under other names, and leaves out what there is not.
+    """Add the aliases to metrics, and leave out metrics without a value.
 
     Args:
-      env_steps: at that moment.
-      figures: ours.
-      names: from `aliases`.
+      env_steps: environment steps at that moment.
+      figures: our metrics.
+      names: the aliases, from `aliases`.
 
     Returns:
-      All figures that have a value.
+      All metrics and aliases that have a value.
     """
     known: dict[str, float] = {name: value for name, value in figures.items() if value is not None}
     ours = {**known, "env_steps": float(env_steps)}

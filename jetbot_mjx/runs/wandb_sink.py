@@ -1,7 +1,8 @@
-"""Weights & Biases, for those who ask for it by `wandb: <project>`; nobody else imports it.
+"""Log a run to Weights & Biases if the configuration sets `wandb: <project>`.
 
-What is logged is what TensorBoard gets. Whatever goes wrong there is said in one line, and the
-training goes on without it. Its own settings hold, such as `WANDB_MODE=offline`.
+The module is imported only in that case. It logs the same metrics as TensorBoard. An error of
+Weights & Biases is reported in one line, and the training continues without it. Its own settings,
+such as `WANDB_MODE=offline`, apply.
 """
 
 import contextlib
@@ -25,7 +26,7 @@ _LONGEST_TAG = 64
 
 
 def check_tracking(config: Config) -> None:
-    """Refuses a run that wants Weights & Biases where that is not installed.
+    """Raise an error if a run needs Weights & Biases and the package is not installed.
 
     Raises:
       UserError: the package is missing.
@@ -33,7 +34,7 @@ def check_tracking(config: Config) -> None:
     if config.wandb is None:
         return
     spec = importlib.util.find_spec("wandb")
-    # Its own folder of earlier runs, `wandb/`, passes for a package without a file.
+    # The folder `wandb/` of earlier runs looks like a package without a file.
     if spec is None or spec.origin is None:
         raise UserError(
             f"wandb = {config.wandb!r} needs a package that is not installed:"
@@ -42,9 +43,10 @@ def check_tracking(config: Config) -> None:
 
 
 class WandbSink:
-    """One run of Weights & Biases, which goes on where the training goes on.
+    """A sink that logs to one run of Weights & Biases, which continues when a training resumes.
 
-    Its id lies in the run folder, with the last step that it was told: no step is told twice.
+    The run folder stores the id of this run and the last step that was logged, so that no step is
+    logged twice.
     """
 
     def __init__(
@@ -55,14 +57,14 @@ class WandbSink:
         say: Callable[[str], None],
         seeds: int = 1,
     ) -> None:
-        """Begins the run, or goes on with it.
+        """Start the run, or continue it.
 
         Args:
-          config: of this seed; `config.wandb` is the project.
-          run_dir: of this seed.
-          history: what was logged before; what the run lacks of it is told first.
-          say: takes a line for people.
-          seeds: how many runs there are of the same training: several share a group.
+          config: the configuration of this seed; `config.wandb` is the project.
+          run_dir: the run folder of this seed.
+          history: metrics that were logged before; those that the run lacks are logged first.
+          say: a function that prints one line for the user.
+          seeds: number of runs of the same training; several runs share a group.
         """
         self._names = aliases(config.ppo)
         self._say = say
@@ -104,7 +106,7 @@ class WandbSink:
         return run
 
     def write(self, env_steps: int, figures: Figures) -> None:
-        """Tells what TensorBoard is told."""
+        """Log the same metrics as TensorBoard, unless this step was logged already."""
         if self._run is None or env_steps <= self._told["env_steps"]:
             return
         with self._or_without():
@@ -113,7 +115,7 @@ class WandbSink:
             write_json(self._path, self._told)
 
     def close(self) -> None:
-        """Waits for what is on its way, for a share of `preemption_notice` at most."""
+        """Wait for pending uploads, for at most a share of `preemption_notice`."""
         if self._run is not None:
             with self._or_without():
                 self._run.finish()
@@ -123,7 +125,7 @@ class WandbSink:
     def _or_without(self) -> Iterator[None]:
         try:
             yield
-        # It has errors of its own, of the network's, of the disk's and of pydantic's.
+        # It raises errors of its own, of the network, of the disk and of pydantic.
         except Exception as error:
             self._run = None
             reason = (str(error).splitlines() or [type(error).__name__])[0]
@@ -131,7 +133,7 @@ class WandbSink:
 
 
 def _read(path: Path, project: str | None) -> dict[str, Any]:
-    """What an earlier process told this project; otherwise the beginning of a new run."""
+    """Return the id and last step of this project's run, or those of a new run if there is none."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
         told = json.loads(path.read_text(encoding="utf-8"))
         if told["project"] == project and isinstance(told["id"], str):
