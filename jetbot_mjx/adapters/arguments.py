@@ -1,4 +1,4 @@
-"""What the adapters share before anything is built: packages, arguments, seeds."""
+"""Arguments, seeds and optional packages, checked before anything is built."""
 
 import contextlib
 import math
@@ -24,7 +24,7 @@ _MOST_ENVS = 2**24
 
 @contextlib.contextmanager
 def an_extra(extra: str) -> Iterator[None]:
-    """Says in one line how to install what is imported inside.
+    """Say in one line how to install what is imported inside.
 
     Args:
       extra: of this project, which brings it.
@@ -53,7 +53,7 @@ class Arguments(NamedTuple):
 
 
 class Settings(NamedTuple):
-    """What these arguments come to."""
+    """The configuration and the view that the arguments resolve to."""
 
     config: Config
     render_mode: str | None
@@ -62,7 +62,7 @@ class Settings(NamedTuple):
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """What one environment declares: render modes that can be had here, pictures a second."""
+        """Return what an environment declares: render modes available here, images per second."""
         modes = [mode for mode in RENDER_MODES if mode == self.render_mode or shown_here(mode)]
         return {
             "render_modes": modes,
@@ -70,7 +70,7 @@ class Settings(NamedTuple):
         }
 
     def view(self, env: JetBotEnv) -> View | None:
-        """What shows an environment; None where nothing is to be shown.
+        """Return what shows an environment; None where nothing is to be shown.
 
         Raises:
           UserError: there is no display for a window.
@@ -79,7 +79,7 @@ class Settings(NamedTuple):
 
 
 def resolve(given: Arguments, config: Source) -> Settings:
-    """Works the tutorial's arguments into a configuration.
+    """Work the tutorial's arguments into a configuration.
 
     Args:
       given: the arguments; None leaves a setting as the configuration has it.
@@ -137,7 +137,7 @@ def _check_seconds(name: str, value: Any) -> None:
 
 
 def check_num_envs(num_envs: Any) -> int:
-    """Refuses what is no number of environments.
+    """Refuse what is no number of environments.
 
     Args:
       num_envs: how many environments are asked for.
@@ -176,7 +176,7 @@ def as_actions(actions: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]
 
 
 def key_from_seed(seed: int | None) -> UInt32[np.ndarray, "2"]:
-    """The random key that a robot's episodes come from.
+    """Return the random key that a robot's episodes come from.
 
     Args:
       seed: a whole number from 0 on; None: something else every time.

@@ -31,12 +31,12 @@ class Steps(NamedTuple):
 
     @property
     def done(self) -> Bool[np.ndarray, " n"]:
-        """Where an episode ended."""
+        """Return where an episode ended."""
         return self.terminated | self.truncated
 
 
 class Pose(NamedTuple):
-    """What there is to show of one robot."""
+    """The state of one robot that is shown."""
 
     qpos: Float[np.ndarray, " nq"]
     goal: PyTree
@@ -48,7 +48,7 @@ class Batch:
     """Robots in one compiled program, which resets those whose episode ends."""
 
     def __init__(self, config: Config, num_envs: int, seed: Seed) -> None:
-        """Builds the environment; the first reset and the first step compile.
+        """Build the environment; the first reset and the first step compile.
 
         Args:
           config: robot, task and physics.
@@ -79,7 +79,7 @@ class Batch:
         self._results: tuple[jax.Array, ...] | None = None
 
     def reset(self, seed: Seed = None) -> Float[np.ndarray, "n obs"]:
-        """Begins an episode in every environment.
+        """Begin an episode in every environment.
 
         Args:
           seed: of the random streams that episodes come from, by Gymnasium's rule (`seeds_of`);
@@ -104,11 +104,11 @@ class Batch:
 
     @property
     def is_begun(self) -> bool:
-        """Whether there was a `reset`."""
+        """Return whether there was a `reset`."""
         return self._state is not None
 
     def start(self, actions: np.ndarray) -> None:
-        """Lets the device begin a step, and does not wait for it.
+        """Let the device begin a step, and does not wait for it.
 
         Args:
           actions: of shape (n, 2), in [-1, 1].
@@ -120,7 +120,7 @@ class Batch:
         self._state, self._results = self._step(self._state, actions)
 
     def finish(self) -> Steps:
-        """Waits for the step that `start` began.
+        """Wait for the step that `start` began.
 
         Returns:
           What came of it, in arrays of the caller's own.
@@ -132,7 +132,7 @@ class Batch:
         return Steps(obs, reward, terminated, truncated, success, nonfinite, final_obs)
 
     def poses(self) -> list[Pose]:
-        """Where every robot is, its goal, and since when it drives there."""
+        """Return where every robot is, its goal, and since when it drives there."""
         assert self._state is not None, "reset() comes before all else"
         physics, goals = jax.device_get((self._state.pipeline_state, self._state.goal))
         return [

@@ -51,7 +51,7 @@ class JetBotGymEnv(gymnasium.Env):
         render_mode: str | None = None,
         config: Source = None,
     ) -> None:
-        """Builds the model, and compiles what is not physics.
+        """Build the model, and compiles what is not physics.
 
         Args:
           skip_frame: `physics_dt` in one environment step.
@@ -96,7 +96,7 @@ class JetBotGymEnv(gymnasium.Env):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, " obs"], dict[str, Any]]:
-        """Begins an episode: the robot at rest at the origin, a new goal.
+        """Begin an episode: the robot at rest at the origin, a new goal.
 
         Args:
           seed: begins a new random stream.
@@ -117,7 +117,7 @@ class JetBotGymEnv(gymnasium.Env):
     def step(
         self, action: Float[np.ndarray, "2"]
     ) -> tuple[Float[np.ndarray, " obs"], float, bool, bool, dict[str, Any]]:
-        """Holds an action for one environment step.
+        """Hold an action for one environment step.
 
         Args:
           action: in [-1, 1]²; values outside are clipped.
@@ -141,7 +141,7 @@ class JetBotGymEnv(gymnasium.Env):
         return obs, reward, terminated, truncated, info
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """A picture from the camera that follows the robot; None unless asked for `rgb_array`.
+        """Return an image from the following camera; None unless asked for `rgb_array`.
 
         Raises:
           ResetNeeded: there was no `reset` yet.
@@ -155,7 +155,7 @@ class JetBotGymEnv(gymnasium.Env):
         return self._view.frame(self.robot.data.qpos, self.robot.goal)
 
     def close(self) -> None:
-        """Closes what was opened to show the robot."""
+        """Close what was opened to show the robot."""
         if self._view is not None:
             self._view.close()
 

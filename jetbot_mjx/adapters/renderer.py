@@ -1,4 +1,4 @@
-"""How an adapted environment shows itself: as pictures, or in MuJoCo's window."""
+"""Render an adapted environment: as images, or in MuJoCo's window."""
 
 import atexit
 import os
@@ -36,7 +36,7 @@ class View:
     """Shows one robot and its goal; opens nothing before the first picture."""
 
     def __init__(self, env: JetBotEnv, mode: str, rendering_dt: float) -> None:
-        """Looks whether there is a display, where one is needed.
+        """Look whether there is a display, where one is needed.
 
         Args:
           env: whose robot and task are shown.
@@ -57,7 +57,7 @@ class View:
     def frame(
         self, qpos: Float[np.ndarray, " nq"], goal: PyTree
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """A picture from the nearest camera that has robot, goal and origin in its frame.
+        """Return a picture from the nearest camera that has robot, goal and origin in its frame.
 
         Args:
           qpos: the robot's pose.
@@ -80,7 +80,7 @@ class View:
         return self._renderer.frame(qpos, markers, camera)
 
     def show(self, qpos: Float[np.ndarray, " nq"], goal: PyTree, now: float) -> None:
-        """Puts a pose into the window, as fast as the robot would move.
+        """Put a pose into the window, as fast as the robot would move.
 
         Args:
           qpos: the robot's pose.
@@ -102,7 +102,7 @@ class View:
         self._next = now + self._rendering_dt, time.monotonic() + self._rendering_dt
 
     def close(self) -> None:
-        """Closes what was opened."""
+        """Close what was opened."""
         atexit.unregister(self.close)
         for shown in (self._renderer, self._window):
             if shown is not None:

@@ -41,7 +41,7 @@ class JetBotVecEnv(VecEnv):
         render_mode: str | None = None,
         config: Source = None,
     ) -> None:
-        """Builds the environment; the first reset and the first step compile.
+        """Build the environment; the first reset and the first step compile.
 
         Args:
           num_envs: robots.
@@ -77,7 +77,7 @@ class JetBotVecEnv(VecEnv):
         self.metadata: dict[str, Any] = {**self.metadata, **settings.metadata}
 
     def reset(self) -> Float[np.ndarray, "n obs"]:
-        """Begins an episode in every environment, with the seeds that `seed` was called with.
+        """Begin an episode in every environment, with the seeds that `seed` was called with.
 
         Returns:
           The first observations.
@@ -90,7 +90,7 @@ class JetBotVecEnv(VecEnv):
         return obs
 
     def step_async(self, actions: Float[np.ndarray, "n 2"]) -> None:
-        """Lets the device begin a step, and does not wait for it.
+        """Let the device begin a step, and does not wait for it.
 
         Args:
           actions: in [-1, 1]²; values outside are clipped.
@@ -109,7 +109,7 @@ class JetBotVecEnv(VecEnv):
         Bool[np.ndarray, " n"],
         list[dict[str, Any]],
     ]:
-        """Waits for the step that `step_async` began.
+        """Wait for the step that `step_async` began.
 
         Returns:
           Observations, rewards, where an episode ended, and what there is to tell of each.
@@ -129,12 +129,12 @@ class JetBotVecEnv(VecEnv):
         return steps.obs, steps.reward, done, infos
 
     def close(self) -> None:
-        """Closes what was opened to show the robots."""
+        """Close what was opened to show the robots."""
         if self._view is not None:
             self._view.close()
 
     def get_images(self) -> Sequence[UInt8[np.ndarray, "height width 3"]]:
-        """A picture of every robot.
+        """Return a picture of every robot.
 
         Raises:
           ResetNeeded: there was no `reset` yet.
@@ -145,11 +145,11 @@ class JetBotVecEnv(VecEnv):
         return [self._view.frame(pose.qpos, pose.goal) for pose in self.batch.poses()]
 
     def render(self, mode: str | None = None) -> UInt8[np.ndarray, "height width 3"] | None:
-        """All robots in one picture; None where a window shows the first, in every step."""
+        """Return all robots in one image; None where a window shows the first, in every step."""
         return None if self.render_mode == "human" else super().render(mode)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """An attribute of the environments: set by `set_attr`, or what they share.
+        """Return an attribute of the environments: set by `set_attr`, or what they share.
 
         Args:
           attr_name: its name, such as `config` or `dt`.
@@ -168,7 +168,7 @@ class JetBotVecEnv(VecEnv):
         return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Keeps a value for `get_attr`. The program is compiled: nothing in it changes.
+        """Keep a value for `get_attr`. The program is compiled: nothing in it changes.
 
         Args:
           attr_name: its name.
@@ -190,7 +190,7 @@ class JetBotVecEnv(VecEnv):
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Calls a method that the environments share, such as `wheel_targets`.
+        """Call a method that the environments share, such as `wheel_targets`.
 
         Args:
           method_name: of `JetBotEnv` or of this class.

@@ -51,7 +51,7 @@ class JetBotVectorEnv(VectorEnv):
         render_mode: str | None = None,
         config: Source = None,
     ) -> None:
-        """Builds the environment; the first reset and the first step compile.
+        """Build the environment; the first reset and the first step compile.
 
         Args:
           num_envs: robots.
@@ -87,7 +87,7 @@ class JetBotVectorEnv(VectorEnv):
     def reset(
         self, *, seed: Seed = None, options: dict[str, Any] | None = None
     ) -> tuple[Float[np.ndarray, "n obs"], dict[str, Any]]:
-        """Begins an episode in every environment.
+        """Begin an episode in every environment.
 
         Args:
           seed: begins new random streams; one number counts on from environment to environment.
@@ -112,7 +112,7 @@ class JetBotVectorEnv(VectorEnv):
         Bool[np.ndarray, " n"],
         dict[str, Any],
     ]:
-        """One step in every environment.
+        """Step every environment.
 
         Args:
           actions: in [-1, 1]²; values outside are clipped.
@@ -147,7 +147,7 @@ class JetBotVectorEnv(VectorEnv):
         return steps.obs, rewards, steps.terminated, steps.truncated, infos
 
     def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
-        """A picture of every robot; None unless asked for `rgb_array`.
+        """Return a picture of every robot; None unless asked for `rgb_array`.
 
         Raises:
           ResetNeeded: there was no `reset` yet.
@@ -161,7 +161,7 @@ class JetBotVectorEnv(VectorEnv):
         return tuple(self._view.frame(pose.qpos, pose.goal) for pose in self.batch.poses())
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Closes what was opened to show the robots."""
+        """Close what was opened to show the robots."""
         del kwargs
         if self._view is not None:
             self._view.close()

@@ -1,4 +1,4 @@
-"""What stands between command and wheel: delay, voltage, dead-band, lag, unequal motors and wheels.
+"""An actuator model: delay, voltage, dead-band, lag, unequal motors and wheels.
 
 A pure pipeline of one robot, outside physics, on wheel speeds (left, right) [rad/s].
 """
@@ -12,7 +12,7 @@ from jetbot_mjx.envs.robot_params import Variation
 
 
 class Motors(NamedTuple):
-    """What stands between command and wheel remembers."""
+    """The memory of the actuator model."""
 
     commands: Float[Array, "delay 2"] | None
     """The last commands, the newest first; None: there is no delay."""
@@ -21,7 +21,7 @@ class Motors(NamedTuple):
 
 
 def motors_at_rest(variation: Variation, longest_delay: int) -> Motors:
-    """Motors that no command has reached yet.
+    """Return the state of actuators that no command has reached yet.
 
     Args:
       variation: the robot's.
@@ -44,7 +44,7 @@ def drive_motors(
     full_speed: float,
     ctrl_dt: float,
 ) -> tuple[Motors, Float[Array, "2"]]:
-    """Passes one command on to the wheels.
+    """Pass one command on to the wheels.
 
         u = voltage · command of `action_delay` steps ago
         w = sign(u) max(|u| - band · full, 0) / (1 - band)
@@ -89,7 +89,7 @@ def drive_motors(
 
 
 def _at_the_wheels(target: Float[Array, "2"], variation: Variation) -> Float[Array, "2"]:
-    """The speeds at which the preset's wheels do what these wheels do at `target`."""
+    """Return the speeds at which the preset's wheels do what these wheels do at `target`."""
     sides = jnp.array([0.5, -0.5])
     if variation.differs("motor_gain", "wheel_radius"):
         target = target * (variation.motor_gain * variation.wheel_radius)

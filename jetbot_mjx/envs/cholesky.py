@@ -24,7 +24,7 @@ _lock = threading.RLock()
 
 @contextlib.contextmanager
 def unrolled() -> Iterator[None]:
-    """Lets what is traced inside factorise by this module instead of `jax.scipy.linalg`."""
+    """Let what is traced inside factorise by this module instead of `jax.scipy.linalg`."""
     # One thread at a time: of two that replace and restore, the second would keep the first's.
     with (
         _lock,
@@ -57,7 +57,7 @@ def cho_factor(
 def cho_solve(
     c_and_lower: tuple[Float[Array, "n n"], bool], b: Float[Array, "n *k"], **options: Any
 ) -> Float[Array, "n *k"]:
-    """Solves A x = b from the factor of A: Rᵀy = b, then R x = y.
+    """Solve A x = b from the factor of A: Rᵀy = b, then R x = y.
 
     Args:
       c_and_lower: as `cho_factor` gives it.

@@ -48,7 +48,7 @@ class Hardware(NamedTuple):
 
 
 def draw(ranges: RandomizationConfig, key: UInt32[Array, "2"]) -> Float[Array, " quantities"]:
-    """Draws a robot, each quantity uniformly from its range.
+    """Draw a robot, each quantity uniformly from its range.
 
     Args:
       ranges: of what is drawn.
@@ -80,7 +80,7 @@ class VariedEnv(Wrapper):
         variation: Variation | None = None,
         ranges: RandomizationConfig | None = None,
     ) -> None:
-        """Wraps one environment.
+        """Wrap one environment.
 
         Args:
           env: unbatched, with its preset's model.
@@ -104,14 +104,14 @@ class VariedEnv(Wrapper):
         return round(value) if isinstance(value, int | float) else traced
 
     def variation(self, state: State) -> Variation:
-        """How the robot of this episode differs."""
+        """Return how the robot of this episode differs."""
         return self._variation(state.hardware.drawn)
 
     def _variation(self, drawn: Float[Array, " quantities"]) -> Variation:
         return self._constant._replace(**dict(zip(self._ranges.drawn, drawn, strict=True)))
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begins an episode: a robot drawn, no command on its way; the goal as without wrapper."""
+        """Begin an episode: a robot drawn, no command on its way; the goal as without wrapper."""
         state = self.env.reset(rng)
         drawn = draw(self._ranges, jax.random.fold_in(rng, _OWN_DRAWS))
         variation = self._variation(drawn)
@@ -127,7 +127,7 @@ class VariedEnv(Wrapper):
         )
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Gives a command, drives by those that have arrived, and sees what there is to see."""
+        """Give a command, drives by those that have arrived, and sees what there is to see."""
         drawn, motors, sensors = state.hardware
         variation = self._variation(drawn)
         # Ahead of the lag: an electronic limit, towards which the motors then run up.
@@ -145,7 +145,7 @@ class VariedEnv(Wrapper):
         )
 
     def _robot(self, variation: Variation) -> JetBotEnv:
-        """The environment with the physics model of one robot."""
+        """Return the environment with the physics model of one robot."""
         model = self.env.mjx_model
         if self.env.robot.max_wheel_speed is not None:
             # What comes out of the motors is limited before gain and wheels, not after them.
@@ -160,7 +160,7 @@ class VariedEnv(Wrapper):
 
 
 def _placed(physics: PhysicsState, variation: Variation) -> PhysicsState:
-    """Where the episode starts."""
+    """Return where the episode starts."""
     if not variation.differs(*_START):
         return physics
     x, y, yaw = (jnp.asarray(getattr(variation, name)) for name in _START)
@@ -170,7 +170,7 @@ def _placed(physics: PhysicsState, variation: Variation) -> PhysicsState:
 
 
 def as_trained(env: JetBotEnv) -> JetBotEnv | VariedEnv:
-    """The environment with what its configuration draws; itself where that is nothing.
+    """Return the environment with what its configuration draws; itself where that is nothing.
 
     Args:
       env: one environment, unwrapped.

@@ -39,7 +39,7 @@ from jetbot_mjx.errors import UserError
 
 
 class TaskStep(NamedTuple):
-    """What the task says of one step of the robot, whoever moved it."""
+    """A `TaskStep` holds the task's answer to one step of the robot, whoever moved it."""
 
     obs: Float[Array, " obs"]
     """Observation after the step."""
@@ -66,7 +66,7 @@ class JetBotEnv(brax.envs.Env):
     """
 
     def __init__(self, config: Config) -> None:
-        """Builds the models.
+        """Build the models.
 
         Args:
           config: robot, task and physics.
@@ -100,11 +100,11 @@ class JetBotEnv(brax.envs.Env):
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """The model that is stepped."""
+        """Return the model that is stepped."""
         return self.physics.model
 
     def with_model(self, mjx_model: mjx.Model) -> "JetBotEnv":
-        """This environment on another physics model, as a new object.
+        """Return this environment on another physics model, as a new object.
 
         Args:
           mjx_model: a model of the same structure, such as one with other friction.
@@ -128,7 +128,7 @@ class JetBotEnv(brax.envs.Env):
         return env
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begins an episode: the robot at rest at the origin, a new goal.
+        """Begin an episode: the robot at rest at the origin, a new goal.
 
         Args:
           rng: a legacy key, `jax.random.PRNGKey`; Brax's wrappers rely on its shape.
@@ -160,7 +160,7 @@ class JetBotEnv(brax.envs.Env):
         )
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Holds an action for one environment step.
+        """Hold an action for one environment step.
 
         Args:
           state: of the same environment.
@@ -174,7 +174,7 @@ class JetBotEnv(brax.envs.Env):
     def step_towards(
         self, state: State, action: Float[Array, "2"], ctrl: Float[Array, "2"]
     ) -> State:
-        """One environment step with wheel speeds other than those that the action commands.
+        """Step the environment with wheel speeds other than those that the action commands.
 
         Args:
           state: of the same environment.
@@ -265,7 +265,7 @@ class JetBotEnv(brax.envs.Env):
         ctrl: Float[Array, "2"],
         mocap_pos: Float[Array, "nmocap 3"] | None = None,
     ) -> PhysicsState:
-        """Integrates one environment step.
+        """Integrate one environment step.
 
         Args:
           physics: where to start.
@@ -301,7 +301,7 @@ class JetBotEnv(brax.envs.Env):
 
     @property
     def backend(self) -> str:
-        """Physics back end, in Brax's words."""
+        """Return the physics back end, in Brax's terms."""
         return "mjx"
 
     @property
@@ -311,7 +311,7 @@ class JetBotEnv(brax.envs.Env):
 
 
 def make_env(config: Config) -> JetBotEnv:
-    """Builds the environment that a configuration describes.
+    """Build the environment that a configuration describes.
 
     Args:
       config: robot, task and physics.

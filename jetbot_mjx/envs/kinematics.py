@@ -94,7 +94,7 @@ def body_twist(
 
 
 def rotate(quat: Float[Array, "4"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
-    """Rotates a vector by a unit quaternion: body frame to world frame.
+    """Rotate a vector by a unit quaternion: body frame to world frame.
 
     Args:
       quat: (w, x, y, z) of the body in the world.
@@ -123,7 +123,7 @@ def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
 
 
 def turned(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"]:
-    """A body turned about the world's z axis.
+    """Return a body turned about the world's z axis.
 
         q' = (cos α/2, 0, 0, sin α/2) ⊗ q
 
@@ -170,7 +170,7 @@ def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
 
 
 def to_body(heading: Float[Array, ""], vector_w: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Turns a horizontal world vector into the frame of a body that heads `heading`.
+    """Turn a horizontal world vector into the frame of a body that heads `heading`.
 
     Args:
       heading: yaw of the body [rad].

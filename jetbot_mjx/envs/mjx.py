@@ -18,19 +18,19 @@ __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 
 
 def put_model(model: mujoco.MjModel) -> Model:
-    """MuJoCo's model as arrays."""
+    """Return MuJoCo's model as arrays."""
     # Whoever asks may be in the middle of tracing something.
     with jax.ensure_compile_time_eval(), on_host() as device:
         return _anywhere(mjx.put_model(model, device=device))
 
 
 def make_data(model: mujoco.MjModel) -> Data:
-    """The model's state before the first step, as arrays."""
+    """Return the model's state before the first step, as arrays."""
     with jax.ensure_compile_time_eval(), on_host() as device:
         return _anywhere(mjx.make_data(model, device=device))
 
 
 def _anywhere(tree: Any) -> Any:
-    """The same arrays, free to go wherever they are needed."""
+    """Return the same arrays, free to go wherever they are needed."""
     # `jnp.asarray` would compile a program for every shape among them.
     return jax.device_put(jax.tree.map(np.asarray, tree))

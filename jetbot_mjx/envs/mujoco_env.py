@@ -36,7 +36,7 @@ _NONFINITE = [
 
 
 class Step(NamedTuple):
-    """What came of one step."""
+    """The result of one step."""
 
     obs: Float[np.ndarray, " obs"]
     reward: float
@@ -47,7 +47,7 @@ class Step(NamedTuple):
 
 
 class _Programs(NamedTuple):
-    """What robots of one configuration share."""
+    """The programs and models that robots of one configuration share."""
 
     env: JetBotEnv
     model: mujoco.MjModel
@@ -61,7 +61,7 @@ class MujocoJetBot:
     """A robot and its goal."""
 
     def __init__(self, config: Config) -> None:
-        """Builds the model, and compiles what is not physics.
+        """Build the model, and compiles what is not physics.
 
         Args:
           config: robot, task and physics; of `randomization` nothing is drawn.
@@ -85,7 +85,7 @@ class MujocoJetBot:
     def reset(
         self, key: UInt32[np.ndarray, "2"]
     ) -> tuple[Float[np.ndarray, " obs"], UInt32[np.ndarray, "2"]]:
-        """Begins the episode that `JetBotEnv.reset` draws from a key.
+        """Begin the episode that `JetBotEnv.reset` draws from a key.
 
         Args:
           key: of this episode.
@@ -101,7 +101,7 @@ class MujocoJetBot:
         return self._obs.copy(), np.asarray(next_key)
 
     def step(self, action: Float[np.ndarray, "2"]) -> Step:
-        """Holds an action for one environment step.
+        """Hold an action for one environment step.
 
         Args:
           action: in [-1, 1]²; values outside are clipped.
@@ -143,12 +143,12 @@ class MujocoJetBot:
         return (speed - half) / CONTROLLER_WHEEL_RADIUS, (speed + half) / CONTROLLER_WHEEL_RADIUS
 
     def _discarded(self, time: float) -> Step:
-        """The step that is not taken, because it would not be finite."""
+        """Return the step that is not taken, because it would not be finite."""
         self._place(time)
         return Step(self._obs.copy(), 0.0, False, False, False)
 
     def _place(self, time: float) -> None:
-        """Puts robot and solid bodies where they were last known to be."""
+        """Put robot and solid bodies where they were last known to be."""
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:], self._qvel[:] = np.split(self._before, [self.model.nq])
         self.data.mocap_pos[:] = self._mocap_pos

@@ -41,7 +41,7 @@ _INPUTS = mujoco.mjtState.mjSTATE_CTRL.value | mujoco.mjtState.mjSTATE_MOCAP_POS
 
 
 class Numerics(NamedTuple):
-    """How C MuJoCo computes. The defaults share none of the choices that training makes."""
+    """Settings of C MuJoCo. The defaults share none of the choices that training makes."""
 
     substeps: int = 8
     """Physics steps per environment step."""
@@ -147,7 +147,7 @@ class MujocoPhysics(Physics):
     """A model and how C MuJoCo steps it; pure and unbatched."""
 
     def __init__(self, env: JetBotEnv, numerics: Numerics, threads: int) -> None:
-        """Builds the model and starts the threads.
+        """Build the model and starts the threads.
 
         Args:
           env: whose physics this is to be.
@@ -193,7 +193,7 @@ class MujocoPhysics(Physics):
 
     @property
     def impl(self) -> str:
-        """Who makes a step; no value of `physics.impl`."""
+        """Return the name of the simulator; no value of `physics.impl`."""
         return "mujoco"
 
     def step(

@@ -33,7 +33,7 @@ class Physics:
     """A model and how it is stepped; pure and unbatched."""
 
     def __init__(self, mj_model: mujoco.MjModel, config: PhysicsConfig) -> None:
-        """Hands the model over to MJX.
+        """Hand the model over to MJX.
 
         Args:
           mj_model: of what moves and touches.
@@ -59,16 +59,16 @@ class Physics:
 
     @functools.cached_property
     def model(self) -> mjx.Model:
-        """The model that is stepped."""
+        """Return the model that is stepped."""
         return mjx.put_model(self._mj_model)
 
     @functools.cached_property
     def _data(self) -> mjx.Data:
-        """Of which a step replaces what a `PhysicsState` holds."""
+        """Return the data of which a step replaces what a `PhysicsState` holds."""
         return mjx.make_data(self._mj_model)
 
     def with_model(self, model: mjx.Model) -> "Physics":
-        """The same on another model, as a new object.
+        """Return the same on another model, as a new object.
 
         Args:
           model: of the same structure, such as one with other friction.
@@ -86,7 +86,7 @@ class Physics:
 
     @property
     def impl(self) -> str:
-        """Who makes a step on JAX's default devices, as in `physics.impl`, but never `auto`."""
+        """Return what `physics.impl` is on JAX's default devices; never `auto`."""
         platform = jax.local_devices()[0].platform
         here = [
             x.IMPL for x in self._backends() if _PLATFORMS.get(platform, platform) == x.PLATFORM
@@ -107,7 +107,7 @@ class Physics:
         ctrl: Float[Array, " nu"],
         mocap_pos: Float[Array, "nmocap 3"] | None = None,
     ) -> PhysicsState:
-        """Integrates one environment step, `n_substeps` physics steps.
+        """Integrate one environment step, `n_substeps` physics steps.
 
         Args:
           state: where to start.
@@ -127,7 +127,7 @@ class Physics:
         return (self._as_kernel() or self._steps)(state, held)
 
     def _steps(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
-        """All physics steps of an environment step, as XLA makes them."""
+        """Make all physics steps of an environment step through XLA."""
         state, _ = jax.lax.scan(
             lambda state, _: (self.substep(state, held), None),
             state,
@@ -136,7 +136,7 @@ class Physics:
         return state
 
     def substep(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
-        """One step of MJX.
+        """Make one step of MJX.
 
         Args:
           state: where to start.
@@ -171,11 +171,11 @@ class Physics:
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
     def _backends(self) -> list[kernel.Backend]:
-        """Who may make a step as one kernel in this process."""
+        """Return the back ends that may compile the step as one kernel in this process."""
         return [x for x in BACKENDS if self._config.impl in ("auto", x.IMPL) and x.is_available()]
 
     def _as_kernel(self) -> kernel.Step | None:
-        """The step as one kernel; None where XLA makes it on all platforms."""
+        """Return the step as one kernel; None where XLA makes it on all platforms."""
         if not self._backends():
             return None
         # Programs are traced in several threads; one is enough to write the kernel.

@@ -33,7 +33,7 @@ _LIBRARIES = ["brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx
 
 
 def programs_of(config: Config, *, keep: bool) -> Programs:
-    """The programs of a configuration on the devices of this process.
+    """Return the programs of a configuration on the devices of this process.
 
     Args:
       config: the run.
@@ -77,7 +77,7 @@ def _version(library: str) -> str | None:
 
 
 def _model(config: Config) -> str:
-    """A name for the model of a configuration, with all options of its solver."""
+    """Return a name for the model of a configuration, with all options of its solver."""
     # A mistyped command says so before MuJoCo is loaded.
     import mujoco
 
@@ -93,7 +93,7 @@ def _model(config: Config) -> str:
 
 @functools.cache
 def _own_source() -> str:
-    """A name for all that this package consists of."""
+    """Return a name for all that this package consists of."""
     digest = hashlib.sha256()
     for path in sorted(_ROOT.rglob("*")):
         if path.suffix in SOURCES:

@@ -80,7 +80,7 @@ def _box_inertia(mass: float, size: tuple[float, float, float]) -> tuple[float, 
 
 
 def _wheel_inertia(mass: float, width: float) -> tuple[float, float, float]:
-    """Moments of a homogeneous wheel [kg m²] from its mass [kg] and width [m]."""
+    """Return moments of a homogeneous wheel [kg m²] from its mass [kg] and width [m]."""
     spin = mass * WHEEL_RADIUS**2 / 2
     across = mass * (3 * WHEEL_RADIUS**2 + width**2) / 12
     return across, spin, across
@@ -139,7 +139,7 @@ def make_mj_model(
     build_scene: Callable[[mujoco.MjSpec], None] = lambda spec: None,
     visual: bool = True,
 ) -> mujoco.MjModel:
-    """Compiles the robot and its scene.
+    """Compile the robot and its scene.
 
     Args:
       robot: the physical numbers.
@@ -242,7 +242,7 @@ def _add_pair(
 
 
 def _strip(spec: mujoco.MjSpec) -> None:
-    """Removes all that takes no part in physics."""
+    """Remove all that takes no part in physics."""
     paired = {pair.geomname1 for pair in spec.pairs} | {pair.geomname2 for pair in spec.pairs}
     for geom in spec.geoms:
         if geom.name not in paired and not geom.contype and not geom.conaffinity:
@@ -255,7 +255,7 @@ def _strip(spec: mujoco.MjSpec) -> None:
 
 
 def _settle(spec: mujoco.MjSpec) -> None:
-    """Puts the robot down as it stands at rest, so that no episode starts with a drop."""
+    """Put the robot down as it stands at rest, so that no episode starts with a drop."""
     model = spec.compile()
     # To the solver's full accuracy, and through implicit damping, which dies out sooner.
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST

@@ -29,7 +29,7 @@ Quantity = Float[ArrayLike, ""]
 
 
 class Variation(NamedTuple):
-    """How one robot differs from its preset. `Variation()` does not differ at all.
+    """Differences of one robot from its preset. `Variation()` does not differ at all.
 
     What is left at its default costs nothing: no program contains it.
     """
@@ -86,7 +86,7 @@ class Variation(NamedTuple):
     """Heading at the start [rad], counter-clockwise."""
 
     def differs(self, *names: str) -> bool:
-        """Whether any of some quantities may differ from the preset's; a traced one may."""
+        """Return whether any of some quantities may differ from the preset's; a traced one may."""
         presets = type(self)._field_defaults
         values = {name: getattr(self, name) for name in names}
         return any(
@@ -96,7 +96,7 @@ class Variation(NamedTuple):
 
 
 def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation) -> mjx.Model:
-    """The physics model of a varied robot, as MuJoCo would compile it.
+    """Return the physics model of a varied robot, as MuJoCo would compile it.
 
     Args:
       model: the preset's.
@@ -193,6 +193,6 @@ def _is_preset(variation: Variation, shift: Float[Array, "3"]) -> Bool[Array, ""
 
 
 def _inverse(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Of a symmetric matrix, without a call of LAPACK or cuSOLVER."""
+    """Decompose a symmetric matrix without a call of LAPACK or cuSOLVER."""
     rows = [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])]
     return jnp.stack(rows, axis=1) / (a[0] * rows[0]).sum()

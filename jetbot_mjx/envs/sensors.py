@@ -1,4 +1,4 @@
-"""What a robot knows of itself: its own state, late and inexact. A pure pipeline of one robot.
+"""A sensor model: the robot's own state, late and inexact. A pure pipeline of one robot.
 
 It stands between physics and the task's `observe`, so any observation of any task has its share.
 The first one of an episode has no delay and no noise: a robot that stands can take its time to
@@ -21,7 +21,7 @@ _OFFSETS = ("height_offset", "pitch_offset")
 
 
 class Sensors(NamedTuple):
-    """What stands between robot and task remembers."""
+    """The memory of the sensor model."""
 
     seen: Float[Array, "delay robot"] | None
     """The last states of the robot, the newest first; None: there is no delay."""
@@ -32,7 +32,7 @@ class Sensors(NamedTuple):
 def sensors_at_start(
     robot: RobotState, key: UInt32[Array, "2"], variation: Variation, longest_delay: int
 ) -> Sensors:
-    """Sensors that have seen the robot stand where it starts.
+    """Return the state of sensors that have seen the robot stand where it starts.
 
     Args:
       robot: there.
@@ -52,7 +52,7 @@ def sensors_at_start(
 def sense(
     sensors: Sensors, robot: RobotState, variation: Variation, step: Int[Array, ""]
 ) -> tuple[Sensors, RobotState]:
-    """What the robot takes its own state to be.
+    """Return the state that the robot measures.
 
     Args:
       sensors: before.

@@ -1,4 +1,4 @@
-"""What an episode carries from step to step: Brax's state, kept as small as physics allows."""
+"""The state of an episode: Brax's state, kept as small as physics allows."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from jetbot_mjx.envs.task import Goal, RobotState
 
 
 class PhysicsState(struct.PyTreeNode):
-    """What physics integrates, and nothing that can be computed from it."""
+    """The quantities that physics integrates, and nothing that can be computed from them."""
 
     qpos: Float[Array, " nq"]
     """Position (x, y, z) [m], quaternion (w, x, y, z), wheel angles (left, right) [rad]."""
@@ -48,7 +48,7 @@ class State(struct.PyTreeNode):
 
 
 def robot_state(physics: PhysicsState) -> RobotState:
-    """The robot as a task sees it, from the generalised coordinates.
+    """Return the robot as a task sees it, from the generalised coordinates.
 
     MuJoCo's free joint holds the velocity of the body's origin in the world frame, but the
     angular velocity in the body frame: it is rotated here.

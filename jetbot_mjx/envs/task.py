@@ -1,4 +1,4 @@
-"""What is to be done: goals, observations, rewards, the end. Pure functions of one robot.
+"""Tasks: goals, observations, rewards, termination. Pure functions of one robot.
 
 `Task` is the contract; `GoalTask` is the tutorial's task and a base class for your own.
 A task is built as `Class(task_config)` and named in YAML as `package.module:Class`.
@@ -111,7 +111,7 @@ def min_std(field: Field) -> float:
 
 
 def layout_table(layout: Layout) -> str:
-    """The layout as a Markdown table: index, name, unit, frame."""
+    """Return the layout as a Markdown table: index, name, unit, frame."""
     lines = ["| index | observation | unit | frame |", "|---|---|---|---|"]
     start = 0
     for field in layout:
@@ -124,7 +124,7 @@ def layout_table(layout: Layout) -> str:
 
 @runtime_checkable
 class Task(Protocol):
-    """What the environment asks of a task. All methods are pure and see one robot.
+    """The interface of a task. All methods are pure and see one robot.
 
     Optional beside these: `move_goal`, of `MovesGoal`, and `advance`, of `AdvancesGoal`.
     """
@@ -133,11 +133,11 @@ class Task(Protocol):
     """The observation as data: name, size, unit and frame of each part."""
 
     def sample(self, key: UInt32[Array, "2"]) -> Goal:
-        """Draws the goal of one episode: arrays in any pytree."""
+        """Draw the goal of one episode: arrays in any pytree."""
         ...
 
     def observe(self, robot: RobotState, goal: Goal) -> Float[Array, " obs"]:
-        """What the policy sees, in the order of `layout`."""
+        """Return the observation, in the order of `layout`."""
         ...
 
     def reward(
@@ -147,27 +147,27 @@ class Task(Protocol):
         goal: Goal,
         action: Float[Array, "2"],
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """The reward of one step and its named terms, the same names at every step."""
+        """Return the reward of one step and its named terms, the same names at every step."""
         ...
 
     def terminated(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Whether the episode has ended for good, in success or failure."""
+        """Return whether the episode has ended for good, in success or failure."""
         ...
 
     def success(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Whether what was to be done is done."""
+        """Return whether the task is done."""
         ...
 
     def goal_position(self, goal: Goal) -> Float[Array, "3"]:
-        """Where the robot has to go [m], world frame: for baselines, pictures and reports."""
+        """Return the goal's position [m], world frame, for baselines, images and reports."""
         ...
 
     def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]:
-        """Where the scene's mocap bodies stand [m], by name."""
+        """Return where the scene's mocap bodies stand [m], by name."""
         ...
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
-        """Adds the task's own bodies to the scene before it is compiled.
+        """Add the task's own bodies to the scene before it is compiled.
 
         What only shows wants `contype=0, conaffinity=0`. What the robot can run into is given a
         contact pair with a geom of the robot; as a mocap body it stands where `markers` says.
@@ -177,10 +177,10 @@ class Task(Protocol):
 
 @runtime_checkable
 class MovesGoal(Protocol):
-    """What a task can offer beside the contract: a goal that a user moves while a robot drives."""
+    """An optional interface of a task whose goal a user can move while a robot drives."""
 
     def move_goal(self, goal: Goal, position_w: Float[Array, "3"]) -> Goal:
-        """The same goal, elsewhere.
+        """Return the same goal, elsewhere.
 
         Args:
           goal: what `sample` drew; all of it that is not the place to go stays.
@@ -194,13 +194,13 @@ class MovesGoal(Protocol):
 
 @runtime_checkable
 class AdvancesGoal(Protocol):
-    """What a task can offer beside the contract: a goal that changes as the robot drives.
+    """An optional interface of a task whose goal changes as the robot drives.
 
     What an episode has to remember, such as how many gates are passed, is part of the goal.
     """
 
     def advance(self, before: RobotState, after: RobotState, goal: Goal) -> Goal:
-        """The goal after a step.
+        """Return the goal after a step.
 
         `reward` sees the goal before it; `terminated`, `success` and `observe` the one after.
 
@@ -228,7 +228,7 @@ class GoalTask:
     """
 
     def __init__(self, config: TaskConfig) -> None:
-        """Builds the task.
+        """Build the task.
 
         Args:
           config: ranges, radius and the observation's layout.
@@ -237,7 +237,7 @@ class GoalTask:
         self.layout: Layout = LAYOUTS[config.observation]
 
     def sample(self, key: UInt32[Array, "2"]) -> Float[Array, "3"]:
-        """Draws a goal position [m], world frame.
+        """Draw a goal position [m], world frame.
 
         α = 2π u₁,  r = span √u₂ + minimum,  goal = (r sin α, r cos α, 0.05)
         """
@@ -249,7 +249,7 @@ class GoalTask:
         )
 
     def observe(self, robot: RobotState, goal: Goal) -> Float[Array, " obs"]:
-        """The observation in the configured layout, see `WORLD` and `EGOCENTRIC`."""
+        """Return the observation in the configured layout, see `WORLD` and `EGOCENTRIC`."""
         position_w = self.goal_position(goal)
         if self.config.observation == "world":
             return jnp.concatenate([*robot, position_w])
@@ -275,24 +275,24 @@ class GoalTask:
         return progress, {"progress": progress}
 
     def terminated(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """The episode ends where it succeeds."""
+        """Return whether the episode has succeeded, which ends it."""
         return self.success(robot, goal)
 
     def success(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Whether the goal is nearer than the success radius."""
+        """Return whether the goal is nearer than the success radius."""
         return self.distance(robot, goal) < self.config.success_radius
 
     def goal_position(self, goal: Goal) -> Float[Array, "3"]:
-        """The goal itself."""
+        """Return the goal itself."""
         return goal
 
     def move_goal(self, goal: Goal, position_w: Float[Array, "3"]) -> Goal:
-        """The position itself; a task that draws more has to say where in its draw that goes."""
+        """Return the position itself; a task that draws more says where in its draw it goes."""
         del goal
         return position_w
 
     def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]:
-        """The red cube stands on the goal."""
+        """Return the place of the red cube, which stands on the goal."""
         return {"goal": self.goal_position(goal)}
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
@@ -305,7 +305,7 @@ class GoalTask:
 
 
 def make_task(config: TaskConfig) -> Task:
-    """Imports and builds the task that a configuration names.
+    """Import and builds the task that a configuration names.
 
     Args:
       config: its `name` is `package.module:Class`.

@@ -1,4 +1,4 @@
-"""What Brax's training wrappers lack: honest episode ends, and a new goal in every episode.
+"""Wrappers for training: termination and truncation apart, and a new goal in every episode.
 
 Brax's `AutoResetWrapper` puts back the first state it ever saw, goal included. Here each
 episode is drawn afresh from the environment's own key. The wrappers see one robot;
@@ -33,7 +33,7 @@ RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 
 
 class _Env(Protocol):
-    """What a wrapper asks of what it wraps."""
+    """The interface that a wrapper needs of what it wraps."""
 
     def reset(self, rng: UInt32[Array, "2"]) -> State: ...
 
@@ -46,7 +46,7 @@ def wrap_for_training(
     action_repeat: int = 1,
     randomization_fn: RandomizationFn | None = None,
 ) -> Env:
-    """Wraps an environment as trainers need it, batched, with what its configuration draws.
+    """Wrap an environment as trainers need it, batched, with what its configuration draws.
 
     The signature is that of Brax's `wrap_env_fn`: pass this function to `ppo.train`.
 
@@ -81,7 +81,7 @@ class EpisodeWrapper(Wrapper):
     env: _Env
 
     def __init__(self, env: Env, episode_length: int, action_repeat: int = 1) -> None:
-        """Wraps one environment.
+        """Wrap one environment.
 
         Args:
           env: unbatched.
@@ -93,7 +93,7 @@ class EpisodeWrapper(Wrapper):
         self.action_repeat = action_repeat
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begins an episode with empty books."""
+        """Begin an episode with empty books."""
         state = self.env.reset(rng)
         zero = jnp.zeros(())
         metrics = {**state.metrics, "nonfinite_worlds": zero}
@@ -112,7 +112,7 @@ class EpisodeWrapper(Wrapper):
         return state.replace(metrics=metrics, info=info)
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """One step, `action_repeat` environment steps unless the episode ends before."""
+        """Make one step: `action_repeat` environment steps, unless the episode ends before."""
         begins = state.info["episode_done"] > 0
         steps = jnp.where(begins, 0.0, state.info["steps"])
         nstate, length = self._repeat(state, action, steps)
@@ -176,7 +176,7 @@ class EpisodeWrapper(Wrapper):
 
 
 class NewEpisodeWrapper(Wrapper):
-    """Where an episode ends, the next one begins, with everything about it drawn anew.
+    """A wrapper that begins the next episode where one ends, with everything about it drawn anew.
 
     `reward`, `done`, `metrics` and `info` still tell of the step that ended the old episode;
     physics, goal, `obs` and the robot's `hardware` are already the new one's.
@@ -185,7 +185,7 @@ class NewEpisodeWrapper(Wrapper):
     env: _Env
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """One step, and a reset where it ended the episode."""
+        """Make one step, and a reset where it ended the episode."""
         state = self.env.step(state, action)
         fresh = self.env.reset(state.key)
         begun = _select(state.done > 0, _episode(fresh), _episode(state))
@@ -204,7 +204,7 @@ class RandomizedVmapWrapper(Wrapper):
         chain: Callable[[JetBotEnv], Any],
         randomization_fn: RandomizationFn,
     ) -> None:
-        """Draws the models.
+        """Draw the models.
 
         Args:
           env: one environment.
@@ -216,7 +216,7 @@ class RandomizedVmapWrapper(Wrapper):
         self._models, self._axes = randomization_fn(env.mjx_model)
 
     def reset(self, rng: UInt32[Array, "n 2"]) -> State:
-        """Begins an episode in every environment."""
+        """Begin an episode in every environment."""
 
         def reset(model: mjx.Model, rng: UInt32[Array, "2"]) -> State:
             return self._chain(self.env.with_model(model)).reset(rng)
@@ -224,7 +224,7 @@ class RandomizedVmapWrapper(Wrapper):
         return jax.vmap(reset, in_axes=(self._axes, 0))(self._models, rng)
 
     def step(self, state: State, action: Float[Array, "n 2"]) -> State:
-        """One step of every environment."""
+        """Step every environment."""
 
         def step(model: mjx.Model, state: State, action: Float[Array, "2"]) -> State:
             return self._chain(self.env.with_model(model)).step(state, action)
@@ -233,12 +233,12 @@ class RandomizedVmapWrapper(Wrapper):
 
 
 def _episode(state: State) -> tuple[PyTree, ...]:
-    """What belongs to an episode, as against the step that led here."""
+    """Return what belongs to an episode, as against the step that led here."""
     return state.pipeline_state, state.obs, state.goal, state.key, state.hardware
 
 
 def _discarded(state: State) -> State:
-    """A state in place of one that is not finite: where the world was, and no step taken."""
+    """Return a state in place of a non-finite one: the state before the step, and no step taken."""
     zeros = jax.tree.map(jnp.zeros_like, state.metrics)
     return state.replace(
         reward=jnp.zeros(()),

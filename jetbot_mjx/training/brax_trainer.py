@@ -28,7 +28,7 @@ class _Enough(Exception):
 
 
 def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
-    """Trains until the end, or until the recorder has enough.
+    """Train until the end, or until the recorder has enough.
 
     Args:
       config: the run; `check_devices` has passed it.
@@ -79,7 +79,7 @@ def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
 
 
 def _figures(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
-    """Brax's figures under this project's names."""
+    """Return Brax's metrics under this project's names."""
     brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     figures = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
     if "entropy_loss" in brax and entropy_cost > 0:
@@ -89,7 +89,7 @@ def _figures(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float
 
 @contextlib.contextmanager
 def device_put_replicated() -> Iterator[None]:
-    """Lends JAX ≥ 0.10 the function that it dropped and that Brax 0.14.2 still calls.
+    """Lend JAX ≥ 0.10 the function that it dropped and that Brax 0.14.2 still calls.
 
     The mesh axis is named `i`, as in Brax's `pmap`: under any other name the shardings of
     the first and the later epochs differ, and the epoch compiles twice.

@@ -1,4 +1,4 @@
-"""What trainers and those who record them agree on: a trainer knows nothing of files."""
+"""The interface between trainers and recorders: a trainer knows nothing of files."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -8,7 +8,7 @@ from jetbot_mjx.agents.ppo import Fault, TrainState
 
 
 class Progress(NamedTuple):
-    """Where the training of one seed stands."""
+    """The progress of the training of one seed."""
 
     env_steps: int
     """Environment steps so far."""
@@ -23,10 +23,10 @@ class Progress(NamedTuple):
 
 
 class Recorder:
-    """Who listens to a trainer; this one lets everything pass."""
+    """A listener of a trainer; this one ignores everything."""
 
     def report(self, progress: Sequence[Progress]) -> bool:
-        """Takes the state of every seed at the end of an interval.
+        """Take the state of every seed at the end of an interval.
 
         Returns:
           Whether to go on.
@@ -35,13 +35,13 @@ class Recorder:
         return True
 
     def pause(self, progress: Sequence[Progress]) -> None:
-        """Takes the state of every seed where training was asked to stop between two reports."""
+        """Take the state of every seed where training was asked to stop between two reports."""
 
     def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
-        """Takes what is known between two reports: the mean of all seeds, and the time spent."""
+        """Take what is known between two reports: the mean of all seeds, and the time spent."""
 
     def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None:
-        """Takes a world that blew up before that many environment steps."""
+        """Take a world that blew up before that many environment steps."""
 
     def compiled(self) -> None:
-        """Hears that the training step is compiled."""
+        """Hear that the training step is compiled."""

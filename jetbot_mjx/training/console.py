@@ -1,4 +1,4 @@
-"""What the terminal says while a policy trains: plain lines, for people, pipes and logs."""
+"""Print the progress of a training: plain lines, for people, pipes and logs."""
 
 import math
 import sys
@@ -20,30 +20,30 @@ _SECONDS_BETWEEN_LINES = 10.0
 
 
 class Terminal(Protocol):
-    """Who tells people how a training goes."""
+    """The interface of what shows the progress of a training."""
 
     def begin(self) -> None:
-        """Shows that compiling has begun."""
+        """Show that compiling has begun."""
         ...
 
     def phase(self, name: str) -> None:
-        """Hears which of `PHASES` begins."""
+        """Hear which of `PHASES` begins."""
         ...
 
     def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
-        """Takes the figures of every seed at the end of an interval."""
+        """Take the figures of every seed at the end of an interval."""
         ...
 
     def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
-        """Takes what is known between two reports: the mean of all seeds."""
+        """Take what is known between two reports: the mean of all seeds."""
         ...
 
     def say(self, text: str) -> None:
-        """Prints a line of its own."""
+        """Print a line of its own."""
         ...
 
     def close(self) -> None:
-        """Leaves the terminal as it was, with the last figures on it."""
+        """Leave the terminal as it was, with the last figures on it."""
         ...
 
 
@@ -51,7 +51,7 @@ class Lines:
     """A line for every interval, with what is left to wait."""
 
     def __init__(self, total_steps: int, stream: TextIO | None = None) -> None:
-        """Prepares the lines.
+        """Prepare the lines.
 
         Args:
           total_steps: environment steps of the whole training.
@@ -62,14 +62,14 @@ class Lines:
         self._last_line = -math.inf
 
     def begin(self) -> None:
-        """Says that compiling has begun: nothing else comes for a while."""
+        """Say that compiling has begun: nothing else comes for a while."""
         self.say("compiling ...")
 
     def phase(self, name: str) -> None:
-        """Lets it pass: the lines tell."""
+        """Let it pass: the lines tell."""
 
     def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
-        """Prints one line, of several seeds the mean."""
+        """Print one line, of several seeds the mean."""
         mean = mean_of(figures)
         wall = mean.get("time/wall_seconds") or 0.0
         parts = [f"{env_steps:>12,} steps"]
@@ -85,7 +85,7 @@ class Lines:
         self._print(parts)
 
     def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
-        """Prints a line between two reports, unless the last one is still new."""
+        """Print a line between two reports, unless the last one is still new."""
         if time.monotonic() - self._last_line < _SECONDS_BETWEEN_LINES:
             return
         self._print(
@@ -103,7 +103,7 @@ class Lines:
         return f"ETA {left:5.0f} s"
 
     def say(self, text: str) -> None:
-        """Prints a line of its own."""
+        """Print a line of its own."""
         self._print([text])
 
     def _print(self, parts: Sequence[str]) -> None:

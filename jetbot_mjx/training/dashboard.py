@@ -30,7 +30,7 @@ _PATIENCE = 1.0
 def open_terminal(
     run_dirs: Sequence[Path], total_steps: int, histories: Sequence[Sequence[History]]
 ) -> Terminal:
-    """The dashboard where standard output is a terminal that people watch, otherwise lines.
+    """Return the dashboard where standard output is a terminal that people watch, otherwise lines.
 
     Rich's conventions hold: `TERM=dumb` and `TTY_INTERACTIVE=0` mean lines, `NO_COLOR` no colours.
 
@@ -59,7 +59,7 @@ class Dashboard:
     """
 
     def __init__(self, board: Board, console: Console) -> None:
-        """Prepares it.
+        """Prepare it.
 
         Args:
           board: what to show.
@@ -75,29 +75,29 @@ class Dashboard:
         self._replaced: dict[str, tuple[TextIO, _Lines]] = {}
 
     def begin(self) -> None:
-        """Takes its place on the terminal."""
+        """Take its place on the terminal."""
         self.phase(COMPILING)
         self._drawing = True
         self._redirect()
         self._thread.start()
 
     def phase(self, name: str) -> None:
-        """Shows which phase it is, and how long it has lasted."""
+        """Show which phase it is, and how long it has lasted."""
         with self._lock:
             self._board.phase(name)
 
     def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
-        """Shows a report."""
+        """Show a report."""
         with self._lock:
             self._board.write(env_steps, figures)
 
     def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
-        """Shows what is known between two reports."""
+        """Show what is known between two reports."""
         with self._lock:
             self._board.tell(env_steps, figures, env_steps_per_second)
 
     def say(self, text: str) -> None:
-        """Has lines scroll above the board."""
+        """Let lines scroll above the board."""
         with self._lock:
             if self._drawing:
                 self._lines.append(text)
@@ -107,12 +107,12 @@ class Dashboard:
         print(text, file=self._console.file, flush=True)
 
     def wait(self) -> None:
-        """Waits until all that was said is drawn, or until the terminal has had its time."""
+        """Wait until all that was said is drawn, or until the terminal has had its time."""
         if threading.current_thread() is not self._thread:
             self._drawn.wait(_PATIENCE)
 
     def close(self) -> None:
-        """Draws it for the last time."""
+        """Draw it for the last time."""
         if self._thread.ident is None:
             return
         for _, lines in self._replaced.values():
@@ -201,7 +201,7 @@ class _Lines:
         self._dashboard.wait()
 
     def end(self) -> None:
-        """Takes what was begun for a line."""
+        """Take what was begun for a line."""
         if self._begun:
             self.write("\n")
 
@@ -210,7 +210,7 @@ class _Lines:
 
 
 def _in_foreground(stream: Any) -> bool:
-    """Whether a shell has given its terminal to this process, or there is no shell."""
+    """Return whether a shell has given its terminal to this process, or there is no shell."""
     try:
         return os.tcgetpgrp(stream.fileno()) == os.getpgrp()
     except (OSError, ValueError):

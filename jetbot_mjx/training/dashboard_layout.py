@@ -1,4 +1,4 @@
-"""What there is to see while a policy trains, laid out by rich."""
+"""Lay out the dashboard of a training with rich."""
 
 import os
 import statistics
@@ -24,7 +24,7 @@ _NONE = "-"
 
 
 def sparkline(rates: Sequence[float], width: int) -> str:
-    """A curve of rates from 0 to 1 as a line of blocks, at most so many."""
+    """Return a curve of rates from 0 to 1 as a line of blocks, at most so many."""
     if len(rates) > width:
         last = len(rates) - 1
         rates = [rates[round(place * last / max(1, width - 1))] for place in range(width)]
@@ -32,7 +32,7 @@ def sparkline(rates: Sequence[float], width: int) -> str:
 
 
 class Board:
-    """What there is to see, and how it looks; for one thread at a time."""
+    """The content of the dashboard and its layout; for one thread at a time."""
 
     def __init__(
         self,
@@ -41,7 +41,7 @@ class Board:
         seeds: Sequence[str],
         histories: Sequence[Sequence[History]],
     ) -> None:
-        """An empty board, or one with what was logged before.
+        """Return an empty board, or one with what was logged before.
 
         Args:
           title: of the run.
@@ -68,14 +68,14 @@ class Board:
         self._spent: dict[str, float] = dict.fromkeys(PHASES, 0.0)
 
     def phase(self, name: str | None) -> None:
-        """Begins a phase; None: all are over."""
+        """Begin a phase; None: all are over."""
         now = time.monotonic()
         if self._phase is not None:
             self._spent[self._phase] += now - self._since
         self._phase, self._since = name, now
 
     def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
-        """Takes a report."""
+        """Take a report."""
         self._reported = figures
         for rates, one in zip(self._rates, figures, strict=True):
             if (rate := one.get("eval/success_rate")) is not None:
@@ -86,7 +86,7 @@ class Board:
         self._learn(env_steps, mean, mean.get("time/env_steps_per_second"))
 
     def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
-        """Takes what is known between two reports."""
+        """Take what is known between two reports."""
         self._learn(env_steps, figures, env_steps_per_second)
 
     def _learn(self, env_steps: int, mean: Figures, speed: float | None) -> None:
@@ -104,7 +104,7 @@ class Board:
             self._end = now + left * (now - began) / (env_steps - first)
 
     def render(self, memory: str) -> RenderableType:
-        """Lays it out.
+        """Lay it out.
 
         Args:
           memory: from `memory_in_use`.
@@ -232,7 +232,7 @@ class _Curve:
 
 
 def memory_in_use() -> str:
-    """Of the first device where it counts its own, otherwise of this process; empty: unknown."""
+    """Return the memory in use, of the first device or of this process; empty: unknown."""
     stats = jax.local_devices()[0].memory_stats()
     if stats:
         used, limit = (stats.get(key, 0) / 2**30 for key in ("bytes_in_use", "bytes_limit"))

@@ -33,7 +33,7 @@ _USER_ERROR = 2
 
 
 def check(config: Config) -> None:
-    """Refuses what several processes cannot do.
+    """Refuse what several processes cannot do.
 
     Args:
       config: the run.
@@ -50,7 +50,7 @@ def check(config: Config) -> None:
 
 
 def join() -> None:
-    """Joins the other processes; to be called before JAX is asked for a device.
+    """Join the other processes; to be called before JAX is asked for a device.
 
     Slurm and Open MPI tell JAX who they are; elsewhere three environment variables do:
     `JAX_COORDINATOR_ADDRESS` (`host:port` of the first process), `JAX_NUM_PROCESSES` and
@@ -80,17 +80,17 @@ def join() -> None:
 
 
 def leave() -> None:
-    """Waits until every process has come here, and parts; nothing where there is one alone."""
+    """Wait until every process has come here, and parts; nothing where there is one alone."""
     jax.distributed.shutdown()
 
 
 def is_first() -> bool:
-    """Whether this is the process that writes and prints."""
+    """Return whether this is the process that writes and prints."""
     return jax.process_index() == 0
 
 
 def exchange(*values: int) -> Int[np.ndarray, "processes n"]:
-    """Tells all processes a few numbers, and hears theirs; every process must call it.
+    """Tell all processes a few numbers, and hears theirs; every process must call it.
 
     Args:
       values: of this process.
@@ -105,7 +105,7 @@ def exchange(*values: int) -> Int[np.ndarray, "processes n"]:
 
 
 def led(action: Callable[[], int]) -> int:
-    """Lets the first process do something, and tells the others what came of it.
+    """Let the first process do something, and tells the others what came of it.
 
     Args:
       action: done by the first process alone; returns no negative number.
@@ -133,7 +133,7 @@ def led(action: Callable[[], int]) -> int:
 
 
 def from_first(trees: Sequence[PyTree], template: PyTree, count: int) -> list[PyTree]:
-    """Hands what the first process holds to all, bit by bit.
+    """Hand what the first process holds to all, bit by bit.
 
     Args:
       trees: arrays on the host; only the first process's count.
@@ -161,7 +161,7 @@ def from_first(trees: Sequence[PyTree], template: PyTree, count: int) -> list[Py
 
 
 def _whereabouts() -> tuple[str | None, int | None, int | None]:
-    """What the environment says; None for what Slurm or Open MPI is to say."""
+    """Return what the environment says; None for what Slurm or Open MPI is to say."""
     address = os.environ.get(_ADDRESS)
     if address is not None:
         host, colon, port = address.rpartition(":")

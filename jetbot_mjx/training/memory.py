@@ -1,4 +1,4 @@
-"""How much of a device's memory a training takes, told from shapes before anything is compiled.
+"""Estimate a training's device memory from shapes, before anything is compiled.
 
 A device holds a copy of the parameters and its share of the environments. A training step then
 needs room for what it collects, and collects and learns one after the other: the larger of the
@@ -39,7 +39,7 @@ _PROGRAMS = 112 * 2**20
 
 
 class Sizes(NamedTuple):
-    """What one of each takes [bytes]."""
+    """The memory that one of each takes [bytes]."""
 
     environment: int
     """The state of an environment."""
@@ -58,7 +58,7 @@ class Sizes(NamedTuple):
 
 
 class Footprint(NamedTuple):
-    """What a training takes on each device [bytes]."""
+    """The memory that a training takes on each device [bytes]."""
 
     num_envs: int
     """Environments, all devices together."""
@@ -77,18 +77,18 @@ class Footprint(NamedTuple):
 
     @property
     def counted(self) -> int:
-        """What its arrays take at the fullest moment."""
+        """Return what its arrays take at the fullest moment."""
         most = max(self.collecting, self.learning, self.evaluation)
         return self.parameters + self.environments + most
 
     @property
     def total(self) -> int:
-        """What a device has to have for it: all that is counted, and what comes on top."""
+        """Return what a device has to have for it: all that is counted, and what comes on top."""
         return int(_TAKEN * self.counted) + _PROGRAMS
 
 
 def sizes(config: Config, env: JetBotEnv) -> Sizes:
-    """Asks JAX for the shapes of a training; nothing is computed.
+    """Ask JAX for the shapes of a training; nothing is computed.
 
     Args:
       config: the run.
@@ -129,7 +129,7 @@ def _physics(config: Config, env: JetBotEnv) -> int:
 
 
 def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
-    """What a training takes on each device.
+    """Return what a training takes on each device.
 
     Args:
       config: the run; `num_envs` and `batch_size` may be others than those of `each`.
@@ -166,7 +166,7 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
 
 
 def resized(config: Config, factor: float) -> Config | None:
-    """The same training with more or fewer environments, and minibatches that go with them.
+    """Return the same training with more or fewer environments, and minibatches that go with them.
 
     Args:
       config: the run.
@@ -183,7 +183,7 @@ def resized(config: Config, factor: float) -> Config | None:
 
 
 def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[Footprint]:
-    """Sizes of a training by factors of two: from a quarter up to the first that does not fit.
+    """Yield sizes by factors of two, from a quarter up to the first that does not fit.
 
     Args:
       config: the run.
@@ -206,7 +206,7 @@ def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[F
 def next_that_fits(
     config: Config, each: Sizes, device_count: int, limit: int | None
 ) -> Footprint | None:
-    """The largest training that is smaller than this by a factor of two or more, and fits.
+    """Return the largest training that is smaller than this by a factor of two or more, and fits.
 
     Args:
       config: the run.
@@ -227,7 +227,7 @@ def next_that_fits(
 
 
 def advice(config: Config, env: JetBotEnv, device_count: int, limit: int | None) -> str:
-    """What to say of a training that ran out of memory.
+    """Return what to say of a training that ran out of memory.
 
     Args:
       config: the run.
@@ -257,7 +257,7 @@ def advice(config: Config, env: JetBotEnv, device_count: int, limit: int | None)
 
 
 def device_memory() -> int | None:
-    """What this process's first device has for JAX [bytes]; None: it does not say."""
+    """Return what this process's first device has for JAX [bytes]; None: it does not say."""
     device: Any = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}

@@ -36,7 +36,7 @@ class Program:
     """One configuration's training, over all devices and all its seeds."""
 
     def __init__(self, config: Config, env: JetBotEnv, programs: Programs | None = None) -> None:
-        """Prepares the program; nothing is compiled yet.
+        """Prepare the program; nothing is compiled yet.
 
         Args:
           config: the run; `check_devices` has passed it.
@@ -70,11 +70,11 @@ class Program:
         self._whole = NamedSharding(self._mesh, PartitionSpec())
 
     def template(self) -> TrainState:
-        """Shapes and dtypes of one seed's state."""
+        """Return shapes and dtypes of one seed's state."""
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._shapes)
 
     def init(self) -> TrainState:
-        """The state before the first step, on the devices."""
+        """Return the state before the first step, on the devices."""
         program = self._compiled_init
         if program is None:
             jitted = jax.jit(self._init, in_shardings=self._whole, out_shardings=self._shardings)
@@ -85,7 +85,7 @@ class Program:
         return jax.vmap(lambda seed: self._ppo.init(jax.random.PRNGKey(seed)))(seeds)
 
     def put(self, states: Sequence[TrainState]) -> TrainState:
-        """States of all seeds from the host, onto the devices."""
+        """Put states of all seeds from the host onto the devices."""
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
         return jax.tree.map(
             lambda x, sharding: jax.make_array_from_callback(x.shape, sharding, x.__getitem__),
@@ -94,7 +94,7 @@ class Program:
         )
 
     def get(self, state: TrainState) -> list[TrainState]:
-        """States of all seeds, on the host."""
+        """Return states of all seeds, on the host."""
         if jax.process_count() > 1:
             # What lies on another process's devices cannot be fetched.
             state = jax.jit(_identity, out_shardings=self._whole)(state)
@@ -102,7 +102,7 @@ class Program:
         return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
 
     def compile(self) -> Callable[[TrainState, int, bool], tuple[TrainState, Fault]]:
-        """Compiles the training step, for once and for all: another shape is an error, not a wait.
+        """Compile the training step, for once and for all: another shape is an error, not a wait.
 
         Returns:
           A function of (state, training steps, whether the tally starts anew), which takes the
@@ -116,7 +116,7 @@ class Program:
         return call
 
     def trace(self) -> jax.stages.Traced:
-        """The training step for the devices, not yet compiled."""
+        """Return the training step for the devices, not yet compiled."""
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
             state, fault = jax.vmap(self._ppo.advance, in_axes=(0, None, None))(
@@ -150,7 +150,7 @@ def train(
     preemption: Preemption,
     states: Sequence[TrainState] | None = None,
 ) -> None:
-    """Trains until the end, until the recorder has enough, or until a signal comes.
+    """Train until the end, until the recorder has enough, or until a signal comes.
 
     Args:
       config: the run.
@@ -239,14 +239,14 @@ def _identity(state: TrainState) -> TrainState:
 
 
 class _Pace:
-    """How many training steps a call may make."""
+    """The number of training steps that a call may make."""
 
     def __init__(self, seconds: float) -> None:
         self._seconds = seconds
         self.steps = 1
 
     def learn(self, steps: int, seconds: float) -> None:
-        """Draws the consequence from the last call."""
+        """Draw the consequence from the last call."""
         self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
 
 
@@ -288,7 +288,7 @@ def _progress(config: Config, state: TrainState, seconds: float) -> Progress:
 
 
 def _figures(config: Config, tally: Mapping[str, Any]) -> dict[str, float]:
-    """Means and counts from sums; empty before the first step."""
+    """Return means and counts from sums; empty before the first step."""
     sums = {name: float(value) for name, value in tally.items()}
     steps, episodes = sums["training_steps"], sums["rollout/episodes"]
     if steps == 0:

@@ -30,7 +30,7 @@ class Preemption:
     """
 
     def __init__(self, notice: float) -> None:
-        """Prepares to listen.
+        """Prepare to listen.
 
         Args:
           notice: how long after a signal the process may still be there [s].
@@ -42,15 +42,15 @@ class Preemption:
 
     @property
     def requested(self) -> bool:
-        """Whether a signal has come."""
+        """Return whether a signal has come."""
         return self._requested.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Waits for a signal, and tells whether one has come."""
+        """Wait for a signal, and tells whether one has come."""
         return self._requested.wait(seconds)
 
     def __enter__(self) -> Self:
-        """Begins to listen; does nothing outside the main thread, where Python allows none."""
+        """Begin to listen; does nothing outside the main thread, where Python allows none."""
         self._former = {}
         if threading.current_thread() is not threading.main_thread():
             return self
@@ -66,7 +66,7 @@ class Preemption:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stops listening and puts the former handlers back."""
+        """Stop listening and puts the former handlers back."""
         if self._listener is None:
             return
         for number, handler in self._former.items():
@@ -80,7 +80,7 @@ class Preemption:
             self._clock.cancel()
 
     def _listen(self) -> None:
-        """Reads the numbers of the signals that come, until the end is told."""
+        """Read the numbers of the signals that come, until the end is told."""
         began = 0.0
         while (number := os.read(self._reader, 1)[0]) != _END:
             # Python tells of every signal that has a handler, whoever set it.
@@ -114,4 +114,4 @@ def _leave(reason: str) -> None:
 
 
 def _do_nothing(number: int, frame: FrameType | None) -> None:
-    """The pipe has told the thread already."""
+    """Do nothing: the pipe has told the thread already."""

@@ -1,4 +1,4 @@
-"""What a training leaves behind: judged, logged and saved at every report, seed by seed."""
+"""Evaluate, log and save a training at every report, seed by seed."""
 
 import contextlib
 import dataclasses
@@ -47,7 +47,7 @@ _METRICS = "metrics.jsonl"
 
 @dataclasses.dataclass
 class Standing:
-    """How far one seed has come; it travels in its checkpoints."""
+    """The progress of one seed, which is stored in its checkpoints."""
 
     env_steps: int = 0
     best_steps: int = 0
@@ -59,7 +59,7 @@ class Standing:
     """Spent on training in all processes so far."""
 
     def to_json(self) -> dict[str, Any]:
-        """As it is stored."""
+        """Return it as it is stored."""
         return {
             **vars(self),
             "best": self.best._asdict() if self.best else None,
@@ -68,7 +68,7 @@ class Standing:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> "Standing":
-        """As it was stored."""
+        """Read it as it was stored."""
         summaries = {
             name: Summary(**values[name]) if values.get(name) else None for name in ("best", "last")
         }
@@ -87,7 +87,7 @@ class RunRecorder(Recorder):
         resumption: Resumption | None = None,
         programs: Programs | None = None,
     ) -> None:
-        """Opens the logs and the checkpoint folders.
+        """Open the logs and the checkpoint folders.
 
         Args:
           config: the run.
@@ -149,12 +149,12 @@ class RunRecorder(Recorder):
 
     @property
     def standings(self) -> list[Standing]:
-        """Of each seed."""
+        """Return the progress of each seed."""
         return [seed.standing for seed in self._seeds]
 
     @property
     def complete(self) -> bool:
-        """Whether every seed has made all its steps, or reached `stop_at_success`."""
+        """Return whether every seed has made all its steps, or reached `stop_at_success`."""
         target = self._config.stop_at_success
         return all(
             one.env_steps >= self._total
@@ -168,17 +168,17 @@ class RunRecorder(Recorder):
         return self._earlier + time.perf_counter() - self._began
 
     def say(self, *lines: str) -> None:
-        """Passes lines to the terminal."""
+        """Pass lines to the terminal."""
         for line in lines:
             self._terminal.say(line)
 
     def begin(self, headline: str) -> None:
-        """Says what is trained, and that compiling has begun."""
+        """Say what is trained, and that compiling has begun."""
         self._terminal.say(headline)
         self._terminal.begin()
 
     def report(self, progress: Sequence[Progress]) -> bool:
-        """Judges, logs and saves every seed; tells whether it is worth going on."""
+        """Evaluate, logs and saves every seed; tells whether it is worth going on."""
         self._at(EVALUATING)
         # What a trainer compiles while it trains belongs to the time it reports.
         compiling = self._lap()
@@ -215,24 +215,24 @@ class RunRecorder(Recorder):
         return not self.complete
 
     def judge(self, params: PolicyParams) -> Summary:
-        """Figures of a policy on the fixed goals of training, with robots as it is trained on."""
+        """Evaluate a policy on the fixed goals of training, with robots as it is trained on."""
         episodes = self._evaluator.run(params, self._keys)
         return summarize(episodes, self._config.physics.ctrl_dt)
 
     def pause(self, progress: Sequence[Progress]) -> None:
-        """Saves every seed as it is."""
+        """Save every seed as it is."""
         self._terminal.phase(SAVING)
         for seed, one in zip(self._seeds, progress, strict=True):
             seed.save(one, {}, self.wall_seconds)
 
     def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
-        """Shows on the terminal that something happens."""
+        """Show on the terminal that something happens."""
         self._tell_first_step()
         steps = env_steps - self._seeds[0].standing.env_steps
         self._terminal.tell(env_steps, figures, steps / max(seconds, 1e-9))
 
     def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None:
-        """Keeps it for replay, and says where."""
+        """Keep it for replay, and says where."""
         path = self._seeds[seed_index].keep_fault(env_steps, fault)
         if path is not None:
             self._terminal.say(
@@ -241,13 +241,13 @@ class RunRecorder(Recorder):
             )
 
     def compiled(self) -> None:
-        """Waits for the first step to tell what came before it."""
+        """Wait for the first step to tell what came before it."""
         self._compiled = True
         self._at(TRAINING)
         self._awaiting_first_step = True
 
     def _film_seeds(self, progress: Sequence[Progress]) -> None:
-        """Comes last: whatever happens to a film, the log and the checkpoints are begun."""
+        """Render a video last: whatever happens to it, the log and the checkpoints are begun."""
         if self._film is None:
             return
         self._at(FILMING)
@@ -263,7 +263,7 @@ class RunRecorder(Recorder):
         self._lap()
 
     def _at(self, phase: str) -> None:
-        """Tells the terminal; what is done before the first training step is mostly compiling."""
+        """Tell the terminal; what is done before the first training step is mostly compiling."""
         self._terminal.phase(phase if self._compiled else COMPILING)
 
     def _tell_first_step(self) -> None:
@@ -286,11 +286,11 @@ class RunRecorder(Recorder):
         return seconds
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Enter."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Waits until all is on disk."""
+        """Wait until all is on disk."""
         self._terminal.phase(SAVING)
         with contextlib.ExitStack() as stack:
             stack.callback(self._terminal.close)
@@ -328,7 +328,7 @@ class _SeedRecorder:
     def report(
         self, progress: Progress, summary: Summary, figures: Figures, wall_seconds: float
     ) -> None:
-        """Logs, then saves: a checkpoint is never ahead of the log."""
+        """Log, then saves: a checkpoint is never ahead of the log."""
         standing = self.standing
         standing.env_steps, standing.last = progress.env_steps, summary
         if standing.best is None or summary.success_rate >= standing.best.success_rate:
@@ -338,7 +338,7 @@ class _SeedRecorder:
         self.save(progress, summary._asdict(), wall_seconds)
 
     def save(self, progress: Progress, judged: Mapping[str, Any], wall_seconds: float) -> None:
-        """Begins to write a checkpoint."""
+        """Begin to write a checkpoint."""
         self.standing.wall_seconds = wall_seconds
         trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}
         about = {**self._about, "figures": dict(judged), "progress": self.standing.to_json()}

@@ -34,7 +34,7 @@ _COMPLETE, _BEGINS, _RESUMES = range(3)
 
 
 class Result(NamedTuple):
-    """What a training leaves; of several processes the first tells, the others what all know."""
+    """The result of a training; of several processes only the first has all of it."""
 
     run_dir: Path
     run_dirs: list[Path]
@@ -50,7 +50,7 @@ class Result(NamedTuple):
 
     @property
     def best(self) -> Summary:
-        """Figures of the best checkpoint, of the first seed."""
+        """Return metrics of the best checkpoint, of the first seed."""
         assert self.standings[0].best is not None
         return self.standings[0].best
 
@@ -61,7 +61,7 @@ class Result(NamedTuple):
 
 
 def run(config: Config, run_dir: Path, programs: Programs | None = None) -> Result:
-    """Trains a policy, from the beginning or from where the folder's run was stopped.
+    """Train a policy, from the beginning or from where the folder's run was stopped.
 
     Args:
       config: the run.
@@ -154,7 +154,7 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: Prog
 def _open_folders(
     stack: contextlib.ExitStack, config: Config, run_dir: Path, program: ppo_trainer.Program
 ) -> tuple[Resumption | None, list[str]]:
-    """Makes the folders, and holds them until the stack ends.
+    """Make the folders, and holds them until the stack ends.
 
     Returns:
       Where the seeds stand, and what there is to say of it.
@@ -207,7 +207,7 @@ def _headline(config: Config, run_dir: Path) -> str:
 
 
 def summary(result: Result) -> str:
-    """What the terminal says at the end of a training."""
+    """Return the text that is printed at the end of a training."""
     lines = []
     for standing, folder, fingerprint in zip(
         result.standings, result.run_dirs, result.fingerprints, strict=True

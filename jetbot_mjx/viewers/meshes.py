@@ -1,4 +1,4 @@
-"""What of a MuJoCo model shows, as triangle meshes: for viewers that are not MuJoCo's own."""
+"""Convert the visible geoms of a MuJoCo model to triangle meshes, for other viewers."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -32,7 +32,7 @@ class Geom(NamedTuple):
 
 
 def shown_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
-    """All geoms that show, except planes and height fields.
+    """Return all geoms that show, except planes and height fields.
 
     Args:
       model: with all that shows.
@@ -58,7 +58,7 @@ def shown_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
 
 
 def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh | None:
-    """A geom's surface about its own centre; None for what is no closed surface."""
+    """Return a geom's surface about its own centre; None for what is no closed surface."""
     size = model.geom_size[index]
     match mujoco.mjtGeom(model.geom_type[index]):
         case mujoco.mjtGeom.mjGEOM_BOX:
@@ -81,7 +81,7 @@ def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh | None:
 
 
 def _rgba(model: mujoco.MjModel, index: int) -> tuple[float, float, float, float]:
-    """As MuJoCo draws it: the geom's own colour where it has one, else its material's."""
+    """Return the colour that MuJoCo draws: the geom's own, else its material's."""
     own, material = model.geom_rgba[index], model.geom_matid[index]
     if material >= 0 and np.allclose(own, _PLAIN):
         own = model.mat_rgba[material]

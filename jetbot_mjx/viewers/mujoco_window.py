@@ -21,7 +21,7 @@ _ARROWS = {265: (1, 0), 264: (-1, 0), 263: (0, 1), 262: (0, -1)}  # GLFW's numbe
 
 
 def require_window(remedy: str = _REMEDY) -> types.ModuleType:
-    """Looks whether a window could be opened, before anything that takes time.
+    """Look whether a window could be opened, before anything that takes time.
 
     Args:
       remedy: what to do where none can.
@@ -55,7 +55,7 @@ class Window:
         key_callback: Callable[[int], None] | None = None,
         remedy: str = _REMEDY,
     ) -> None:
-        """Opens the window.
+        """Open the window.
 
         Args:
           mj_model: with all that shows.
@@ -79,7 +79,7 @@ class Window:
             raise UserError(f"no window can be opened here ({error}): {remedy}") from None
 
     def is_running(self) -> bool:
-        """Whether nobody has closed it."""
+        """Return whether the window is open."""
         return self._viewer.is_running()
 
     def show(
@@ -88,7 +88,7 @@ class Window:
         markers: Mapping[str, Any],
         texts: tuple[str, str] | None = None,
     ) -> None:
-        """Shows one pose.
+        """Show one pose.
 
         Args:
           qpos: the robot's.
@@ -106,11 +106,11 @@ class Window:
         self._viewer.sync()
 
     def close(self) -> None:
-        """Closes it."""
+        """Close it."""
         self._viewer.close()
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Enter."""
         return self
 
     def __exit__(
@@ -119,12 +119,12 @@ class Window:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Closes the window."""
+        """Close the window."""
         self.close()
 
 
 def run(player: Player) -> None:
-    """Drives and shows, until the window is closed; the arrow keys ask for speed and turn.
+    """Drive and shows, until the window is closed; the arrow keys ask for speed and turn.
 
     Args:
       player: what drives.

@@ -72,7 +72,7 @@ class Renderer:
     """Draws a model in given poses; a context manager that frees its OpenGL context."""
 
     def __init__(self, mj_model: mujoco.MjModel, *, width: int = 480, height: int = 480) -> None:
-        """Opens an OpenGL context.
+        """Open an OpenGL context.
 
         Args:
           mj_model: with all that shows.
@@ -103,7 +103,7 @@ class Renderer:
         shadows: bool = True,
         trail_w: Float[np.ndarray, "n 3"] | None = None,
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Draws one pose.
+        """Draw one pose.
 
         Args:
           qpos: the robot's.
@@ -140,7 +140,7 @@ class Renderer:
             scene.ngeom += 1
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Enter."""
         return self
 
     def __exit__(
@@ -149,7 +149,7 @@ class Renderer:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Frees the context."""
+        """Free the context."""
         self._renderer.close()
 
 
@@ -161,7 +161,7 @@ def overview(
     above: float = 0.9,
     below: float = 0.9,
 ) -> mujoco.MjvCamera:
-    """The nearest camera that looks down along x and has all points in its frame.
+    """Return the nearest camera that looks down along x and has all points in its frame.
 
     A point at (x right, y up, z ahead) is below the upper border, of slope k, of a camera at height
     s and d behind the origin where y - s ≤ k (z + d), and above the lower one, of slope k', where
@@ -201,7 +201,7 @@ def overview(
 
 @functools.cache
 def find_backend() -> str:
-    """The first OpenGL back end that works here; one that `MUJOCO_GL` names is the only choice.
+    """Return the first OpenGL back end that works; only `MUJOCO_GL`'s where it names one.
 
     Returns:
       `egl`, `osmesa` or `glfw`.

@@ -38,7 +38,7 @@ class Player:
         agent: str = "policy",
         seed: int = 0,
     ) -> None:
-        """Loads the policy, compiles what all agents share, and draws a goal.
+        """Load the policy, compiles what all agents share, and draws a goal.
 
         Args:
           run_or_checkpoint: a run folder, or one checkpoint folder of it.
@@ -78,7 +78,7 @@ class Player:
         self._restart_clock()
 
     def tick(self) -> None:
-        """One control step; for a moment after an episode's end the robot stands still instead."""
+        """Make one control step; after an episode's end the robot stands still for a moment."""
         self._count += 1
         if self._hold > 0:
             self._hold -= 1
@@ -94,7 +94,7 @@ class Player:
             self._hold = round(_HOLD_SECONDS / self.env.dt)
 
     def advance(self) -> int:
-        """Takes the steps that are due in real time, none while paused.
+        """Take the steps that are due in real time, none while paused.
 
         Returns:
           How many.
@@ -109,15 +109,15 @@ class Player:
         return steps
 
     def wait(self) -> float:
-        """How long until the next step is due [s]."""
+        """Return how long until the next step is due [s]."""
         return self._clock.wait(time.monotonic())
 
     def reset(self) -> None:
-        """Begins the next episode: the robot at the origin, a new goal."""
+        """Begin the next episode: the robot at the origin, a new goal."""
         self._begin(self._state.key)
 
     def move_goal(self, x: float, y: float) -> bool:
-        """Puts the goal elsewhere on the floor; the time limit begins anew.
+        """Put the goal elsewhere on the floor; the time limit begins anew.
 
         Args:
           x: world frame [m].
@@ -135,7 +135,7 @@ class Player:
         return True
 
     def switch_checkpoint(self, env_steps: int) -> None:
-        """Lets another checkpoint of the run drive on from here.
+        """Let another checkpoint of the run drive on from here.
 
         Args:
           env_steps: by which it is named.
@@ -146,7 +146,7 @@ class Player:
         self._take(load_checkpoint(self.run_dir, env_steps))
 
     def drive(self, speed: float, yaw_rate: float) -> None:
-        """What the user asks of the robot while the agent is `keyboard`; held until changed.
+        """Return what the user asks of the robot while the agent is `keyboard`; held until changed.
 
         Args:
           speed: forward [m/s], clipped to what an action can ask for.
@@ -160,7 +160,7 @@ class Player:
         """Speed [m/s] and yaw rate [rad/s] that are asked for."""
 
     def nudge(self, ahead: int, left: int) -> None:
-        """Asks for a little more than before: one press of a key.
+        """Ask for a little more than before: one press of a key.
 
         Args:
           ahead: 1 faster, -1 slower.
@@ -174,7 +174,7 @@ class Player:
 
     @property
     def agent(self) -> str:
-        """Who drives, one of `AGENTS`."""
+        """Return who drives, one of `AGENTS`."""
         return AGENTS[self._agent]
 
     @agent.setter
@@ -221,7 +221,7 @@ class Player:
 
     @property
     def frames_per_second(self) -> float:
-        """Pictures that the viewer handed out within the last second [1/s]."""
+        """Return how many frames the viewer handed out within the last second [1/s]."""
         return self.frames.per_second(time.monotonic())
 
     def _take(self, checkpoint: Checkpoint) -> None:

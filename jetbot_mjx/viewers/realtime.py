@@ -10,7 +10,7 @@ class Clock:
     """Says how many control steps are due, at an even pace that does not drift."""
 
     def __init__(self, period: float, now: float) -> None:
-        """Starts.
+        """Start.
 
         Args:
           period: from one step to the next [s].
@@ -20,7 +20,7 @@ class Clock:
         self._next = now + period
 
     def due(self, now: float) -> int:
-        """How many steps to take, at most what is due within a tenth of a second.
+        """Return how many steps to take, at most what is due within a tenth of a second.
 
         A clock that was held up for longer goes on from here: what it missed is not made good.
         """
@@ -30,24 +30,24 @@ class Clock:
         return min(steps, most)
 
     def wait(self, now: float) -> float:
-        """How long until the next step is due [s]."""
+        """Return how long until the next step is due [s]."""
         return max(0.0, self._next - now)
 
 
 class Rate:
-    """How often something happened within the last second."""
+    """A counter of events within the last second."""
 
     def __init__(self) -> None:
-        """Begins with nothing."""
+        """Begin with nothing."""
         self._times: collections.deque[float] = collections.deque()
 
     def count(self, now: float, events: int = 1) -> None:
-        """Notes events that happened just now [s]."""
+        """Note events that happened just now [s]."""
         self._times.extend([now] * events)
         self.per_second(now)
 
     def per_second(self, now: float) -> float:
-        """Events of the second up to now [1/s]."""
+        """Return the number of events of the second up to now [1/s]."""
         while self._times and self._times[0] <= now - 1.0:
             self._times.popleft()
         return float(len(self._times))

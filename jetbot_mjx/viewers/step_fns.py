@@ -69,7 +69,7 @@ class Programs(NamedTuple):
 
 
 def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Programs:
-    """Prepares the programs; each compiles at its first use.
+    """Prepare the programs; each compiles at its first use.
 
     Args:
       env: one environment, unwrapped.
@@ -123,7 +123,7 @@ def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Program
 
 
 def why_goals_stay(env: JetBotEnv, state: State) -> str:
-    """Looks whether a task's goals can be moved, without moving one.
+    """Look whether a task's goals can be moved, without moving one.
 
     Args:
       env: with the task.

@@ -73,17 +73,17 @@ class Drive(NamedTuple):
         return min(round(seconds / self.dt), self.steps)
 
     def trail_w(self, step: int) -> Float[np.ndarray, "n 3"]:
-        """Points of the way until then [m], just above the floor."""
+        """Return the points of the way until then [m], just above the floor."""
         places = [*range(0, step, _TRAIL_STEPS), step]
         return np.pad(self.qpos[places][:, QPOS_XYZ][:, :2], ((0, 0), (0, 1)), constant_values=0.01)
 
     def distance(self, step: int) -> float:
-        """What is left to the goal then [m], on the floor."""
+        """Return what is left to the goal then [m], on the floor."""
         return float(np.linalg.norm(self.goal_w[:2] - self.qpos[step, QPOS_XYZ][:2]))
 
 
 def drives(env: JetBotEnv, episodes: Episodes, goal_numbers: Sequence[int]) -> list[Drive]:
-    """Takes recorded episodes apart.
+    """Take recorded episodes apart.
 
     Args:
       env: that they were driven in.
@@ -111,7 +111,7 @@ class Studio:
     """The cameras of a film; a context manager that frees them."""
 
     def __init__(self, env: JetBotEnv, side: int = VIEW, fps: float = FPS) -> None:
-        """Opens what drawing needs.
+        """Open what drawing needs.
 
         Args:
           env: whose robots are to be drawn.
@@ -130,7 +130,7 @@ class Studio:
             self._stack = stack.pop_all()
 
     def film_episode(self, drive: Drive) -> Iterator[Frame]:
-        """One episode: the chase camera, the onboard camera in its corner, beside the plan view.
+        """Draw one episode: chase camera, onboard camera in its corner, plan view beside them.
 
         Args:
           drive: the episode.
@@ -179,7 +179,7 @@ class Studio:
         return np.hstack([self._labelled(chase, drive, step), top])
 
     def _clock(self, shown: Sequence[Drive]) -> Iterator[float]:
-        """Moments of the frames [s], until the last robot has finished and stood for a while."""
+        """Return the times of the frames [s], until the last robot has finished for a while."""
         longest = max(drive.steps * drive.dt for drive in shown)
         count = math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps)
         return (frame / self._fps for frame in range(count + 1))
@@ -193,7 +193,7 @@ class Studio:
         return self._labelled(self._with_inset(view, drive, step, top=True), drive, step, heading)
 
     def _with_inset(self, view: Frame, drive: Drive, step: int, *, top: bool) -> Frame:
-        """Sets the onboard camera's picture, in a white frame, into a corner on the right."""
+        """Set the onboard camera's picture, in a white frame, into a corner on the right."""
         inset = self._inset.frame(drive.qpos[step], drive.markers, "onboard", shadows=False)
         inset = np.pad(inset, ((2, 2), (2, 2), (0, 0)), constant_values=255)
         height, width = inset.shape[:2]
@@ -222,11 +222,11 @@ class Studio:
         return np.asarray(image)
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Enter."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Frees the cameras."""
+        """Free the cameras."""
         self._stack.close()
 
 
@@ -236,7 +236,7 @@ def _font(size: float) -> Any:
 
 
 def _extent(drive: Drive) -> Float[np.ndarray, "n 3"]:
-    """Corners of all that an episode shows [m]."""
+    """Return the corners of all that an episode shows [m]."""
     way = np.pad(drive.qpos[:, QPOS_XYZ][:, :2], ((0, 0), (0, 1)))
     places = np.vstack([way, *(p * [1, 1, 0] for p in (drive.goal_w, *drive.markers.values()))])
     steps = np.meshgrid([-_AROUND, _AROUND], [-_AROUND, _AROUND], [0, _AROUND])
@@ -252,7 +252,7 @@ class EvaluationFilm:
     _SIDE, _FPS = 256, 12.5  # what a training can wait for
 
     def __init__(self, env: JetBotEnv, networks: ppo_networks.PPONetworks) -> None:
-        """Prepares the program; it compiles at its first use.
+        """Prepare the program; it compiles at its first use.
 
         Args:
           env: one environment, unwrapped.
@@ -262,7 +262,7 @@ class EvaluationFilm:
         self._evaluator = Evaluator(env, networks, record=True)
 
     def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
-        """Drives and films.
+        """Drive and films.
 
         Args:
           path: of the mp4 file.
@@ -280,14 +280,14 @@ class EvaluationFilm:
 
 
 def shrunk(frame: Frame, factor: float) -> Frame:
-    """A frame at a fraction of its size."""
+    """Return a frame at a fraction of its size."""
     image = Image.fromarray(frame)
     size = (round(image.width * factor), round(image.height * factor))
     return np.asarray(image.resize(size, Image.Resampling.BOX))
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
-    """Writes a film that every browser and notebook plays."""
+    """Write a film that every browser and notebook plays."""
     # In memory, where nothing can go wrong half-way.
     file = io.BytesIO()
     with iio.imopen(file, "w", plugin="pyav", extension=".mp4") as opened:
@@ -299,7 +299,7 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
 
 
 def write_gif(path: Path, frames: Sequence[Frame]) -> None:
-    """Writes an animation in one palette, each frame `GIF_STRIDE` times as long as a film's."""
+    """Write an animation in one palette, each frame `GIF_STRIDE` times as long as a film's."""
     # One palette for all frames: a palette each flickers.
     images = [Image.fromarray(frame) for frame in frames]
     sample = Image.fromarray(np.vstack(frames[:: max(1, len(frames) // 8)]))
@@ -320,7 +320,7 @@ def write_gif(path: Path, frames: Sequence[Frame]) -> None:
 
 
 def _write_whole(path: Path, content: bytes) -> None:
-    """Leaves the file that was there until the one in its place is complete."""
+    """Leave the file that was there until the one in its place is complete."""
     unfinished = path.with_name(f".{path.name}.unfinished")
     try:
         unfinished.write_bytes(content)

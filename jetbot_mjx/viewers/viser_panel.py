@@ -20,7 +20,7 @@ class Panel:
     def __init__(
         self, server: viser.ViserServer, player: Player, scene: Scene, ask: Callable[..., None]
     ) -> None:
-        """Builds the panel.
+        """Build the panel.
 
         Args:
           server: shows it.
@@ -46,7 +46,7 @@ class Panel:
         self.tell()
 
     def tell(self) -> None:
-        """Writes the present figures."""
+        """Write the present figures."""
         player = self._player
         ended = f", {player.outcome}" if player.shown.done else ""
         self.goals.value = f"{player.successes} of {player.episodes} reached"
@@ -81,7 +81,7 @@ class Panel:
         shadows.on_update(lambda _: self._ask(self._scene.cast_shadows, shadows.value))
 
     def _add_wheel(self) -> None:
-        """What a user drives with: two sliders, and keys that move them."""
+        """Return what a user drives with: two sliders, and keys that move them."""
         gui, player, limits = self._server.gui, self._player, self._player.env.config.task
         fastest = math.ceil(math.degrees(limits.max_yaw_rate))
         self.wheel = gui.add_folder("Drive")

@@ -36,10 +36,10 @@ _LAG_SECONDS = 0.35  # in which that camera makes up for most of a turn
 
 
 class Scene:
-    """What a page shows of a player, and what it hands back."""
+    """The scene of a page, and the events that it hands back."""
 
     def __init__(self, server: viser.ViserServer, player: Player, ask: Callable[..., None]) -> None:
-        """Builds the scene.
+        """Build the scene.
 
         Args:
           server: shows it.
@@ -66,7 +66,7 @@ class Scene:
         self.show()
 
     def show(self) -> None:
-        """Sends the pages the present moment."""
+        """Send the pages the present moment."""
         shown = self._player.shown
         self._data.qpos[:] = shown.qpos
         for name, position in shown.markers.items():
@@ -81,7 +81,7 @@ class Scene:
         self._player.frames.count(time.monotonic())
 
     def point(self, origin: Any, direction: Any, grabbed: Any = (0.0, 0.0, 0.0)) -> None:
-        """Asks for the goal to go where a ray meets a level plane, unless that is off the floor.
+        """Ask for the goal to go where a ray meets a level plane, unless that is off the floor.
 
         Args:
           origin: of the ray [m], world frame.
@@ -96,7 +96,7 @@ class Scene:
             self._ask(self._player.move_goal, float(goal_w[0]), float(goal_w[1]))
 
     def cast_shadows(self, cast: bool) -> None:
-        """Lets the sun cast shadows on a floor that takes them, or not."""
+        """Let the sun cast shadows on a floor that takes them, or not."""
         with self._server.atomic():
             self._sun.cast_shadow = cast
             self._plane.visible = cast
@@ -179,7 +179,7 @@ class Scene:
 
 
 def _lines(edge: float) -> bytes:
-    """A square's lattice [m] about the origin, flat on the floor, as binary glTF."""
+    """Return a square's lattice [m] about the origin, flat on the floor, as binary glTF."""
     scene = trimesh.Scene()
     for name, spacing, width, color in _LINES:
         count = int(edge / spacing)

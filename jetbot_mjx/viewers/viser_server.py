@@ -43,7 +43,7 @@ class _Server(viser.ViserServer):
     """viser's server without the tunnel through its makers' machine."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Opens nothing, whatever a page asks for."""
+        """Open nothing, whatever a page asks for."""
         del verbose
 
 
@@ -59,7 +59,7 @@ class Browser:
         allow: Sequence[str] = (),
         tell: Callable[[str], None],
     ) -> None:
-        """Opens the port and builds scene and panel.
+        """Open the port and builds scene and panel.
 
         Args:
           player: what drives.
@@ -91,13 +91,13 @@ class Browser:
         self._figures = Clock(1 / _FIGURES_PER_SECOND, time.monotonic())
 
     def run(self) -> None:
-        """Drives and shows, until it is interrupted."""
+        """Drive and shows, until it is interrupted."""
         while True:
             self.work()
             time.sleep(min(self._player.wait(), self._pictures.wait(time.monotonic())))
 
     def work(self) -> None:
-        """Does what was asked for, takes the steps that are due, and shows where that led."""
+        """Do what was asked for, take the steps that are due, and show the result."""
         while not self._asked.empty():
             self._asked.get()()
         self._player.advance()
@@ -107,12 +107,12 @@ class Browser:
             self.panel.tell()
 
     def close(self) -> None:
-        """Stops the server."""
+        """Stop the server."""
         with _quiet():
             self.server.stop()
 
     def __enter__(self) -> Self:
-        """Enters."""
+        """Enter."""
         return self
 
     def __exit__(
@@ -121,7 +121,7 @@ class Browser:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Stops the server."""
+        """Stop the server."""
         self.close()
 
     def _ask(self, do: Callable[..., Any], *given: Any) -> None:
@@ -132,7 +132,7 @@ class _Door:
     """Lets in this player's page and those that the user allows, and no other."""
 
     def __init__(self, host: str, allow: Sequence[str], tell: Callable[[str], None]) -> None:
-        """Stands nowhere yet.
+        """Create the object without a place yet.
 
         Args:
           host: the address that is listened on.
@@ -148,7 +148,7 @@ class _Door:
 
     @contextlib.contextmanager
     def at_viser(self) -> Iterator[None]:
-        """Gives the door to the server that viser starts inside, for which viser has no option."""
+        """Give the door to the server that viser starts inside, for which viser has no option."""
         module = websockets.asyncio.server
         serve = module.serve
 
@@ -216,7 +216,7 @@ def _is_address(name: str) -> bool:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Looks for a port to listen on.
+    """Look for a port to listen on.
 
     Args:
       host: the address to listen on.
@@ -253,7 +253,7 @@ def free_port(host: str, port: int | None) -> int:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keeps what viser tells on starting and stopping out of the terminal."""
+    """Keep what viser tells on starting and stopping out of the terminal."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

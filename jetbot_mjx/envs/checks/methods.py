@@ -1,4 +1,4 @@
-"""What a task's methods have to keep to: a check yields a line for everything that is wrong."""
+"""Checks of a task's methods; each yields a line for everything that is wrong."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -13,7 +13,7 @@ from jetbot_mjx.errors import UserError
 
 
 def layout(subject: Subject) -> Iterator[str]:
-    """Names, sizes, units, frames and smallest deviations of the observation."""
+    """Name, sizes, units, frames and smallest deviations of the observation."""
     fields = subject.task.layout
     if not isinstance(fields, tuple) or not all(isinstance(field, Field) for field in fields):
         yield "layout is no tuple of Field(name, size, unit, frame): make it one"
@@ -44,7 +44,7 @@ _LIKE = {"name": "goal_distance", "unit": "m, or 1 for none", "frame": "world or
 
 
 def purity(subject: Subject) -> Iterator[str]:
-    """Methods trace, twice into the same program, and leave `self` alone."""
+    """Check that methods trace, twice into the same program, and leave `self` alone."""
     task = subject.task
     before = _attributes(task)
     for name, function, arguments in _calls(subject):
@@ -68,7 +68,7 @@ def purity(subject: Subject) -> Iterator[str]:
 
 
 def _calls(subject: Subject) -> list[tuple[str, Callable[..., Any], tuple[Any, ...]]]:
-    """Every method that is traced, with arguments for it."""
+    """Return every method that is traced, with arguments for it."""
     task = subject.task
     try:
         before, after, goal, action = subject.example
@@ -96,13 +96,13 @@ def _traced(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[s
 
 
 def _attributes(task: Task) -> dict[str, str]:
-    """What `self` holds, to be compared."""
+    """Return what `self` holds, to be compared."""
     held = getattr(task, "__dict__", {})
     return {name: f"{type(value).__name__} {value!r}" for name, value in held.items()}
 
 
 def types(subject: Subject) -> Iterator[str]:
-    """Shapes and dtypes are those of the contract."""
+    """Check that shapes and dtypes are those of the contract."""
     task, (before, after, goal, action) = subject.task, subject.example
     yield from _weak("sample", jax.eval_shape(task.sample, first_key()))
     rewarded = jax.eval_shape(task.reward, before, after, goal, action)
@@ -146,7 +146,7 @@ _CAST = {"bool": ", such as a comparison gives", "float32": ", as .astype(jnp.fl
 
 
 def _weak(name: str, tree: Any) -> Iterator[str]:
-    """Types that Python's numbers bring along: a loop refuses them, or is compiled twice."""
+    """Find weak types of Python's numbers: a loop refuses them, or is compiled twice."""
     if any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(tree)):
         yield f"{name} has a weak type, of Python's own number: write jnp.float32(...) instead"
 
@@ -166,7 +166,7 @@ def _other_tree(name: str, got: Any, goal: Any) -> Iterator[str]:
 
 
 def draws(subject: Subject) -> Iterator[str]:
-    """A key gives one draw, and another key another."""
+    """Check that a key gives one draw, and another key another."""
     draw = jax.jit(jax.vmap(subject.task.sample))
     keys = jax.random.split(first_key(), DRAWS)
     first, again = (jax.device_get(draw(keys)) for _ in range(2))
@@ -217,7 +217,7 @@ def _is_finite(tree: Any) -> bool:
 
 
 def reward(subject: Subject) -> Iterator[str]:
-    """The terms add up to the reward."""
+    """Check that the terms add up to the reward."""
     for where, answers in subject.answers.items():
         reward = answers["reward"]
         total = sum(answers[TERMS].values(), np.zeros(DRAWS))

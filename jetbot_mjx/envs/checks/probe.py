@@ -37,7 +37,7 @@ _REMEDIES = {
 
 
 def in_one_line(error: Exception, who: str, homes: Sequence[Path]) -> str:
-    """What was raised, by whom and where.
+    """Return what was raised, by whom and where.
 
     Args:
       error: as it was raised.
@@ -83,7 +83,7 @@ class Subject:
     """A task, and what it says of ordinary and extreme robots."""
 
     def __init__(self, task: Task, config: Config) -> None:
-        """Asks nothing yet.
+        """Ask nothing yet.
 
         Args:
           task: to be tried.
@@ -92,7 +92,7 @@ class Subject:
         self.task, self.config = task, config
 
     def explain(self, error: Exception) -> str:
-        """What was raised somewhere inside the task, in one line."""
+        """Return what was raised somewhere inside the task, in one line."""
         inside = (
             frame.f_code.co_name
             for frame, _ in traceback.walk_tb(error.__traceback__)
@@ -109,12 +109,12 @@ class Subject:
 
     @functools.cached_property
     def goals(self) -> Any:
-        """What is drawn for `DRAWS` episodes."""
+        """Return what is drawn for `DRAWS` episodes."""
         return jax.jit(jax.vmap(self.task.sample))(jax.random.split(first_key(), DRAWS))
 
     @functools.cached_property
     def example(self) -> Case:
-        """A step in which the robot stands still."""
+        """Make a step in which the robot stands still."""
         quat = jnp.array([1.0, 0.0, 0.0, 0.0])
         robot = RobotState(jnp.array([0.1, 0.2, _AXLE_HEIGHT]), quat, *jnp.zeros((2, 3)))
         return Case(robot, robot, self.task.sample(first_key()), jnp.zeros(2))
@@ -158,18 +158,18 @@ class Subject:
 
     @functools.cached_property
     def answers(self) -> dict[str, dict[str, Any]]:
-        """All that the task says of the cases."""
+        """Return all that the task says of the cases."""
         ask = jax.jit(jax.vmap(ask_all(self.task)))
         return {where: jax.device_get(ask(case)) for where, case in self.cases.items()}
 
 
 def first_key() -> jax.Array:
-    """The key of all that is drawn here, or its root."""
+    """Return the key of all that is drawn here, or its root."""
     return jax.random.PRNGKey(0)
 
 
 def ask_all(task: Task) -> Callable[[Case], dict[str, Any]]:
-    """All that a task says of a step, as one function.
+    """Return all that a task says of a step, as one function.
 
     Args:
       task: to be asked.

@@ -1,4 +1,4 @@
-"""What a task has to keep to, checked without training: each fault in one line, with the remedy.
+"""Check a task without training: each fault in one line, with the remedy.
 
 The environment, the trainer and the reports rely on it. A task that breaks one of these rules
 often trains all the same, on something else than was meant.
@@ -36,7 +36,7 @@ class Finding(NamedTuple):
 
 
 def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
-    """Checks the task that a configuration names.
+    """Check the task that a configuration names.
 
     Args:
       config: the run.
@@ -112,7 +112,7 @@ def _scene(subject: Subject) -> Iterator[str]:
 
 
 def _touching(subject: Subject, solid: mujoco.MjModel) -> Iterator[str]:
-    """What the robot stands in when episodes begin."""
+    """Return what the robot stands in when episodes begin."""
     places = jax.device_get(jax.vmap(subject.task.markers)(subject.goals))
     data, touched = mujoco.MjData(solid), collections.Counter()
     for draw in range(DRAWS if solid.nmocap else 1):
@@ -135,7 +135,7 @@ def _mocap_bodies(model: mujoco.MjModel) -> set[str]:
 
 
 def _drive(subject: Subject) -> Iterator[str]:
-    """Steps of a training's environment, under random and extreme actions."""
+    """Step a training's environment under random and extreme actions."""
     env = make_env(subject.config)
     begun = jax.eval_shape(env.reset, first_key())
     gone = jax.eval_shape(env.step, begun, jax.eval_shape(lambda: jnp.zeros(2)))
@@ -169,7 +169,7 @@ def _drive(subject: Subject) -> Iterator[str]:
 
 
 def _changed(first: Any, last: Any) -> str:
-    """Which part of two states differs in more than its numbers; empty where none does."""
+    """Return which part of two states differs in more than its numbers; empty where none does."""
     sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
     for path in (*sides[0], *sides[1]):
         one, other = (side.get(path) for side in sides)
