@@ -24,7 +24,7 @@ from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.runs.run_dir import write_json
 from jetbot_mjx.training import ppo_trainer
-from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import RunRecorder
 
@@ -34,22 +34,22 @@ _UNJUDGED = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
 WAYS = {"off": "nobody listens", "logs": "logs", "saved": "logs, checkpoints"}
 
 
-class _Timed(Recorder):
+class _Timed(TrainerCallback):
     """Passes reports on, and notes when they have been dealt with."""
 
-    def __init__(self, recorder: Recorder) -> None:
+    def __init__(self, recorder: TrainerCallback) -> None:
         self._recorder = recorder
         self.began = self.ended = 0.0
 
-    def report(self, progress: Sequence[Progress]) -> bool:
-        going_on = self._recorder.report(progress)
+    def on_interval(self, progress: Sequence[Progress]) -> bool:
+        going_on = self._recorder.on_interval(progress)
         # From the end of the first report: what compiles comes before it.
         self.ended = time.perf_counter()
         self.began = self.began or self.ended
         return going_on
 
-    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
-        self._recorder.tell(env_steps, figures, seconds)
+    def on_progress(self, env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
+        self._recorder.on_progress(env_steps, metrics, seconds)
 
 
 class _Unjudged(RunRecorder):
@@ -80,7 +80,7 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
       Seconds of every training from its first report to its last, all of that on disk.
     """
     env = make_env(config)
-    program = ppo_trainer.Program(config, env)
+    program = ppo_trainer.CompiledTrainer(config, env)
     compiled = program.compile()
     program.compile = lambda: compiled
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
@@ -92,10 +92,10 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
     return seconds
 
 
-def _once(config: Config, env: Any, program: ppo_trainer.Program, way: str) -> float:
+def _once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, way: str) -> float:
     with tempfile.TemporaryDirectory() as folder, CompileClock() as clock:
 
-        def train(recorder: Recorder) -> _Timed:
+        def train(recorder: TrainerCallback) -> _Timed:
             timed = _Timed(recorder)
             ppo_trainer.train(config, program, timed, Preemption(config.preemption_notice))
             return timed

@@ -26,7 +26,7 @@ from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.training import brax_trainer, ppo_trainer
-from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 
 _LONGEST_HOLD = 24  # environment steps
@@ -66,7 +66,7 @@ def measure_physics(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times the physics alone."""
     row = _measure(prepare_physics(config, num_envs, sizes), sizes)
     # Here no wrapper ends episodes or mends worlds; only the last look tells of them.
-    return row._replace(episodes_per_env_step=None, nonfinite_worlds=None)
+    return row._replace(episodes_per_env_step=None, nonfinite_envs=None)
 
 
 def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
@@ -92,7 +92,7 @@ def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
     n_substeps = config.physics.n_substeps
     timed = Timed("switched", step, first, n_substeps=n_substeps, calls=sizes.unroll)
     row = _measure(timed, sizes)
-    return row._replace(episodes_per_env_step=None, nonfinite_worlds=None)
+    return row._replace(episodes_per_env_step=None, nonfinite_envs=None)
 
 
 def prepare_env(config: Config, num_envs: int, sizes: Sizes) -> Timed:
@@ -139,7 +139,7 @@ def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:
     return _measure(timed, sizes)
 
 
-class Listener(Recorder):
+class Listener(TrainerCallback):
     """Keeps neither logs nor checkpoints, only times."""
 
     def __init__(self, clock: CompileClock) -> None:
@@ -153,7 +153,7 @@ class Listener(Recorder):
         """Environment steps, seconds since the last report, compilation among them."""
         self.finite = True
 
-    def report(self, progress: Sequence[Progress]) -> bool:
+    def on_interval(self, progress: Sequence[Progress]) -> bool:
         """Notes the times."""
         one = progress[0]
         compiling = self._clock.lap()
@@ -167,7 +167,7 @@ class Listener(Recorder):
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times the resumable trainer by its own reports, the first intervals left out."""
     config = training_config(config, num_envs, sizes, trainer="resumable")
-    program = ppo_trainer.Program(config, make_env(config))
+    program = ppo_trainer.CompiledTrainer(config, make_env(config))
     preemption = Preemption(config.preemption_notice)
     return _time_trainer(
         "training", config, lambda to: ppo_trainer.train(config, program, to, preemption)
@@ -272,4 +272,4 @@ def _exploring_policy(config: Config, env: JetBotEnv) -> Callable[..., Any]:
 def _ended(info: PyTree) -> tuple[Array, Array]:
     """Where episodes ended, and where they did because the world blew up."""
     done = info["episode_done"]
-    return done, done * info["episode_metrics"]["nonfinite_worlds"]
+    return done, done * info["episode_metrics"]["nonfinite_envs"]

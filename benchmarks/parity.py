@@ -76,7 +76,7 @@ from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
 from jetbot_mjx.runs.run_dir import versions, write_json
 from jetbot_mjx.training import brax_trainer, ppo_trainer
-from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 
 _FOLDER = Path(__file__).resolve().parent
@@ -164,7 +164,7 @@ class Comparison(NamedTuple):
     verdict: str
 
 
-class _Judge(Recorder):
+class _Judge(TrainerCallback):
     """Judges every policy that a trainer reports."""
 
     def __init__(self, judge: Callable[[Any], float]) -> None:
@@ -172,7 +172,7 @@ class _Judge(Recorder):
         self.env_steps: list[int] = []
         self.success: list[float] = []
 
-    def report(self, progress: Sequence[Progress]) -> bool:
+    def on_interval(self, progress: Sequence[Progress]) -> bool:
         self.env_steps.append(progress[0].env_steps)
         self.success.append(self._judge(progress[0].params))
         return True
@@ -198,7 +198,7 @@ def train(
     if trainer == "brax":
         brax_trainer.train(config, env, recorder)
     else:
-        program = ppo_trainer.Program(config, env)
+        program = ppo_trainer.CompiledTrainer(config, env)
         ppo_trainer.train(config, program, recorder, Preemption(config.preemption_notice))
     seconds = time.perf_counter() - began
     return Curve(trainer, seed, recorder.env_steps, recorder.success, seconds)

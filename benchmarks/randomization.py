@@ -22,7 +22,7 @@ from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
@@ -57,7 +57,9 @@ class Judge:
         )
         self._evaluators = {
             "preset": Evaluator(env, networks),
-            "ranges": Evaluator(VariedEnv(env, ranges=config.randomization), networks),
+            "ranges": Evaluator(
+                DomainRandomizationWrapper(env, ranges=config.randomization), networks
+            ),
         }
         self._sweeper = Sweeper(env, networks, report_keys(goals))
 

@@ -20,7 +20,7 @@ from jetbot_mjx import cli
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.training.ppo_trainer import Program
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 _CONFIG = Path(__file__).resolve().parents[1] / "configs" / "real_jetbot.yaml"
 WAYS = ("off", "on")
@@ -68,7 +68,7 @@ class _Training:
     """A compiled training that goes on at every call."""
 
     def __init__(self, config: Config, steps: int) -> None:
-        program = Program(config, make_env(config))
+        program = CompiledTrainer(config, make_env(config))
         self._advance = program.compile()
         self._state = program.init()
         self._steps, self._size = steps, config.ppo.steps_per_training_step

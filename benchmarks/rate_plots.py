@@ -1,4 +1,4 @@
-"""Figures of rates: `python benchmarks/rate_plots.py FILE...` draws them again from their JSON."""
+"""Plot rates: `python benchmarks/rate_plots.py FILE...` draws them again from their JSON."""
 
 import json
 from collections.abc import Mapping, Sequence

@@ -184,8 +184,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     run(config, num_envs, sizes, rates=rates, report=report)
     for row in rows:
-        if row.nonfinite_worlds:
-            print(f"{row.rate} at {row.num_envs}: {row.nonfinite_worlds} worlds blew up")
+        if row.nonfinite_envs:
+            print(f"{row.rate} at {row.num_envs}: {row.nonfinite_envs} worlds blew up")
     picture = draw(output, {**measured, "results": [row._asdict() for row in rows]})
     print(f"results: {output}, {picture.name}")
     found = changes(rows, baseline)

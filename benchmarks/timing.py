@@ -43,7 +43,7 @@ class Row(NamedTuple):
     """Steps that each environment made in one repeat."""
     episodes_per_env_step: float | None = None
     """Share of the steps that ended an episode; None: not counted."""
-    nonfinite_worlds: int | None = None
+    nonfinite_envs: int | None = None
     """Worlds that blew up and were reset, warm-up included; None: not counted."""
     peak_device_bytes: int | None = None
     """Most memory that one device had in use so far in this process; None: it does not tell."""
@@ -142,7 +142,7 @@ class Timed:
         tally = self._carry.tally
         return row._replace(
             episodes_per_env_step=float(tally.episodes.sum()) / (self.num_envs * self._steps),
-            nonfinite_worlds=int(tally.nonfinite.sum()),
+            nonfinite_envs=int(tally.nonfinite.sum()),
         )
 
     def _clocked(self, calls: int) -> float:

@@ -37,7 +37,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     read_tree,
 )
 from jetbot_mjx.runs.resume import to_trees
-from jetbot_mjx.training.ppo_trainer import Program
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 CONFIG = Path(__file__).resolve().parents[1] / "configs" / "smoke.yaml"
 INTERVAL = 65_536
@@ -206,7 +206,7 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
 def make_template(settings: Sequence[str]) -> TrainState:
     """Shapes and dtypes of the state that such a training saves."""
     config = load_config(CONFIG, settings)
-    return Program(config, make_env(config)).template()
+    return CompiledTrainer(config, make_env(config)).template()
 
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:

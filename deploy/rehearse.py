@@ -18,13 +18,15 @@ from drive import Outcome, Policy, Settings, arrival_radius, at_least, drive, lo
 from motors import Calibration, DriveError, check_calibration, default_calibration
 from poses import Tracker
 
-from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, StandIn
+from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, SimulatedJetBot
 
 
 class Camera:
     """Sees a stand-in and sends what a tracker receives."""
 
-    def __init__(self, robot: StandIn, rate: float, noise: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, robot: SimulatedJetBot, rate: float, noise: float, rng: np.random.Generator
+    ) -> None:
         """Looks for the first time now.
 
         Args:
@@ -85,7 +87,7 @@ def rehearse(
     Returns:
       How each ended. Whether it arrived is told by the true pose.
     """
-    robot = StandIn(motors)
+    robot = SimulatedJetBot(motors)
     calibration = calibration or true_calibration(motors)
     within = arrival_radius(policy.contract)
     rng = np.random.default_rng(0)

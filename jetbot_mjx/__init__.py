@@ -19,7 +19,7 @@ use, so that a mistyped command fails at once and a GPU initialises while the re
 
 from typing import TYPE_CHECKING
 
-from jetbot_mjx.imports import lighten as _lighten
+from jetbot_mjx.imports import install_lazy_imports as _install_lazy_imports
 from jetbot_mjx.imports import load_lazily as _load_lazily
 from jetbot_mjx.interrupts import leave_at_once as _leave_at_once
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _leave_at_once()
-_lighten()
+_install_lazy_imports()
 
 # Configurations and runs refer to tasks by these names, independently of the module they are in.
 __getattr__, __dir__ = _load_lazily(

@@ -14,7 +14,7 @@ import jax
 from jetbot_mjx import cli
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.errors import UserError
@@ -38,8 +38,8 @@ from jetbot_mjx.evaluation.report import (
 )
 from jetbot_mjx.evaluation.robustness import (
     SWEEP_GOALS,
-    InMujoco,
     MujocoEvaluator,
+    MujocoResult,
     SweepResult,
     sweep,
 )
@@ -102,14 +102,14 @@ def run(
     return next(reports)
 
 
-def run_in_mujoco(
+def evaluate_in_mujoco(
     run_or_checkpoint: str | Path,
     *,
     episodes: int = REPORT_GOALS,
     which: Which = "best",
     ranges: str | Path | None = None,
     numerics: Numerics = OTHER_NUMERICS,
-) -> InMujoco:
+) -> MujocoResult:
     """Evaluate one policy in C MuJoCo, and write nothing.
 
     Args:
@@ -207,20 +207,21 @@ class _Ranges(NamedTuple):
         return cls(Path(path), ranges)
 
 
-class _Entrant(NamedTuple):
-    """An `_Entrant` is a run that takes part in a comparison."""
+class RunEntry(NamedTuple):
+    """A `RunEntry` is a run that takes part in a comparison."""
 
     folder: Path
     seeds: Mapping[str, Checkpoint]
 
     @property
     def config(self) -> Config:
+        """Return the configuration of the first seed."""
         return next(iter(self.seeds.values())).config
 
 
-def _load(paths: Sequence[Path], which: Which) -> dict[str, _Entrant]:
+def _load(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
     """Load the runs and return them by a unique name."""
-    entrants: list[_Entrant] = []
+    entrants: list[RunEntry] = []
     owners: dict[Path, Path] = {}
     for path in paths:
         folders = seed_folders(path)
@@ -234,11 +235,11 @@ def _load(paths: Sequence[Path], which: Which) -> dict[str, _Entrant]:
                 )
             owners[place] = path
         first = next(iter(seeds.values()))
-        entrants.append(_Entrant(first.run_dir.parent if folders else first.run_dir, seeds))
+        entrants.append(RunEntry(first.run_dir.parent if folders else first.run_dir, seeds))
     return dict(zip(_names(entrants), entrants, strict=True))
 
 
-def _names(entrants: Sequence[_Entrant]) -> list[str]:
+def _names(entrants: Sequence[RunEntry]) -> list[str]:
     """Return the shortest unique end of each folder's path, with the steps if needed."""
     folders = [entrant.folder for entrant in entrants]
     different = set(folders)
@@ -282,7 +283,9 @@ def _judge(
         if evaluator is None or (_program(checkpoint.config), ranges) != fits:
             evaluator = Evaluator(env, checkpoint.networks, baselines=True, record=True)
             if ranges.drawn:
-                varied = Evaluator(VariedEnv(env, ranges=ranges), checkpoint.networks)
+                varied = Evaluator(
+                    DomainRandomizationWrapper(env, ranges=ranges), checkpoint.networks
+                )
             if elsewhere:
                 mujoco = MujocoEvaluator(env, checkpoint.networks, ranges)
             fits = _program(checkpoint.config), ranges
@@ -350,7 +353,7 @@ def _learning_curve(run_dir: Path) -> tuple[CurvePoint, ...]:
         history = read_history(path, sys.maxsize)
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from None
-    return learning_curve((line.env_steps, line.figures) for line in history)
+    return learning_curve((line.env_steps, line.metrics) for line in history)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -372,7 +375,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="where the report goes, or of several runs or seeds the comparison",
     )
     parser.add_argument(
-        "--sweep",
+        "--robustness",
         action="store_true",
         help="judge on robots that differ from the preset too: friction, mass, motors, delay; and"
         " in C MuJoCo",
@@ -403,7 +406,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         episodes=options.episodes,
         which=options.checkpoint,
         output=options.output,
-        robustness=options.sweep,
+        robustness=options.robustness,
         ranges=options.ranges,
         simulator=options.simulator,
     )
@@ -413,8 +416,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f"{best_known_lines(report)}{robustness_table(report)}"
         f"report: {report.folder / 'report.html'}"
     )
-    if report.policy.nonfinite_worlds:
-        print(f"{report.policy.nonfinite_worlds} episodes ended in a world that blew up")
+    if report.policy.nonfinite_envs:
+        print(f"{report.policy.nonfinite_envs} episodes ended in a world that blew up")
     return _verdict({"": report.policy.success_rate}, options.min_success)
 
 
@@ -424,7 +427,7 @@ def _main_comparison(options: argparse.Namespace) -> int:
         episodes=options.episodes,
         which=options.checkpoint,
         output=options.output,
-        robustness=options.sweep,
+        robustness=options.robustness,
         ranges=options.ranges,
         simulator=options.simulator,
     )

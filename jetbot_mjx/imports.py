@@ -38,8 +38,8 @@ def load_lazily(
     return find, lambda: sorted(homes)
 
 
-class PutOff(types.ModuleType):
-    """A `PutOff` is a lazy module, which is imported at the first access to an attribute."""
+class LazyModule(types.ModuleType):
+    """A `LazyModule` is a lazy module, which is imported at the first access to an attribute."""
 
     def __getattr__(self, name: str) -> Any:
         if sys.modules.get(self.__name__) is self:
@@ -47,7 +47,7 @@ class PutOff(types.ModuleType):
         return getattr(importlib.import_module(self.__name__), name)
 
 
-class _Trimesh(PutOff):
+class _Trimesh(LazyModule):
     """A lazy trimesh with its class `Trimesh`, which MJX's annotations use at import time."""
 
     @staticmethod
@@ -125,7 +125,7 @@ class _Loader(importlib.abc.Loader):
 def _mjx() -> Iterator[None]:
     with (
         standing_in("trimesh", _Trimesh("trimesh")),
-        standing_in("scipy.spatial", PutOff("scipy.spatial")),
+        standing_in("scipy.spatial", LazyModule("scipy.spatial")),
         contextlib.redirect_stdout(io.StringIO()),
     ):
         yield
@@ -140,8 +140,8 @@ def _opengl() -> Iterator[None]:
 
 
 _AROUND: Mapping[str, _Around] = {
-    "brax.generalized.constraint": lambda: standing_in("jaxopt", PutOff("jaxopt")),
-    "mujoco.glfw": lambda: standing_in("glfw", PutOff("glfw")),
+    "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
+    "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
     "mujoco.rendering.classic.gl_context": _opengl,
     "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _Comet()),
@@ -149,6 +149,6 @@ _AROUND: Mapping[str, _Around] = {
 """Context managers by the name of the module that they surround."""
 
 
-def lighten() -> None:
+def install_lazy_imports() -> None:
     """Install the lazy imports for the whole process from now on."""
     sys.meta_path.insert(0, _Finder(_AROUND))

@@ -1,4 +1,4 @@
-"""Replays a world that stopped being finite: `python -m jetbot_mjx.replay RUN/faults/FILE`."""
+"""Replays a world that stopped being finite: `python -m jetbot_mjx.replay RUN/nan_dumps/FILE`."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,13 +11,13 @@ import numpy as np
 
 from jetbot_mjx import cli
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
-from jetbot_mjx.envs.domain_randomization import as_trained
+from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.kinematics import yaw
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs.checkpoint_store import flatten
-from jetbot_mjx.runs.nan_dump import StoredFault, load_fault
+from jetbot_mjx.runs.nan_dump import StoredNanDump, load_nan_dump
 
 NOT_REPRODUCED = 1
 
@@ -32,20 +32,20 @@ class Moment(NamedTuple):
     """Names of the arrays that are not finite."""
 
 
-def run(stored: StoredFault, env: JetBotEnv) -> Iterator[Moment]:
+def run(stored: StoredNanDump, env: JetBotEnv) -> Iterator[Moment]:
     """Replay the recorded actions from the state in which the unroll began.
 
     Args:
-      stored: the stored fault.
-      env: the environment of the fault.
+      stored: the stored nan_dump.
+      env: the environment of the nan_dump.
 
     Yields:
       Every step up to the one with the non-finite state.
     """
     wrapped = wrap_for_training(env, stored.config.task.episode_length)
-    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(as_trained(env).step))
-    state: Any = jax.tree.map(lambda x: jnp.asarray(x)[None], stored.fault.env_state)
-    for action in stored.fault.actions[: int(stored.fault.step) + 1]:
+    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(maybe_randomize(env).step))
+    state: Any = jax.tree.map(lambda x: jnp.asarray(x)[None], stored.nan_dump.env_state)
+    for action in stored.nan_dump.actions[: int(stored.nan_dump.step) + 1]:
         after = jax.device_get(jax.tree.map(lambda x: x[0], raw_step(state, action[None])))
         seen = {"pipeline_state": after.pipeline_state, "obs": after.obs, "reward": after.reward}
         odd = [name for name, leaf in flatten(seen).items() if not np.all(np.isfinite(leaf))]
@@ -75,11 +75,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 1 if the state stayed finite this time.
     """
     parser = cli.Parser(prog="python -m jetbot_mjx.replay", description=__doc__)
-    parser.add_argument("file", type=Path, help="a file in a run's faults/")
+    parser.add_argument("file", type=Path, help="a file in a run's nan_dumps/")
     options = parser.parse_args(arguments)
     cli.require_device()
     use_compilation_cache()
-    stored = load_fault(options.file)
+    stored = load_nan_dump(options.file)
     print(
         f"a world that blew up before step {stored.env_steps:,} of its training, from where its"
         " unroll began\n"

@@ -11,7 +11,7 @@ from pathlib import Path
 from jetbot_mjx import cli
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import CONFIG, default_run_dir, stored_config
 from jetbot_mjx.training import distributed
@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     cli.require_device()
     use_compilation_cache()
-    programs = programs_of(config, keep=True)
+    programs = open_program_cache(config, keep=True)
     programs.prefetch("advance", "init")
     from jetbot_mjx.training import session
 

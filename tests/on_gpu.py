@@ -60,7 +60,7 @@ COMMANDS = [
     Command(f"{_RUN}.evaluate {{runs}}/mine"),
     Command(f"{_RUN}.evaluate {{runs}}/real --episodes 64 --ranges configs/real_jetbot.yaml"),
     Command(f"{_RUN}.evaluate {{runs}}/mine {{runs}}/gpu --episodes 64"),
-    Command(f"{_RUN}.evaluate {{runs}}/ptx --sweep --episodes 64"),
+    Command(f"{_RUN}.evaluate {{runs}}/ptx --robustness --episodes 64"),
     Command(f"{_RUN}.render {{runs}}/mine --goals 3,17", needs=("av", "OpenGL")),
     Command(f"{_RUN}.export {{runs}}/mine --format numpy"),
     Command(f"{_RUN}.export {{runs}}/mine --format stablehlo"),

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from jetbot_mjx.adapters.renderer import RENDER_MODES, View, shown_here
+from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, shown_here
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import UserError
@@ -69,13 +69,13 @@ class Settings(NamedTuple):
             "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
         }
 
-    def view(self, env: JetBotEnv) -> View | None:
+    def view(self, env: JetBotEnv) -> FrameRenderer | None:
         """Return what shows an environment; None where nothing is to be shown.
 
         Raises:
           UserError: there is no display for a window.
         """
-        return View(env, self.render_mode, self.rendering_dt) if self.render_mode else None
+        return FrameRenderer(env, self.render_mode, self.rendering_dt) if self.render_mode else None
 
 
 def resolve(given: Arguments, config: Source) -> Settings:

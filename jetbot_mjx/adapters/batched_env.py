@@ -44,7 +44,7 @@ class Pose(NamedTuple):
     """Since its episode began [s]."""
 
 
-class Batch:
+class BatchedEnv:
     """Robots in one compiled program, which resets those whose episode ends."""
 
     def __init__(self, config: Config, num_envs: int, seed: Seed) -> None:
@@ -70,7 +70,7 @@ class Batch:
             state = wrapped.step(state, actions)
             info, metrics = state.info, state.metrics
             flags = (info["terminated"], info["truncation"], metrics["success"])
-            flags = jnp.stack([*flags, metrics["nonfinite_worlds"]]) > 0
+            flags = jnp.stack([*flags, metrics["nonfinite_envs"]]) > 0
             return state, (state.obs, state.reward, flags, info["final_obs"])
 
         self._reset = jax.jit(wrapped.reset, compiler_options=options)

@@ -32,7 +32,7 @@ def shown_here(mode: str) -> bool:
     return mode != "human" or sys.platform != "linux" or any(map(os.environ.get, _DISPLAYS))
 
 
-class View:
+class FrameRenderer:
     """Shows one robot and its goal; opens nothing before the first picture."""
 
     def __init__(self, env: JetBotEnv, mode: str, rendering_dt: float) -> None:

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Arguments, Source, an_extra, check_num_envs, resolve
-from jetbot_mjx.adapters.batched_env import Batch
+from jetbot_mjx.adapters.batched_env import BatchedEnv
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 
@@ -65,7 +65,7 @@ class JetBotVecEnv(VecEnv):
         self.config: Config = settings.config
         """What the environments were built from."""
         self.render_mode = settings.render_mode
-        self.batch = Batch(settings.config, check_num_envs(num_envs), seed)
+        self.batch = BatchedEnv(settings.config, check_num_envs(num_envs), seed)
         self._view = settings.view(self.batch.env)
         self._attributes: dict[str, list[Any]] = {}
         env = self.batch.env

@@ -13,7 +13,7 @@ from jetbot_mjx.adapters.arguments import (
     check_num_envs,
     resolve,
 )
-from jetbot_mjx.adapters.batched_env import Batch
+from jetbot_mjx.adapters.batched_env import BatchedEnv
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.config import Config
 
@@ -74,7 +74,7 @@ class JetBotVectorEnv(VectorEnv):
         self.config: Config = settings.config
         """What the environments were built from."""
         self.num_envs = check_num_envs(num_envs)
-        self.batch = Batch(settings.config, self.num_envs, seed)
+        self.batch = BatchedEnv(settings.config, self.num_envs, seed)
         self.render_mode = settings.render_mode
         self._view = settings.view(self.batch.env)
         self.metadata = {**type(self).metadata, **settings.metadata}

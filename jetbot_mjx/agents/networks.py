@@ -12,7 +12,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import identity_observation_preprocessor
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.compiler.xla_options import on_host
+from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import NetworkConfig
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
@@ -89,7 +89,7 @@ def make_networks(
     """
     preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
     # Brax's networks keep an observation of zeros, which has no need of a GPU.
-    with jax.ensure_compile_time_eval(), on_host():
+    with jax.ensure_compile_time_eval(), default_device_cpu():
         return network_factory(config)(
             observation_size, action_size, preprocess_observations_fn=preprocess
         )

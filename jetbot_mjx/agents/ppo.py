@@ -62,7 +62,7 @@ _EPISODE_SUMS = {
     "sum_reward": "rollout/return",
     "length": "rollout/length",
     "success": "rollout/successes",
-    "nonfinite_worlds": "nonfinite_worlds",
+    "nonfinite_envs": "nonfinite_envs",
 }
 """Metrics summed over the episodes that end, by their name in `info["episode_metrics"]`."""
 
@@ -86,7 +86,7 @@ class TrainState(struct.PyTreeNode):
     env_steps: UInt64
     """Environment steps so far, over all devices."""
     tally: dict[str, Any]
-    """Sums of the figures of the training steps since `tally["training_steps"]` was 0."""
+    """Sums of the metrics of the training steps since `tally["training_steps"]` was 0."""
 
     @property
     def policy_params(self) -> PolicyParams:
@@ -94,7 +94,7 @@ class TrainState(struct.PyTreeNode):
         return PolicyParams(self.normalizer, self.params.policy, self.params.value)
 
 
-class Fault(struct.PyTreeNode):
+class NanDump(struct.PyTreeNode):
     """The first non-finite state of an unroll, and the actions that led to it."""
 
     found: Any
@@ -107,12 +107,12 @@ class Fault(struct.PyTreeNode):
     """Index of the action that led to the non-finite state."""
 
 
-class Metrics(NamedTuple):
-    """The metrics of one training step."""
+class StepOutput(NamedTuple):
+    """A `StepOutput` holds what one training step reports beside its state."""
 
-    figures: dict[str, Float[Array, ""]]
+    metrics: dict[str, Float[Array, ""]]
     """Means over the minibatches, and counts over the collected steps."""
-    fault: Fault
+    nan_dump: NanDump
     """The first non-finite state of this shard."""
 
 
@@ -197,7 +197,7 @@ class PPO:
 
     def advance(
         self, state: TrainState, num_steps: Int[Array, ""], restart: Bool[Array, ""]
-    ) -> tuple[TrainState, Fault]:
+    ) -> tuple[TrainState, NanDump]:
         """Run several training steps; their number is an argument, so that one program serves all.
 
         Args:
@@ -206,19 +206,19 @@ class PPO:
           restart: whether the tally starts from nothing.
 
         Returns:
-          The state after them, and the first fault among them on this shard.
+          The state after them, and the first nan_dump among them on this shard.
         """
         tally = jax.tree.map(lambda x: jnp.where(restart, 0.0, x), state.tally)
 
-        def body(_: Array, carry: tuple[TrainState, Fault]) -> tuple[TrainState, Fault]:
-            before, fault = carry
-            state, metrics = self.train_step(before)
-            added = {**metrics.figures, "training_steps": jnp.ones(())}
+        def body(_: Array, carry: tuple[TrainState, NanDump]) -> tuple[TrainState, NanDump]:
+            before, nan_dump = carry
+            state, output = self.train_step(before)
+            added = {**output.metrics, "training_steps": jnp.ones(())}
             tally = {name: total + added[name] for name, total in before.tally.items()}
-            fault = _first(fault, metrics.fault)
-            return state.replace(tally=tally), fault
+            nan_dump = _first(nan_dump, output.nan_dump)
+            return state.replace(tally=tally), nan_dump
 
-        none = Fault(
+        none = NanDump(
             found=jnp.zeros((), bool),
             env_state=jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.env_state),
             actions=jnp.zeros((self.config.unroll_length, self._env.action_size)),
@@ -226,7 +226,7 @@ class PPO:
         )
         return jax.lax.fori_loop(0, num_steps, body, (state.replace(tally=tally), none))
 
-    def train_step(self, state: TrainState) -> tuple[TrainState, Metrics]:
+    def train_step(self, state: TrainState) -> tuple[TrainState, StepOutput]:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
@@ -240,17 +240,17 @@ class PPO:
             index = jax.lax.axis_index(self._axis)
             update_key = jax.random.fold_in(update_key, index)
             rollout_key = jax.random.fold_in(rollout_key, index)
-        env_state, data, fault = self.collect(state, rollout_key)
+        env_state, data, nan_dump = self.collect(state, rollout_key)
         seen = self._with_floor(
             running_statistics.update(state.normalizer, data.observation, pmap_axis_name=self._axis)
         )
         # As Brax does it: ADAPTIVE_KL compares with distributions under the old normaliser.
         adaptive = self.config.learning_rate_schedule == "ADAPTIVE_KL"
         normalizer = state.normalizer if adaptive else seen
-        params, optimizer_state, figures = self.update(
+        params, optimizer_state, metrics = self.update(
             state.params, state.optimizer_state, normalizer, data, update_key
         )
-        figures = {**figures, **self._episode_sums(data)}
+        metrics = {**metrics, **self._episode_sums(data)}
         state = state.replace(
             params=params,
             optimizer_state=optimizer_state,
@@ -259,7 +259,7 @@ class PPO:
             key=next_key,
             env_steps=state.env_steps + self.config.steps_per_training_step,
         )
-        return state, Metrics(figures, fault)
+        return state, StepOutput(metrics, nan_dump)
 
     def _with_floor(
         self, normalizer: running_statistics.RunningStatisticsState
@@ -277,7 +277,7 @@ class PPO:
 
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]
-    ) -> tuple[PyTree, Transition, Fault]:
+    ) -> tuple[PyTree, Transition, NanDump]:
         """Collect unrolls, one after the other, until there are enough for all minibatches.
 
         Args:
@@ -301,18 +301,20 @@ class PPO:
                 self.config.unroll_length,
                 extra_fields=("truncation", "episode_metrics", "episode_done"),
             )
-            fault = _find_fault(env_state, data)
+            nan_dump = _find_fault(env_state, data)
             # The loss needs the next observation only at the end of an unroll.
             data = data._replace(next_observation=data.next_observation[-1:])
-            return (after, next_key), (data, fault)
+            return (after, next_key), (data, nan_dump)
 
         count = self.config.batch_size * self.config.num_minibatches // self.num_envs
-        (env_state, _), (data, faults) = jax.lax.scan(unroll, (state.env_state, key), length=count)
-        fault = jax.tree.map(lambda x: x[jnp.argmax(faults.found)], faults)
+        (env_state, _), (data, nan_dumps) = jax.lax.scan(
+            unroll, (state.env_state, key), length=count
+        )
+        nan_dump = jax.tree.map(lambda x: x[jnp.argmax(nan_dumps.found)], nan_dumps)
         # From (unrolls, time, environments) to (unrolls x environments, time).
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2), data)
         data = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), data)
-        return env_state, data, fault
+        return env_state, data, nan_dump
 
     def update(
         self,
@@ -350,22 +352,22 @@ class PPO:
             def minibatches(x: Array) -> Array:
                 return x[order].reshape((self.config.num_minibatches, -1, *x.shape[1:]))
 
-            (params, optimizer_state, _), figures = jax.lax.scan(
+            (params, optimizer_state, _), metrics = jax.lax.scan(
                 lambda carry, batch: self._minibatch_step(carry, batch, normalizer),
                 (params, optimizer_state, minibatch_key),
                 jax.tree.map(minibatches, data),
             )
-            return (params, optimizer_state, key), figures
+            return (params, optimizer_state, key), metrics
 
-        (params, optimizer_state, _), figures = jax.lax.scan(
+        (params, optimizer_state, _), metrics = jax.lax.scan(
             one_pass, (params, optimizer_state, key), length=self.config.num_updates_per_batch
         )
         if self._axis is not None:
-            figures = jax.lax.pmean(figures, self._axis)
-        applied = figures.pop("applied")
+            metrics = jax.lax.pmean(metrics, self._axis)
+        applied = metrics.pop("applied")
         count = jnp.maximum(applied.sum(), 1.0)
         means = {
-            ours: jnp.where(applied > 0, figures[theirs], 0.0).sum() / count
+            ours: jnp.where(applied > 0, metrics[theirs], 0.0).sum() / count
             for theirs, ours in LOSSES.items()
         }
         return params, optimizer_state, {**means, "nonfinite_updates": (1.0 - applied).sum()}
@@ -379,11 +381,11 @@ class PPO:
         """Apply one gradient step, or skip it where the gradient is not finite."""
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
-        (_, figures), gradient = self._loss_and_gradient(params, normalizer, batch, loss_key)
+        (_, metrics), gradient = self._loss_and_gradient(params, normalizer, batch, loss_key)
         finite = jnp.isfinite(optax.tree.norm(gradient))
         before = params, optimizer_state
         if self.config.learning_rate_schedule == "ADAPTIVE_KL":
-            kl = figures["kl_mean"]
+            kl = metrics["kl_mean"]
             optimizer_state, _ = optimizer.adaptive_kl_learning_rate(
                 # It modifies the state that it is given.
                 jax.tree.map(lambda x: x, optimizer_state),
@@ -397,12 +399,12 @@ class PPO:
         params, optimizer_state = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), after, before
         )
-        figures = {
-            **figures,
+        metrics = {
+            **metrics,
             "learning_rate": optimizer_state[-1].hyperparams["learning_rate"],
             "applied": finite.astype(jnp.float32),
         }
-        return (params, optimizer_state, key), figures
+        return (params, optimizer_state, key), metrics
 
     def _loss(
         self,
@@ -431,9 +433,9 @@ class PPO:
     def _episode_sums(self, data: Transition) -> dict[str, Float[Array, ""]]:
         """Sum the metrics of the episodes that ended during collection, over all devices."""
         ended = data.extras["state_extras"]["episode_done"]
-        books: Any = data.extras["state_extras"]["episode_metrics"]
+        statistics: Any = data.extras["state_extras"]["episode_metrics"]
         sums = {
-            ours: (ended * books.get(theirs, jnp.zeros(()))).sum()
+            ours: (ended * statistics.get(theirs, jnp.zeros(()))).sum()
             for theirs, ours in _EPISODE_SUMS.items()
         }
         sums["rollout/episodes"] = ended.sum()
@@ -470,15 +472,15 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
 
-def _find_fault(start: PyTree, data: Transition) -> Fault:
+def _find_fault(start: PyTree, data: Transition) -> NanDump:
     """Return the first non-finite state of an unroll, from data of shape (time, world)."""
-    books: Any = data.extras["state_extras"]["episode_metrics"]
+    statistics: Any = data.extras["state_extras"]["episode_metrics"]
     ended = data.extras["state_extras"]["episode_done"]
-    blown = ended * books.get("nonfinite_worlds", jnp.zeros(())) > 0
+    blown = ended * statistics.get("nonfinite_envs", jnp.zeros(())) > 0
     # In order of time, then of the worlds.
     first = jnp.argmax(blown)
     step, world = jnp.divmod(first, blown.shape[1])
-    return Fault(
+    return NanDump(
         found=blown.any(),
         env_state=jax.tree.map(lambda x: x[world], start),
         actions=data.action[:, world],
@@ -486,6 +488,6 @@ def _find_fault(start: PyTree, data: Transition) -> Fault:
     )
 
 
-def _first(one: Fault, other: Fault) -> Fault:
+def _first(one: NanDump, other: NanDump) -> NanDump:
     """Return the earlier of two non-finite states, if there is one."""
     return jax.tree.map(lambda a, b: jnp.where(one.found, a, b), one, other)

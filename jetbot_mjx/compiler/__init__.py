@@ -12,11 +12,11 @@ from typing import TYPE_CHECKING
 from jetbot_mjx.imports import load_lazily
 
 if TYPE_CHECKING:
-    from jetbot_mjx.compiler.program_cache import Programs as Programs
+    from jetbot_mjx.compiler.program_cache import ProgramCache as ProgramCache
 
 __getattr__, __dir__ = load_lazily(
     __name__,
     {
-        "Programs": "program_cache",
+        "ProgramCache": "program_cache",
     },
 )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from jetbot_mjx.compiler.scalar_ir import Scalar, UnsupportedError, is_known
+from jetbot_mjx.compiler.scalar_ir import Scalar, UnsupportedError, is_constant
 
 Numbers = np.ndarray
 """An array of `Scalar`, dtype object."""
@@ -47,7 +47,7 @@ def known_values(numbers: Numbers, dtype: Any) -> np.ndarray:
     Raises:
       UnsupportedError: they depend on what the program is given.
     """
-    if not all(map(is_known, numbers.ravel())):
+    if not all(map(is_constant, numbers.ravel())):
         raise UnsupportedError("an index that depends on the state")
     return np.asarray(list(numbers.ravel()), dtype).reshape(numbers.shape)
 

@@ -33,7 +33,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from jetbot_mjx.compiler.lower_jaxpr import Program
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
 from jetbot_mjx.errors import UserError
 
@@ -46,7 +46,7 @@ class Kernel:
 
     def __init__(
         self,
-        program: Program,
+        program: ScalarProgram,
         *,
         carried: int,
         steps: int,
@@ -69,7 +69,7 @@ class Kernel:
         self.fallback = fallback
         self.impl = impl
         self._texts: dict[str, str] = {}
-        # Programs are lowered in several threads.
+        # ProgramCache are lowered in several threads.
         self._lock = threading.Lock()
 
     def text(self, name: str, write: Callable[[], str]) -> str:

@@ -121,7 +121,7 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 def _registered(text: str) -> str:
     """Return the name by which XLA knows a kernel, and compile the kernel on first use."""
     name = f"jetbot_mjx_{hashlib.sha256(_key(text)).hexdigest()}"
-    # Programs are traced in several threads.
+    # ProgramCache are traced in several threads.
     with _lock:
         if name not in _loaded:
             _register(name, _machine_code(text))

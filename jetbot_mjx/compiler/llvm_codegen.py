@@ -14,8 +14,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jetbot_mjx.compiler.lower_jaxpr import Program
-from jetbot_mjx.compiler.scalar_ir import COMPARISONS, Scalar, UnsupportedError, Value, is_known
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
+from jetbot_mjx.compiler.scalar_ir import COMPARISONS, Expr, Scalar, UnsupportedError, is_constant
 from jetbot_mjx.compiler.schedule import Block, PlacedBranch, PlacedLoop
 
 STEP = "step"
@@ -28,7 +28,7 @@ _EXTREMES = {"max": "maximum", "min": "minimum"}
 _INTRINSICS = {"abs": "fabs", "floor": "floor", "sqrt": "sqrt"}
 
 
-def step_text(program: Program, *, carried: int, lanes: int) -> str:
+def step_text(program: ScalarProgram, *, carried: int, lanes: int) -> str:
     """Write a function that runs a program once and stores the results in the first arguments.
 
     The function's parameter is the address of a tile: a row for each number of the arguments, of
@@ -45,7 +45,7 @@ def step_text(program: Program, *, carried: int, lanes: int) -> str:
     Raises:
       UnsupportedError: the program has an operation that is not written here.
     """
-    writer = Writer(program, lanes)
+    writer = LlvmEmitter(program, lanes)
     number = writer.type("f")
 
     def row(place: int) -> str:
@@ -69,19 +69,19 @@ def step_text(program: Program, *, carried: int, lanes: int) -> str:
     )
 
 
-def require(program: Program) -> None:
+def require(program: ScalarProgram) -> None:
     """Check that a program can be written.
 
     Raises:
       UnsupportedError: it has an operation that is not written here.
     """
-    Writer(program, lanes=1).step([""] * sum(array.size for array in program.inputs))
+    LlvmEmitter(program, lanes=1).step([""] * sum(array.size for array in program.inputs))
 
 
-class Writer:
-    """A `Writer` holds the lines of a function that runs a program, and the names of its values."""
+class LlvmEmitter:
+    """An `LlvmEmitter` holds the lines of a function and the names of its values."""
 
-    def __init__(self, program: Program, lanes: int, label: str = "entry") -> None:
+    def __init__(self, program: ScalarProgram, lanes: int, label: str = "entry") -> None:
         """Begin with no lines.
 
         Args:
@@ -163,7 +163,7 @@ class Writer:
         return f"@llvm.{name}.{size}i32.{size}f32" if "sat" in name else f"@llvm.{name}.{size}f32"
 
     def _operand(self, x: Scalar) -> str:
-        return self._constant(x) if is_known(x) else self._names[x.index]
+        return self._constant(x) if is_constant(x) else self._names[x.index]
 
     def _splat(self, kind: str, number: str) -> str:
         return number if self._lanes == 1 else f"splat ({_ELEMENTS[kind]} {number})"
@@ -265,7 +265,7 @@ class Writer:
             for kind, name in zip(kinds, names, strict=True)
         ]
 
-    def _operation(self, value: Value) -> None:
+    def _operation(self, value: Expr) -> None:
         kind = value.operands[0].dtype.kind if value.op != "select" else value.dtype.kind
         write = _WRITERS.get((value.op, kind))
         if write is None:
@@ -275,47 +275,47 @@ class Writer:
 
     # Of an operation, the last instruction; what comes before it is already among the lines.
 
-    def _call(self, value: Value, operands: list[str]) -> str:
+    def _call(self, value: Expr, operands: list[str]) -> str:
         (x,) = operands
         return (
             f"call {self.type('f')} {self._function(_INTRINSICS[value.op])}({self.type('f')} {x})"
         )
 
-    def _extreme(self, value: Value, operands: list[str]) -> str:
+    def _extreme(self, value: Expr, operands: list[str]) -> str:
         number = self.type("f")
         if self._lanes == 1:
             function = self._function(_EXTREMES[value.op])
             return f"call {number} {function}({number} {operands[0]}, {number} {operands[1]})"
         # One instruction on x86, which takes the second where one is not a number.
         ordered = sorted(
-            zip(value.operands, operands, strict=True), key=lambda x: not is_known(x[0])
+            zip(value.operands, operands, strict=True), key=lambda x: not is_constant(x[0])
         )
         (first, a), (_, b) = ordered
         better = "ogt" if value.op == "max" else "olt"
         best = self._chosen(self.do(f"fcmp {better} {number} {a}, {b}"), "f", a, b)
-        if is_known(first):
+        if is_constant(first):
             return best
         best = self.do(best)
         return self._chosen(self.do(f"fcmp uno {number} {a}, {a}"), "f", a, best)
 
-    def _finite(self, value: Value, operands: list[str]) -> str:
+    def _finite(self, value: Expr, operands: list[str]) -> str:
         number = self.type("f")
         size = self.do(f"call {number} {self._function('fabs')}({number} {operands[0]})")
         return f"fcmp olt {number} {size}, {self._splat('f', _float(np.inf))}"
 
-    def _magnitude(self, value: Value, operands: list[str]) -> str:
+    def _magnitude(self, value: Expr, operands: list[str]) -> str:
         whole, (x,) = self.type("i"), operands
         zero = self._splat("i", "0")
         below = self.do(f"icmp slt {whole} {x}, {zero}")
         return self._chosen(below, "i", self.do(f"sub {whole} {zero}, {x}"), x)
 
-    def _negative(self, value: Value, operands: list[str]) -> str:
+    def _negative(self, value: Expr, operands: list[str]) -> str:
         return f"sub {self.type('i')} {self._splat('i', '0')}, {operands[0]}"
 
-    def _negation(self, value: Value, operands: list[str]) -> str:
+    def _negation(self, value: Expr, operands: list[str]) -> str:
         return f"xor {self.type('b')} {operands[0]}, {self._splat('b', 'true')}"
 
-    def _larger(self, value: Value, operands: list[str]) -> str:
+    def _larger(self, value: Expr, operands: list[str]) -> str:
         a, b = operands
         better = "sgt" if value.op == "max" else "slt"
         return self._chosen(self.do(f"icmp {better} {self.type('i')} {a}, {b}"), "i", a, b)
@@ -323,11 +323,11 @@ class Writer:
     def _chosen(self, which: str, kind: str, yes: str, no: str) -> str:
         return f"select {self.type('b')} {which}, {self.type(kind)} {yes}, {self.type(kind)} {no}"
 
-    def _select(self, value: Value, operands: list[str]) -> str:
+    def _select(self, value: Expr, operands: list[str]) -> str:
         which, no, yes = operands
         return self._chosen(which, value.dtype.kind, yes, no)
 
-    def _convert(self, value: Value, operands: list[str]) -> str:
+    def _convert(self, value: Expr, operands: list[str]) -> str:
         source, to = value.operands[0].dtype.kind, value.dtype.kind
         if source == "f":
             function = self._function("fptosi.sat")
@@ -335,7 +335,7 @@ class Writer:
         how = "zext" if to == "i" else "uitofp" if source == "b" else "sitofp"
         return f"{how} {self.type(source)} {operands[0]} to {self.type(to)}"
 
-    def _comparison(self, value: Value, operands: list[str]) -> str:
+    def _comparison(self, value: Expr, operands: list[str]) -> str:
         kind = value.operands[0].dtype.kind
         pair = f"{self.type(kind)} {', '.join(operands)}"
         if kind == "f":
@@ -345,11 +345,11 @@ class Writer:
         return f"icmp {sign}{value.op} {pair}"
 
 
-_Writer = Callable[[Writer, Value, list[str]], str]
+_Writer = Callable[[LlvmEmitter, Expr, list[str]], str]
 
 
 def _plain(instruction: str, kind: str) -> _Writer:
-    def write(text: Writer, value: Value, operands: list[str]) -> str:
+    def write(text: LlvmEmitter, value: Expr, operands: list[str]) -> str:
         return f"{instruction} {text.type(kind)} {', '.join(operands)}"
 
     return write
@@ -367,17 +367,17 @@ _WRITERS: dict[tuple[str, str], _Writer] = {
     **{(op, "f"): _plain(f"f{op} {_FUSED}", "f") for op in ("add", "div", "mul", "sub")},
     **{(op, "i"): _plain(op, "i") for op in ("add", "mul", "sub")},
     **{(op, "b"): _plain(op, "b") for op in ("and", "or", "xor")},
-    **{(op, kind): Writer._comparison for op in COMPARISONS for kind in "fi"},
-    **{(op, "b"): Writer._comparison for op in ("eq", "ne")},
-    **{(op, "f"): Writer._call for op in _INTRINSICS},
-    **{(op, "f"): Writer._extreme for op in ("max", "min")},
-    **{(op, "i"): Writer._larger for op in ("max", "min")},
-    **{("select", kind): Writer._select for kind in "fi"},
-    **{("convert", kind): Writer._convert for kind in "fib"},
-    ("abs", "i"): Writer._magnitude,
-    ("is_finite", "f"): Writer._finite,
+    **{(op, kind): LlvmEmitter._comparison for op in COMPARISONS for kind in "fi"},
+    **{(op, "b"): LlvmEmitter._comparison for op in ("eq", "ne")},
+    **{(op, "f"): LlvmEmitter._call for op in _INTRINSICS},
+    **{(op, "f"): LlvmEmitter._extreme for op in ("max", "min")},
+    **{(op, "i"): LlvmEmitter._larger for op in ("max", "min")},
+    **{("select", kind): LlvmEmitter._select for kind in "fi"},
+    **{("convert", kind): LlvmEmitter._convert for kind in "fib"},
+    ("abs", "i"): LlvmEmitter._magnitude,
+    ("is_finite", "f"): LlvmEmitter._finite,
     ("neg", "f"): _plain("fneg", "f"),
-    ("neg", "i"): Writer._negative,
-    ("not", "b"): Writer._negation,
+    ("neg", "i"): LlvmEmitter._negative,
+    ("not", "b"): LlvmEmitter._negation,
 }
 """By operation and kind of the operands' dtype."""

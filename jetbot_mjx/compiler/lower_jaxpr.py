@@ -36,13 +36,13 @@ from jetbot_mjx.compiler.indexing import (
 )
 from jetbot_mjx.compiler.scalar_ir import (
     EVALUATE,
-    Graph,
+    Expr,
+    ExprGraph,
     Loop,
     Scalar,
     UnsupportedError,
-    Value,
     converted,
-    is_known,
+    is_constant,
     is_same,
 )
 from jetbot_mjx.compiler.schedule import Block, PlacedBranch, PlacedLoop, schedule
@@ -61,8 +61,8 @@ LEAST_IN_BRANCH = 24
 
 
 @dataclasses.dataclass(frozen=True)
-class Program:
-    """A `Program` holds a function's operations on scalars."""
+class ScalarProgram:
+    """A `ScalarProgram` holds a function's operations on scalars."""
 
     inputs: list[Numbers]
     """The numbers of each leaf of the arguments, in their shapes."""
@@ -108,7 +108,7 @@ class _Evaluation:
         self.known: dict[int, np.ndarray] = {}
 
     def look_up(self, x: Scalar) -> np.ndarray:
-        return np.broadcast_to(x, self._batch) if is_known(x) else self.known[x.index]
+        return np.broadcast_to(x, self._batch) if is_constant(x) else self.known[x.index]
 
     def block(self, block: Block) -> None:
         for item in block.items:
@@ -124,7 +124,7 @@ class _Evaluation:
         self.block(block)
         self._mask = around
 
-    def _operation(self, value: Value) -> np.ndarray:
+    def _operation(self, value: Expr) -> np.ndarray:
         operands = [self.look_up(x) for x in value.operands]
         if value.op == "select":
             return np.where(operands[0], operands[2], operands[1])
@@ -159,7 +159,7 @@ class _Evaluation:
             self.known[result.index] = np.where(which, *sides)
 
 
-def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
+def scalarize(function: Callable[..., Any], *arguments: Any) -> ScalarProgram:
     """Lower a function to arithmetic on scalars.
 
     Args:
@@ -173,23 +173,23 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> Program:
       UnsupportedError: the function has an operation that cannot be lowered.
     """
     closed = jax.make_jaxpr(function)(*arguments)
-    graph = Graph()
+    graph = ExprGraph()
     inputs = [
         filled(leaf.shape, lambda dtype=leaf.dtype: graph.input(dtype))
         for leaf in jax.tree.leaves(arguments)
     ]
-    outputs = _Writer(graph).closed(closed, inputs)
+    outputs = _JaxprLowering(graph).closed(closed, inputs)
     block = schedule(x for array in outputs for x in array.ravel())
-    program = Program(inputs, outputs, block)
+    program = ScalarProgram(inputs, outputs, block)
     if program.size > MOST_IN_PROGRAM:
         raise UnsupportedError(f"{program.size:,} operations, more than {MOST_IN_PROGRAM:,}")
     return program
 
 
-class _Writer:
-    """A `_Writer` walks a function's jaxpr and records its operations on scalars."""
+class _JaxprLowering:
+    """A `_JaxprLowering` walks a function's jaxpr and records its operations on scalars."""
 
-    def __init__(self, graph: Graph) -> None:
+    def __init__(self, graph: ExprGraph) -> None:
         self._graph = graph
 
     def closed(self, closed: ClosedJaxpr, arguments: Sequence[Numbers]) -> list[Numbers]:
@@ -357,9 +357,11 @@ class _Writer:
         # them stays known, and with it how often the loop is written out.
         for _ in range(MOST_TRIPS + 1):
             still = self._graph.apply("and", still, going(state))
-            if is_known(still) and not still:
+            if is_constant(still) and not still:
                 return result
-            if is_short and (not is_known(still) or self._graph.count - before > MOST_WRITTEN_OUT):
+            if is_short and (
+                not is_constant(still) or self._graph.count - before > MOST_WRITTEN_OUT
+            ):
                 raise UnsupportedError("a loop that is not short")
             state = trip(state)
             result = [self._choose(still, *pair) for pair in zip(result, state, strict=True)]
@@ -407,7 +409,7 @@ class _Writer:
         self, equation: Any, params: Any, index: Numbers, *operands: Numbers
     ) -> list[Numbers]:
         branches, which = params["branches"], index.item()
-        if is_known(which):
+        if is_constant(which):
             return self.closed(branches[min(max(int(which), 0), len(branches) - 1)], operands)
         before = self._graph.count
         sides = [self.closed(branch, operands) for branch in branches]
@@ -430,7 +432,7 @@ class _Writer:
             last = x.shape[axis] - size
             cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
             at = start.item()
-            if is_known(at):
+            if is_constant(at):
                 x = cases[min(max(int(at), 0), last)]
                 continue
             x = cases[last]
@@ -595,7 +597,7 @@ class _Derivation:
     and after every one. The two are compared operation by operation.
     """
 
-    def __init__(self, graph: Graph, loop: Loop, carried: set[int]) -> None:
+    def __init__(self, graph: ExprGraph, loop: Loop, carried: set[int]) -> None:
         self._graph = graph
         self._loop = loop
         # What has fewer operations first: the others may follow from it.
@@ -648,7 +650,7 @@ class _Derivation:
 
 def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
     """Return the operands of two matching operations, in pairs."""
-    if is_known(before) or is_known(after) or not before.operands:
+    if is_constant(before) or is_constant(after) or not before.operands:
         return None
     if before.op != after.op or before.dtype != after.dtype or before.op == "input":
         return None
@@ -656,11 +658,11 @@ def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
 
 
 def _names(numbers: tuple[Scalar, Scalar]) -> tuple[Any, ...]:
-    return tuple((x.dtype.str, x.tobytes()) if is_known(x) else x.index for x in numbers)
+    return tuple((x.dtype.str, x.tobytes()) if is_constant(x) else x.index for x in numbers)
 
 
 def _recorded(x: Scalar) -> int:
-    return -1 if is_known(x) else x.index
+    return -1 if is_constant(x) else x.index
 
 
 def _flat(arrays: Sequence[Numbers]) -> list[Scalar]:

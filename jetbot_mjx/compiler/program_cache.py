@@ -30,7 +30,7 @@ _CACHE_HIT = "/jax/compilation_cache/cache_hits"
 _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
-class Programs:
+class ProgramCache:
     """The compiled programs of one configuration, by name."""
 
     def __init__(self, options: Options, folder: Path | None = None, key: str = "") -> None:

@@ -17,8 +17,8 @@ import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.compiler.kernel import Kernel
-from jetbot_mjx.compiler.llvm_codegen import Writer
-from jetbot_mjx.compiler.lower_jaxpr import Program, scalarize
+from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
 
 IMPL = "ptx"
 PLATFORM = "cuda"
@@ -124,7 +124,7 @@ def compiled(kernel: Kernel, architecture: int) -> str:
     return machine.emit_assembly(module)
 
 
-def kernel_text(program: Program, *, carried: int, steps: int) -> str:
+def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
     """Write a kernel in LLVM's representation.
 
     Its parameters are the addresses of all leaves of the arguments and then of all leaves of the
@@ -138,7 +138,7 @@ def kernel_text(program: Program, *, carried: int, steps: int) -> str:
     Returns:
       The text of a module.
     """
-    writer = Writer(program, lanes=1, label="steps")
+    writer = LlvmEmitter(program, lanes=1, label="steps")
     sizes = [array.size for array in program.inputs]
     first = _transfers(sizes, "load")
     arguments = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]

@@ -1,9 +1,9 @@
 """Record arithmetic on scalars as a graph of operations.
 
-A `Graph` records operations on scalars. Operations on constants are computed at once, an operation
-that was recorded before is not recorded again, and products with zero are removed: most entries of
-the matrices of a robot's physics are zeros, so most of the arithmetic disappears. A `Loop` and
-a `Branch` are recorded as wholes; where each operation is done, `schedule` decides.
+An `ExprGraph` records operations on scalars. Operations on constants are computed at once, an
+operation that was recorded before is not recorded again, and products with zero are removed: most
+entries of the matrices of a robot's physics are zeros, so most of the arithmetic disappears. A
+`Loop` and a `Branch` are recorded as wholes; where each operation is done, `schedule` decides.
 
 Two rules hold for finite numbers only: 0·x is 0, and x - x is 0.
 """
@@ -20,10 +20,10 @@ class UnsupportedError(Exception):
 
 
 Scalar = Any
-"""A `Value`, or a NumPy scalar where the number is known."""
+"""An `Expr`, or a NumPy scalar where the number is known."""
 
 
-class Value:
+class Expr:
     """A scalar that is known only when the program runs."""
 
     __slots__ = ("dtype", "index", "op", "operands", "owner", "place")
@@ -62,7 +62,7 @@ class Loop:
 
     index: int
     """Place in the order of recording, after all that a trip computes."""
-    carries: list[Value]
+    carries: list[Expr]
     """The values that an iteration begins with."""
     first: list[Scalar]
     """The values that the first iteration begins with."""
@@ -86,9 +86,9 @@ class Branch:
     yes: list[Scalar]
 
 
-def is_known(x: Scalar) -> bool:
+def is_constant(x: Scalar) -> bool:
     """Return whether a scalar is a constant."""
-    return not isinstance(x, Value)
+    return not isinstance(x, Expr)
 
 
 COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
@@ -151,15 +151,15 @@ MOST_VALUES = 1_000_000
 _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 
 
-class Graph:
-    """A `Graph` records operations on scalars, each of them once."""
+class ExprGraph:
+    """An `ExprGraph` records operations on scalars, each of them once."""
 
     def __init__(self) -> None:
         """Start with an empty graph."""
-        self._values: dict[tuple[Any, ...], Value] = {}
+        self._values: dict[tuple[Any, ...], Expr] = {}
         self._count = 0
 
-    def input(self, dtype: np.dtype) -> Value:
+    def input(self, dtype: np.dtype) -> Expr:
         """Add an input of the program."""
         return self._record("input", (np.int32(self._count),), np.dtype(dtype))
 
@@ -178,10 +178,10 @@ class Graph:
         """
         if op not in EVALUATE:
             raise UnsupportedError(f"the operation {op}")
-        if all(is_known(x) for x in operands):
+        if all(is_constant(x) for x in operands):
             with np.errstate(all="ignore"):
                 return np.asarray(EVALUATE[op](*operands))[()]
-        kind = next(x.dtype for x in operands if not is_known(x))
+        kind = next(x.dtype for x in operands if not is_constant(x))
         if kind not in (_FLOAT, _INT, _BOOL):
             raise UnsupportedError(f"{op} of {kind}")
         shorter = _SHORTER.get(op, _unchanged)(self, kind, *operands)
@@ -192,7 +192,7 @@ class Graph:
 
     def select(self, which: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
         """Select one of two scalars of one dtype by a bool scalar."""
-        if is_known(which):
+        if is_constant(which):
             return on_true if which else on_false
         if on_false is on_true or (_known_and(on_true, on_false) and on_false == on_true):
             return on_false
@@ -207,7 +207,7 @@ class Graph:
 
     def convert(self, x: Scalar, dtype: np.dtype) -> Scalar:
         """Convert a scalar to another dtype."""
-        if is_known(x):
+        if is_constant(x):
             return converted(np.asarray(x), dtype)[()]
         # Without 64-bit types, as JAX has them by default, only these are met.
         if dtype not in (_FLOAT, _INT, _BOOL):
@@ -218,7 +218,7 @@ class Graph:
             return self.apply("ne", x, x.dtype.type(0))
         return self._record("convert", (x,), dtype)
 
-    def repeat(self, value: Value, operands: Sequence[Scalar]) -> Value:
+    def repeat(self, value: Expr, operands: Sequence[Scalar]) -> Expr:
         """Record an operation again with other operands, without simplifying it."""
         return self._record(value.op, tuple(operands), value.dtype)
 
@@ -229,7 +229,7 @@ class Graph:
             loop.carries.append(self._new("carry", (), number.dtype, loop, place))
         return loop
 
-    def end_loop(self, loop: Loop) -> list[Value]:
+    def end_loop(self, loop: Loop) -> list[Expr]:
         """End a loop whose attributes are all set except `index`, and return its results."""
         loop.index = self._next()
         return [
@@ -237,7 +237,7 @@ class Graph:
             for place, number in enumerate(loop.outcomes)
         ]
 
-    def branch(self, which: Value, no: Sequence[Scalar], yes: Sequence[Scalar]) -> list[Scalar]:
+    def branch(self, which: Expr, no: Sequence[Scalar], yes: Sequence[Scalar]) -> list[Scalar]:
         """Record a branch, of which only the selected side is computed, and return its results."""
         branch = Branch(self._next(), which, list(no), list(yes))
         return [
@@ -250,7 +250,7 @@ class Graph:
         """Return the number of recorded operations."""
         return self._count
 
-    def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Value:
+    def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Expr:
         names = [_identity(x) for x in operands]
         # Found in whichever order, but kept as given: what is recorded twice in the same way looks
         # the same.
@@ -259,8 +259,8 @@ class Graph:
             self._values[key] = self._new(op, operands, dtype)
         return self._values[key]
 
-    def _new(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype, *owner: Any) -> Value:
-        return Value(op, operands, dtype, self._next(), *owner)
+    def _new(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype, *owner: Any) -> Expr:
+        return Expr(op, operands, dtype, self._next(), *owner)
 
     def _next(self) -> int:
         if self._count >= MOST_VALUES:
@@ -276,28 +276,28 @@ def is_same(x: Scalar, y: Scalar) -> bool:
 
 def _identity(x: Scalar) -> Any:
     # By bits, or 0.0 would be -0.0, and NaN not itself.
-    return x.index if isinstance(x, Value) else (x.dtype.str, x.tobytes())
+    return x.index if isinstance(x, Expr) else (x.dtype.str, x.tobytes())
 
 
 def _known_and(x: Scalar, *others: Scalar) -> bool:
-    return is_known(x) and all(is_known(other) for other in others)
+    return is_constant(x) and all(is_constant(other) for other in others)
 
 
 def _is(x: Scalar, number: float) -> bool:
-    return is_known(x) and x == number
+    return is_constant(x) and x == number
 
 
-def _unchanged(graph: Graph, kind: np.dtype, *operands: Scalar) -> None:
+def _unchanged(graph: ExprGraph, kind: np.dtype, *operands: Scalar) -> None:
     return None
 
 
-def _shorter_add(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_add(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(x, 0):
         return y
     return x if _is(y, 0) else None
 
 
-def _shorter_sub(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_sub(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if x is y:
         return kind.type(0)
     if _is(x, 0):
@@ -305,7 +305,7 @@ def _shorter_sub(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar |
     return x if _is(y, 0) else None
 
 
-def _shorter_mul(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_mul(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     for one, other in ((x, y), (y, x)):
         if _is(one, 0):
             return kind.type(0)
@@ -316,54 +316,54 @@ def _shorter_mul(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar |
     return None
 
 
-def _shorter_div(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_div(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(x, 0):
         return kind.type(0)
     if _is(y, 1):
         return x
-    if is_known(y) and kind == _FLOAT and y != 0:
+    if is_constant(y) and kind == _FLOAT and y != 0:
         return graph.apply("mul", x, np.float32(1 / np.float64(y)))
     return None
 
 
-def _shorter_neg(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar | None:
+def _simplify_neg(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar | None:
     return x.operands[0] if x.op == "neg" else None
 
 
-def _shorter_not(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar | None:
+def _simplify_not(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar | None:
     return x.operands[0] if x.op == "not" else None
 
 
-def _shorter_and(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_and(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if x is y:
         return x
     for one, other in ((x, y), (y, x)):
-        if kind == _BOOL and is_known(one):
+        if kind == _BOOL and is_constant(one):
             return other if one else np.bool_(False)
     return None
 
 
-def _shorter_or(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_or(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if x is y:
         return x
     for one, other in ((x, y), (y, x)):
-        if kind == _BOOL and is_known(one):
+        if kind == _BOOL and is_constant(one):
             return np.bool_(True) if one else other
     return None
 
 
-def _shorter_xor(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_xor(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     for one, other in ((x, y), (y, x)):
-        if kind == _BOOL and is_known(one):
+        if kind == _BOOL and is_constant(one):
             return graph.apply("not", other) if one else other
     return None
 
 
-def _shorter_extreme(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_extreme(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     return x if x is y else None
 
 
-def _shorter_pow(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_pow(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if _is(y, 1):
         return x
     if _is(y, 2):
@@ -371,7 +371,7 @@ def _shorter_pow(graph: Graph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar |
     return graph.apply("sqrt", x) if _is(y, 0.5) else None
 
 
-def _shorter_sign(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar:
+def _simplify_sign(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar:
     zero, one = kind.type(0), kind.type(1)
     below = graph.select(graph.apply("lt", x, zero), x, -one)
     return graph.select(graph.apply("gt", x, zero), below, one)
@@ -398,7 +398,7 @@ _SINE = _polynomial(lambda r: np.sinc(r / np.pi), 4)  # sin(r)/r
 _COSINE = _polynomial(np.cos, 5)
 
 
-def _shorter_sine(graph: Graph, kind: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
+def _simplify_sine(graph: ExprGraph, kind: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
     """Expand a sine to basic arithmetic, equal on every machine; for |x| up to some 10⁴."""
     do = graph.apply
     turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
@@ -424,25 +424,25 @@ def _shorter_sine(graph: Graph, kind: np.dtype, x: Scalar, ahead: int = 0) -> Sc
     return graph.select(do("ge", quarter, np.float32(2)), value, do("neg", value))
 
 
-def _shorter_cosine(graph: Graph, kind: np.dtype, x: Scalar) -> Scalar:
-    return _shorter_sine(graph, kind, x, ahead=1)
+def _simplify_cosine(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar:
+    return _simplify_sine(graph, kind, x, ahead=1)
 
 
 _SHORTER: dict[str, Callable[..., Scalar | None]] = {
-    "add": _shorter_add,
-    "and": _shorter_and,
-    "cos": _shorter_cosine,
-    "div": _shorter_div,
-    "max": _shorter_extreme,
-    "min": _shorter_extreme,
-    "mul": _shorter_mul,
-    "neg": _shorter_neg,
-    "not": _shorter_not,
-    "or": _shorter_or,
-    "pow": _shorter_pow,
-    "sign": _shorter_sign,
-    "sin": _shorter_sine,
-    "sub": _shorter_sub,
-    "xor": _shorter_xor,
+    "add": _simplify_add,
+    "and": _simplify_and,
+    "cos": _simplify_cosine,
+    "div": _simplify_div,
+    "max": _simplify_extreme,
+    "min": _simplify_extreme,
+    "mul": _simplify_mul,
+    "neg": _simplify_neg,
+    "not": _simplify_not,
+    "or": _simplify_or,
+    "pow": _simplify_pow,
+    "sign": _simplify_sign,
+    "sin": _simplify_sine,
+    "sub": _simplify_sub,
+    "xor": _simplify_xor,
 }
 """What else gives the same number; None: nothing does."""

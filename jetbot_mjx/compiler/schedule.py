@@ -1,7 +1,8 @@
 """Place each recorded operation in a block of the program.
 
-A `Graph` says what depends on what, not when it is computed. Here every operation gets a place: out
-of all loops that it does not depend on, and into a branch if nothing outside the branch needs it.
+An `ExprGraph` says what depends on what, not when it is computed. Here every operation gets a
+place: out of all loops that it does not depend on, and into a branch if nothing outside the branch
+needs it.
 
 Source: C. Click, Global Code Motion / Global Value Numbering, PLDI 1995, with blocks that are
 nested instead of a control-flow graph.
@@ -11,10 +12,10 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from typing import TypeAlias
 
-from jetbot_mjx.compiler.scalar_ir import Branch, Loop, Scalar, Value, is_known
+from jetbot_mjx.compiler.scalar_ir import Branch, Expr, Loop, Scalar, is_constant
 
-Item: TypeAlias = "Value | PlacedLoop | PlacedBranch"
-_Node: TypeAlias = Value | Loop | Branch
+Item: TypeAlias = "Expr | PlacedLoop | PlacedBranch"
+_Node: TypeAlias = Expr | Loop | Branch
 
 
 @dataclasses.dataclass(eq=False)
@@ -34,10 +35,10 @@ class Block:
             yield block
             block = block.parent
 
-    def values(self) -> Iterator[Value]:
+    def values(self) -> Iterator[Expr]:
         """Yield all operations of this block and of those inside it."""
         for item in self.items:
-            if isinstance(item, Value):
+            if isinstance(item, Expr):
                 yield item
             else:
                 for block in item.blocks:
@@ -51,7 +52,7 @@ class PlacedLoop:
     loop: Loop
     places: list[int]
     """Which carries are needed; the others are not computed."""
-    results: list[Value]
+    results: list[Expr]
     """Which results are needed."""
     head: Block
     body: Block
@@ -67,7 +68,7 @@ class PlacedBranch:
     """A branch and the block of each side."""
 
     branch: Branch
-    results: list[Value]
+    results: list[Expr]
     """Which results are needed."""
     no: Block
     yes: Block
@@ -87,18 +88,18 @@ def schedule(outputs: Iterable[Scalar]) -> Block:
     Returns:
       The outermost block. Every operand of an item stands before it or in a block around it.
     """
-    return _Scheduler().schedule([x for x in outputs if not is_known(x)])
+    return _Scheduler().schedule([x for x in outputs if not is_constant(x)])
 
 
 class _Scheduler:
     def __init__(self) -> None:
         self._reached: dict[int, _Node] = {}
-        self._results: dict[int, list[Value]] = {}
+        self._results: dict[int, list[Expr]] = {}
         self._carries: dict[int, list[int]] = {}
         self._loops: dict[int, frozenset[int]] = {}
         self._use: dict[int, Block] = {}
 
-    def schedule(self, outputs: list[Value]) -> Block:
+    def schedule(self, outputs: list[Expr]) -> Block:
         root = Block()
         self._reach(outputs)
         nodes = sorted(self._reached.values(), key=lambda node: node.index)
@@ -110,7 +111,7 @@ class _Scheduler:
         self._needed_in(root, outputs)
         blocks = [root]
         for node in reversed(nodes):
-            if isinstance(node, Value):
+            if isinstance(node, Expr):
                 self._place_value(node)
             else:
                 blocks += self._place_control(node)
@@ -118,21 +119,21 @@ class _Scheduler:
             block.items.reverse()
         return root
 
-    def _reach(self, outputs: list[Value]) -> None:
+    def _reach(self, outputs: list[Expr]) -> None:
         pending: list[_Node] = list(outputs)
         while pending:
             node = pending.pop()
             if node.index in self._reached:
                 continue
             self._reached[node.index] = node
-            if isinstance(node, Value) and node.owner is not None:
+            if isinstance(node, Expr) and node.owner is not None:
                 pending += self._reach_owned(node)
-            elif isinstance(node, Value):
+            elif isinstance(node, Expr):
                 pending += _values(node.operands)
             else:
                 pending += _values([node.going if isinstance(node, Loop) else node.which])
 
-    def _reach_owned(self, value: Value) -> list[_Node]:
+    def _reach_owned(self, value: Expr) -> list[_Node]:
         owner, place = self._owner(value), value.place
         if value.op == "carry":
             assert isinstance(owner, Loop)
@@ -147,13 +148,13 @@ class _Scheduler:
         return [owner, *_values(sides)]
 
     def _owner(self, value: _Node) -> Loop | Branch:
-        assert isinstance(value, Value)
+        assert isinstance(value, Expr)
         assert value.owner is not None
         return value.owner
 
     def _inputs(self, node: _Node) -> list[_Node]:
         """Return all dependencies of a node, except the next value of a carry of the same loop."""
-        if isinstance(node, Value):
+        if isinstance(node, Expr):
             if node.op == "carry":
                 return []
             return [self._owner(node)] if node.op == "result" else [*_values(node.operands)]
@@ -165,7 +166,7 @@ class _Scheduler:
         numbers = [side[place] for place in places for side in (node.first, node.following)]
         return [*_values([node.going, *numbers, *(node.outcomes[i] for i in results)])]
 
-    def _place_value(self, value: Value) -> None:
+    def _place_value(self, value: Expr) -> None:
         if value.op in ("input", "carry"):
             return
         if value.op == "result":
@@ -212,12 +213,12 @@ class _Scheduler:
             self._use[node.index] = block if before is None else _common(before, block)
 
 
-def _values(numbers: Iterable[Scalar]) -> list[Value]:
-    return [x for x in numbers if not is_known(x)]
+def _values(numbers: Iterable[Scalar]) -> list[Expr]:
+    return [x for x in numbers if not is_constant(x)]
 
 
 def _op(node: _Node) -> str:
-    return node.op if isinstance(node, Value) else ""
+    return node.op if isinstance(node, Expr) else ""
 
 
 def _common(one: Block, other: Block) -> Block:

@@ -53,7 +53,7 @@ def _is_known(name: str, value: Any) -> bool:
 
 
 @contextlib.contextmanager
-def on_host() -> Iterator[Any]:
+def default_device_cpu() -> Iterator[Any]:
     """Run the computations inside on the host CPU, where small programs compile at once.
 
     Yields:

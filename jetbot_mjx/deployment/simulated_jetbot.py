@@ -49,7 +49,7 @@ class Pose(NamedTuple):
     """Counter-clockwise from the world's x axis, in (-π, π] [rad]."""
 
 
-class StandIn:
+class SimulatedJetBot:
     """One simulated JetBot with its motors and its clock."""
 
     def __init__(self, motors: MotorModel | None = None) -> None:
@@ -152,7 +152,7 @@ def replayed(
     Returns:
       (x, y, yaw) [m, m, rad] at each of the times, before its value is set; yaw without jumps.
     """
-    robot = StandIn(motors)
+    robot = SimulatedJetBot(motors)
     robot.place(start)
     poses = []
     for time, (left, right) in zip(times, values, strict=True):

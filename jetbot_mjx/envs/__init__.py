@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING
 from jetbot_mjx.imports import load_lazily
 
 if TYPE_CHECKING:
-    from jetbot_mjx.envs.domain_randomization import VariedEnv as VariedEnv
+    from jetbot_mjx.envs.domain_randomization import (
+        DomainRandomizationWrapper as DomainRandomizationWrapper,
+    )
     from jetbot_mjx.envs.jetbot_env import JetBotEnv as JetBotEnv
     from jetbot_mjx.envs.jetbot_env import make_env as make_env
     from jetbot_mjx.envs.state import State as State
@@ -25,7 +27,7 @@ __getattr__, __dir__ = load_lazily(
         "RobotState": "task",
         "State": "state",
         "Task": "task",
-        "VariedEnv": "domain_randomization",
+        "DomainRandomizationWrapper": "domain_randomization",
         "make_env": "jetbot_env",
         "wrap_for_training": "wrappers",
     },

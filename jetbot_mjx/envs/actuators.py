@@ -8,10 +8,10 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.envs.robot_params import RobotParams
 
 
-class Motors(NamedTuple):
+class ActuatorState(NamedTuple):
     """The memory of the actuator model."""
 
     commands: Float[Array, "delay 2"] | None
@@ -20,30 +20,30 @@ class Motors(NamedTuple):
     """What the motors were asked for in the last step; None: there is no lag."""
 
 
-def motors_at_rest(variation: Variation, longest_delay: int) -> Motors:
+def motors_at_rest(robot_params: RobotParams, longest_delay: int) -> ActuatorState:
     """Return the state of actuators that no command has reached yet.
 
     Args:
-      variation: the robot's.
+      robot_params: the robot's.
       longest_delay: of any robot that the program serves [control steps].
 
     Returns:
       What they remember.
     """
-    return Motors(
+    return ActuatorState(
         jnp.zeros((longest_delay, 2)) if longest_delay else None,
-        jnp.zeros(2) if variation.differs("motor_lag") else None,
+        jnp.zeros(2) if robot_params.differs("motor_lag") else None,
     )
 
 
 def drive_motors(
-    motors: Motors,
+    motors: ActuatorState,
     command: Float[Array, "2"],
-    variation: Variation,
+    robot_params: RobotParams,
     *,
     full_speed: float,
     ctrl_dt: float,
-) -> tuple[Motors, Float[Array, "2"]]:
+) -> tuple[ActuatorState, Float[Array, "2"]]:
     """Pass one command on to the wheels.
 
         u = voltage · command of `action_delay` steps ago
@@ -62,7 +62,7 @@ def drive_motors(
     Args:
       motors: before.
       command: within the motors' limits.
-      variation: the robot's.
+      robot_params: the robot's.
       full_speed: what a motor makes of full voltage [rad/s].
       ctrl_dt: duration of one control step [s].
 
@@ -72,32 +72,32 @@ def drive_motors(
     commands, targets = motors
     if commands is not None:
         line = jnp.concatenate([command[None], commands])
-        command = line[jnp.round(variation.action_delay).astype(jnp.int32)]
+        command = line[jnp.round(robot_params.action_delay).astype(jnp.int32)]
         commands = line[:-1]
-    if variation.differs("supply_voltage"):
-        command = command * variation.supply_voltage
-    if variation.differs("dead_band"):
-        band = jnp.asarray(variation.dead_band)
+    if robot_params.differs("supply_voltage"):
+        command = command * robot_params.supply_voltage
+    if robot_params.differs("dead_band"):
+        band = jnp.asarray(robot_params.dead_band)
         excess = jnp.maximum(jnp.abs(command) - band * full_speed, 0.0)
         command = jnp.sign(command) * excess / (1.0 - band)
     if targets is not None:
         # Without a lag exp(-∞) is exactly zero, and the command passes bit for bit.
-        decay = jnp.exp(-ctrl_dt / jnp.asarray(variation.motor_lag))
+        decay = jnp.exp(-ctrl_dt / jnp.asarray(robot_params.motor_lag))
         targets = decay * targets + (1.0 - decay) * command
         command = targets
-    return Motors(commands, targets), _at_the_wheels(command, variation)
+    return ActuatorState(commands, targets), _at_the_wheels(command, robot_params)
 
 
-def _at_the_wheels(target: Float[Array, "2"], variation: Variation) -> Float[Array, "2"]:
+def _at_the_wheels(target: Float[Array, "2"], robot_params: RobotParams) -> Float[Array, "2"]:
     """Return the speeds at which the preset's wheels do what these wheels do at `target`."""
     sides = jnp.array([0.5, -0.5])
-    if variation.differs("motor_gain", "wheel_radius"):
-        target = target * (variation.motor_gain * variation.wheel_radius)
+    if robot_params.differs("motor_gain", "wheel_radius"):
+        target = target * (robot_params.motor_gain * robot_params.wheel_radius)
     for name in ("motor_gain_mismatch", "wheel_radius_mismatch"):
-        if variation.differs(name):
-            target = target * (1.0 + sides * getattr(variation, name))
-    if variation.differs("wheel_separation"):
+        if robot_params.differs(name):
+            target = target * (1.0 + sides * getattr(robot_params, name))
+    if robot_params.differs("wheel_separation"):
         # As a difference, so that no rounding is left where there is none.
-        change = 0.5 * (1.0 / jnp.asarray(variation.wheel_separation) - 1.0)
+        change = 0.5 * (1.0 / jnp.asarray(robot_params.wheel_separation) - 1.0)
         target = target + change * (target - target[::-1])
     return target

@@ -169,9 +169,9 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           The next state, with the same tree, shapes and dtypes.
         """
-        return self.step_towards(state, action, self.wheel_targets(action))
+        return self.step_with_ctrl(state, action, self.wheel_targets(action))
 
-    def step_towards(
+    def step_with_ctrl(
         self, state: State, action: Float[Array, "2"], ctrl: Float[Array, "2"]
     ) -> State:
         """Step the environment with wheel speeds other than those that the action commands.

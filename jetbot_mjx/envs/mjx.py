@@ -12,7 +12,7 @@ import numpy as np
 from mujoco import mjx
 from mujoco.mjx import Data, Model, step
 
-from jetbot_mjx.compiler.xla_options import on_host
+from jetbot_mjx.compiler.xla_options import default_device_cpu
 
 __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 
@@ -20,13 +20,13 @@ __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 def put_model(model: mujoco.MjModel) -> Model:
     """Return MuJoCo's model as arrays."""
     # Whoever asks may be in the middle of tracing something.
-    with jax.ensure_compile_time_eval(), on_host() as device:
+    with jax.ensure_compile_time_eval(), default_device_cpu() as device:
         return _anywhere(mjx.put_model(model, device=device))
 
 
 def make_data(model: mujoco.MjModel) -> Data:
     """Return the model's state before the first step, as arrays."""
-    with jax.ensure_compile_time_eval(), on_host() as device:
+    with jax.ensure_compile_time_eval(), default_device_cpu() as device:
         return _anywhere(mjx.make_data(model, device=device))
 
 

@@ -15,7 +15,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.compiler.xla_options import on_host
+from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.robot_model import (
@@ -194,7 +194,7 @@ def _programs(settings: str) -> _Programs:
         return judged, task.goal, env.mocap_positions(task.goal)
 
     # On a GPU every call would wait for the device.
-    with on_host():
+    with default_device_cpu():
         key, given = np.zeros(2, np.uint32), np.zeros(2 * size + env.action_size, np.float32)
         begin_program = jax.jit(begin).lower(key).compile()
         judge_program = jax.jit(judge).lower(given, begin_program(key)[1]).compile()

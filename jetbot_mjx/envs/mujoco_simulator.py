@@ -86,8 +86,8 @@ def in_mujoco(
 ) -> JetBotEnv:
     """Return the same environment with C MuJoCo as its physics.
 
-    Its programs run on the CPU: compile them within `compiling.on_host`. `VariedEnv` may wrap it;
-    each robot then gets an `MjModel` of its own.
+    Its programs run on the CPU: compile them within `xla_options.default_device_cpu`.
+    `DomainRandomizationWrapper` may wrap it; each robot then gets an `MjModel` of its own.
 
     Args:
       env: one environment, unwrapped, with its preset's model.

@@ -119,11 +119,11 @@ class Physics:
           The state one `ctrl_dt` later.
         """
         leaves = jax.tree.leaves(self.model)
-        known_late = [leaves[place] for place in self._varied]
+        traced_leaves = [leaves[place] for place in self._varied]
         if self._mj_model.nmocap:
             places = self._data.mocap_pos if mocap_pos is None else mocap_pos
-            known_late.append(jnp.asarray(places, self._data.mocap_pos.dtype))
-        held = jnp.asarray(ctrl, state.qpos.dtype), known_late
+            traced_leaves.append(jnp.asarray(places, self._data.mocap_pos.dtype))
+        held = jnp.asarray(ctrl, state.qpos.dtype), traced_leaves
         return (self._as_kernel() or self._steps)(state, held)
 
     def _steps(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
@@ -147,9 +147,9 @@ class Physics:
         Returns:
           The state one `sim_dt` later.
         """
-        ctrl, known_late = held
+        ctrl, traced_leaves = held
         leaves, treedef = jax.tree.flatten(self.model)
-        varied, places = known_late[: len(self._varied)], known_late[len(self._varied) :]
+        varied, places = traced_leaves[: len(self._varied)], traced_leaves[len(self._varied) :]
         for place, leaf in zip(self._varied, varied, strict=True):
             leaves[place] = leaf
         data = self._data.replace(
@@ -202,9 +202,11 @@ class Physics:
         model = self._mj_model
         state = PhysicsState(numbers(model.nq), numbers(model.nv), numbers(model.nv), numbers())
         leaves = jax.tree.leaves(self.model)
-        known_late = [jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied]
-        known_late += [numbers(model.nmocap, 3)] if model.nmocap else []
-        arguments = state, (numbers(model.nu), known_late)
+        traced_leaves = [
+            jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied
+        ]
+        traced_leaves += [numbers(model.nmocap, 3)] if model.nmocap else []
+        arguments = state, (numbers(model.nu), traced_leaves)
         program = scalarize(self.substep, *arguments)
         llvm_codegen.require(program)
         structure = jax.tree.structure(arguments)

@@ -16,7 +16,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jetbot_mjx.compiler.program_cache import Programs, processor
+from jetbot_mjx.compiler.program_cache import ProgramCache, processor
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
 
@@ -32,7 +32,7 @@ SOURCES = {".ll", ".py", ".xml"}
 _LIBRARIES = ["brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx", "numpy", "optax"]
 
 
-def programs_of(config: Config, *, keep: bool) -> Programs:
+def open_program_cache(config: Config, *, keep: bool) -> ProgramCache:
     """Return the programs of a configuration on the devices of this process.
 
     Args:
@@ -46,14 +46,14 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
     folder = jax.config.values["jax_compilation_cache_dir"]
     own_task = config.task.name not in TRUSTED
     if not keep or folder is None or own_task or jax.process_count() > 1:
-        return Programs(options)
+        return ProgramCache(options)
     devices = jax.devices()
     settings = {
         name: repr(value)
         for name, value in jax.config.values.items()
         if not name.startswith(("jax_compilation_cache", "jax_persistent_cache", "jax_log"))
     }
-    depends_on = [
+    cache_key = [
         # Seeds are arguments of programs.
         config.model_copy(update={"seed": 0}).model_dump(mode="json"),
         _own_source(),
@@ -66,7 +66,7 @@ def programs_of(config: Config, *, keep: bool) -> Programs:
         devices[0].client.platform_version,
         [device.device_kind for device in devices],
     ]
-    return Programs(options, Path(folder), json.dumps(depends_on, sort_keys=True))
+    return ProgramCache(options, Path(folder), json.dumps(cache_key, sort_keys=True))
 
 
 def _version(library: str) -> str | None:

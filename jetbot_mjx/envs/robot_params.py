@@ -1,6 +1,6 @@
 """Robots that differ from their preset, and the physics model of each.
 
-A `Variation` is data, not structure: one compiled program serves every value, traced or not,
+A `RobotParams` is data, not structure: one compiled program serves every value, traced or not,
 and `jax.vmap` gives each robot its own. Floor and masses enter physics through the model; wheels,
 motors and what the robot sees of itself stand before and behind it, in `motors` and `sensors`.
 """
@@ -28,8 +28,8 @@ _SIDES = ("left", "right")
 Quantity = Float[ArrayLike, ""]
 
 
-class Variation(NamedTuple):
-    """Differences of one robot from its preset. `Variation()` does not differ at all.
+class RobotParams(NamedTuple):
+    """Differences of one robot from its preset. `RobotParams()` does not differ at all.
 
     What is left at its default costs nothing: no program contains it.
     """
@@ -95,13 +95,13 @@ class Variation(NamedTuple):
         )
 
 
-def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation) -> mjx.Model:
+def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams) -> mjx.Model:
     """Return the physics model of a varied robot, as MuJoCo would compile it.
 
     Args:
       model: the preset's.
       mj_model: the same robot for C, with or without what only shows.
-      variation: its friction, mass and centre of mass.
+      robot_params: its friction, mass and centre of mass.
 
     Returns:
       A model of the same structure. The constants that MuJoCo derives from the masses when it
@@ -109,32 +109,34 @@ def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation)
       stay as they were.
     """
     changed = {}
-    if variation.differs("friction"):
+    if robot_params.differs("friction"):
         wheels = np.zeros(mj_model.npair, bool)
         wheels[[mj_model.pair(f"{side}_wheel").id for side in _SIDES]] = True
         # Tangential only: torsion and rolling take no part in a contact of three dimensions.
         tangential = wheels[:, None] & (np.arange(5) < 2)
-        factor = jnp.where(tangential, variation.friction, 1.0)
+        factor = jnp.where(tangential, robot_params.friction, 1.0)
         changed["pair_friction"] = model.pair_friction * factor
     chassis = np.arange(model.nbody) == mj_model.body(_CHASSIS).id
-    if variation.differs("mass"):
-        mass = jnp.where(chassis, variation.mass, 1.0)
+    if robot_params.differs("mass"):
+        mass = jnp.where(chassis, robot_params.mass, 1.0)
         changed["body_mass"] = model.body_mass * mass
         changed["body_inertia"] = model.body_inertia * mass[:, None]
-    if variation.differs("com_x", "com_y", "com_z"):
-        shift = jnp.where(chassis[:, None], _com_shift(variation), 0.0)
+    if robot_params.differs("com_x", "com_y", "com_z"):
+        shift = jnp.where(chassis[:, None], _com_shift(robot_params), 0.0)
         changed["body_ipos"] = model.body_ipos + shift
-    if variation.differs("mass", "com_x", "com_y", "com_z"):
-        changed["body_invweight0"] = _invweights(model, mj_model, variation)
+    if robot_params.differs("mass", "com_x", "com_y", "com_z"):
+        changed["body_invweight0"] = _invweights(model, mj_model, robot_params)
     return model.replace(**changed)
 
 
-def _com_shift(variation: Variation) -> Float[Array, "3"]:
-    return jnp.stack([jnp.asarray(x) for x in (variation.com_x, variation.com_y, variation.com_z)])
+def _com_shift(robot_params: RobotParams) -> Float[Array, "3"]:
+    return jnp.stack(
+        [jnp.asarray(x) for x in (robot_params.com_x, robot_params.com_y, robot_params.com_z)]
+    )
 
 
 def _invweights(
-    model: mjx.Model, mj_model: mujoco.MjModel, variation: Variation
+    model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams
 ) -> Float[Array, "bodies 2"]:
     """`body_invweight0`, the softness of contacts, which follows chassis mass and centre of mass.
 
@@ -182,14 +184,14 @@ def _invweights(
         rotation = jnp.stack([trace, wheel, wheel]) / 3.0
         return jnp.stack([1.0 / total + swing / 3.0, rotation], axis=1)
 
-    shift = _com_shift(variation)
-    varied = model.body_invweight0.at[np.asarray(bodies)].set(weights(variation.mass, shift))
+    shift = _com_shift(robot_params)
+    varied = model.body_invweight0.at[np.asarray(bodies)].set(weights(robot_params.mass, shift))
     # Where it is the preset's robot, to the bit.
-    return jnp.where(_is_preset(variation, shift), model.body_invweight0, varied)
+    return jnp.where(_is_preset(robot_params, shift), model.body_invweight0, varied)
 
 
-def _is_preset(variation: Variation, shift: Float[Array, "3"]) -> Bool[Array, ""]:
-    return (jnp.asarray(variation.mass) == 1.0) & (shift == 0.0).all()
+def _is_preset(robot_params: RobotParams, shift: Float[Array, "3"]) -> Bool[Array, ""]:
+    return (jnp.asarray(robot_params.mass) == 1.0) & (shift == 0.0).all()
 
 
 def _inverse(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

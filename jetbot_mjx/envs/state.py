@@ -35,14 +35,14 @@ class State(struct.PyTreeNode):
     done: Float[Array, ""]
     """1 where that step ended the episode."""
     metrics: dict[str, Float[Array, ""]]
-    """Figures of that step; the same names at every step."""
+    """Metrics of that step; the same names at every step."""
     info: dict[str, Any]
     """What wrappers and trainers keep beside; the same names at every step."""
     goal: Goal
     """What the task drew for this episode."""
     key: UInt32[Array, "2"]
     """Random key from which the next episode is drawn."""
-    hardware: Any = None
+    episode_params: Any = None
     """How this episode's robot differs from its preset, and what its motors and sensors remember;
     None: it is its preset."""
 

@@ -24,7 +24,7 @@ from brax.envs.wrappers.training import VmapWrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx.envs import mjx
-from jetbot_mjx.envs.domain_randomization import as_trained
+from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
 
@@ -62,7 +62,7 @@ def wrap_for_training(
     """
 
     def chain(env: JetBotEnv) -> NewEpisodeWrapper:
-        varied = as_trained(env)
+        varied = maybe_randomize(env)
         return NewEpisodeWrapper(EpisodeWrapper(varied, episode_length, action_repeat))
 
     if randomization_fn is None:
@@ -75,7 +75,7 @@ class EpisodeWrapper(Wrapper):
 
     A world whose state, observation or reward is not finite ends here: the step counts for
     nothing (reward 0, truncated, so the loss masks it), the learner sees the last finite
-    observation instead, and `nonfinite_worlds` counts it.
+    observation instead, and `nonfinite_envs` counts it.
     """
 
     env: _Env
@@ -96,7 +96,7 @@ class EpisodeWrapper(Wrapper):
         """Begin an episode with empty books."""
         state = self.env.reset(rng)
         zero = jnp.zeros(())
-        metrics = {**state.metrics, "nonfinite_worlds": zero}
+        metrics = {**state.metrics, "nonfinite_envs": zero}
         info = {
             **state.info,
             "steps": zero,
@@ -125,7 +125,7 @@ class EpisodeWrapper(Wrapper):
         truncation = jnp.where(out_of_time | ~finite, 1.0 - terminated, 0.0)
         done = jnp.maximum(terminated, truncation)
 
-        metrics = {**nstate.metrics, "nonfinite_worlds": 1.0 - finite.astype(jnp.float32)}
+        metrics = {**nstate.metrics, "nonfinite_envs": 1.0 - finite.astype(jnp.float32)}
         step_values = {"sum_reward": nstate.reward, "length": length, **metrics}
         sums = {
             name: jnp.where(begins, 0.0, total) + step_values[name]
@@ -179,7 +179,7 @@ class NewEpisodeWrapper(Wrapper):
     """A wrapper that begins the next episode where one ends, with everything about it drawn anew.
 
     `reward`, `done`, `metrics` and `info` still tell of the step that ended the old episode;
-    physics, goal, `obs` and the robot's `hardware` are already the new one's.
+    physics, goal, `obs` and the robot's `episode_params` are already the new one's.
     """
 
     env: _Env
@@ -189,8 +189,10 @@ class NewEpisodeWrapper(Wrapper):
         state = self.env.step(state, action)
         fresh = self.env.reset(state.key)
         begun = _select(state.done > 0, _episode(fresh), _episode(state))
-        physics, obs, goal, key, hardware = begun
-        return state.replace(pipeline_state=physics, obs=obs, goal=goal, key=key, hardware=hardware)
+        physics, obs, goal, key, episode_params = begun
+        return state.replace(
+            pipeline_state=physics, obs=obs, goal=goal, key=key, episode_params=episode_params
+        )
 
 
 class RandomizedVmapWrapper(Wrapper):
@@ -234,7 +236,7 @@ class RandomizedVmapWrapper(Wrapper):
 
 def _episode(state: State) -> tuple[PyTree, ...]:
     """Return what belongs to an episode, as against the step that led here."""
-    return state.pipeline_state, state.obs, state.goal, state.key, state.hardware
+    return state.pipeline_state, state.obs, state.goal, state.key, state.episode_params
 
 
 def _discarded(state: State) -> State:

@@ -70,8 +70,8 @@ class Run(NamedTuple):
     """
 
 
-class Duel(NamedTuple):
-    """A `Duel` compares two runs, `a` and `b`, in one quantity."""
+class PairwiseResult(NamedTuple):
+    """A `PairwiseResult` compares two runs, `a` and `b`, in one quantity."""
 
     difference: Estimate
     """Mean of `a` minus mean of `b`."""
@@ -94,9 +94,9 @@ class Pair(NamedTuple):
     seeds: int
     """Number of seeds of each run that are compared goal by goal. It is the same for both runs,
     counted from the first seed, because more seeds of one run would bias the comparison."""
-    success_rate: Duel
+    success_rate: PairwiseResult
     """Success rate; goal by goal, the run that reached the goal with more of its seeds wins."""
-    time_to_goal: Duel
+    time_to_goal: PairwiseResult
     """[s] Time to the goal, less is better; goal by goal for goals that both runs reached."""
 
 
@@ -317,11 +317,11 @@ def _duel(
     worse: Bool[np.ndarray, " n"],
     *,
     less_is_better: bool = False,
-) -> Duel:
+) -> PairwiseResult:
     wins, losses = int(better.sum()), int(worse.sum())
     several = len(a) > 1 and len(b) > 1
     order = (b, a) if less_is_better else (a, b)
-    return Duel(
+    return PairwiseResult(
         difference=bootstrap(mean_difference, a, b),
         # With a single seed the comparison says nothing about other seeds.
         improvement=bootstrap(probability_of_improvement, *order) if several else Estimate(None),

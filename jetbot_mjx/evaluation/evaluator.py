@@ -15,11 +15,11 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx.agents.networks import PolicyParams, make_policy
-from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 
@@ -74,7 +74,7 @@ class Summary(NamedTuple):
     """Mean over all episodes, which is near the mean distance covered for every good policy."""
     final_distance_median: float
     """[m] Median over all episodes of the distance to the goal at the end, on the floor."""
-    nonfinite_worlds: int
+    nonfinite_envs: int
 
 
 def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
@@ -103,7 +103,7 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
         path_efficiency=float(path_efficiencies(host)[won].mean()) if wins else None,
         episode_return=float(host.episode_return.mean()),
         final_distance_median=float(np.median(final_distances(host))),
-        nonfinite_worlds=int(host.nonfinite.sum()),
+        nonfinite_envs=int(host.nonfinite.sum()),
     )
 
 
@@ -170,12 +170,12 @@ class Evaluator:
 
     def __init__(
         self,
-        env: JetBotEnv | VariedEnv,
+        env: JetBotEnv | DomainRandomizationWrapper,
         networks: ppo_networks.PPONetworks,
         *,
         baselines: bool = False,
         record: bool = False,
-        programs: Programs | None = None,
+        programs: ProgramCache | None = None,
     ) -> None:
         """Prepare the program, which compiles at its first use.
 
@@ -193,9 +193,9 @@ class Evaluator:
             controllers += [make(env) for make in BASELINES.values()]
         length = env.config.task.episode_length
         self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
-        drawn = ", drawn" if isinstance(env, VariedEnv) else ""
+        drawn = ", drawn" if isinstance(env, DomainRandomizationWrapper) else ""
         self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
-        self._programs = programs or programs_of(env.config, keep=False)
+        self._programs = programs or open_program_cache(env.config, keep=False)
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
@@ -240,7 +240,7 @@ class Evaluator:
         return self._compiled[count](*arguments)
 
 
-def _random(env: JetBotEnv | VariedEnv) -> Controller:
+def _random(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
         del params, state
         return jax.random.uniform(key, (env.action_size,), minval=-1.0, maxval=1.0)
@@ -248,7 +248,7 @@ def _random(env: JetBotEnv | VariedEnv) -> Controller:
     return act
 
 
-def _constant(env: JetBotEnv | VariedEnv) -> Controller:
+def _constant(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     """Return a controller that holds the middle of the action range: half speed straight ahead."""
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
@@ -258,7 +258,7 @@ def _constant(env: JetBotEnv | VariedEnv) -> Controller:
     return act
 
 
-def _turn_then_go(env: JetBotEnv | VariedEnv) -> Controller:
+def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     """Return a controller that turns towards the goal and drives faster the better it is aligned.
 
     It turns in place until the goal lies ahead.

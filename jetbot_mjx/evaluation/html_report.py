@@ -40,7 +40,7 @@ LISTED_FAILURES = 50
 _REPLAYED = 8
 
 _NOT_ALWAYS = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
-"""Figures that a page may lack."""
+"""Images that a page may lack."""
 
 _FORMS = {
     "percent": "{:.2%}",
@@ -73,8 +73,8 @@ _PAGES = jinja2.Environment(
 _PAGES.filters["cell"] = lambda text: text.replace("|", "\\|")
 
 
-class _Picture(NamedTuple):
-    """A `_Picture` holds one figure of a page: its file and data URIs of both themes."""
+class _Image(NamedTuple):
+    """An `_Image` holds one figure of a page: its file and data URIs of both themes."""
 
     file: str
     light: str
@@ -156,7 +156,7 @@ def _write(
     """Draw all figures and render all pages, then write the files, the HTML page last."""
     drawn = {figure: _draw(draw) for figure, draw in figures.items()}
     pictures = {
-        figure: _Picture(f"{figure}.png", *(_data_uri(png) for png in pngs))
+        figure: _Image(f"{figure}.png", *(_data_uri(png) for png in pngs))
         for figure, pngs in drawn.items()
     }
     pages = {

@@ -19,7 +19,7 @@ from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from jetbot_mjx.evaluation.evaluator import Summary, final_distances, path_efficiencies
-from jetbot_mjx.evaluation.report import SECTORS, Cell, Report
+from jetbot_mjx.evaluation.report import SECTORS, GoalBin, Report
 from jetbot_mjx.evaluation.robustness import CARRIES_AT, SweepResult
 from jetbot_mjx.evaluation.rollout import Episodes
 
@@ -139,7 +139,7 @@ def plot_trajectories(
     return figure
 
 
-def plot_by_goal(cells: Sequence[Cell]) -> Figure:
+def plot_by_goal(cells: Sequence[GoalBin]) -> Figure:
     """Plot success and time over the goal's distance and bearing, as seen from above the start.
 
     Args:
@@ -181,7 +181,7 @@ def _cycle() -> list[str]:
 
 def _polar(
     axes: Any,
-    cells: Sequence[Cell],
+    cells: Sequence[GoalBin],
     values: Sequence[float | None],
     labels: Sequence[str],
     colours: Colormap,

@@ -22,7 +22,7 @@ from jetbot_mjx.evaluation.evaluator import (
     final_distances,
     wilson_interval,
 )
-from jetbot_mjx.evaluation.robustness import InMujoco, SweepResult, as_json
+from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
 
 TIME_LIMIT = "time limit"
@@ -47,8 +47,8 @@ _SETTINGS = (
 """Settings of the configuration that a report shows, besides those of the task."""
 
 
-class Cell(NamedTuple):
-    """A `Cell` holds the results for the goals in one range of distances and bearings."""
+class GoalBin(NamedTuple):
+    """A `GoalBin` holds the results for the goals in one range of distances and bearings."""
 
     distance_low: float
     """[m] on the floor, from the start, like `distance_high`."""
@@ -135,7 +135,7 @@ class Report(NamedTuple):
     config: Config
     policy: Summary
     baselines: Mapping[str, Summary]
-    cells: tuple[Cell, ...]
+    cells: tuple[GoalBin, ...]
     failures: tuple[Failure, ...]
     learning_curve: tuple[CurvePoint, ...]
     """Evaluations during the training; empty if the run folder holds no metrics."""
@@ -150,7 +150,7 @@ class Report(NamedTuple):
     """The ranges that those robots were sampled from."""
     ranges_file: Path | None = None
     """The file that holds the ranges; None: the run's own configuration."""
-    mujoco: InMujoco | None = None
+    mujoco: MujocoResult | None = None
     """Metrics on the same goals in C MuJoCo; None if they were not requested."""
     best_known: BestKnown | None = None
     """Best-known times; None if there are none for these goals and settings."""
@@ -169,7 +169,8 @@ class Report(NamedTuple):
         return (
             f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
-            f"{' --sweep' if self.robustness else ' --simulator mujoco' if self.mujoco else ''}"
+            f"{' --robustness' if self.robustness else ''}"
+            f"{' --simulator mujoco' if self.mujoco and not self.robustness else ''}"
             f"{f' --ranges {shlex.quote(str(self.ranges_file))}' if self.ranges_file else ''}"
         )
 
@@ -216,7 +217,7 @@ def goal_places(
     return np.hypot(x, y), 180 - (180 - bearing) % 360
 
 
-def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[Cell, ...]:
+def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
     """Compute success and time by the goal's distance and bearing.
 
     Args:
@@ -304,10 +305,10 @@ def _cell(
     place: tuple[float, float, float, float],
     won: np.ndarray,
     seconds: Float[np.ndarray, " n"],
-) -> Cell:
+) -> GoalBin:
     count, wins = won.size, int(won.sum())
     low, high = wilson_interval(wins, count) if count else (None, None)
-    return Cell(
+    return GoalBin(
         *place,
         episodes=count,
         successes=wins,
@@ -371,8 +372,8 @@ def learning_curve(history: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[Cu
       One point for each line that holds a success rate with its interval.
     """
     points = []
-    for env_steps, figures in history:
-        rate, low, high, seconds = (figures.get(f"eval/{name}") for name in CurvePoint._fields[1:])
+    for env_steps, metrics in history:
+        rate, low, high, seconds = (metrics.get(f"eval/{name}") for name in CurvePoint._fields[1:])
         if rate is not None and low is not None and high is not None:
             points.append(CurvePoint(env_steps, rate, low, high, seconds))
     return tuple(sorted(points, key=lambda point: point.env_steps))

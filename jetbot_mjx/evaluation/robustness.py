@@ -23,12 +23,12 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, Int, UInt32
 
 from jetbot_mjx.agents.networks import PolicyParams
-from jetbot_mjx.compiler.xla_options import compiler_options, on_host
+from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
 from jetbot_mjx.config import RandomizationConfig
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
-from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.evaluation.evaluator import (
     BASELINES,
     GOAL_SET_VERSION,
@@ -50,7 +50,7 @@ class Sweep(NamedTuple):
     """A `Sweep` holds one parameter and the values at which a policy is evaluated."""
 
     name: str
-    """Name of the parameter, a field of `Variation`."""
+    """Name of the parameter, a field of `RobotParams`."""
     label: str
     unit: str
     values: tuple[float, ...]
@@ -61,12 +61,12 @@ class Sweep(NamedTuple):
     @property
     def nominal(self) -> float:
         """Return the preset's value."""
-        return getattr(Variation(), self.name)
+        return getattr(RobotParams(), self.name)
 
     @property
-    def robots(self) -> list[Variation]:
+    def robots(self) -> list[RobotParams]:
         """Return the robot for each value."""
-        return [Variation()._replace(**{self.name: value}) for value in self.values]
+        return [RobotParams()._replace(**{self.name: value}) for value in self.values]
 
 
 SWEEPS = (
@@ -252,16 +252,16 @@ class Sweeper:
             index: int | Int[Array, ""],
             params: PolicyParams,
             keys: UInt32[Array, "n 2"],
-            variations: Float[Array, "robots quantities"],
+            robot_params: Float[Array, "robots quantities"],
         ) -> Episodes:
-            def one(variation: Float[Array, " quantities"]) -> Episodes:
-                varied = VariedEnv(env, Variation(*variation))
+            def one(robot_params: Float[Array, " quantities"]) -> Episodes:
+                varied = DomainRandomizationWrapper(env, RobotParams(*robot_params))
                 return rollout_fn(varied, controllers, length)(index, params, keys)
 
-            return jax.lax.map(one, variations, batch_size=at_once)
+            return jax.lax.map(one, robot_params, batch_size=at_once)
 
         self._drive = jax.jit(drive, compiler_options=compiler_options(env.config))
-        self._scripted: dict[Variation, Summary] = {}
+        self._scripted: dict[RobotParams, Summary] = {}
 
     def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
         """Evaluate a policy at every value of every parameter, on the same goals.
@@ -284,9 +284,9 @@ class Sweeper:
             for one in self._sweeps
         )
 
-    def _judged(self, controller: int, params: PolicyParams) -> dict[Variation, Summary]:
-        variations = jnp.asarray(self._robots, jnp.float32)
-        driven = jax.device_get(self._drive(controller, params, self._keys, variations))
+    def _judged(self, controller: int, params: PolicyParams) -> dict[RobotParams, Summary]:
+        robot_params = jnp.asarray(self._robots, jnp.float32)
+        driven = jax.device_get(self._drive(controller, params, self._keys, robot_params))
         each = (jax.tree.map(lambda x, i=i: x[i], driven) for i in range(len(self._robots)))
         summaries = (summarize(one, self._env.dt) for one in each)
         return dict(zip(self._robots, summaries, strict=True))
@@ -314,8 +314,8 @@ def sweep(
     return Sweeper(env, networks, keys, sweeps).run(params)
 
 
-class InMujoco(NamedTuple):
-    """An `InMujoco` holds the metrics of a policy in C MuJoCo, on the goals of the report."""
+class MujocoResult(NamedTuple):
+    """A `MujocoResult` holds the metrics of a policy in C MuJoCo, on the goals of the report."""
 
     numerics: Numerics
     policy: Summary
@@ -359,17 +359,21 @@ class MujocoEvaluator:
         simulator = in_mujoco(env, numerics)
         self._preset = Evaluator(simulator, networks)
         drawn = ranges is not None and ranges.drawn
-        self._drawn = Evaluator(VariedEnv(simulator, ranges=ranges), networks) if drawn else None
+        self._drawn = (
+            Evaluator(DomainRandomizationWrapper(simulator, ranges=ranges), networks)
+            if drawn
+            else None
+        )
 
-    def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> InMujoco:
+    def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> MujocoResult:
         """Evaluate a policy.
 
         Args:
           params: parameters of the policy.
           keys: one reset key for each episode, such as `report_keys(1024)`.
         """
-        with on_host():
-            return InMujoco(
+        with default_device_cpu():
+            return MujocoResult(
                 self._numerics,
                 summarize(self._preset.run(params, keys), self._dt),
                 summarize(self._drawn.run(params, keys), self._dt) if self._drawn else None,

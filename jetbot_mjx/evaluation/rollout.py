@@ -112,7 +112,7 @@ def rollout_fn(
             steps=jnp.ones(()),
             episode_return=nstate.reward,
             terminated=nstate.info["terminated"],
-            nonfinite=nstate.metrics["nonfinite_worlds"],
+            nonfinite=nstate.metrics["nonfinite_envs"],
             path_length=moved,
         )
         added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)

@@ -31,10 +31,10 @@ PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
 POLICY = "policy"
 """The tree that holds a policy's parameters."""
 
-FORMAT = "jetbot_mjx/2"
+FORMAT = "jetbot_mjx/3"
 """Format of a checkpoint's content; a checkpoint with another number cannot be read here."""
 
-_KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "figures")
+_KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "metrics")
 
 
 class Checkpoint(NamedTuple):
@@ -215,7 +215,7 @@ def _find(path: Path, which: Which) -> Path:
 def _success_rate(folder: Path) -> float:
     """Return a checkpoint's success rate, or -1 if it was not evaluated or cannot be read."""
     try:
-        return float(explanation(folder)["figures"].get("success_rate", -1.0))
+        return float(explanation(folder)["metrics"].get("success_rate", -1.0))
     except CheckpointError:
         return -1.0
 

@@ -62,8 +62,8 @@ class CheckpointError(UserError):
     """Raised when a checkpoint is missing or cannot be used."""
 
 
-class Store:
-    """A `Store` writes the checkpoints of one run.
+class CheckpointStore:
+    """A `CheckpointStore` writes the checkpoints of one run.
 
     It is a context manager that waits for the last write. Writing runs in the background, one
     checkpoint at a time. A checkpoint has a temporary name until it is complete, so a process that

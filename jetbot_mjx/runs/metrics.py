@@ -8,7 +8,7 @@ TensorBoard also shows the metrics under the names of Stable-Baselines3 (`sb3_ta
   eval/path_efficiency      straight line over way travelled, mean over the successes
   eval/episode_return       mean sum of rewards [m]: about the distance covered
   eval/final_distance_median    [m] to the goal at the end, on the floor
-  eval/nonfinite_worlds     episodes that were cut off because of a non-finite state
+  eval/nonfinite_envs     episodes that were cut off because of a non-finite state
   loss/total, policy, value, entropy    means over the interval, as Brax computes them
   policy/entropy            of the actions, after squashing where they are squashed [nat]
   policy/kl                 between the policy before and after an update, mean
@@ -16,7 +16,7 @@ TensorBoard also shows the metrics under the names of Stable-Baselines3 (`sb3_ta
   policy/learning_rate      Adam's step size
   rollout/episodes          that ended while collecting, driven by the exploring policy
   rollout/success_rate      of those; likewise rollout/episode_return, rollout/episode_length
-  train/nonfinite_worlds    while collecting: each was reset, and the first one saved for replay
+  train/nonfinite_envs    while collecting: each was reset, and the first one saved for replay
   train/nonfinite_updates   updates that were skipped because their gradient was not finite
   time/env_steps_per_second environment steps per training second, without compilation
   time/training_seconds     spent on training since the last report
@@ -48,13 +48,13 @@ with standing_in("torch", None):
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto import event_pb2, summary_pb2
 
-Figures = Mapping[str, float | None]
+MetricValues = Mapping[str, float | None]
 
 
 class Sink(Protocol):
     """A `Sink` receives metrics and writes them somewhere."""
 
-    def write(self, env_steps: int, figures: Figures) -> None:
+    def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Write the metrics of one moment; a metric that has no value then is None."""
         ...
 
@@ -74,10 +74,10 @@ class Sinks:
         """
         self._sinks = sinks
 
-    def write(self, env_steps: int, figures: Figures) -> None:
+    def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Write the metrics to every sink."""
         for sink in self._sinks:
-            sink.write(env_steps, figures)
+            sink.write(env_steps, metrics)
 
     def close(self) -> None:
         """Close every sink."""
@@ -93,11 +93,11 @@ class Sinks:
         self.close()
 
 
-def mean_of(figures: Sequence[Figures]) -> Figures:
+def mean_of(metrics: Sequence[MetricValues]) -> MetricValues:
     """Compute the mean of each metric over several seeds, leaving out seeds without a value."""
     means: dict[str, float | None] = {}
-    for name in figures[0]:
-        values = [value for one in figures if (value := one.get(name)) is not None]
+    for name in metrics[0]:
+        values = [value for one in metrics if (value := one.get(name)) is not None]
         means[name] = sum(values) / len(values) if values else None
     return means
 
@@ -108,7 +108,7 @@ class History(NamedTuple):
     env_steps: int
     timestamp: float
     """Time at which the line was written [s since 1970]."""
-    figures: Figures
+    metrics: MetricValues
 
 
 def read_history(path: Path, last: int) -> list[History]:
@@ -148,9 +148,9 @@ class JsonlSink:
             write_text(path, text)
         self._file = path.open("a", encoding="utf-8")
 
-    def write(self, env_steps: int, figures: Figures) -> None:
+    def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Append a line and sync it to disk, so that no checkpoint is newer than the metrics."""
-        self._file.write(_line(env_steps, time.time(), figures))
+        self._file.write(_line(env_steps, time.time(), metrics))
         self._file.flush()
         os.fsync(self._file.fileno())
 
@@ -159,11 +159,11 @@ class JsonlSink:
         self._file.close()
 
 
-def _line(env_steps: int, timestamp: float, figures: Figures) -> str:
+def _line(env_steps: int, timestamp: float, metrics: MetricValues) -> str:
     """Return one line of JSON, with null for values that are not finite, as JSON has no NaN."""
     values = {
         name: value if value is not None and math.isfinite(value) else None
-        for name, value in figures.items()
+        for name, value in metrics.items()
     }
     return json.dumps({"env_steps": env_steps, "timestamp": timestamp, **values}) + "\n"
 
@@ -199,15 +199,15 @@ class TensorBoardSink:
             self._add(*entry)
         self._writer.flush()
 
-    def write(self, env_steps: int, figures: Figures) -> None:
+    def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Write one scalar for each metric that has a value."""
-        self._add(env_steps, time.time(), figures)
+        self._add(env_steps, time.time(), metrics)
         self._writer.flush()
 
-    def _add(self, env_steps: int, timestamp: float, figures: Figures) -> None:
+    def _add(self, env_steps: int, timestamp: float, metrics: MetricValues) -> None:
         values = [
             _SUMMARY.Value(tag=name, simple_value=value)
-            for name, value in with_aliases(env_steps, figures, self._names).items()
+            for name, value in with_aliases(env_steps, metrics, self._names).items()
         ]
         event = _EVENT(wall_time=timestamp, step=env_steps, summary=_SUMMARY(value=values))
         self._writer.write_event(event)

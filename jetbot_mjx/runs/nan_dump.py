@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jetbot_mjx.agents.ppo import Fault
+from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import Config, ConfigError, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
@@ -15,35 +15,35 @@ from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint_store import flatten
 
-FOLDER = "faults"
+FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
 
 MOST = 20
 """Largest number of dumps that a run keeps, as further ones would add no information."""
 
-_FORMAT = "jetbot_mjx.fault/1"
+_FORMAT = "jetbot_mjx.nan_dump/1"
 
 
-class StoredFault(NamedTuple):
-    """A `StoredFault` holds a dump that was loaded from a file."""
+class StoredNanDump(NamedTuple):
+    """A `StoredNanDump` holds a dump that was loaded from a file."""
 
     config: Config
     env_steps: int
-    """Environment steps of the training at the end of the call in which the fault happened."""
-    fault: Fault
+    """Environment steps of the training at the end of the call in which the nan_dump happened."""
+    nan_dump: NanDump
 
 
-def save_fault(run_dir: Path, config: Config, env_steps: int, fault: Fault) -> Path | None:
-    """Save a fault to `faults/<env_steps>.npz`, unless the run already holds `MOST` of them.
+def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDump) -> Path | None:
+    """Save a nan_dump to `nan_dumps/<env_steps>.npz`, unless the run already holds `MOST` of them.
 
     Args:
       run_dir: the run folder.
       config: the configuration of the run.
       env_steps: environment steps so far.
-      fault: the fault, with arrays on the host.
+      nan_dump: the nan_dump, with arrays on the host.
 
     Returns:
-      The path of the file; None if the fault was not saved.
+      The path of the file; None if the nan_dump was not saved.
 
     Raises:
       OSError: the file cannot be written.
@@ -56,21 +56,21 @@ def save_fault(run_dir: Path, config: Config, env_steps: int, fault: Fault) -> P
     about = {"format": _FORMAT, "config": config.model_dump(mode="json"), "env_steps": env_steps}
     unfinished = path.with_suffix(".unfinished")
     with unfinished.open("wb") as file:
-        np.savez(file, about=np.array(json.dumps(about)), **flatten(fault))
+        np.savez(file, about=np.array(json.dumps(about)), **flatten(nan_dump))
     return unfinished.replace(path)
 
 
-def load_fault(path: Path) -> StoredFault:
-    """Load a fault.
+def load_nan_dump(path: Path) -> StoredNanDump:
+    """Load a nan_dump.
 
     Args:
-      path: a file that `save_fault` wrote.
+      path: a file that `save_nan_dump` wrote.
 
     Returns:
-      The fault with its configuration and environment steps.
+      The nan_dump with its configuration and environment steps.
 
     Raises:
-      UserError: there is no such file, or `save_fault` did not write it.
+      UserError: there is no such file, or `save_nan_dump` did not write it.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
@@ -84,8 +84,10 @@ def load_fault(path: Path) -> StoredFault:
         if wanted.keys() != arrays.keys():
             odd = sorted(wanted.keys() ^ arrays.keys())[0]
             raise ValueError(f"{odd} is missing, or does not belong there")
-        fault = jax.tree.unflatten(jax.tree.structure(template), [arrays[name] for name in wanted])
-        return StoredFault(config, about["env_steps"], fault)
+        nan_dump = jax.tree.unflatten(
+            jax.tree.structure(template), [arrays[name] for name in wanted]
+        )
+        return StoredNanDump(config, about["env_steps"], nan_dump)
     except FileNotFoundError:
         raise UserError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
     except ConfigError as error:
@@ -93,14 +95,14 @@ def load_fault(path: Path) -> StoredFault:
     # NumPy reports a damaged archive by many kinds of exception.
     except Exception as error:
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise UserError(f"{path} is not a fault kept by a training: {reason[0]}") from None
+        raise UserError(f"{path} is not a nan_dump kept by a training: {reason[0]}") from None
 
 
-def _template(config: Config) -> Fault:
+def _template(config: Config) -> NanDump:
     env = wrap_for_training(JetBotEnv(config), config.task.episode_length)
     batched: Any = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
-    return Fault(
+    return NanDump(
         found=np.bool_(True),  # pyright: ignore[reportArgumentType]
         env_state=state,
         actions=np.zeros((config.ppo.unroll_length, env.action_size)),  # pyright: ignore[reportArgumentType]

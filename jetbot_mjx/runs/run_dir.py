@@ -1,8 +1,8 @@
 """Create, lock and read run folders; everything after training needs only the run folder.
 
 A run folder holds config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/,
-checkpoints/<env_steps>/, evaluations/<env_steps>/, videos/, policy/ and faults/. If several seeds
-are trained at once, it holds one folder seed-<n>/ for each of them, with all of that inside.
+checkpoints/<env_steps>/, evaluations/<env_steps>/, videos/, policy/ and nan_dumps/. If several
+seeds are trained at once, it holds one folder seed-<n>/ for each of them, with all of that inside.
 """
 
 import contextlib

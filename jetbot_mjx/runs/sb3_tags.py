@@ -55,19 +55,19 @@ def aliases(ppo: PPOConfig) -> dict[str, Alias]:
 
 
 def with_aliases(
-    env_steps: int, figures: Mapping[str, float | None], names: Mapping[str, Alias]
+    env_steps: int, metrics: Mapping[str, float | None], names: Mapping[str, Alias]
 ) -> dict[str, float]:
     """Add the aliases to metrics, and leave out metrics without a value.
 
     Args:
       env_steps: environment steps at that moment.
-      figures: our metrics.
+      metrics: our metrics.
       names: the aliases, from `aliases`.
 
     Returns:
       All metrics and aliases that have a value.
     """
-    known: dict[str, float] = {name: value for name, value in figures.items() if value is not None}
+    known: dict[str, float] = {name: value for name, value in metrics.items() if value is not None}
     ours = {**known, "env_steps": float(env_steps)}
     for tag, (figure, times, over) in names.items():
         divisor = ours.get(over) if isinstance(over, str) else over

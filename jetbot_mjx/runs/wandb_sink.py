@@ -15,7 +15,7 @@ from typing import Any
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.metrics import Figures, History
+from jetbot_mjx.runs.metrics import History, MetricValues
 from jetbot_mjx.runs.run_dir import write_json
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
 
@@ -75,7 +75,7 @@ class WandbSink:
             self._run = self._begin(config, run_dir, seeds)
             write_json(self._path, self._told)
         for entry in history:
-            self.write(entry.env_steps, entry.figures)
+            self.write(entry.env_steps, entry.metrics)
 
     def _begin(self, config: Config, run_dir: Path, seeds: int) -> Any:
         wandb: Any = importlib.import_module("wandb")
@@ -105,12 +105,12 @@ class WandbSink:
         self._say(f"Weights & Biases: {where or 'disabled'}")
         return run
 
-    def write(self, env_steps: int, figures: Figures) -> None:
+    def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Log the same metrics as TensorBoard, unless this step was logged already."""
         if self._run is None or env_steps <= self._told["env_steps"]:
             return
         with self._or_without():
-            self._run.log(with_aliases(env_steps, figures, self._names), step=env_steps)
+            self._run.log(with_aliases(env_steps, metrics, self._names), step=env_steps)
             self._told["env_steps"] = env_steps
             write_json(self._path, self._told)
 

@@ -1,7 +1,7 @@
 """The stock trainer: `brax.training.agents.ppo.train.train` on our environment.
 
 Nothing of PPO is written here. This module translates the configuration, hands Brax our
-wrappers, and reports each epoch to a `Recorder`. `trainer: brax` selects it.
+wrappers, and reports each epoch to a `TrainerCallback`. `trainer: brax` selects it.
 """
 
 import contextlib
@@ -20,14 +20,14 @@ from jetbot_mjx.agents.ppo import LOSSES
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 
 
-class _Enough(Exception):
+class _StopTraining(Exception):
     """Brax's loop has no other way out."""
 
 
-def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
+def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
     """Train until the end, or until the recorder has enough.
 
     Args:
@@ -54,13 +54,14 @@ def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
 
     def report(env_steps: int, metrics: Mapping[str, Any], seconds: float) -> None:
         nonlocal clock
-        figures = _figures(metrics, config.ppo.entropy_cost)
         params = jax.device_get(latest["params"])
-        if not recorder.report([Progress(env_steps, params, figures, seconds)]):
-            raise _Enough
+        if not recorder.on_interval(
+            [Progress(env_steps, params, to_our_metrics(metrics, config.ppo.entropy_cost), seconds)]
+        ):
+            raise _StopTraining
         clock = time.perf_counter()
 
-    with device_put_replicated(), contextlib.suppress(_Enough):
+    with device_put_replicated(), contextlib.suppress(_StopTraining):
         brax_train.train(
             environment=env,
             episode_length=config.task.episode_length,
@@ -78,13 +79,13 @@ def train(config: Config, env: JetBotEnv, recorder: Recorder) -> None:
         )
 
 
-def _figures(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+def to_our_metrics(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
     """Return Brax's metrics under this project's names."""
     brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
-    figures = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
+    metrics = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
     if "entropy_loss" in brax and entropy_cost > 0:
-        figures["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
-    return figures
+        metrics["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
+    return metrics
 
 
 @contextlib.contextmanager

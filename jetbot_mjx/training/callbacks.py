@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from jetbot_mjx.agents.networks import PolicyParams
-from jetbot_mjx.agents.ppo import Fault, TrainState
+from jetbot_mjx.agents.ppo import NanDump, TrainState
 
 
 class Progress(NamedTuple):
@@ -14,7 +14,7 @@ class Progress(NamedTuple):
     """Environment steps so far."""
     params: PolicyParams
     """On the host."""
-    figures: Mapping[str, float]
+    metrics: Mapping[str, float]
     """Means and counts since the last complete report, by this project's names."""
     seconds: float
     """Time that training took since the last report, compilation apart where that is known."""
@@ -22,10 +22,10 @@ class Progress(NamedTuple):
     """All that is needed to go on from here, on the host; None: the trainer cannot."""
 
 
-class Recorder:
+class TrainerCallback:
     """A listener of a trainer; this one ignores everything."""
 
-    def report(self, progress: Sequence[Progress]) -> bool:
+    def on_interval(self, progress: Sequence[Progress]) -> bool:
         """Take the state of every seed at the end of an interval.
 
         Returns:
@@ -34,14 +34,14 @@ class Recorder:
         del progress
         return True
 
-    def pause(self, progress: Sequence[Progress]) -> None:
+    def on_preempt(self, progress: Sequence[Progress]) -> None:
         """Take the state of every seed where training was asked to stop between two reports."""
 
-    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
+    def on_progress(self, env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
         """Take what is known between two reports: the mean of all seeds, and the time spent."""
 
-    def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None:
+    def on_nan_dump(self, seed_index: int, env_steps: int, nan_dump: NanDump) -> None:
         """Take a world that blew up before that many environment steps."""
 
-    def compiled(self) -> None:
+    def on_compiled(self) -> None:
         """Hear that the training step is compiled."""

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from typing import Protocol, TextIO
 
-from jetbot_mjx.runs.metrics import Figures, mean_of
+from jetbot_mjx.runs.metrics import MetricValues, mean_of
 
 COMPILING = "compiling"
 TRAINING = "training"
@@ -30,11 +30,11 @@ class Terminal(Protocol):
         """Hear which of `PHASES` begins."""
         ...
 
-    def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
-        """Take the figures of every seed at the end of an interval."""
+    def write(self, env_steps: int, metrics: Sequence[MetricValues]) -> None:
+        """Take the metrics of every seed at the end of an interval."""
         ...
 
-    def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
+    def tell(self, env_steps: int, metrics: MetricValues, env_steps_per_second: float) -> None:
         """Take what is known between two reports: the mean of all seeds."""
         ...
 
@@ -43,7 +43,7 @@ class Terminal(Protocol):
         ...
 
     def close(self) -> None:
-        """Leave the terminal as it was, with the last figures on it."""
+        """Leave the terminal as it was, with the last metrics on it."""
         ...
 
 
@@ -68,9 +68,9 @@ class Lines:
     def phase(self, name: str) -> None:
         """Let it pass: the lines tell."""
 
-    def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
+    def write(self, env_steps: int, metrics: Sequence[MetricValues]) -> None:
         """Print one line, of several seeds the mean."""
-        mean = mean_of(figures)
+        mean = mean_of(metrics)
         wall = mean.get("time/wall_seconds") or 0.0
         parts = [f"{env_steps:>12,} steps"]
         parts.append(_shown(mean, "eval/success_rate", "success {:6.1%}"))
@@ -84,14 +84,14 @@ class Lines:
             parts.append(f"(compiling {compiled:.1f} s)")
         self._print(parts)
 
-    def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
+    def tell(self, env_steps: int, metrics: MetricValues, env_steps_per_second: float) -> None:
         """Print a line between two reports, unless the last one is still new."""
         if time.monotonic() - self._last_line < _SECONDS_BETWEEN_LINES:
             return
         self._print(
             [
                 f"{env_steps:>12,} steps",
-                _shown(figures, "rollout/success_rate", "exploring {:6.1%}"),
+                _shown(metrics, "rollout/success_rate", "exploring {:6.1%}"),
                 f"{env_steps_per_second:>10,.0f} steps/s",
                 self._eta(env_steps, env_steps_per_second),
             ]
@@ -114,6 +114,6 @@ class Lines:
         """Nothing is left."""
 
 
-def _shown(figures: Figures, name: str, form: str) -> str:
-    value = figures.get(name)
+def _shown(metrics: MetricValues, name: str, form: str) -> str:
+    value = metrics.get(name)
     return form.format(value) if value is not None else ""

@@ -1,8 +1,8 @@
 """A terminal that people watch shows how a training goes, in place: rich's live display.
 
-One thread of its own draws. Training only leaves figures and lines for it and never waits, not
+One thread of its own draws. Training only leaves metrics and lines for it and never waits, not
 even for a terminal that no longer reads. The display hides no cursor and ends with an empty
-line: however the process ends, by SIGKILL too, the terminal is in order and the last figures
+line: however the process ends, by SIGKILL too, the terminal is in order and the last metrics
 stay on it.
 """
 
@@ -18,9 +18,9 @@ from rich.console import Console, RenderableType
 from rich.live import Live
 from rich.text import Text
 
-from jetbot_mjx.runs.metrics import Figures, History
+from jetbot_mjx.runs.metrics import History, MetricValues
 from jetbot_mjx.training.console import COMPILING, Lines, Terminal
-from jetbot_mjx.training.dashboard_layout import Board, memory_in_use
+from jetbot_mjx.training.dashboard_layout import DashboardLayout, memory_in_use
 
 _SECONDS_BETWEEN_DRAWINGS = 0.5
 _PATIENCE = 1.0
@@ -49,7 +49,7 @@ def open_terminal(
         return Lines(total_steps, stream)
     seeds = [folder.name.removeprefix("seed-") for folder in run_dirs]
     folder = run_dirs[0] if len(run_dirs) == 1 else run_dirs[0].parent
-    return Dashboard(Board(folder.name, total_steps, seeds, histories), console)
+    return Dashboard(DashboardLayout(folder.name, total_steps, seeds, histories), console)
 
 
 class Dashboard:
@@ -58,7 +58,7 @@ class Dashboard:
     What is printed while it is there, by whomever, scrolls above it.
     """
 
-    def __init__(self, board: Board, console: Console) -> None:
+    def __init__(self, board: DashboardLayout, console: Console) -> None:
         """Prepare it.
 
         Args:
@@ -86,15 +86,15 @@ class Dashboard:
         with self._lock:
             self._board.phase(name)
 
-    def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
+    def write(self, env_steps: int, metrics: Sequence[MetricValues]) -> None:
         """Show a report."""
         with self._lock:
-            self._board.write(env_steps, figures)
+            self._board.write(env_steps, metrics)
 
-    def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
+    def tell(self, env_steps: int, metrics: MetricValues, env_steps_per_second: float) -> None:
         """Show what is known between two reports."""
         with self._lock:
-            self._board.tell(env_steps, figures, env_steps_per_second)
+            self._board.tell(env_steps, metrics, env_steps_per_second)
 
     def say(self, text: str) -> None:
         """Let lines scroll above the board."""

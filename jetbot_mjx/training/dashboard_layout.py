@@ -14,7 +14,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from jetbot_mjx.runs.metrics import Figures, History, mean_of
+from jetbot_mjx.runs.metrics import History, MetricValues, mean_of
 from jetbot_mjx.training.console import PHASES
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
@@ -31,7 +31,7 @@ def sparkline(rates: Sequence[float], width: int) -> str:
     return "".join(_BLOCKS[min(int(rate * len(_BLOCKS)), len(_BLOCKS) - 1)] for rate in rates)
 
 
-class Board:
+class DashboardLayout:
     """The content of the dashboard and its layout; for one thread at a time."""
 
     def __init__(
@@ -53,7 +53,7 @@ class Board:
         self._total = total_steps
         self._seeds = seeds
         self._rates: list[list[float]] = [[] for _ in seeds]
-        self._reported: Sequence[Figures] = [{} for _ in seeds]
+        self._reported: Sequence[MetricValues] = [{} for _ in seeds]
         self._mean: dict[str, float | None] = {}
         self._nonfinite = 0.0
         self._env_steps = 0
@@ -61,7 +61,7 @@ class Board:
         self._first: tuple[float, int] | None = None
         self._end: float | None = None
         for entries in zip(*histories, strict=False):
-            self.write(entries[0].env_steps, [entry.figures for entry in entries])
+            self.write(entries[0].env_steps, [entry.metrics for entry in entries])
         self._speed = self._first = self._end = None
         self._began = self._since = time.monotonic()
         self._phase: str | None = None
@@ -74,22 +74,22 @@ class Board:
             self._spent[self._phase] += now - self._since
         self._phase, self._since = name, now
 
-    def write(self, env_steps: int, figures: Sequence[Figures]) -> None:
+    def write(self, env_steps: int, metrics: Sequence[MetricValues]) -> None:
         """Take a report."""
-        self._reported = figures
-        for rates, one in zip(self._rates, figures, strict=True):
+        self._reported = metrics
+        for rates, one in zip(self._rates, metrics, strict=True):
             if (rate := one.get("eval/success_rate")) is not None:
                 rates.append(rate)
-            for name in ("train/nonfinite_worlds", "train/nonfinite_updates"):
+            for name in ("train/nonfinite_envs", "train/nonfinite_updates"):
                 self._nonfinite += one.get(name) or 0.0
-        mean = mean_of(figures)
+        mean = mean_of(metrics)
         self._learn(env_steps, mean, mean.get("time/env_steps_per_second"))
 
-    def tell(self, env_steps: int, figures: Figures, env_steps_per_second: float) -> None:
+    def tell(self, env_steps: int, metrics: MetricValues, env_steps_per_second: float) -> None:
         """Take what is known between two reports."""
-        self._learn(env_steps, figures, env_steps_per_second)
+        self._learn(env_steps, metrics, env_steps_per_second)
 
-    def _learn(self, env_steps: int, mean: Figures, speed: float | None) -> None:
+    def _learn(self, env_steps: int, mean: MetricValues, speed: float | None) -> None:
         self._env_steps, self._speed = env_steps, speed
         self._mean |= mean
         if env_steps == 0:
@@ -146,20 +146,20 @@ class Board:
         table.add_column("", ratio=1, no_wrap=True)
         for name in ("best", "exploring", "to goal", "p95"):
             table.add_column(name, justify="right", no_wrap=True)
-        for name, rates, figures in self._rows():
+        for name, rates, metrics in self._rows():
             table.add_row(
                 *([name] if several else []),
-                Text(_percent(figures.get("eval/success_rate")), "bold green"),
+                Text(_percent(metrics.get("eval/success_rate")), "bold green"),
                 _Curve(rates),
                 _percent(max(rates, default=None)),
-                _percent(figures.get("rollout/success_rate")),
-                _seconds(figures.get("eval/time_to_goal_median")),
-                _seconds(figures.get("eval/time_to_goal_p95")),
+                _percent(metrics.get("rollout/success_rate")),
+                _seconds(metrics.get("eval/time_to_goal_median")),
+                _seconds(metrics.get("eval/time_to_goal_p95")),
             )
         return table
 
-    def _rows(self) -> list[tuple[str, Sequence[float], Figures]]:
-        """Name, success rates and figures: of each seed, or of many the mean and the range."""
+    def _rows(self) -> list[tuple[str, Sequence[float], MetricValues]]:
+        """Name, success rates and metrics: of each seed, or of many the mean and the range."""
         if len(self._seeds) == 1:
             return [("", self._rates[0], self._mean)]
         if len(self._seeds) <= _MOST_ROWS:
@@ -171,8 +171,8 @@ class Board:
                 key: [value for one in self._reported if (value := one.get(key)) is not None]
                 for key in self._reported[0]
             }
-            figures = {key: of(values) if values else None for key, values in known.items()}
-            rows.append((name, [of(one) for one in rates], figures))
+            metrics = {key: of(values) if values else None for key, values in known.items()}
+            rows.append((name, [of(one) for one in rates], metrics))
         return rows
 
     def _progress(self) -> Table:

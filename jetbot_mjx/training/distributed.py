@@ -89,7 +89,7 @@ def is_first() -> bool:
     return jax.process_index() == 0
 
 
-def exchange(*values: int) -> Int[np.ndarray, "processes n"]:
+def all_gather_ints(*values: int) -> Int[np.ndarray, "processes n"]:
     """Tell all processes a few numbers, and hears theirs; every process must call it.
 
     Args:
@@ -104,7 +104,7 @@ def exchange(*values: int) -> Int[np.ndarray, "processes n"]:
     return np.asarray(multihost_utils.process_allgather(mine))
 
 
-def led(action: Callable[[], int]) -> int:
+def run_on_primary(action: Callable[[], int]) -> int:
     """Let the first process do something, and tells the others what came of it.
 
     Args:
@@ -119,20 +119,20 @@ def led(action: Callable[[], int]) -> int:
     if jax.process_count() == 1:
         return action()
     if not is_first():
-        outcome = int(exchange(0)[0, 0])
+        outcome = int(all_gather_ints(0)[0, 0])
         if outcome == _FAILED:
             raise UserError("process 0 could not go on, and says why; this one leaves with it")
         return outcome
     try:
         outcome = action()
     except BaseException:
-        exchange(_FAILED)
+        all_gather_ints(_FAILED)
         raise
-    exchange(outcome)
+    all_gather_ints(outcome)
     return outcome
 
 
-def from_first(trees: Sequence[PyTree], template: PyTree, count: int) -> list[PyTree]:
+def broadcast_from_primary(trees: Sequence[PyTree], template: PyTree, count: int) -> list[PyTree]:
     """Hand what the first process holds to all, bit by bit.
 
     Args:

@@ -3,7 +3,7 @@
 Each device holds its share of every seed's environments and a copy of the rest; the devices may
 be those of several processes, which then all run this, call for call. How many
 training steps one call makes is an argument of the compiled program: short calls answer
-signals and tell of progress, and since figures are summed inside the state, what is logged and
+signals and tell of progress, and since metrics are summed inside the state, what is logged and
 what is computed do not depend on how the steps were cut into calls.
 """
 
@@ -17,14 +17,14 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
-from jetbot_mjx.agents.ppo import LOSSES, PPO, Fault, TrainState
-from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.training import distributed
-from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 
 _AXIS = "devices"
@@ -32,10 +32,12 @@ _CALL_SECONDS = 1.0
 _CALLS_PER_NOTICE = 10
 
 
-class Program:
+class CompiledTrainer:
     """One configuration's training, over all devices and all its seeds."""
 
-    def __init__(self, config: Config, env: JetBotEnv, programs: Programs | None = None) -> None:
+    def __init__(
+        self, config: Config, env: JetBotEnv, programs: ProgramCache | None = None
+    ) -> None:
         """Prepare the program; nothing is compiled yet.
 
         Args:
@@ -43,7 +45,7 @@ class Program:
           env: the environment, unwrapped.
           programs: of that configuration; None: they are not kept.
         """
-        self._programs = programs or programs_of(config, keep=False)
+        self._programs = programs or open_program_cache(config, keep=False)
         devices = jax.devices()
         self._mesh = Mesh(np.array(devices), (_AXIS,))
         # On the host, from where every process's devices can take them.
@@ -101,7 +103,7 @@ class Program:
         host = jax.device_get(state)
         return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
 
-    def compile(self) -> Callable[[TrainState, int, bool], tuple[TrainState, Fault]]:
+    def compile(self) -> Callable[[TrainState, int, bool], tuple[TrainState, NanDump]]:
         """Compile the training step, for once and for all: another shape is an error, not a wait.
 
         Returns:
@@ -110,7 +112,7 @@ class Program:
         """
         program = self._programs.compile("advance", self.trace)
 
-        def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, Fault]:
+        def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, NanDump]:
             return program(state, np.int32(steps), np.bool_(restart))
 
         return call
@@ -119,10 +121,10 @@ class Program:
         """Return the training step for the devices, not yet compiled."""
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
-            state, fault = jax.vmap(self._ppo.advance, in_axes=(0, None, None))(
+            state, nan_dump = jax.vmap(self._ppo.advance, in_axes=(0, None, None))(
                 state, steps, restart
             )
-            return state, jax.tree.map(lambda x: x[None], fault)
+            return state, jax.tree.map(lambda x: x[None], nan_dump)
 
         sharded = jax.shard_map(
             advance,
@@ -136,7 +138,7 @@ class Program:
             sharded,
             donate_argnums=0,
             in_shardings=(self._shardings, self._whole, self._whole),
-            # Every process sees the faults of all.
+            # Every process sees the nan_dumps of all.
             out_shardings=(self._shardings, self._whole),
         )
         scalars = (np.zeros((), np.int32), np.zeros((), bool))
@@ -145,8 +147,8 @@ class Program:
 
 def train(
     config: Config,
-    program: Program,
-    recorder: Recorder,
+    program: CompiledTrainer,
+    recorder: TrainerCallback,
     preemption: Preemption,
     states: Sequence[TrainState] | None = None,
 ) -> None:
@@ -170,36 +172,36 @@ def train(
         done = env_steps(states[0]) // config.ppo.steps_per_training_step
     running = True
     while running:
-        heard = distributed.exchange(preemption.wait(0.02), compiling.running)
+        heard = distributed.all_gather_ints(preemption.wait(0.02), compiling.running)
         if heard[:, 0].any():
             return
         running = heard[:, 1].any()
     advance = compiling.result()
-    recorder.compiled()
+    recorder.on_compiled()
 
     size = config.ppo.steps_per_training_step
     interval = -(-config.checkpoint_interval // size)
-    pace = _Pace(min(_CALL_SECONDS, config.preemption_notice / _CALLS_PER_NOTICE))
+    pace = ChunkSizer(min(_CALL_SECONDS, config.preemption_notice / _CALLS_PER_NOTICE))
     seconds, restart = 0.0, False
     while done < config.ppo.training_steps:
         goal = min(config.ppo.training_steps, (done // interval + 1) * interval)
-        heard = distributed.exchange(preemption.requested, min(pace.steps, goal - done))
+        heard = distributed.all_gather_ints(preemption.requested, min(pace.steps, goal - done))
         if heard[:, 0].any():
             break
         count = int(heard[0, 1])
         began = time.perf_counter()
-        state, faults = advance(state, count, restart)
-        found = np.asarray(faults.found)
+        state, nan_dumps = advance(state, count, restart)
+        found = np.asarray(nan_dumps.found)
         lasted = time.perf_counter() - began
         pace.learn(count, lasted)
         done, seconds, restart = done + count, seconds + lasted, False
         for device, seed in np.argwhere(found):
-            fault = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], faults)
-            recorder.keep_fault(int(seed), done * size, fault)
+            nan_dump = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
+            recorder.on_nan_dump(int(seed), done * size, nan_dump)
         if done < goal:
             tallies = jax.device_get(state.tally)
-            figures = _figures(config, jax.tree.map(np.mean, tallies))
-            recorder.tell(done * size, figures, seconds)
+            metrics = _metrics(config, jax.tree.map(np.mean, tallies))
+            recorder.on_progress(done * size, metrics, seconds)
             continue
         if not _report(config, program, recorder, state, seconds):
             return
@@ -210,7 +212,11 @@ def train(
 
 
 def _report(
-    config: Config, program: Program, recorder: Recorder, state: TrainState, seconds: float
+    config: Config,
+    program: CompiledTrainer,
+    recorder: TrainerCallback,
+    state: TrainState,
+    seconds: float,
 ) -> bool:
     """At the end of an interval: whoever goes on from here begins a new tally."""
     begins_anew = [
@@ -219,26 +225,30 @@ def _report(
         )
         for one in program.get(state)
     ]
-    return bool(distributed.led(lambda: recorder.report(begins_anew)))
+    return bool(distributed.run_on_primary(lambda: recorder.on_interval(begins_anew)))
 
 
 def _pause(
-    config: Config, program: Program, recorder: Recorder, state: TrainState, seconds: float
+    config: Config,
+    program: CompiledTrainer,
+    recorder: TrainerCallback,
+    state: TrainState,
+    seconds: float,
 ) -> None:
     progress = [_progress(config, one, seconds) for one in program.get(state)]
 
     def save() -> int:
-        recorder.pause(progress)
+        recorder.on_preempt(progress)
         return 0
 
-    distributed.led(save)
+    distributed.run_on_primary(save)
 
 
 def _identity(state: TrainState) -> TrainState:
     return state
 
 
-class _Pace:
+class ChunkSizer:
     """The number of training steps that a call may make."""
 
     def __init__(self, seconds: float) -> None:
@@ -283,24 +293,24 @@ def env_steps(state: TrainState) -> int:
 
 def _progress(config: Config, state: TrainState, seconds: float) -> Progress:
     return Progress(
-        env_steps(state), state.policy_params, _figures(config, state.tally), seconds, state
+        env_steps(state), state.policy_params, _metrics(config, state.tally), seconds, state
     )
 
 
-def _figures(config: Config, tally: Mapping[str, Any]) -> dict[str, float]:
+def _metrics(config: Config, tally: Mapping[str, Any]) -> dict[str, float]:
     """Return means and counts from sums; empty before the first step."""
     sums = {name: float(value) for name, value in tally.items()}
     steps, episodes = sums["training_steps"], sums["rollout/episodes"]
     if steps == 0:
         return {}
-    figures = {name: sums[name] / steps for name in LOSSES.values()}
+    metrics = {name: sums[name] / steps for name in LOSSES.values()}
     if config.ppo.entropy_cost > 0:
-        figures["policy/entropy"] = -figures["loss/entropy"] / config.ppo.entropy_cost
-    figures["rollout/episodes"] = episodes
+        metrics["policy/entropy"] = -metrics["loss/entropy"] / config.ppo.entropy_cost
+    metrics["rollout/episodes"] = episodes
     if episodes > 0:
-        figures["rollout/success_rate"] = sums["rollout/successes"] / episodes
-        figures["rollout/episode_return"] = sums["rollout/return"] / episodes
-        figures["rollout/episode_length"] = sums["rollout/length"] / episodes
-    figures["train/nonfinite_worlds"] = sums["nonfinite_worlds"]
-    figures["train/nonfinite_updates"] = sums["nonfinite_updates"]
-    return figures
+        metrics["rollout/success_rate"] = sums["rollout/successes"] / episodes
+        metrics["rollout/episode_return"] = sums["rollout/return"] / episodes
+        metrics["rollout/episode_length"] = sums["rollout/length"] / episodes
+    metrics["train/nonfinite_envs"] = sums["nonfinite_envs"]
+    metrics["train/nonfinite_updates"] = sums["nonfinite_updates"]
+    return metrics

@@ -10,37 +10,37 @@ from typing import Any, Self
 import jax
 
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
-from jetbot_mjx.agents.ppo import Fault
-from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.agents.ppo import NanDump
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.domain_randomization import as_trained
+from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.runs.checkpoint import POLICY, about_policy
-from jetbot_mjx.runs.checkpoint_store import Store, checkpoint_path, digest
+from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
 from jetbot_mjx.runs.metrics import (
     CompileClock,
-    Figures,
     History,
     JsonlSink,
+    MetricValues,
     Sink,
     Sinks,
     TensorBoardSink,
     process_seconds,
     read_history,
 )
-from jetbot_mjx.runs.nan_dump import save_fault
+from jetbot_mjx.runs.nan_dump import save_nan_dump
 from jetbot_mjx.runs.resume import Resumption, to_trees
 from jetbot_mjx.runs.run_dir import make_folder, versions, writing_to
 from jetbot_mjx.runs.sb3_tags import aliases
 from jetbot_mjx.runs.wandb_sink import WandbSink
-from jetbot_mjx.training.callbacks import Progress, Recorder
+from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.console import COMPILING, EVALUATING, FILMING, SAVING, TRAINING
 from jetbot_mjx.training.dashboard import open_terminal
 from jetbot_mjx.viewers.offscreen import find_backend
-from jetbot_mjx.viewers.video import EvaluationFilm
+from jetbot_mjx.viewers.video import EvaluationVideo
 
 _METRICS = "metrics.jsonl"
 
@@ -75,7 +75,7 @@ class Standing:
         return cls(**{**values, **summaries})
 
 
-class RunRecorder(Recorder):
+class RunRecorder(TrainerCallback):
     """Records the training of one run, of one seed or several; a context manager."""
 
     def __init__(
@@ -85,7 +85,7 @@ class RunRecorder(Recorder):
         run_dirs: Sequence[Path],
         clock: CompileClock,
         resumption: Resumption | None = None,
-        programs: Programs | None = None,
+        programs: ProgramCache | None = None,
     ) -> None:
         """Open the logs and the checkpoint folders.
 
@@ -107,13 +107,13 @@ class RunRecorder(Recorder):
             normalize=config.ppo.normalize_observations,
         )
         self._config = config
-        programs = programs or programs_of(config, keep=False)
-        self._evaluator = Evaluator(as_trained(env), networks, programs=programs)
+        programs = programs or open_program_cache(config, keep=False)
+        self._evaluator = Evaluator(maybe_randomize(env), networks, programs=programs)
         # As one program: operation by operation it would be half a dozen.
         keys = jax.jit(training_keys, static_argnums=0)
         episodes = config.evaluation.episodes
         self._keys = programs.compile(f"{episodes} keys", lambda: keys.trace(episodes))()
-        self._film = EvaluationFilm(env, networks) if config.evaluation.video else None
+        self._film = EvaluationVideo(env, networks) if config.evaluation.video else None
         self._clock = clock
         resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
         histories = [
@@ -177,7 +177,7 @@ class RunRecorder(Recorder):
         self._terminal.say(headline)
         self._terminal.begin()
 
-    def report(self, progress: Sequence[Progress]) -> bool:
+    def on_interval(self, progress: Sequence[Progress]) -> bool:
         """Evaluate, logs and saves every seed; tells whether it is worth going on."""
         self._at(EVALUATING)
         # What a trainer compiles while it trains belongs to the time it reports.
@@ -192,9 +192,9 @@ class RunRecorder(Recorder):
         for seed, one, summary in zip(self._seeds, progress, summaries, strict=True):
             steps = one.env_steps - seed.standing.env_steps
             training = one.seconds - (compiling if one.state is None else 0.0)
-            figures = {
+            metrics = {
                 **{f"eval/{name}": value for name, value in summary._asdict().items()},
-                **one.figures,
+                **one.metrics,
                 "time/env_steps_per_second": steps / training if steps and training > 0 else None,
                 "time/training_seconds": training,
                 "time/evaluation_seconds": judging,
@@ -202,8 +202,8 @@ class RunRecorder(Recorder):
                 "time/compile_seconds": compiled,
                 "time/wall_seconds": self.wall_seconds,
             }
-            seed.report(one, summary, figures, self.wall_seconds)
-            lines.append(figures)
+            seed.report(one, summary, metrics, self.wall_seconds)
+            lines.append(metrics)
         self._tell_first_step()
         self._terminal.write(progress[0].env_steps, lines)
         self.fingerprints = [digest(one.params) for one in progress]
@@ -219,28 +219,28 @@ class RunRecorder(Recorder):
         episodes = self._evaluator.run(params, self._keys)
         return summarize(episodes, self._config.physics.ctrl_dt)
 
-    def pause(self, progress: Sequence[Progress]) -> None:
+    def on_preempt(self, progress: Sequence[Progress]) -> None:
         """Save every seed as it is."""
         self._terminal.phase(SAVING)
         for seed, one in zip(self._seeds, progress, strict=True):
             seed.save(one, {}, self.wall_seconds)
 
-    def tell(self, env_steps: int, figures: Mapping[str, float], seconds: float) -> None:
+    def on_progress(self, env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
         """Show on the terminal that something happens."""
         self._tell_first_step()
         steps = env_steps - self._seeds[0].standing.env_steps
-        self._terminal.tell(env_steps, figures, steps / max(seconds, 1e-9))
+        self._terminal.tell(env_steps, metrics, steps / max(seconds, 1e-9))
 
-    def keep_fault(self, seed_index: int, env_steps: int, fault: Fault) -> None:
+    def on_nan_dump(self, seed_index: int, env_steps: int, nan_dump: NanDump) -> None:
         """Keep it for replay, and says where."""
-        path = self._seeds[seed_index].keep_fault(env_steps, fault)
+        path = self._seeds[seed_index].on_nan_dump(env_steps, nan_dump)
         if path is not None:
             self._terminal.say(
                 f"a world stopped being finite before step {env_steps:,} and was reset:"
                 f" python -m jetbot_mjx.replay {path}"
             )
 
-    def compiled(self) -> None:
+    def on_compiled(self) -> None:
         """Wait for the first step to tell what came before it."""
         self._compiled = True
         self._at(TRAINING)
@@ -323,10 +323,10 @@ class _SeedRecorder:
             if config.wandb is not None:
                 sinks.append(WandbSink(config, run_dir, history, say, seeds))
         self._sinks = Sinks(sinks)
-        self._store = Store(run_dir, config.checkpoints_to_keep)
+        self._store = CheckpointStore(run_dir, config.checkpoints_to_keep)
 
     def report(
-        self, progress: Progress, summary: Summary, figures: Figures, wall_seconds: float
+        self, progress: Progress, summary: Summary, metrics: MetricValues, wall_seconds: float
     ) -> None:
         """Log, then saves: a checkpoint is never ahead of the log."""
         standing = self.standing
@@ -334,26 +334,26 @@ class _SeedRecorder:
         if standing.best is None or summary.success_rate >= standing.best.success_rate:
             standing.best_steps, standing.best = progress.env_steps, summary
         with writing_to(self._run_dir):
-            self._sinks.write(progress.env_steps, figures)
+            self._sinks.write(progress.env_steps, metrics)
         self.save(progress, summary._asdict(), wall_seconds)
 
     def save(self, progress: Progress, judged: Mapping[str, Any], wall_seconds: float) -> None:
         """Begin to write a checkpoint."""
         self.standing.wall_seconds = wall_seconds
         trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}
-        about = {**self._about, "figures": dict(judged), "progress": self.standing.to_json()}
+        about = {**self._about, "metrics": dict(judged), "progress": self.standing.to_json()}
         self._store.save(progress.env_steps, trees, about, judged.get("success_rate"))
 
-    def film(self, film: EvaluationFilm, progress: Progress) -> None:
+    def film(self, film: EvaluationVideo, progress: Progress) -> None:
         name = checkpoint_path(self._run_dir, progress.env_steps).name
         path = self._run_dir / "videos" / name / "evaluation.mp4"
         make_folder(path.parent)
         with writing_to(path):
             film.write(path, progress.params, progress.env_steps)
 
-    def keep_fault(self, env_steps: int, fault: Fault) -> Path | None:
+    def on_nan_dump(self, env_steps: int, nan_dump: NanDump) -> Path | None:
         with writing_to(self._run_dir):
-            return save_fault(self._run_dir, self._config, env_steps, fault)
+            return save_nan_dump(self._run_dir, self._config, env_steps, nan_dump)
 
     def close(self) -> None:
         with contextlib.ExitStack() as stack:

@@ -6,10 +6,10 @@ from typing import NamedTuple
 
 import jax
 
-from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
-from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
@@ -24,7 +24,7 @@ from jetbot_mjx.runs.run_dir import (
 )
 from jetbot_mjx.runs.wandb_sink import check_tracking
 from jetbot_mjx.training import distributed, ppo_trainer
-from jetbot_mjx.training.callbacks import Recorder
+from jetbot_mjx.training.callbacks import TrainerCallback
 from jetbot_mjx.training.memory import advice, device_memory
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import RunRecorder, Standing
@@ -60,7 +60,7 @@ class Result(NamedTuple):
         return self.standings[0].best_steps
 
 
-def run(config: Config, run_dir: Path, programs: Programs | None = None) -> Result:
+def run(config: Config, run_dir: Path, programs: ProgramCache | None = None) -> Result:
     """Train a policy, from the beginning or from where the folder's run was stopped.
 
     Args:
@@ -82,7 +82,7 @@ def run(config: Config, run_dir: Path, programs: Programs | None = None) -> Resu
     config.check_devices(jax.device_count())
     check_tracking(config)
     env = make_env(config)
-    programs = programs or programs_of(config, keep=False)
+    programs = programs or open_program_cache(config, keep=False)
     try:
         if config.trainer == "brax":
             return _run_brax(config, env, run_dir, programs)
@@ -107,7 +107,7 @@ def _check_folder(config: Config, run_dir: Path) -> None:
             stored.check_resume(config)
 
 
-def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, programs: Programs) -> Result:
+def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, programs: ProgramCache) -> Result:
     # Brax's own trainer takes half a second to import.
     from jetbot_mjx.training import brax_trainer
 
@@ -120,12 +120,12 @@ def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, programs: Programs)
     return _result(run_dir, [run_dir], recorder, finished=True)
 
 
-def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: Programs) -> Result:
+def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: ProgramCache) -> Result:
     opened: list[tuple[RunRecorder, Resumption | None]] = []
     with contextlib.ExitStack() as stack:
         clock = stack.enter_context(CompileClock())
         preemption = stack.enter_context(Preemption(config.preemption_notice))
-        program = ppo_trainer.Program(config, env, programs)
+        program = ppo_trainer.CompiledTrainer(config, env, programs)
 
         def begin() -> int:
             resumption, welcome = _open_folders(stack, config, run_dir, program)
@@ -138,21 +138,21 @@ def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: Prog
             recorder.begin("\n".join([*welcome, _headline(config, run_dir)]))
             return _RESUMES if resumption else _BEGINS
 
-        outset = distributed.led(begin)
-        recorder, resumption = opened[0] if opened else (Recorder(), None)
+        outset = distributed.run_on_primary(begin)
+        recorder, resumption = opened[0] if opened else (TrainerCallback(), None)
         states = None
         if outset == _RESUMES:
             stored = resumption.states if resumption else []
-            states = distributed.from_first(stored, program.template(), config.seeds)
+            states = distributed.broadcast_from_primary(stored, program.template(), config.seeds)
         if outset != _COMPLETE:
             ppo_trainer.train(config, program, recorder, preemption, states)
     first = recorder if isinstance(recorder, RunRecorder) else None
-    finished = bool(distributed.led(lambda: first is not None and first.complete))
+    finished = bool(distributed.run_on_primary(lambda: first is not None and first.complete))
     return _result(run_dir, seed_dirs(run_dir, config), first, finished=finished)
 
 
 def _open_folders(
-    stack: contextlib.ExitStack, config: Config, run_dir: Path, program: ppo_trainer.Program
+    stack: contextlib.ExitStack, config: Config, run_dir: Path, program: ppo_trainer.CompiledTrainer
 ) -> tuple[Resumption | None, list[str]]:
     """Make the folders, and holds them until the stack ends.
 

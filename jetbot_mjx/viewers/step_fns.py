@@ -57,7 +57,7 @@ class Shown(NamedTuple):
     nonfinite: Float[Array | np.ndarray, ""]
 
 
-class Programs(NamedTuple):
+class ViewerFns(NamedTuple):
     """Three compiled functions; each returns the state and what to show of it."""
 
     reset: Callable[[UInt32[Array, "2"]], tuple[State, Shown]]
@@ -68,7 +68,7 @@ class Programs(NamedTuple):
     """Puts the goal elsewhere [m], world frame, and lets the time limit begin anew."""
 
 
-def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Programs:
+def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerFns:
     """Prepare the programs; each compiles at its first use.
 
     Args:
@@ -94,7 +94,7 @@ def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Program
             done=state.done,
             success=state.metrics["success"],
             terminated=state.info["terminated"],
-            nonfinite=state.metrics["nonfinite_worlds"],
+            nonfinite=state.metrics["nonfinite_envs"],
         )
 
     def reset(key: UInt32[Array, "2"]) -> tuple[State, Shown]:
@@ -119,7 +119,7 @@ def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Program
         return state, show(state)
 
     compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))
-    return Programs(compiled(reset), compiled(step), compiled(move))
+    return ViewerFns(compiled(reset), compiled(step), compiled(move))
 
 
 def why_goals_stay(env: JetBotEnv, state: State) -> str:

@@ -243,7 +243,7 @@ def _extent(drive: Drive) -> Float[np.ndarray, "n 3"]:
     return (places[:, None] + np.stack(steps, -1).reshape(-1, 3)).reshape(-1, 3)
 
 
-class EvaluationFilm:
+class EvaluationVideo:
     """Films a training's policies on the report's first goals, by one small compiled program."""
 
     GOALS = 4

@@ -28,7 +28,7 @@ from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import flatten
-from jetbot_mjx.runs.nan_dump import load_fault
+from jetbot_mjx.runs.nan_dump import load_nan_dump
 from jetbot_mjx.training import brax_trainer, ppo_trainer, session
 from jetbot_mjx.training.run_recorder import RunRecorder
 
@@ -110,7 +110,7 @@ class Reports:
     def __init__(self):
         self.all = []
 
-    def report(self, progress):
+    def on_interval(self, progress):
         self.all.append(progress[0])
         return True
 
@@ -189,13 +189,13 @@ def test_one_training_step_is_brax_s(side_by_side, smoke):
     # Sums over 4096 observations of up to 1.2 m and 6 rad/s.
     assert_close(state.normalizer, brax.params.normalizer, rtol=2e-6)
     assert int(brax.env_steps) == ppo_trainer.env_steps(state) == SIZE
-    figures = {name: float(state.tally[name]) for name in LOSSES.values()}
-    expected = {name: brax.figures[name] for name in LOSSES.values()}
+    metrics = {name: float(state.tally[name]) for name in LOSSES.values()}
+    expected = {name: brax.metrics[name] for name in LOSSES.values()}
     # Means of 16 minibatches of 1024 samples; they agree to 1e-7 here.
-    assert figures == pytest.approx(expected, rel=1e-5, abs=1e-6)
-    adaptive = figures["policy/learning_rate"] < 0.9 * smoke.ppo.learning_rate
+    assert metrics == pytest.approx(expected, rel=1e-5, abs=1e-6)
+    adaptive = metrics["policy/learning_rate"] < 0.9 * smoke.ppo.learning_rate
     assert adaptive == (schedule == "ADAPTIVE_KL")
-    assert state.tally["nonfinite_updates"] == state.tally["nonfinite_worlds"] == 0
+    assert state.tally["nonfinite_updates"] == state.tally["nonfinite_envs"] == 0
 
 
 def assert_close(one, other, rtol):
@@ -212,7 +212,7 @@ def test_several_training_steps_are_brax_s(side_by_side):
         assert travelled > 5e-3
         assert furthest(state.policy_params[1:], brax.params[1:]) < 0.1 * travelled
         assert float(state.tally["loss/total"]) == pytest.approx(
-            brax.figures["loss/total"], rel=0.02, abs=1e-3
+            brax.metrics["loss/total"], rel=0.02, abs=1e-3
         )
 
 
@@ -383,10 +383,10 @@ def by_hand(ppo, params, normalizer, data, key):
         if np.isnan(batch.reward).any():
             skipped += 1
             continue
-        gradient, figures = differentiate(params, normalizer, batch, loss_key)
+        gradient, metrics = differentiate(params, normalizer, batch, loss_key)
         change, moments = adam.update(gradient, moments)
         params = optax.apply_updates(params, change)
-        seen.append(figures)
+        seen.append(metrics)
     return params, moments, seen, skipped
 
 
@@ -394,10 +394,10 @@ def test_a_gradient_that_is_not_finite_skips_its_own_step_alone():
     ppo, update = tiny()
     params, optimizer_state, normalizer = beginning(ppo)
     data, key = made_up(ppo, spoiled=[13]), jax.random.PRNGKey(5)
-    after, state_after, figures = update(params, optimizer_state, normalizer, data, key)
+    after, state_after, metrics = update(params, optimizer_state, normalizer, data, key)
     expected, moments, seen, skipped = by_hand(ppo, params, normalizer, data, key)
     assert skipped == 1
-    assert float(figures.pop("nonfinite_updates")) == 1
+    assert float(metrics.pop("nonfinite_updates")) == 1
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves((after, state_after)))
     assert furthest(params, after) > 1e-3
     assert furthest(expected, after) < 2e-6
@@ -408,18 +408,18 @@ def test_a_gradient_that_is_not_finite_skips_its_own_step_alone():
     for theirs, name in LOSSES.items():
         if theirs in seen[0]:
             mean = np.mean([one[theirs] for one in seen])
-            np.testing.assert_allclose(figures[name], mean, rtol=1e-4, err_msg=name)
-    assert float(figures["policy/learning_rate"]) == pytest.approx(1e-3)
+            np.testing.assert_allclose(metrics[name], mean, rtol=1e-4, err_msg=name)
+    assert float(metrics["policy/learning_rate"]) == pytest.approx(1e-3)
 
 
 def test_a_bad_unroll_costs_one_update_in_every_pass():
     ppo, update = tiny("ADAPTIVE_KL", passes=3)
     params, optimizer_state, normalizer = beginning(ppo)
     data = made_up(ppo, spoiled=[0])
-    *_, figures = update(params, optimizer_state, normalizer, data, jax.random.PRNGKey(5))
-    assert float(figures["nonfinite_updates"]) == 3
-    *_, figures = update(params, optimizer_state, normalizer, made_up(ppo), jax.random.PRNGKey(5))
-    assert float(figures["nonfinite_updates"]) == 0
+    *_, metrics = update(params, optimizer_state, normalizer, data, jax.random.PRNGKey(5))
+    assert float(metrics["nonfinite_updates"]) == 3
+    *_, metrics = update(params, optimizer_state, normalizer, made_up(ppo), jax.random.PRNGKey(5))
+    assert float(metrics["nonfinite_updates"]) == 0
 
 
 def test_where_every_gradient_is_bad_nothing_moves_by_a_bit():
@@ -427,12 +427,12 @@ def test_where_every_gradient_is_bad_nothing_moves_by_a_bit():
     ppo, update = tiny("ADAPTIVE_KL", passes=3)
     params, optimizer_state, normalizer = beginning(ppo)
     data = made_up(ppo, spoiled=range(32))
-    after, state_after, figures = update(
+    after, state_after, metrics = update(
         params, optimizer_state, normalizer, data, jax.random.PRNGKey(5)
     )
     assert_same_bits((after, state_after), (params, optimizer_state))
-    assert float(figures["nonfinite_updates"]) == 12
-    assert all(np.isfinite(float(value)) for value in figures.values())
+    assert float(metrics["nonfinite_updates"]) == 12
+    assert all(np.isfinite(float(value)) for value in metrics.values())
 
 
 # Worlds that blow up, a falling step size, and sums that outlive a call.
@@ -464,7 +464,7 @@ def begun(brittle):
 
 @pytest.fixture(scope="module")
 def at_once(brittle, begun):
-    """The state after all steps, made in one call, and the first fault."""
+    """The state after all steps, made in one call, and the first nan_dump."""
     return brittle.advance(begun, LINEAR_STEPS)
 
 
@@ -472,41 +472,41 @@ def test_worlds_that_blow_up_are_counted_and_do_not_spoil_the_state(brittle, beg
     state, _ = brittle.advance(begun)
     ppo = brittle.ppo.config
     steps = ppo.steps_per_training_step // ppo.num_envs
-    assert float(state.tally["nonfinite_worlds"]) == ppo.num_envs * (steps // FUSE)
+    assert float(state.tally["nonfinite_envs"]) == ppo.num_envs * (steps // FUSE)
     assert float(state.tally["rollout/episodes"]) == ppo.num_envs * (steps // FUSE)
     state, _ = at_once
-    assert float(state.tally["nonfinite_worlds"]) == ppo.num_envs * (LINEAR_STEPS * steps // FUSE)
+    assert float(state.tally["nonfinite_envs"]) == ppo.num_envs * (LINEAR_STEPS * steps // FUSE)
     assert float(state.tally["nonfinite_updates"]) == 0
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(state))
 
 
-def replayed(env, config, fault):
-    """1 for each step that blew up, from a fault's beginning, in a batch of one."""
+def replayed(env, config, nan_dump):
+    """1 for each step that blew up, from a nan_dump's beginning, in a batch of one."""
     wrapped = wrap_for_training(env, config.task.episode_length)
     step = jax.jit(wrapped.step)
-    state = jax.tree.map(lambda x: jnp.asarray(x)[None], fault.env_state)
+    state = jax.tree.map(lambda x: jnp.asarray(x)[None], nan_dump.env_state)
     found = []
-    for action in fault.actions:
+    for action in nan_dump.actions:
         state = step(state, action[None])
-        found.append(float(state.metrics["nonfinite_worlds"][0]))
+        found.append(float(state.metrics["nonfinite_envs"][0]))
     return found
 
 
 def test_the_first_fault_leads_to_the_same_end(brittle, begun, at_once, smoke):
-    _, fault = at_once
-    assert bool(fault.found)
-    assert int(fault.step) == FUSE - 1
+    _, nan_dump = at_once
+    assert bool(nan_dump.found)
+    assert int(nan_dump.step) == FUSE - 1
     first_world = jax.tree.map(lambda x: x[0], begun.env_state)
-    assert_same_bits(fault.env_state, first_world)
+    assert_same_bits(nan_dump.env_state, first_world)
     unroll = smoke.ppo.unroll_length
     blown = [float((index + 1) % FUSE == 0) for index in range(unroll)]
-    assert replayed(Brittle(smoke), smoke, fault) == blown
+    assert replayed(Brittle(smoke), smoke, nan_dump) == blown
 
 
 def test_where_nothing_blew_up_there_is_no_fault(ours, smoke):
     _, one = ours(Gliding, "NONE", 1.0)
-    _, fault = one.advance(one.init(jax.random.PRNGKey(smoke.seed)), 2)
-    assert not bool(fault.found)
+    _, nan_dump = one.advance(one.init(jax.random.PRNGKey(smoke.seed)), 2)
+    assert not bool(nan_dump.found)
 
 
 def test_the_linear_step_size_falls_to_nothing(brittle, begun, smoke):
@@ -542,8 +542,8 @@ def test_a_restart_empties_the_tally_and_nothing_else(brittle, begun):
     for name, value in anew.tally.items():
         total = float(earlier.tally[name]) + float(value)
         assert float(added.tally[name]) == pytest.approx(total, rel=1e-6), name
-    no_steps, fault = brittle.advance(earlier, 0, restart=True)
-    assert not bool(fault.found)
+    no_steps, nan_dump = brittle.advance(earlier, 0, restart=True)
+    assert not bool(nan_dump.found)
     assert set(map(float, no_steps.tally.values())) == {0.0}
 
 
@@ -575,32 +575,32 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
     sound = losses.compute_ppo_loss
 
     def now_and_then(params, normalizer, data, key, **settings):
-        loss, figures = sound(params, normalizer, data, key, **settings)
+        loss, metrics = sound(params, normalizer, data, key, **settings)
         bad = jax.random.bernoulli(jax.random.fold_in(key, 1), BAD_UPDATES)
-        return loss * jnp.where(bad, jnp.nan, 1.0), figures
+        return loss * jnp.where(bad, jnp.nan, 1.0), metrics
 
     monkeypatch.setattr(losses, "compute_ppo_loss", now_and_then)
     task = smoke.task.model_copy(update={"name": f"{__name__}:Doomed"})
     spoiled = session.run(config.model_copy(update={"task": task}), tmp_path / "spoiled")
 
     history = lines(tmp_path / "spoiled")
-    worlds = sum(line.get("train/nonfinite_worlds", 0) for line in history)
+    worlds = sum(line.get("train/nonfinite_envs", 0) for line in history)
     updates = sum(line.get("train/nonfinite_updates", 0) for line in history)
     episodes = sum(line.get("rollout/episodes", 0) for line in history)
     assert episodes > 500
     assert 0.001 < worlds / episodes < 0.02
     assert 2 <= updates <= 30  # of 512
-    for name in ("train/nonfinite_worlds", "train/nonfinite_updates"):
+    for name in ("train/nonfinite_envs", "train/nonfinite_updates"):
         assert sum(line.get(name, 0) for line in lines(tmp_path / "clean")) == 0
     assert clean.best.success_rate > 0.9
     assert spoiled.best.success_rate > clean.best.success_rate - 0.1
 
-    files = sorted((tmp_path / "spoiled" / "faults").glob("*.npz"))
+    files = sorted((tmp_path / "spoiled" / "nan_dumps").glob("*.npz"))
     assert 1 <= len(files) <= worlds
-    stored = load_fault(files[0])
+    stored = load_nan_dump(files[0])
     assert stored.config.task.name == task.name
-    found = replayed(Gliding(stored.config), stored.config, stored.fault)
-    assert found.index(1.0) == int(stored.fault.step)
+    found = replayed(Gliding(stored.config), stored.config, stored.nan_dump)
+    assert found.index(1.0) == int(stored.nan_dump.step)
     monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "helpers"), prepend=os.pathsep)
     again = subprocess.run(
         [sys.executable, *gliding.program("replay"), str(files[0])],
@@ -609,7 +609,7 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
     )
     assert again.returncode == 0, again.stderr
     last = again.stdout.splitlines()[-1]
-    assert last.split()[0] == str(int(stored.fault.step))
+    assert last.split()[0] == str(int(stored.nan_dump.step))
     assert last.endswith("reward")
 
 

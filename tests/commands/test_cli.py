@@ -226,8 +226,8 @@ def trained(tmp_path_factory):
     folder = tmp_path_factory.mktemp("trained") / "run"
     folder.mkdir()
     params = jax.tree.map(lambda leaf: np.asarray(jnp.asarray(leaf)), params)
-    about["figures"] = {"success_rate": 0.5}
-    with checkpoint_store.Store(folder, keep=5) as checkpoints:
+    about["metrics"] = {"success_rate": 0.5}
+    with checkpoint_store.CheckpointStore(folder, keep=5) as checkpoints:
         for env_steps in (0, 2048):
             checkpoints.save(env_steps, {"policy": params}, about, 0.5)
     return folder
@@ -340,7 +340,7 @@ DAMAGES = {
     ),
     "another format": (
         damage_about(lambda about: about.update(format="jetbot_mjx/9")),
-        "is in the format 'jetbot_mjx/9', and only 'jetbot_mjx/2' can be read here",
+        "is in the format 'jetbot_mjx/9', and only 'jetbot_mjx/3' can be read here",
     ),
     "no configuration": (
         damage_about(lambda about: about.pop("config")),
@@ -458,7 +458,7 @@ def test_train_takes_seeds(asked):
 
 
 def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
-    assert "nothing.npz does not exist: give a file of a run's faults/" in refused(
+    assert "nothing.npz does not exist: give a file of a run's nan_dumps/" in refused(
         replay, here / "nothing.npz"
     )
     for name, write in {
@@ -467,7 +467,7 @@ def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
         "empty.npz": lambda path: path.touch(),
     }.items():
         write(tmp_path / name)
-        assert "is not a fault kept by a training" in refused(replay, tmp_path / name)
+        assert "is not a nan_dump kept by a training" in refused(replay, tmp_path / name)
 
 
 def test_train_names_its_run_folder_after_the_configuration(asked):

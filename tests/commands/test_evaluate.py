@@ -136,7 +136,7 @@ def test_the_page_tells_the_numbers_of_the_json_file(judged):
     _, folder, (first, _), _ = judged
     values = json.loads(first["report.json"])
     places = check_numbers(folder / "report.html", values)
-    policy = set(values["policy"]) - {"success_low", "success_high", "nonfinite_worlds"}
+    policy = set(values["policy"]) - {"success_low", "success_high", "nonfinite_envs"}
     assert {f"policy.{name}" for name in policy} <= places
     assert {f"baselines.{name}.success_rate" for name in BASELINES} <= places
     assert {f"cells.{i}.success_high" for i in range(len(values["cells"]))} <= places
@@ -185,7 +185,7 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
         )
 
     monkeypatch.setattr(evaluate, "sweep", sweep)
-    code, said = judge(run_dir, "--sweep", "--output", tmp_path)
+    code, said = judge(run_dir, "--robustness", "--output", tmp_path)
     assert code == 0
     assert "wheel-floor friction        1 to 1 × preset" in said
     values = json.loads((tmp_path / "report.json").read_text())
@@ -213,7 +213,7 @@ def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_pa
     assert own["mujoco"] is None
     assert values["policy"] == own["policy"]
     found = values["mujoco"]["policy"]
-    assert (found["episodes"], found["nonfinite_worlds"]) == (EPISODES, 0)
+    assert (found["episodes"], found["nonfinite_envs"]) == (EPISODES, 0)
     assert values["mujoco"]["randomized"] is None
     numerics = values["mujoco"]["numerics"]
     assert (numerics["substeps"], numerics["cone"]) == (8, "elliptic")
@@ -224,7 +224,7 @@ def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_pa
     assert "implicitfast with 8 steps per control step, elliptic friction cone" in page
     assert f"--episodes {EPISODES} --simulator mujoco\n" in page
     # And without a report, the same again.
-    again = evaluate.run_in_mujoco(run_dir, episodes=EPISODES)
+    again = evaluate.evaluate_in_mujoco(run_dir, episodes=EPISODES)
     assert json.loads(json.dumps(again.to_json())) == values["mujoco"]
 
 
@@ -291,7 +291,7 @@ def still(smoke_run, tmp_path_factory):
     folder = tmp_path_factory.mktemp("still") / "a still run"
     folder.mkdir()
     about = {key: checkpoint.about[key] for key in checkpoint.about if key != "sha256"}
-    with checkpoint_store.Store(folder, keep=1) as checkpoints:
+    with checkpoint_store.CheckpointStore(folder, keep=1) as checkpoints:
         params = checkpoint.params._replace(policy=policy)
         checkpoints.save(checkpoint.env_steps, {"policy": params}, about, 0.0)
     return folder

@@ -7,7 +7,7 @@ from importlib.util import find_spec
 
 import pytest
 
-from jetbot_mjx.imports import PutOff, standing_in
+from jetbot_mjx.imports import LazyModule, standing_in
 
 
 def test_inside_the_stand_in_is_found_and_afterwards_the_module_is_as_it_was():
@@ -40,7 +40,7 @@ def test_an_error_inside_leaves_nothing_behind():
 
 def test_a_module_that_was_put_off_is_there_when_it_is_needed(monkeypatch):
     monkeypatch.delitem(sys.modules, "fractions", raising=False)
-    with standing_in("fractions", PutOff("fractions")):
+    with standing_in("fractions", LazyModule("fractions")):
         import fractions
     assert "fractions" not in sys.modules
     assert fractions.Fraction(1, 2) == 0.5
@@ -49,7 +49,7 @@ def test_a_module_that_was_put_off_is_there_when_it_is_needed(monkeypatch):
 
 def test_a_module_that_was_put_off_may_be_needed_while_it_is(monkeypatch):
     monkeypatch.delitem(sys.modules, "fractions", raising=False)
-    with standing_in("fractions", PutOff("fractions")):
+    with standing_in("fractions", LazyModule("fractions")):
         from fractions import Fraction
     assert sys.modules["fractions"].Fraction is Fraction
 

@@ -36,7 +36,7 @@ def test_the_metrics_hold_what_is_promised(lines):
         "eval/success_rate",
         "eval/time_to_goal_median",
         "eval/episode_return",
-        "eval/nonfinite_worlds",
+        "eval/nonfinite_envs",
         "loss/total",
         "loss/policy",
         "loss/value",
@@ -44,7 +44,7 @@ def test_the_metrics_hold_what_is_promised(lines):
         "policy/kl",
         "policy/learning_rate",
         "rollout/success_rate",
-        "train/nonfinite_worlds",
+        "train/nonfinite_envs",
         "train/nonfinite_updates",
         "time/training_seconds",
         "time/env_steps_per_second",
@@ -56,7 +56,7 @@ def test_the_metrics_hold_what_is_promised(lines):
     assert all(np.isfinite(last[name]) for name in wanted)
     walls = [line["time/wall_seconds"] for line in lines]
     assert walls == sorted(walls)
-    assert last["eval/nonfinite_worlds"] == 0
+    assert last["eval/nonfinite_envs"] == 0
 
 
 def test_tensorboard_has_the_curves_of_stable_baselines3_too(smoke_run, lines):
@@ -76,7 +76,7 @@ def test_figures_of_rollouts_are_those_of_finished_episodes(lines):
         assert 0 < line["rollout/episodes"] < 16_384 / 2
         assert 0 <= line["rollout/success_rate"] <= 1
         assert 1 <= line["rollout/episode_length"] <= 256
-        assert line["train/nonfinite_worlds"] == line["train/nonfinite_updates"] == 0
+        assert line["train/nonfinite_envs"] == line["train/nonfinite_updates"] == 0
 
 
 def test_nothing_compiles_after_the_first_interval(lines):

@@ -7,7 +7,7 @@ import pytest
 
 from jetbot_mjx.compiler import lower_jaxpr
 from jetbot_mjx.compiler.lower_jaxpr import LEAST_IN_BRANCH, MOST_WRITTEN_OUT
-from jetbot_mjx.compiler.scalar_ir import UnsupportedError, Value
+from jetbot_mjx.compiler.scalar_ir import Expr, UnsupportedError
 from jetbot_mjx.compiler.schedule import PlacedBranch, PlacedLoop
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import mjx
@@ -206,7 +206,7 @@ def items(block, kind):
     for item in block.items:
         if isinstance(item, kind):
             yield item
-        if not isinstance(item, Value):
+        if not isinstance(item, Expr):
             for inner in item.blocks:
                 yield from items(inner, kind)
 

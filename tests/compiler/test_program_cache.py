@@ -16,13 +16,13 @@ from jax.experimental.compilation_cache import compilation_cache
 
 import jetbot_mjx
 from jetbot_mjx.compiler import program_cache
-from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs import program_key, robot_model
-from jetbot_mjx.envs.program_key import programs_of
+from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.task import GoalTask, make_task
 from jetbot_mjx.runs.checkpoint import PRETRAINED
-from jetbot_mjx.training.ppo_trainer import Program
+from jetbot_mjx.training.ppo_trainer import ScalarProgram
 
 KEY = "all that it depends on"
 
@@ -49,7 +49,7 @@ def folder(tmp_path):
 @pytest.fixture
 def kept(folder):
     """The only file in the folder."""
-    Programs({}, folder, KEY).compile("double", double)
+    ProgramCache({}, folder, KEY).compile("double", double)
     (path,) = folder.glob("program-*")
     return path
 
@@ -59,13 +59,13 @@ def twice(program):
 
 
 def test_a_program_is_found_without_being_traced(kept):
-    program = Programs({}, kept.parent, KEY).compile("double", never)
+    program = ProgramCache({}, kept.parent, KEY).compile("double", never)
     assert twice(program) == [0.0, 2.0, 4.0]
     assert program.out_info["twice"].shape == (3,)
 
 
 def test_a_program_that_was_fetched_ahead_is_that_program(kept):
-    ahead = Programs({}, kept.parent, KEY)
+    ahead = ProgramCache({}, kept.parent, KEY)
     ahead.prefetch("double", "another")
     assert ahead.find("another") is None
     assert twice(ahead.compile("double", never)) == [0.0, 2.0, 4.0]
@@ -80,7 +80,7 @@ def test_a_program_that_was_fetched_ahead_is_that_program(kept):
     ],
 )
 def test_another_program_is_not_taken_for_it(kept, options, key, name):
-    assert Programs(options, kept.parent, key).find(name) is None
+    assert ProgramCache(options, kept.parent, key).find(name) is None
 
 
 @pytest.mark.parametrize(
@@ -95,7 +95,7 @@ def test_another_program_is_not_taken_for_it(kept, options, key, name):
 def test_a_damaged_file_is_compiled_anew_and_replaced(kept, damage):
     whole = kept.read_bytes()
     kept.write_bytes(damage(whole))
-    again = Programs({}, kept.parent, KEY)
+    again = ProgramCache({}, kept.parent, KEY)
     assert again.find("double") is None
     assert twice(again.compile("double", double)) == [0.0, 2.0, 4.0]
     assert twice(again.compile("double", never)) == [0.0, 2.0, 4.0]
@@ -106,20 +106,20 @@ def test_one_that_the_device_no_longer_loads_is_compiled_anew(kept, monkeypatch)
         raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: another driver")
 
     monkeypatch.setattr(program_cache.serialize_executable, "deserialize_and_load", refuse)
-    again = Programs({}, kept.parent, KEY)
+    again = ProgramCache({}, kept.parent, KEY)
     assert again.find("double") is None
     assert twice(again.compile("double", double)) == [0.0, 2.0, 4.0]
 
 
 def test_a_folder_that_cannot_be_written_costs_nothing_but_time(folder):
-    nowhere = Programs({}, folder / "missing", KEY)
+    nowhere = ProgramCache({}, folder / "missing", KEY)
     assert twice(nowhere.compile("double", double)) == [0.0, 2.0, 4.0]
     assert not list(folder.iterdir())
 
 
 def test_without_a_folder_nothing_is_kept(folder):
-    assert twice(Programs({}).compile("double", double)) == [0.0, 2.0, 4.0]
-    assert Programs({}).find("double") is None
+    assert twice(ProgramCache({}).compile("double", double)) == [0.0, 2.0, 4.0]
+    assert ProgramCache({}).find("double") is None
 
 
 @pytest.mark.parametrize(("platform", "written"), [("cpu", 0), ("gpu", 1)])
@@ -134,7 +134,7 @@ def test_what_a_cpu_found_in_jax_s_cache_is_not_written_again(
 
     monkeypatch.setattr(program_cache._CacheHits, "__exit__", found)
     monkeypatch.setattr(jax, "default_backend", lambda: platform)
-    Programs({}, folder, KEY).compile("double", double)
+    ProgramCache({}, folder, KEY).compile("double", double)
     assert len(list(folder.iterdir())) == written
 
 
@@ -142,7 +142,7 @@ def test_what_nobody_used_for_long_makes_room(kept):
     old = kept.parent / "program-of-last-year"
     old.touch()
     os.utime(old, (0, time.time() - 31 * 86_400))
-    Programs({}, kept.parent, KEY).compile("another", double)
+    ProgramCache({}, kept.parent, KEY).compile("another", double)
     assert not old.exists()
     assert kept.exists()
 
@@ -158,7 +158,7 @@ def paths(tmp_path, monkeypatch):
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
 
     def paths(settings, *, keep=True):
-        found = programs_of(parse_config(settings), keep=keep)
+        found = open_program_cache(parse_config(settings), keep=keep)
         return found._path("advance") if found._folder else None
 
     yield paths
@@ -246,13 +246,13 @@ def test_a_training_from_kept_programs_is_the_same_to_the_bit(root, folder, monk
         env = gliding.Gliding(config)
 
         def trained():
-            program = Program(config, env, Programs({}, folder, KEY))
+            program = ScalarProgram(config, env, ProgramCache({}, folder, KEY))
             state, _ = program.compile()(program.init(), 2, False)
             return program.template(), program.get(state)[0]
 
         shapes, first = trained()
-        monkeypatch.setattr(Program, "trace", never)
-        monkeypatch.setattr(Program, "_init", never)
+        monkeypatch.setattr(ScalarProgram, "trace", never)
+        monkeypatch.setattr(ScalarProgram, "_init", never)
         again, second = trained()
     assert jax.tree.structure(shapes) == jax.tree.structure(again)
     assert jax.tree.leaves(shapes) == jax.tree.leaves(again)
@@ -305,9 +305,9 @@ def test_a_program_for_one_of_several_devices_is_kept_for_that_one(tmp_path):
 import sys
 import jax, jax.numpy as jnp
 from pathlib import Path
-from jetbot_mjx.compiler.program_cache import Programs
+from jetbot_mjx.compiler.program_cache import ProgramCache
 step = jax.jit(lambda x: 3 * x + 1)
-found = Programs({{}}, Path({str(tmp_path)!r}), "key")
+found = ProgramCache({{}}, Path({str(tmp_path)!r}), "key")
 kept = found.find("it") is not None
 program = found.compile("it", lambda: step.trace(jnp.ones(4)))
 print(jax.device_count(), kept, float(program(jnp.ones(4)).sum()))

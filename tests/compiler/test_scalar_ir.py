@@ -5,8 +5,8 @@ import pytest
 
 from jetbot_mjx.compiler import scalar_ir
 from jetbot_mjx.compiler.indexing import numbers_of
-from jetbot_mjx.compiler.lower_jaxpr import Program
-from jetbot_mjx.compiler.scalar_ir import Graph, UnsupportedError, is_known, is_same
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
+from jetbot_mjx.compiler.scalar_ir import ExprGraph, UnsupportedError, is_constant, is_same
 from jetbot_mjx.compiler.schedule import schedule
 
 ONE, TWO, ZERO = (np.float32(x) for x in (1, 2, 0))
@@ -15,7 +15,7 @@ YES, NO = np.bool_(True), np.bool_(False)
 
 @pytest.fixture
 def graph():
-    return Graph()
+    return ExprGraph()
 
 
 @pytest.fixture
@@ -30,7 +30,7 @@ def flag(graph):
 
 def test_what_is_known_is_computed(graph):
     result = graph.apply("mul", np.float32(3), graph.apply("sub", TWO, np.float32(0.5)))
-    assert is_known(result)
+    assert is_constant(result)
     assert result == 4.5
     assert result.dtype == np.float32
 
@@ -48,7 +48,7 @@ def test_what_changes_nothing_is_left_out(graph, x):
 @pytest.mark.parametrize(("op", "other"), [("mul", ZERO), ("sub", None)])
 def test_what_comes_to_nothing_is_zero(graph, x, op, other):
     result = graph.apply(op, x, x if other is None else other)
-    assert is_known(result)
+    assert is_constant(result)
     assert result == 0
 
 
@@ -89,7 +89,9 @@ def evaluate(result, *inputs):
     """A number for each robot; `inputs` are what it depends on, with an array of numbers each."""
     values, columns = zip(*inputs, strict=True)
     leaves = [numbers_of([value], ()) for value in values]
-    (ends,) = Program(leaves, [numbers_of([result], ())], schedule([result])).evaluate(columns)
+    (ends,) = ScalarProgram(leaves, [numbers_of([result], ())], schedule([result])).evaluate(
+        columns
+    )
     return ends
 
 

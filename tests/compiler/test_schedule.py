@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from jetbot_mjx.compiler.scalar_ir import Graph, Value
+from jetbot_mjx.compiler.scalar_ir import Expr, ExprGraph
 from jetbot_mjx.compiler.schedule import PlacedBranch, PlacedLoop, schedule
 
 ONE = np.float32(1)
@@ -11,7 +11,7 @@ ONE = np.float32(1)
 
 @pytest.fixture
 def graph():
-    return Graph()
+    return ExprGraph()
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def loop_of(graph, first, body):
 
 def ops(block):
     """Names of what is done in a block, in order, without what lies deeper."""
-    return [x.op if isinstance(x, Value) else type(x).__name__ for x in block.items]
+    return [x.op if isinstance(x, Expr) else type(x).__name__ for x in block.items]
 
 
 def inside(block, kind):
@@ -185,11 +185,11 @@ def test_every_operand_of_a_large_program_is_there_before_it(graph, x):
     known = {x.index}
 
     def check(numbers):
-        assert all(not isinstance(number, Value) or number.index in known for number in numbers)
+        assert all(not isinstance(number, Expr) or number.index in known for number in numbers)
 
     def visit(block):
         for item in block.items:
-            if isinstance(item, Value):
+            if isinstance(item, Expr):
                 check(item.operands)
                 known.add(item.index)
             elif isinstance(item, PlacedLoop):
@@ -204,7 +204,7 @@ def test_every_operand_of_a_large_program_is_there_before_it(graph, x):
                 for side, numbers in ((item.no, item.branch.no), (item.yes, item.branch.yes)):
                     visit(side)
                     check(numbers[result.place] for result in item.results)
-            if not isinstance(item, Value):
+            if not isinstance(item, Expr):
                 known.update(result.index for result in item.results)
 
     visit(schedule(results))

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import pytest
 
 from jetbot_mjx.compiler import kernel, program_cache
-from jetbot_mjx.compiler.program_cache import Programs, use_compilation_cache
+from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
 from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "geteuid"), reason="files have no owners here")
@@ -196,8 +196,10 @@ def test_a_place_that_only_jax_knows_is_left_to_it(settings, tmp_path, monkeypat
 
 def keep_program(folder):
     """Keeps a program; returns a function that says whether it is found."""
-    Programs({}, folder, "key").compile("it", lambda: jax.jit(lambda x: 2 * x).trace(jnp.ones(3)))
-    return lambda: Programs({}, folder, "key").find("it") is not None
+    ProgramCache({}, folder, "key").compile(
+        "it", lambda: jax.jit(lambda x: 2 * x).trace(jnp.ones(3))
+    )
+    return lambda: ProgramCache({}, folder, "key").find("it") is not None
 
 
 def keep_kernel(folder):

@@ -21,7 +21,7 @@ from jetbot_mjx import export, sim2real
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.deployment.drive_log import read_log, replay
 from jetbot_mjx.deployment.numpy_policy import record
-from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, StandIn
+from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, SimulatedJetBot
 from jetbot_mjx.envs.task import GOAL_HEIGHT, LAYOUTS, GoalTask, RobotState
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import session
@@ -114,7 +114,7 @@ def test_a_trained_policy_reaches_95_of_100_goals(tmp_path, monkeypatch, capsys)
 
 
 def test_a_stale_pose_stops_the_motors_within_100_ms(policy):
-    robot = StandIn()
+    robot = SimulatedJetBot()
     eye = camera(robot)
     lines = []
 
@@ -144,7 +144,7 @@ def test_a_stale_pose_stops_the_motors_within_100_ms(policy):
 
 
 def test_the_robot_stands_still_without_a_pose(policy):
-    robot = StandIn()
+    robot = SimulatedJetBot()
     outcome = drive.drive(
         robot,
         robot,
@@ -157,7 +157,7 @@ def test_the_robot_stands_still_without_a_pose(policy):
     assert robot.pose() == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
-class Recorder:
+class TrainerCallback:
     """A robot and a clock that keep what they are told."""
 
     def __init__(self, at=0.5, happens=None):
@@ -186,7 +186,7 @@ def failing(error):
 @pytest.mark.parametrize("where", ["clock", "poses", "policy", "log", "start"])
 @pytest.mark.parametrize("error", [ValueError("!"), KeyboardInterrupt(), SystemExit(143)])
 def test_whatever_goes_wrong_stops_the_motors(where, error, policy):
-    robot = Recorder(happens=failing(error) if where == "clock" else None)
+    robot = TrainerCallback(happens=failing(error) if where == "clock" else None)
     source = poses.Odometry(motors.default_calibration())
     count = iter(range(1000))
 
@@ -214,7 +214,7 @@ def test_whatever_goes_wrong_stops_the_motors(where, error, policy):
 
 
 def test_a_bus_that_refuses_once_is_asked_again(policy):
-    robot = Recorder()
+    robot = TrainerCallback()
     refusals = [OSError(121, "Remote I/O error")] * 4
 
     def set_motors(left, right):
@@ -231,7 +231,7 @@ def test_a_bus_that_refuses_once_is_asked_again(policy):
 
 
 def test_a_policy_that_gives_no_numbers_stands_still(policy):
-    robot = Recorder()
+    robot = TrainerCallback()
     lost = policy._replace(act=lambda obs: ((0.0, 0.0), (math.nan, 5.0)))
     source = poses.Odometry(motors.default_calibration())
     drive.drive(robot, robot, source, lost, motors.default_calibration(), settings(timeout=0.5))
@@ -240,7 +240,7 @@ def test_a_policy_that_gives_no_numbers_stands_still(policy):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_stops_the_motors_and_tells_its_number(number, exported, monkeypatch):
-    robot = Recorder(happens=lambda: os.kill(os.getpid(), number))
+    robot = TrainerCallback(happens=lambda: os.kill(os.getpid(), number))
     monkeypatch.setattr(drive, "NoRobot", lambda: robot)
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as left:
@@ -252,7 +252,7 @@ def test_a_signal_stops_the_motors_and_tells_its_number(number, exported, monkey
 
 
 def test_late_periods_are_counted_and_do_not_pile_up(policy):
-    robot = Recorder()
+    robot = TrainerCallback()
     naps = iter([0.03] * 10)
     slow = policy._replace(act=lambda obs: robot.sleep(next(naps, 0.0)) or scripted(obs))
     source = poses.Odometry(motors.default_calibration())
@@ -287,7 +287,7 @@ def test_motor_values_undo_dead_band_and_full_speed():
     assert motors.motor_value(9.0, wheel) == 1.0
     assert motors.motor_value(-9.0, wheel) == -1.0
     # As the stand-in's motors do.
-    robot = StandIn(IDEAL._replace(dead_band=(0.2, 0.2)))
+    robot = SimulatedJetBot(IDEAL._replace(dead_band=(0.2, 0.2)))
     robot.set_motors(*[motors.motor_value(0.3, motors.Wheel(0.2, 12.56 * ROLLING_RADIUS))] * 2)
     robot.sleep(1.0)
     assert robot.speed() == pytest.approx(0.3, rel=2e-3)
@@ -324,7 +324,7 @@ def test_an_observation_that_cannot_be_made_is_told(policy):
 
 def test_dead_reckoning_follows_the_stand_in(policy):
     model = MotorModel(delay=0.0)
-    robot = StandIn(model)
+    robot = SimulatedJetBot(model)
     calibration = rehearse.true_calibration(model)
     source = poses.Odometry(calibration)
     outcome = drive.drive(robot, robot, source, policy, calibration, settings((0.8, 0.6)))
@@ -396,7 +396,7 @@ NASTY = [
 @pytest.mark.parametrize("content", NASTY, ids=range(len(NASTY)))
 def test_no_datagram_ends_a_drive(content, policy):
     """The robot stops while nothing else comes, and goes on when the tracker is back."""
-    robot = StandIn()
+    robot = SimulatedJetBot()
     eye = camera(robot)
 
     def receive():
@@ -612,7 +612,7 @@ def test_a_key_that_cannot_be_used_is_told(damage, message, key):
 
 def test_calibration_finds_dead_bands_and_full_speeds(tmp_path, monkeypatch, capsys):
     model = MotorModel(dead_band=(0.1, 0.16), full_speed=(12.0, 11.0))
-    robot = StandIn(model)
+    robot = SimulatedJetBot(model)
     places = [robot.pose()]
 
     def measure():
@@ -781,7 +781,7 @@ def test_a_rehearsal_of_nonsense_is_refused(arguments, message, exported, capsys
     ],
 )
 def test_a_calibration_that_does_not_end_is_told(arguments, error, code, message, tmp_path, capsys):
-    robot, path = Recorder(), tmp_path / "calibration.json"
+    robot, path = TrainerCallback(), tmp_path / "calibration.json"
     arguments = ["--output", str(path), *arguments]
     assert calibrate.main(arguments, robot, robot, failing(error)) == code
     assert message in capsys.readouterr().err
@@ -803,7 +803,7 @@ def test_a_rehearsal_tells_how_many_goals_were_reached(exported, capsys):
 def driven(policy, tmp_path_factory):
     """The log of a drive in a stand-in whose calibration is known, but for its delay."""
     model = MotorModel(full_speed=(12.0, 11.5), dead_band=(0.1, 0.15))
-    robot, calibration = StandIn(model), rehearse.true_calibration(model)
+    robot, calibration = SimulatedJetBot(model), rehearse.true_calibration(model)
     robot.place(Pose(0.2, -0.1, 3.0))
     path = tmp_path_factory.mktemp("log") / "drive.jsonl"
     where = settings((-0.6, 0.5))

@@ -7,7 +7,7 @@ from jetbot_mjx.deployment.simulated_jetbot import (
     ROLLING_RADIUS,
     MotorModel,
     Pose,
-    StandIn,
+    SimulatedJetBot,
     replayed,
 )
 
@@ -15,7 +15,7 @@ IDEAL = MotorModel(dead_band=(0.0, 0.0), lag=0.0, delay=0.0)
 
 
 def driven(model, left, right, seconds=2.0):
-    robot = StandIn(model)
+    robot = SimulatedJetBot(model)
     robot.set_motors(left, right)
     robot.sleep(seconds)
     return robot
@@ -60,7 +60,7 @@ def test_the_clock_moves_the_robot_and_nothing_else_does():
 
 
 def test_a_replay_is_the_drive():
-    robot = StandIn()
+    robot = SimulatedJetBot()
     robot.place(Pose(0.3, 0.1, 2.0))
     values = np.random.default_rng(0).uniform(0.2, 0.9, (40, 2))
     times, path = [], []

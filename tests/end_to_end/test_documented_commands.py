@@ -20,12 +20,12 @@ from ruamel.yaml import YAML
 from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, own_files
 
 from jetbot_mjx import plan, render
-from jetbot_mjx.agents.ppo import Fault
+from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import load_config
-from jetbot_mjx.deployment.simulated_jetbot import StandIn
+from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.runs.nan_dump import save_fault
+from jetbot_mjx.runs.nan_dump import save_nan_dump
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.video import Studio
 
@@ -204,13 +204,13 @@ def test_a_documented_replay_ends_where_the_world_did(page, words, reader, monke
     state = jax.tree.map(lambda x: x[0], env.reset(jax.random.PRNGKey(0)[None]))
     physics = state.pipeline_state
     physics = physics.replace(qvel=jnp.full_like(physics.qvel, jnp.inf))
-    fault = Fault(
+    nan_dump = NanDump(
         found=np.array(True),
         env_state=state.replace(pipeline_state=physics),
         actions=np.zeros((8, 2), np.float32),
         step=np.array(0),
     )
-    assert str(save_fault(Path("runs/mine"), config, 131_072, fault)) == words[-1]
+    assert str(save_nan_dump(Path("runs/mine"), config, 131_072, nan_dump)) == words[-1]
     assert execute(page, words, reader, monkeypatch) == 0
     assert "qvel" in capsys.readouterr().out
 
@@ -292,7 +292,7 @@ def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monk
     from poses import Tracker
     from rehearse import Camera
 
-    robot = StandIn()
+    robot = SimulatedJetBot()
     eye = Camera(robot, 60.0, 0.0, np.random.default_rng(0))
     distances = iter([0.14, 0.33])
     monkeypatch.setattr(drive, "make_robot", lambda: robot)

@@ -7,17 +7,17 @@ import pytest
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import drive_motors, motors_at_rest
 from jetbot_mjx.envs.robot_model import WHEEL_RADIUS, WHEEL_SEPARATION
-from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, Variation
+from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, RobotParams
 
 FULL = 12.0
 RAMP = np.arange(1.0, 25.0).reshape(12, 2)
 
 
-def drive(variation, commands, longest_delay=MAX_ACTION_DELAY):
-    motors, speeds = motors_at_rest(variation, longest_delay), []
+def drive(robot_params, commands, longest_delay=MAX_ACTION_DELAY):
+    motors, speeds = motors_at_rest(robot_params, longest_delay), []
     for command in np.asarray(commands, np.float32):
         motors, speed = drive_motors(
-            motors, jnp.asarray(command), variation, full_speed=FULL, ctrl_dt=1 / 60
+            motors, jnp.asarray(command), robot_params, full_speed=FULL, ctrl_dt=1 / 60
         )
         speeds.append(speed)
     return np.asarray(speeds)
@@ -25,32 +25,32 @@ def drive(variation, commands, longest_delay=MAX_ACTION_DELAY):
 
 @pytest.mark.parametrize("delay", [0, 1, 3, MAX_ACTION_DELAY])
 def test_until_the_first_command_arrives_the_motors_are_asked_to_stand(delay):
-    speeds = drive(Variation(action_delay=delay), RAMP)
+    speeds = drive(RobotParams(action_delay=delay), RAMP)
     np.testing.assert_array_equal(speeds[:delay], 0.0)
     np.testing.assert_array_equal(speeds[delay:], RAMP[: 12 - delay])
 
 
 def test_a_delay_is_rounded_to_whole_steps():
     np.testing.assert_array_equal(
-        drive(Variation(action_delay=1.6), RAMP), drive(Variation(action_delay=2.0), RAMP)
+        drive(RobotParams(action_delay=1.6), RAMP), drive(RobotParams(action_delay=2.0), RAMP)
     )
 
 
 def test_a_lag_is_of_first_order():
-    speeds = drive(Variation(motor_lag=0.1), [(10.0, -5.0)] * 12)
+    speeds = drive(RobotParams(motor_lag=0.1), [(10.0, -5.0)] * 12)
     expected = 1.0 - np.exp(-np.arange(1, 13) / 60 / 0.1)
     np.testing.assert_allclose(speeds, expected[:, None] * (10.0, -5.0), rtol=1e-5)
 
 
 def test_below_the_dead_band_a_wheel_stands_and_at_full_command_it_is_as_fast_as_without():
     commands = [(2.9, -2.9), (3.0 + 4.5, -(3.0 + 4.5)), (FULL, -FULL)]
-    speeds = drive(Variation(dead_band=0.25), commands)
+    speeds = drive(RobotParams(dead_band=0.25), commands)
     expected = np.array([0.0, 0.5 * FULL, FULL])
     np.testing.assert_allclose(speeds, expected[:, None] * (1.0, -1.0), rtol=1e-6)
 
 
 def test_a_low_voltage_slows_the_motors_and_widens_their_dead_band():
-    slow, gain = Variation(supply_voltage=0.5), Variation(motor_gain=0.5)
+    slow, gain = RobotParams(supply_voltage=0.5), RobotParams(motor_gain=0.5)
     np.testing.assert_allclose(drive(slow, RAMP), 0.5 * RAMP)
     np.testing.assert_allclose(drive(gain, RAMP), 0.5 * RAMP)
     at_low_voltage, at_low_gain = (
@@ -62,14 +62,14 @@ def test_a_low_voltage_slows_the_motors_and_widens_their_dead_band():
 
 def test_unequal_motors_and_wheels_part_symmetrically():
     for name in ("motor_gain_mismatch", "wheel_radius_mismatch"):
-        left, right = drive(Variation(**{name: 0.1}), [(10.0, 10.0)])[0]
+        left, right = drive(RobotParams(**{name: 0.1}), [(10.0, 10.0)])[0]
         assert (left, right) == pytest.approx((10.5, 9.5))
 
 
 @pytest.mark.parametrize(("left", "right"), [(3.0, 7.0), (-4.0, 4.0), (5.0, 5.0)])
 def test_wheels_of_another_size_and_distance_move_the_robot_as_kinematics_says(left, right):
-    variation = Variation(wheel_radius=1.04, wheel_separation=0.95)
-    entered = drive(variation, [(left, right)])[0]
+    robot_params = RobotParams(wheel_radius=1.04, wheel_separation=0.95)
+    entered = drive(robot_params, [(left, right)])[0]
     as_entered = kinematics.body_twist(
         jnp.asarray(entered), wheel_radius=WHEEL_RADIUS, wheel_separation=WHEEL_SEPARATION
     )
@@ -82,7 +82,7 @@ def test_wheels_of_another_size_and_distance_move_the_robot_as_kinematics_says(l
 
 
 def test_what_does_not_differ_leaves_every_bit_and_takes_no_place():
-    np.testing.assert_array_equal(drive(Variation(), RAMP, longest_delay=0), RAMP)
-    traced = Variation(*(jnp.float32(value) for value in Variation()))
+    np.testing.assert_array_equal(drive(RobotParams(), RAMP, longest_delay=0), RAMP)
+    traced = RobotParams(*(jnp.float32(value) for value in RobotParams()))
     np.testing.assert_array_equal(drive(traced, RAMP), RAMP)
-    assert motors_at_rest(Variation(), 0) == (None, None)
+    assert motors_at_rest(RobotParams(), 0) == (None, None)

@@ -12,9 +12,9 @@ import pytest
 from jetbot_mjx import make_env, train
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
-from jetbot_mjx.envs.domain_randomization import VariedEnv, as_trained, draw
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper, draw, maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.evaluation.evaluator import report_keys
@@ -38,15 +38,15 @@ def ranges(config):
 
 
 def test_what_can_be_drawn_is_what_can_differ():
-    assert tuple(RandomizationConfig.model_fields) == Variation._fields
+    assert tuple(RandomizationConfig.model_fields) == RobotParams._fields
 
 
 def test_the_preset_draws_all_that_its_policy_can_tell_around_the_presets_robot(ranges):
-    assert tuple(ranges.drawn) == tuple(n for n in Variation._fields if n not in NOT_OBSERVED)
+    assert tuple(ranges.drawn) == tuple(n for n in RobotParams._fields if n not in NOT_OBSERVED)
     for name, (low, high) in ranges.drawn.items():
         assert low < high, name
         if name not in {"dead_band", "motor_lag", "position_noise", "yaw_noise"}:
-            assert low <= getattr(Variation(), name) <= high, name
+            assert low <= getattr(RobotParams(), name) <= high, name
 
 
 def test_draws_fill_their_ranges_evenly_and_by_themselves(ranges):
@@ -84,7 +84,7 @@ def driven(config):
 
 
 def test_every_quantity_is_another_one_in_every_episode_and_environment(driven, ranges):
-    drawn = driven.hardware.drawn
+    drawn = driven.episode_params.drawn
     assert drawn.shape == (1 + EPISODES * EPISODE_LENGTH, ENVS, len(ranges.drawn))
     within = drawn[:-1].reshape(EPISODES, EPISODE_LENGTH, ENVS, -1)
     assert (within == within[:, :1]).all()
@@ -99,7 +99,7 @@ def test_every_quantity_is_another_one_in_every_episode_and_environment(driven, 
 def test_an_episode_begins_with_motors_at_rest_and_sensors_that_saw_its_start(driven):
     begun = np.flatnonzero(driven.done[:, 0] > 0)
     assert len(begun) == EPISODES
-    motors, sensors = driven.hardware.motors, driven.hardware.sensors
+    motors, sensors = driven.episode_params.motors, driven.episode_params.sensors
     np.testing.assert_array_equal(motors.commands[begun], 0.0)
     np.testing.assert_array_equal(motors.targets[begun], 0.0)
     assert np.abs(motors.commands[begun - 1]).max() > 1.0
@@ -111,7 +111,7 @@ def test_an_episode_begins_with_motors_at_rest_and_sensors_that_saw_its_start(dr
 
 def test_the_first_observation_is_exact_and_the_others_are_not(config):
     env = make_env(config)
-    varied = as_trained(env)
+    varied = maybe_randomize(env)
     state = varied.reset(jax.random.PRNGKey(5))
     exact = env.task.observe(robot_state(state.pipeline_state), state.goal)
     np.testing.assert_array_equal(state.obs, exact)
@@ -123,7 +123,9 @@ def test_the_first_observation_is_exact_and_the_others_are_not(config):
 
 def test_an_offset_is_in_the_first_observation_and_not_in_physics(world_env):
     state = world_env.reset(jax.random.PRNGKey(5))
-    offset = VariedEnv(world_env, Variation(height_offset=0.003, pitch_offset=0.02))
+    offset = DomainRandomizationWrapper(
+        world_env, RobotParams(height_offset=0.003, pitch_offset=0.02)
+    )
     seen = offset.reset(jax.random.PRNGKey(5))
     jax.tree.map(np.testing.assert_array_equal, seen.pipeline_state, state.pipeline_state)
     assert float(seen.obs[2] - state.obs[2]) == pytest.approx(0.003, abs=1e-7)
@@ -136,7 +138,7 @@ def test_an_offset_is_in_the_first_observation_and_not_in_physics(world_env):
 
 def test_an_episode_starts_where_and_as_the_robot_was_put(driven, ranges):
     place = [list(ranges.drawn).index(name) for name in ("start_x", "start_y", "start_yaw")]
-    x, y, yaw = np.moveaxis(driven.hardware.drawn[0][:, place], -1, 0)
+    x, y, yaw = np.moveaxis(driven.episode_params.drawn[0][:, place], -1, 0)
     qpos = driven.pipeline_state.qpos[0]
     np.testing.assert_allclose(qpos[:, :2], np.stack([x, y], axis=-1), atol=1e-6)
     np.testing.assert_allclose(2 * np.arctan2(qpos[:, 6], qpos[:, 3]), yaw, atol=1e-4)
@@ -144,8 +146,8 @@ def test_an_episode_starts_where_and_as_the_robot_was_put(driven, ranges):
 
 def test_the_state_keeps_its_tree_and_the_goal_is_that_of_the_plain_environment(config):
     env = make_env(config)
-    varied = as_trained(env)
-    assert isinstance(varied, VariedEnv)
+    varied = maybe_randomize(env)
+    assert isinstance(varied, DomainRandomizationWrapper)
     key = report_keys(1)[0]
     first = jax.eval_shape(varied.reset, key)
     second = jax.eval_shape(varied.step, first, jnp.zeros(2))
@@ -157,10 +159,10 @@ def test_the_state_keeps_its_tree_and_the_goal_is_that_of_the_plain_environment(
 
 def test_nothing_drawn_is_the_program_of_the_plain_environment():
     env = make_env(parse_config({}))
-    assert as_trained(env) is env
+    assert maybe_randomize(env) is env
     action = jnp.zeros(2)
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    assert state.hardware is None
+    assert state.episode_params is None
     plain, same = (
         str(jax.make_jaxpr(one.step)(state, action))
         for one in (env, make_env(parse_config({"randomization": {}})))
@@ -170,8 +172,8 @@ def test_nothing_drawn_is_the_program_of_the_plain_environment():
 
 def test_only_what_is_drawn_enters_the_physics():
     few = make_env(parse_config({"randomization": {"friction": [0.5, 1.0]}}))
-    state = as_trained(few).reset(jax.random.PRNGKey(0))
-    assert jax.tree.leaves((state.hardware.motors, state.hardware.sensors)) == []
+    state = maybe_randomize(few).reset(jax.random.PRNGKey(0))
+    assert jax.tree.leaves((state.episode_params.motors, state.episode_params.sensors)) == []
     varied = []
 
     class Seen(JetBotEnv):
@@ -181,7 +183,9 @@ def test_only_what_is_drawn_enters_the_physics():
             return env
 
     jax.eval_shape(
-        VariedEnv(Seen(few.config), ranges=few.config.randomization).step, state, jnp.zeros(2)
+        DomainRandomizationWrapper(Seen(few.config), ranges=few.config.randomization).step,
+        state,
+        jnp.zeros(2),
     )
     assert [len(places) for places in varied] == [1]
 
@@ -210,7 +214,7 @@ def test_a_training_resumes_to_the_bit_with_everything_drawn(config, tmp_path):
     assert sums[0] != read_about(checkpoint_path(stopped, 64))["sha256"]
 
 
-@pytest.mark.parametrize("name", Variation._fields)
+@pytest.mark.parametrize("name", RobotParams._fields)
 def test_the_page_tells_what_the_preset_draws(root, ranges, name):
     page = (root / "docs" / "randomization.md").read_text("utf-8")
     (row,) = (line for line in page.splitlines() if line.startswith(f"| `{name}` |"))

@@ -10,11 +10,11 @@ import pytest
 
 from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
 from jetbot_mjx.envs import mujoco_simulator
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.mujoco_simulator import in_mujoco, make_model, training_numerics
 from jetbot_mjx.envs.robot_model import make_mj_model
-from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.wrappers import EpisodeWrapper
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
@@ -101,7 +101,7 @@ def test_a_varied_robot_is_the_one_that_mujoco_compiles(preset_env, mass, shift)
         max_wheel_speed=None,
     )
     simulator = in_mujoco(preset_env, training_numerics(preset_env.config.physics))
-    varied = VariedEnv(simulator, Variation(0.7, mass, *shift))
+    varied = DomainRandomizationWrapper(simulator, RobotParams(0.7, mass, *shift))
     actions = held(uniform)
     actions[..., 0] = -0.6  # [0.2 m/s], so that no motor is at its limit
     driven = trajectories(varied, actions)
@@ -125,10 +125,14 @@ def test_what_mujoco_derives_from_masses_follows_them(preset_env):
 def test_every_episode_has_its_own_robot(world_env):
     ranges = RandomizationConfig(friction=(0.3, 1.2), mass=(0.8, 1.25), motor_gain=(0.5, 1.0))
     simulator = in_mujoco(world_env)
-    together = episodes(VariedEnv(simulator, ranges=ranges), report_keys(8), steps=20)
+    together = episodes(
+        DomainRandomizationWrapper(simulator, ranges=ranges), report_keys(8), steps=20
+    )
     assert len({tuple(end) for end in together.end_w.tolist()}) == 8
     # Each is the robot that its key draws, whoever drives beside it.
-    alone = episodes(VariedEnv(simulator, ranges=ranges), report_keys(8)[3:5], steps=20)
+    alone = episodes(
+        DomainRandomizationWrapper(simulator, ranges=ranges), report_keys(8)[3:5], steps=20
+    )
     np.testing.assert_array_equal(alone.end_w, together.end_w[3:5])
 
 

@@ -12,7 +12,7 @@ import pytest
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
@@ -20,7 +20,7 @@ from jetbot_mjx.envs.robot_model import (
     WHEEL_SEPARATION,
     make_mj_model,
 )
-from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, Variation, vary_model
+from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, RobotParams, vary_model
 
 ROBOTS = 16
 STEPS = 256
@@ -34,9 +34,9 @@ true_yaw = jax.jit(jax.vmap(kinematics.yaw))
 
 
 def many(**fields):
-    """One variation for each of `ROBOTS` robots: fields are cycled, the rest is the preset's."""
-    columns = Variation()._replace(**fields)
-    return Variation(*(jnp.resize(jnp.asarray(c, jnp.float32), (ROBOTS,)) for c in columns))
+    """One robot_params for each of `ROBOTS` robots: fields are cycled, the rest is the preset's."""
+    columns = RobotParams()._replace(**fields)
+    return RobotParams(*(jnp.resize(jnp.asarray(c, jnp.float32), (ROBOTS,)) for c in columns))
 
 
 def straight(steps, drive):
@@ -45,24 +45,26 @@ def straight(steps, drive):
 
 @pytest.fixture(scope="module", params=["isaac", "real"])
 def driver(request):
-    """An environment and a compiled `(variation (n,), actions (n, t, 2)) -> (physics, targets)`.
+    """An environment and a compiled `(robot_params (n,), actions (n, t, 2)) -> (physics, targets)`.
 
-    Without a variation it drives the environment itself.
+    Without a robot_params it drives the environment itself.
     """
     env = make_env(parse_config({"robot": {"preset": request.param}}))
 
-    def drive(variation, actions):
-        def one(variation, actions):
-            robot = env if variation is None else VariedEnv(env, variation)
+    def drive(robot_params, actions):
+        def one(robot_params, actions):
+            robot = env if robot_params is None else DomainRandomizationWrapper(env, robot_params)
 
             def step(state, action):
                 state = robot.step(state, action)
-                targets = jnp.zeros(2) if variation is None else state.hardware.motors.targets
+                targets = (
+                    jnp.zeros(2) if robot_params is None else state.episode_params.motors.targets
+                )
                 return state, (state.pipeline_state, targets)
 
             return jax.lax.scan(step, robot.reset(jax.random.PRNGKey(0)), actions)[1]
 
-        return jax.vmap(one)(variation, actions)
+        return jax.vmap(one)(robot_params, actions)
 
     return env, jax.jit(drive, compiler_options=compiler_options(env.config))
 
@@ -100,8 +102,8 @@ def drive_in_c(env, mj_model, actions, height=None):
 
 def test_without_a_difference_the_robot_is_its_preset_to_the_bit(driver):
     env, _ = driver
-    varied = jax.jit(lambda variation: vary_model(env.mjx_model, env.mj_model, variation))
-    jax.tree.map(np.testing.assert_array_equal, varied(Variation()), env.mjx_model)
+    varied = jax.jit(lambda robot_params: vary_model(env.mjx_model, env.mj_model, robot_params))
+    jax.tree.map(np.testing.assert_array_equal, varied(RobotParams()), env.mjx_model)
 
 
 def test_without_a_difference_the_robot_drives_as_its_preset(driver, actions):
@@ -144,8 +146,8 @@ def test_a_varied_robot_drives_as_one_compiled_with_its_numbers(driver, actions)
 def test_a_varied_model_is_the_one_that_mujoco_compiles(preset_env, mass, shift):
     robot = varied_robot(preset_env.robot, mass, 0.4, shift)
     compiled = mjx.put_model(make_mj_model(robot, preset_env.config.physics, visual=False))
-    variation = Variation(0.4, mass, *shift)
-    varied = vary_model(preset_env.mjx_model, preset_env.mj_model, variation)
+    robot_params = RobotParams(0.4, mass, *shift)
+    varied = vary_model(preset_env.mjx_model, preset_env.mj_model, robot_params)
     for name in ("body_mass", "body_ipos", "body_inertia", "body_invweight0", "pair_friction"):
         changed, preset = getattr(varied, name), getattr(preset_env.mjx_model, name)
         np.testing.assert_allclose(changed, getattr(compiled, name), rtol=1e-5, atol=1e-7)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.robot_params import Variation
+from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.sensors import sense, sensors_at_start
 from jetbot_mjx.envs.task import RobotState
 
@@ -22,11 +22,11 @@ def robot(x=0.0, heading=0.0):
 
 
 def test_a_robot_sees_itself_as_it_was():
-    variation = Variation(observation_delay=jnp.float32(2.0))
-    sensors = sensors_at_start(robot(), KEY, variation, 4)
+    robot_params = RobotParams(observation_delay=jnp.float32(2.0))
+    sensors = sensors_at_start(robot(), KEY, robot_params, 4)
     seen = []
     for step in range(5):
-        sensors, now = sense(sensors, robot(1.0 + step, 0.1 * step), variation, jnp.int32(step))
+        sensors, now = sense(sensors, robot(1.0 + step, 0.1 * step), robot_params, jnp.int32(step))
         seen.append((float(now.position_w[0]), float(kinematics.yaw(now.quat))))
     expected = [(0.0, 0.0), (0.0, 0.0), (1.0, 0.0), (2.0, 0.1), (3.0, 0.2)]
     np.testing.assert_allclose(seen, expected, atol=1e-6)
@@ -35,14 +35,14 @@ def test_a_robot_sees_itself_as_it_was():
 @pytest.fixture(scope="module")
 def seen():
     """One robot that stands, as it sees itself over many steps, at noise of four sizes."""
-    variation = Variation(
+    robot_params = RobotParams(
         position_noise=jnp.float32(0.02),
         yaw_noise=jnp.float32(0.03),
         speed_noise=jnp.float32(0.01),
         yaw_rate_noise=jnp.float32(0.04),
     )
-    one = functools.partial(sense, sensors_at_start(robot(), KEY, variation, 0))
-    _, found = jax.jit(jax.vmap(lambda step: one(robot(heading=0.5), variation, step)))(
+    one = functools.partial(sense, sensors_at_start(robot(), KEY, robot_params, 0))
+    _, found = jax.jit(jax.vmap(lambda step: one(robot(heading=0.5), robot_params, step)))(
         jnp.arange(SAMPLES)
     )
     return found
@@ -73,10 +73,10 @@ def test_noise_leaves_height_and_level_and_is_new_at_every_step(seen):
 
 
 def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_heading():
-    variation = Variation(observation_delay=1, height_offset=0.003, pitch_offset=0.02)
-    sensors = sensors_at_start(robot(), KEY, variation, 1)
-    sensors, _ = sense(sensors, robot(1.0, 0.7), variation, jnp.int32(0))
-    _, now = sense(sensors, robot(2.0, 0.9), variation, jnp.int32(1))
+    robot_params = RobotParams(observation_delay=1, height_offset=0.003, pitch_offset=0.02)
+    sensors = sensors_at_start(robot(), KEY, robot_params, 1)
+    sensors, _ = sense(sensors, robot(1.0, 0.7), robot_params, jnp.int32(0))
+    _, now = sense(sensors, robot(2.0, 0.9), robot_params, jnp.int32(1))
     # Height and pitch differ, and nothing else; the delayed state has them once.
     np.testing.assert_allclose(now.position_w, (1.0, 0.0, 0.033), atol=1e-7)
     ahead = kinematics.rotate(now.quat, jnp.array([1.0, 0.0, 0.0]))
@@ -86,7 +86,7 @@ def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_headi
 
 
 def test_an_exact_robot_sees_every_bit_and_remembers_nothing():
-    sensors = sensors_at_start(robot(), KEY, Variation(), 0)
+    sensors = sensors_at_start(robot(), KEY, RobotParams(), 0)
     assert sensors == (None, None)
-    _, now = sense(sensors, robot(1.5, 0.7), Variation(), jnp.int32(3))
+    _, now = sense(sensors, robot(1.5, 0.7), RobotParams(), jnp.int32(3))
     jax.tree.map(np.testing.assert_array_equal, now, robot(1.5, 0.7))

@@ -104,13 +104,13 @@ def test_a_world_that_blows_up_is_cut_off_counted_and_replaced():
     before, blown, after = run(chain(), [GO, BLOW_UP, GO])[1:]
     assert float(blown.done) == float(blown.info["truncation"]) == 1
     assert float(blown.info["terminated"]) == 0
-    assert float(blown.metrics["nonfinite_worlds"]) == 1
-    assert float(blown.info["episode_metrics"]["nonfinite_worlds"]) == 1
+    assert float(blown.metrics["nonfinite_envs"]) == 1
+    assert float(blown.info["episode_metrics"]["nonfinite_envs"]) == 1
     assert float(blown.reward) == 0
     np.testing.assert_array_equal(blown.info["final_obs"], before.obs)  # the last finite one
     for state in (blown, after):
         assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(state))
-    assert float(after.metrics["nonfinite_worlds"]) == 0
+    assert float(after.metrics["nonfinite_envs"]) == 0
     np.testing.assert_array_equal(after.pipeline_state.qpos, 1.0)
 
 
@@ -142,7 +142,7 @@ def test_action_repeat_adds_up_terms_as_it_does_rewards():
     assert float(second.metrics["reward/given"]) == float(second.reward) == 2
     sums = second.info["episode_metrics"]
     assert float(sums["reward/given"]) == float(sums["sum_reward"]) == 5
-    assert float(sums["nonfinite_worlds"]) == 0
+    assert float(sums["nonfinite_envs"]) == 0
     ended = run(chain(action_repeat=3), [END])[-1]
     assert float(ended.metrics["success"]) == float(ended.info["episode_metrics"]["success"]) == 1
 
@@ -160,7 +160,7 @@ def test_a_world_that_blows_up_while_an_action_is_held_counts_for_nothing():
     before, blown = run(chain(action_repeat=2), [GO, BLOW_UP])[1:]
     assert float(blown.reward) == float(blown.metrics["reward/given"]) == 0
     assert float(blown.info["episode_metrics"]["reward/given"]) == 2
-    assert float(blown.metrics["nonfinite_worlds"]) == 1
+    assert float(blown.metrics["nonfinite_envs"]) == 1
     np.testing.assert_array_equal(blown.info["final_obs"], before.obs)
 
 

@@ -1,4 +1,4 @@
-"""Figures of several seeds: by hand, and whether their intervals hold what they promise."""
+"""Metrics of several seeds: by hand, and whether their intervals hold what they promise."""
 
 import numpy as np
 import pytest

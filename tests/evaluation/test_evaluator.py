@@ -56,7 +56,7 @@ def test_the_figures_by_hand():
     assert got.path_efficiency == pytest.approx((0.9 + 0.5) / 2)
     assert got.episode_return == pytest.approx(0.25)
     assert got.final_distance_median == pytest.approx(0.3)  # of 0.1, 0.1, 1.0, 0.5
-    assert got.nonfinite_worlds == 1
+    assert got.nonfinite_envs == 1
 
 
 def test_without_a_success_there_is_no_time_to_goal():

@@ -1,4 +1,4 @@
-"""Figures say what the report says; themes leave nothing behind."""
+"""Metrics say what the report says; themes leave nothing behind."""
 
 import io
 

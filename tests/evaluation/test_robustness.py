@@ -8,9 +8,9 @@ import pytest
 
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs.domain_randomization import VariedEnv
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, MAX_OBSERVATION_DELAY, Variation
+from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, MAX_OBSERVATION_DELAY, RobotParams
 from jetbot_mjx.evaluation import robustness
 from jetbot_mjx.evaluation.evaluator import Summary, report_keys, wilson_interval
 from jetbot_mjx.evaluation.plots import plot_robustness
@@ -34,7 +34,7 @@ def result(policy, values=(0.4, 0.6, 1.0, 1.2)):
 
 
 def test_every_difference_is_swept_around_the_presets_value():
-    assert tuple(one.name for one in SWEEPS) == Variation._fields
+    assert tuple(one.name for one in SWEEPS) == RobotParams._fields
     for one in SWEEPS:
         assert one.nominal in one.values
         assert list(one.values) == sorted(set(one.values))
@@ -98,14 +98,14 @@ def test_the_figure_shows_success_its_band_and_the_presets_value(count):
     np.testing.assert_array_equal(np.isnan(time.lines[1].get_ydata()), [True, False, False, False])
 
 
-class Counted(VariedEnv):
+class Counted(DomainRandomizationWrapper):
     """Counts how often a robot is built, which is once for each trace."""
 
     built = 0
 
-    def __init__(self, env, variation):
+    def __init__(self, env, robot_params):
         type(self).built += 1
-        super().__init__(env, variation)
+        super().__init__(env, robot_params)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def swept():
     values = {"motor_gain": (0.2, 1.0), "action_delay": (0.0, 9.0)}
     sweeps = [one._replace(values=values[one.name]) for one in SWEEPS if one.name in values]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(robustness, "VariedEnv", Counted)
+        patch.setattr(robustness, "DomainRandomizationWrapper", Counted)
         results = sweep(env, networks, params, report_keys(EPISODES), sweeps)
     return env, results
 

@@ -41,7 +41,7 @@ def execute(root, tmp_path_factory):
         patch.setenv("JUPYTER_PATH", str(folder / "jupyter"))
         patch.setenv("JUPYTER_RUNTIME_DIR", str(folder / "runtime"))
         patch.setenv("JUPYTER_PLATFORM_DIRS", "1")
-        # The kernel sets its own back end, which puts figures into the notebook.
+        # The kernel sets its own back end, which puts metrics into the notebook.
         patch.delenv("MPLBACKEND", raising=False)
 
         def run(name, profile="ipython"):

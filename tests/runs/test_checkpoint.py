@@ -17,7 +17,7 @@ from jetbot_mjx.runs.checkpoint import (
     find_checkpoint,
     load_checkpoint,
 )
-from jetbot_mjx.runs.checkpoint_store import Store, checkpoint_steps, digest
+from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_steps, digest
 from jetbot_mjx.runs.resume import TRAINING
 
 
@@ -33,7 +33,7 @@ def test_a_checkpoint_explains_itself(smoke_run):
     names = [field["name"] for field in checkpoint.about["layout"]]
     assert names[0] == "goal_position"
     assert checkpoint.about["versions"]["packages"]["brax"]
-    assert checkpoint.about["figures"]["success_rate"] >= 0.0
+    assert checkpoint.about["metrics"]["success_rate"] >= 0.0
     assert checkpoint.run_dir == smoke_run
 
 
@@ -52,10 +52,10 @@ def write(smoke_run, tmp_path):
         about = {**checkpoint.about, **changes}
         for key in without:
             del about[key]
-        with Store(run_dir, keep=50) as store:
+        with CheckpointStore(run_dir, keep=50) as store:
             for env_steps, success_rate in steps:
                 judged = {} if success_rate is None else {"success_rate": success_rate}
-                explained = {**about, "figures": judged}
+                explained = {**about, "metrics": judged}
                 store.save(env_steps, trees or {POLICY: checkpoint.params}, explained, success_rate)
         return run_dir
 

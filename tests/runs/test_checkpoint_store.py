@@ -15,7 +15,7 @@ import pytest
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
-    Store,
+    CheckpointStore,
     checkpoint_path,
     checkpoint_steps,
     digest,
@@ -42,7 +42,7 @@ def run_dir(tmp_path):
 
 def save(run_dir, *steps, keep=50, tree=TREE):
     """Checkpoints at some steps, each a number or a pair of steps and success rate."""
-    with Store(run_dir, keep) as store:
+    with CheckpointStore(run_dir, keep) as store:
         for one in steps:
             env_steps, success_rate = one if isinstance(one, tuple) else (one, None)
             store.save(env_steps, {"tree": tree}, {"explained": True}, success_rate)
@@ -74,7 +74,7 @@ def test_what_is_read_is_what_was_written(run_dir):
 
 def test_what_is_written_later_does_not_change_what_is_being_written(run_dir):
     tree = {"weights": np.zeros(100_000)}
-    with Store(run_dir, keep=50) as store:
+    with CheckpointStore(run_dir, keep=50) as store:
         store.save(1, {"tree": tree}, {}, None)
         store.save(2, {"tree": {"weights": np.ones(100_000)}}, {}, None)
     assert read(run_dir, 1, tree)["weights"].max() == 0
@@ -164,7 +164,7 @@ def test_the_latest_the_first_and_the_best_stay_and_of_equals_the_later(run_dir,
 
 
 def test_where_old_ones_are_moved_to_is_not_taken_away_while_one_may_be_on_its_way(run_dir):
-    with Store(run_dir, keep=1) as store:
+    with CheckpointStore(run_dir, keep=1) as store:
         moved = run_dir / FOLDER / ".deleted"
         (moved / "1").mkdir(parents=True)
         before = moved.stat()
@@ -241,7 +241,7 @@ def test_what_orbax_raises_while_writing_costs_one_line(run_dir, monkeypatch, me
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def use():
-        with Store(run_dir, keep=50) as store:
+        with CheckpointStore(run_dir, keep=50) as store:
             store.save(2, {"tree": TREE}, {}, None)
             store.wait()
 

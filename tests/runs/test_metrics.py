@@ -1,4 +1,4 @@
-"""Where the figures go: each sink says what it was told, and the clock counts compiling once."""
+"""Where the metrics go: each sink says what it was told, and the clock counts compiling once."""
 
 import errno
 import json
@@ -140,7 +140,7 @@ def test_jsonl_goes_on_after_its_history_and_drops_the_rest(logged, last):
     sink.close()
     again = read_history(logged, 3000)
     assert again[:-1] == history
-    assert again[-1].figures == {"loss/total": 1.0}
+    assert again[-1].metrics == {"loss/total": 1.0}
 
 
 def test_a_file_that_is_its_history_is_not_written_anew(logged):
@@ -226,14 +226,14 @@ def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):
     assert (folder / "notes.txt").read_text() == "mine"
 
 
-class Recorder:
+class TrainerCallback:
     """A sink that remembers."""
 
     def __init__(self, log):
         self.log = log
 
-    def write(self, env_steps, figures):
-        self.log.append((self, env_steps, dict(figures)))
+    def write(self, env_steps, metrics):
+        self.log.append((self, env_steps, dict(metrics)))
 
     def close(self):
         self.log.append((self, "closed"))
@@ -241,7 +241,7 @@ class Recorder:
 
 def test_joined_sinks_all_get_everything_and_are_all_closed():
     log = []
-    first, second = Recorder(log), Recorder(log)
+    first, second = TrainerCallback(log), TrainerCallback(log)
     with Sinks([first, second]) as sinks:
         sinks.write(3, {"a": 1.0})
     assert log == [
@@ -254,14 +254,14 @@ def test_joined_sinks_all_get_everything_and_are_all_closed():
 
 def test_joined_sinks_are_closed_where_training_fails():
     log = []
-    sink = Recorder(log)
+    sink = TrainerCallback(log)
     with pytest.raises(ZeroDivisionError), Sinks([sink]):
         raise ZeroDivisionError
     assert log == [(sink, "closed")]
 
 
 def test_tensorboard_is_written_again_with_the_same_other_names(tmp_path):
-    figures = {"loss/value": 1 / 3, "policy/entropy": 0.1, "time/wall_seconds": 7.7}
+    metrics = {"loss/value": 1 / 3, "policy/entropy": 0.1, "time/wall_seconds": 7.7}
     for name in ("once", "again"):
         history = read_history(tmp_path / "metrics.jsonl", 120)
         folder = tmp_path / name
@@ -269,7 +269,7 @@ def test_tensorboard_is_written_again_with_the_same_other_names(tmp_path):
         sinks.append(TensorBoardSink(folder, history, aliases(PPOConfig())))
         if not history:
             for sink in sinks:
-                sink.write(120, figures)
+                sink.write(120, metrics)
         for sink in sinks:
             sink.close()
     once, again = (read_events(tmp_path / name) for name in ("once", "again"))

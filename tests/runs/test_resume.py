@@ -31,7 +31,7 @@ from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
-    Store,
+    CheckpointStore,
     checkpoint_path,
     checkpoint_steps,
     digest,
@@ -61,11 +61,11 @@ def config(smoke):
 def program(config, smoke_run):
     """Every training of this file runs the same programs: they are traced once."""
     env = make_env(config)
-    original = ppo_trainer.Program(config, env)
+    original = ppo_trainer.CompiledTrainer(config, env)
     compiled = functools.cache(original.compile)
     first = functools.cache(lambda: original.get(original.init()))
 
-    class Program(ppo_trainer.Program):
+    class Program(ppo_trainer.CompiledTrainer):
         def compile(self):
             return compiled()
 
@@ -134,7 +134,7 @@ def same(smoke_run, states, config, template):
             )
             assert ours["sha256"][POLICY] == theirs["sha256"][POLICY]
             assert ours["sha256"][TRAINING] == theirs["sha256"][TRAINING]
-            assert ours["figures"] == theirs["figures"]
+            assert ours["metrics"] == theirs["metrics"]
             for about in (ours, theirs):
                 assert about["progress"].pop("wall_seconds") > 0
             assert ours["progress"] == theirs["progress"]
@@ -205,7 +205,7 @@ def stop_after(monkeypatch):
 
     def stop_after(training_steps):
         monkeypatch.setattr(session, "Preemption", lambda notice: StopAfter(training_steps))
-        monkeypatch.setattr(ppo_trainer, "_Pace", lambda seconds: pace)
+        monkeypatch.setattr(ppo_trainer, "ChunkSizer", lambda seconds: pace)
 
     return stop_after
 
@@ -238,7 +238,7 @@ def test_a_state_between_two_reports_is_saved_with_what_was_summed_up(
     assert found.env_steps == 24_576
     assert found.states[0].tally["training_steps"] == 2
     assert found.progress[0]["env_steps"] == 16_384
-    assert read_about(checkpoint_path(tmp_path, 24_576))["figures"] == {}
+    assert read_about(checkpoint_path(tmp_path, 24_576))["metrics"] == {}
 
 
 def test_a_finished_run_is_not_trained_again(config, smoke_run, run_copy, same, monkeypatch):
@@ -317,7 +317,7 @@ def rewrite(change_about=lambda about: None, change_trees=lambda trees: None):
         change_about(about)
         change_trees(trees)
         shutil.rmtree(newest)
-        with Store(newest.parents[1], keep=50) as store:
+        with CheckpointStore(newest.parents[1], keep=50) as store:
             store.save(LAST, trees, about, None)
 
     return harm
@@ -394,7 +394,7 @@ DAMAGES = {
         "about/metadata is not as it was written",
     ),
     "about with another figure": (
-        edit(lambda about: about["figures"].update(success_rate=0.123)),
+        edit(lambda about: about["metrics"].update(success_rate=0.123)),
         "about/metadata is not as it was written",
     ),
     "about without its hash": (
@@ -440,7 +440,7 @@ DAMAGES = {
     ),
     "another format": (
         rewrite(lambda about: about.update(format="jetbot_mjx/1")),
-        "in the format 'jetbot_mjx/1', and only 'jetbot_mjx/2' can be read",
+        "in the format 'jetbot_mjx/1', and only 'jetbot_mjx/3' can be read",
     ),
     "another seed": (
         rewrite(lambda about: about["config"].update(seed=1)),
@@ -846,7 +846,7 @@ def test_the_best_stays_though_the_training_was_resumed(config, run_copy, states
     for env_steps in (one for one in STEPS if one > best):
         remove(checkpoint_path(run_copy, env_steps), None)
     about = read_about(checkpoint_path(run_copy, best))
-    with Store(run_copy, keep=1) as store:
+    with CheckpointStore(run_copy, keep=1) as store:
         for env_steps in (LAST + 1, LAST + 2):
             store.save(env_steps, to_trees(states[LAST]), about, 0.0)
     assert checkpoint_steps(run_copy) == [0, best, LAST + 2]

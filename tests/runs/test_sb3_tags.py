@@ -18,7 +18,7 @@ PPO = PPOConfig(
 def test_figures_have_the_names_and_units_of_stable_baselines3_as_well():
     # What Brax computes of these: a policy loss of 0.1, squared errors of 4 m² in the mean (400 in
     # scaled rewards) and an entropy of 1.5 nat.
-    figures = {
+    metrics = {
         "rollout/episode_return": 0.75,
         "rollout/episode_length": 64.0,
         "eval/episode_return": 0.5,
@@ -31,8 +31,8 @@ def test_figures_have_the_names_and_units_of_stable_baselines3_as_well():
         "policy/learning_rate": 1e-3,
         "time/wall_seconds": 80.0,
     }
-    found = with_aliases(1_200, figures, aliases(PPO))
-    assert {name: found.pop(name) for name in figures} == figures
+    found = with_aliases(1_200, metrics, aliases(PPO))
+    assert {name: found.pop(name) for name in metrics} == metrics
     assert found == {
         "rollout/ep_rew_mean": 0.75,
         "rollout/ep_len_mean": 64.0,
@@ -53,8 +53,8 @@ def test_figures_have_the_names_and_units_of_stable_baselines3_as_well():
 
 
 def test_what_does_not_exist_has_no_other_name_either():
-    figures = {"rollout/episode_return": None, "time/wall_seconds": 0.0}
-    found = with_aliases(0, figures, aliases(PPO))
+    metrics = {"rollout/episode_return": None, "time/wall_seconds": 0.0}
+    found = with_aliases(0, metrics, aliases(PPO))
     assert found == {
         "time/wall_seconds": 0.0,
         "train/n_updates": 0.0,

@@ -16,8 +16,8 @@ def lines():
     def lines(*reports):
         stream = io.StringIO()
         sink = Lines(10_000, stream)
-        for env_steps, figures in reports:
-            sink.write(env_steps, [figures])
+        for env_steps, metrics in reports:
+            sink.write(env_steps, [metrics])
         assert stream.getvalue().endswith("\n")
         return stream.getvalue().splitlines()
 
@@ -29,21 +29,21 @@ def clocks(wall, compiled):
 
 
 def test_a_line_of_progress_says_how_far_how_good_and_how_fast(lines):
-    figures = {
+    metrics = {
         "eval/success_rate": 0.875,
         "eval/time_to_goal_median": 1.25,
         "time/env_steps_per_second": 123_456.7,
         **clocks(wall=61.5, compiled=12.3),
     }
-    (line,) = lines((4_096, figures))
+    (line,) = lines((4_096, metrics))
     for part in ("4,096 steps", "success  87.5%", "to goal 1.25 s", "123,457 steps/s", "61.5 s"):
         assert part in line
     assert "(compiling 12.3 s)" in line
 
 
 def test_a_line_leaves_out_what_there_is_not_yet(lines):
-    figures = {"eval/success_rate": 0.0, "eval/time_to_goal_median": None, **clocks(1.0, 0.1)}
-    (line,) = lines((0, figures))
+    metrics = {"eval/success_rate": 0.0, "eval/time_to_goal_median": None, **clocks(1.0, 0.1)}
+    (line,) = lines((0, metrics))
     assert "success   0.0%" in line
     for part in ("to goal", "steps/s", "ETA", "compiling", "None"):
         assert part not in line

@@ -18,7 +18,7 @@ from jetbot_mjx.runs import metrics
 from jetbot_mjx.training import dashboard as dashboard_module
 from jetbot_mjx.training.console import SAVING, Lines
 from jetbot_mjx.training.dashboard import Dashboard, open_terminal
-from jetbot_mjx.training.dashboard_layout import Board
+from jetbot_mjx.training.dashboard_layout import DashboardLayout
 
 PATIENCE = 60
 
@@ -218,7 +218,7 @@ def test_a_drawing_that_fails_ends_and_lines_come_instead(screen, opened, monkey
     dashboard = opened()
     dashboard.begin()
     screen.until("╭")
-    monkeypatch.setattr(Board, "render", fail)
+    monkeypatch.setattr(DashboardLayout, "render", fail)
     deadline = time.monotonic() + PATIENCE
     while sys.stdout is not screen.stream:
         assert time.monotonic() < deadline
@@ -281,6 +281,6 @@ def test_a_training_on_a_terminal_has_the_dashboard(screen, watch, root, tmp_pat
     end = on_screen(text)
     assert "100%  8,192 of 8,192" in end
     assert re.search(r"compiling \d:\d\d   training 0:\d\d   evaluating 0:\d\d   saving", end)
-    figures = metrics.read_history(tmp_path / "mine" / "metrics.jsonl", 8_192)[-1].figures
-    assert f"{figures['time/env_steps_per_second']:,.0f} environment steps/s" in end
+    logged = metrics.read_history(tmp_path / "mine" / "metrics.jsonl", 8_192)[-1].metrics
+    assert f"{logged['time/env_steps_per_second']:,.0f} environment steps/s" in end
     assert end.index("╯") < end.index("best policy: ")

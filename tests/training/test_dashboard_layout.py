@@ -9,7 +9,7 @@ from rich.console import Console
 from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.training import dashboard_layout as board_module
 from jetbot_mjx.training.console import EVALUATING, SAVING, TRAINING
-from jetbot_mjx.training.dashboard_layout import Board, memory_in_use, sparkline
+from jetbot_mjx.training.dashboard_layout import DashboardLayout, memory_in_use, sparkline
 
 
 def text_of(board, width=80):
@@ -42,7 +42,7 @@ REPORT = {
     "policy/kl": 0.0051,
     "policy/std": 0.42,
     "policy/learning_rate": 3e-4,
-    "train/nonfinite_worlds": 0.0,
+    "train/nonfinite_envs": 0.0,
     "train/nonfinite_updates": 0.0,
     "time/env_steps_per_second": 41_234.5,
 }
@@ -58,7 +58,7 @@ def now(monkeypatch):
 
 
 def board(seeds=1, history=(), total=10_000):
-    return Board("mine", total, [str(seed) for seed in range(seeds)], [history] * seeds)
+    return DashboardLayout("mine", total, [str(seed) for seed in range(seeds)], [history] * seeds)
 
 
 def test_an_empty_board_shows_that_time_passes(now):
@@ -121,7 +121,7 @@ def test_what_was_not_finite_is_counted_and_otherwise_not_mentioned():
     one = board(seeds=2)
     one.write(1, [REPORT, REPORT])
     assert "finite" not in "".join(text_of(one))
-    one.write(2, [{**REPORT, "train/nonfinite_worlds": 2.0}, REPORT])
+    one.write(2, [{**REPORT, "train/nonfinite_envs": 2.0}, REPORT])
     one.write(3, [REPORT, {**REPORT, "train/nonfinite_updates": 1.0}])
     assert row(one, "not finite") == "3 worlds or gradients so far"
 

@@ -25,7 +25,7 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, digest, read_about
 from jetbot_mjx.runs.resume import resume, to_trees
 from jetbot_mjx.training import session
-from jetbot_mjx.training.ppo_trainer import Program
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 DEVICES = 8
 STEPS = 3
@@ -81,7 +81,7 @@ def said(*arguments):
 
 
 def trained_program(config):
-    program = Program(config, make_env(config))
+    program = CompiledTrainer(config, make_env(config))
     begun = program.init()
     (first,) = program.get(begun)
     advance = program.compile()
@@ -120,11 +120,11 @@ def robots(config):
     """What was drawn for the environments, and each one's key of noise."""
     drawn = {"friction": (0.4, 1.2), "motor_gain": (0.9, 1.1), "yaw_noise": (0.0, 0.1)}
     config = config.model_copy(update={"randomization": RandomizationConfig(**drawn)})
-    hardware = Program(config, make_env(config)).init().env_state.hardware
+    episode_params = CompiledTrainer(config, make_env(config)).init().env_state.episode_params
     return {
-        "shards": [shard.data.shape for shard in hardware.drawn.addressable_shards],
-        "drawn": np.asarray(hardware.drawn)[0].tolist(),
-        "keys": np.asarray(hardware.sensors.key)[0].tolist(),
+        "shards": [shard.data.shape for shard in episode_params.drawn.addressable_shards],
+        "drawn": np.asarray(episode_params.drawn)[0].tolist(),
+        "keys": np.asarray(episode_params.sensors.key)[0].tolist(),
     }
 
 
@@ -152,8 +152,8 @@ def averaging():
     )
 
     def moment(update, data):
-        _, state, figures = jax.jit(update)(params, optimizer_state, normalizer, data, key)
-        return jax.device_get((state[-1].inner_state[0].mu, figures["loss/total"]))
+        _, state, metrics = jax.jit(update)(params, optimizer_state, normalizer, data, key)
+        return jax.device_get((state[-1].inner_state[0].mu, metrics["loss/total"]))
 
     (all_of_it, loss), (together, same_loss) = moment(alone.update, data), moment(sharded, data)
     half, _ = moment(alone.update, jax.tree.map(lambda x: x[:16], data))
@@ -167,7 +167,7 @@ def averaging():
 def restored(run_dir):
     """SHA-256 of the last checkpoint's trees: as they were stored, and after the devices."""
     checkpoint = load_checkpoint(run_dir, "last")
-    program = Program(checkpoint.config, make_env(checkpoint.config))
+    program = CompiledTrainer(checkpoint.config, make_env(checkpoint.config))
     resumption = resume([run_dir], [checkpoint.config], program.template())
     (state,) = program.get(program.put(resumption.states))
     stored = read_about(checkpoint_path(run_dir, resumption.env_steps))["sha256"]

@@ -18,7 +18,7 @@ from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
 from jetbot_mjx.training import distributed, ppo_trainer
-from jetbot_mjx.training.callbacks import Recorder
+from jetbot_mjx.training.callbacks import TrainerCallback
 from jetbot_mjx.training.preemption import STOPPED
 
 ROOT = Path(__file__).parents[2]
@@ -41,7 +41,7 @@ VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
 def tell(interrupted, *arguments):
-    ppo_trainer._Pace.learn = lambda self, steps, seconds: None
+    ppo_trainer.ChunkSizer.learn = lambda self, steps, seconds: None
     report = ppo_trainer._report
 
     def reported(config, program, recorder, state, seconds):
@@ -55,13 +55,13 @@ def tell(interrupted, *arguments):
         print("told:", json.dumps(told), flush=True)
         return report(config, program, recorder, state, seconds)
 
-    def interrupt(self, env_steps, figures, seconds):
+    def interrupt(self, env_steps, metrics, seconds):
         os.kill(os.getpid(), signal.SIGTERM)
         time.sleep(0.5)
 
     ppo_trainer._report = reported
     if interrupted == "interrupted":
-        Recorder.tell = interrupt
+        TrainerCallback.tell = interrupt
     cli.run_command(lambda _: train.main(arguments))
 
 
@@ -204,8 +204,8 @@ def test_they_end_with_the_bits_of_one_process_on_two_devices(alone, finished):
 
 def test_alone_nothing_is_exchanged():
     assert distributed.is_first()
-    assert distributed.exchange(3, 4).tolist() == [[3, 4]]
-    assert distributed.led(lambda: 5) == 5
+    assert distributed.all_gather_ints(3, 4).tolist() == [[3, 4]]
+    assert distributed.run_on_primary(lambda: 5) == 5
 
 
 def heard(monkeypatch, index, said=0):
@@ -225,17 +225,17 @@ def heard(monkeypatch, index, said=0):
 
 def test_the_others_do_what_the_first_came_to(monkeypatch):
     heard(monkeypatch, 1, said=1)
-    assert distributed.led(lambda: pytest.fail("only the first does it")) == 1
+    assert distributed.run_on_primary(lambda: pytest.fail("only the first does it")) == 1
 
 
 def test_where_the_first_fails_all_leave(monkeypatch):
     told = heard(monkeypatch, 0)
     with pytest.raises(ZeroDivisionError):
-        distributed.led(lambda: 1 // 0)
+        distributed.run_on_primary(lambda: 1 // 0)
     assert told == [[distributed._FAILED]]
     heard(monkeypatch, 1, said=distributed._FAILED)
     with pytest.raises(UserError, match="process 0 could not go on"):
-        distributed.led(lambda: 0)
+        distributed.run_on_primary(lambda: 0)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import memory, session
 from jetbot_mjx.training.memory import GIB, footprint, ladder, next_that_fits, resized, sizes
-from jetbot_mjx.training.ppo_trainer import Program
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 
 @pytest.fixture(scope="module")
@@ -47,7 +47,7 @@ def test_xla_sets_aside_what_was_told(root, settings, fullest):
     config = load_config(root / "configs" / "smoke.yaml", settings)
     env = make_env(config)
     told = footprint(config, sizes(config, env), 1)
-    program = Program(config, env)
+    program = CompiledTrainer(config, env)
     stats = program.trace().lower().compile(compiler_options(config)).memory_analysis()
     taken = (
         stats.argument_size_in_bytes
@@ -74,7 +74,7 @@ def test_what_a_gpu_had_in_use_was_foretold(root):
 
 
 def test_sizes_are_those_of_the_arrays(config, env, each):
-    state = Program(config, env).template()
+    state = CompiledTrainer(config, env).template()
     size = {
         name: sum(np.prod(x.shape, dtype=int) * x.dtype.itemsize for x in jax.tree.leaves(tree))
         for name, tree in {"all": state, "environments": state.env_state}.items()

@@ -49,19 +49,19 @@ def dwell(owner, name, seconds):
     setattr(owner, name, wrapper)
 
 def dwell_in_calls(seconds):
-    def compile(self, original=Program.compile):
+    def compile(self, original=CompiledTrainer.compile):
         self.call = original(self)
         dwell(self, "call", seconds)
         return self.call
-    Program.compile = compile
+    CompiledTrainer.compile = compile
 
 {before_imports}
 import gliding
 from jetbot_mjx import cli, train
 from jetbot_mjx.training import session as training
 from jetbot_mjx.evaluation.evaluator import Evaluator
-from jetbot_mjx.training.ppo_trainer import Program
-from jetbot_mjx.runs.checkpoint_store import Store
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer
+from jetbot_mjx.runs.checkpoint_store import CheckpointStore
 {before_training}
 with gliding.everywhere():
     cli.run_command(train.main, at_once=True)
@@ -129,7 +129,7 @@ def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
 
 
 def test_compiling_before_the_first_checkpoint_it_writes_that_and_goes_on(undisturbed, tmp_path):
-    with training(tmp_path / "run", f"dwell(Program, 'compile', {LONG})") as process:
+    with training(tmp_path / "run", f"dwell(CompiledTrainer, 'compile', {LONG})") as process:
         code = stop(process, "compile")
     assert_saved_and_gone(process, code)
     assert checkpoint_steps(tmp_path / "run") == [0]
@@ -137,7 +137,7 @@ def test_compiling_before_the_first_checkpoint_it_writes_that_and_goes_on(undist
 
 
 def test_compiling_after_a_checkpoint_it_does_not_wait_for_the_compiler(begun):
-    with training(begun, f"dwell(Program, 'compile', {LONG})") as process:
+    with training(begun, f"dwell(CompiledTrainer, 'compile', {LONG})") as process:
         code = stop(process, "compile")
     assert_saved_and_gone(process, code)
     assert checkpoint_steps(begun) == [0, INTERVAL]

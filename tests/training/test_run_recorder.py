@@ -78,21 +78,21 @@ def events(monkeypatch, tmp_path):
             run_dir = path.parents[2]
             found.append(("film", str(path.relative_to(run_dir)), run_dir.name, lines(run_dir)))
 
-    class Store(run_recorder.Store):
+    class CheckpointStore(run_recorder.CheckpointStore):
         def save(self, env_steps, *arguments):
             run_dir = self._folder.parent
             found.append(("save", env_steps, run_dir.name, lines(run_dir)))
             super().save(env_steps, *arguments)
 
-    monkeypatch.setattr(run_recorder, "EvaluationFilm", Film)
-    monkeypatch.setattr(run_recorder, "Store", Store)
+    monkeypatch.setattr(run_recorder, "EvaluationVideo", Film)
+    monkeypatch.setattr(run_recorder, "CheckpointStore", CheckpointStore)
     monkeypatch.setattr(run_recorder, "find_backend", lambda: "egl")
     return found
 
 
 def report(recorder, *env_steps, seeds=1):
     for steps in env_steps:
-        assert recorder.report([Progress(steps, PARAMS, {}, 1.0)] * seeds)
+        assert recorder.on_interval([Progress(steps, PARAMS, {}, 1.0)] * seeds)
 
 
 def times(folder):
@@ -119,7 +119,7 @@ def test_nothing_is_prepared_where_nothing_is_asked_for(recorder, tmp_path, monk
     def refuse(*arguments):
         raise AssertionError("this was not asked for")
 
-    for name in ("EvaluationFilm", "find_backend"):
+    for name in ("EvaluationVideo", "find_backend"):
         monkeypatch.setattr(run_recorder, name, refuse)
     with recorder() as it:
         report(it, 0)
@@ -158,8 +158,8 @@ def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
         offscreen.find_backend()
     except UserError as error:
         pytest.skip(str(error))
-    monkeypatch.setattr(video.EvaluationFilm, "_SIDE", 64)
-    monkeypatch.setattr(video.EvaluationFilm, "_FPS", 2.0)
+    monkeypatch.setattr(video.EvaluationVideo, "_SIDE", 64)
+    monkeypatch.setattr(video.EvaluationVideo, "_FPS", 2.0)
     settings = ["evaluation.video=true", "ppo.num_timesteps=16384"]
     config = load_config(root / "configs" / "smoke.yaml", settings)
     session.run(config, tmp_path / "run")
@@ -170,10 +170,10 @@ def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
         )
         for tree in ("policy", "training"):
             assert ours["sha256"][tree] == theirs["sha256"][tree]
-        assert ours["figures"] == theirs["figures"]
+        assert ours["metrics"] == theirs["metrics"]
         path = tmp_path / "run" / "videos" / f"{steps:012}" / "evaluation.mp4"
         pictures = iio.imread(path, plugin="pyav")
-        assert pictures.shape[1:] == (64, video.EvaluationFilm.GOALS * 64, 3)
+        assert pictures.shape[1:] == (64, video.EvaluationVideo.GOALS * 64, 3)
         assert len(pictures) > 4
     lines = [
         json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()

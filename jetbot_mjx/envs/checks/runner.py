@@ -158,7 +158,7 @@ def _drive(subject: Subject) -> Iterator[str]:
     compiled, nonfinite = jax.jit(step), 0
     for action in actions:
         state = compiled(state, action)
-        nonfinite += int(state.metrics["nonfinite_worlds"].sum())
+        nonfinite += int(state.metrics["nonfinite_envs"].sum())
     if traces > 1:
         yield f"a step is traced {traces} times and not once: keep tree, shapes and dtypes"
     if nonfinite:
