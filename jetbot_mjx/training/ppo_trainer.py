@@ -193,7 +193,7 @@ def train(
         state, nan_dumps = advance(state, count, restart)
         found = np.asarray(nan_dumps.found)
         lasted = time.perf_counter() - began
-        pace.learn(count, lasted)
+        pace.update(count, lasted)
         done, seconds, restart = done + count, seconds + lasted, False
         for device, seed in np.argwhere(found):
             nan_dump = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
@@ -255,7 +255,7 @@ class ChunkSizer:
         self._seconds = seconds
         self.steps = 1
 
-    def learn(self, steps: int, seconds: float) -> None:
+    def update(self, steps: int, seconds: float) -> None:
         """Draw the consequence from the last call."""
         self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
 

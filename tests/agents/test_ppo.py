@@ -620,14 +620,14 @@ def test_a_training_compiles_its_step_once_and_nothing_later(smoke, glide, tmp_p
         if event == "/jax/core/compile/backend_compile_duration":
             compiled.append(fun_name)
 
-    report = RunRecorder.report
+    report = RunRecorder.on_interval
 
     def noting(self, progress):
         going_on = report(self, progress)
         after_report.append(len(compiled))
         return going_on
 
-    monkeypatch.setattr(RunRecorder, "report", noting)
+    monkeypatch.setattr(RunRecorder, "on_interval", noting)
     jax.monitoring.register_event_duration_secs_listener(listen)
     try:
         config = with_ppo(smoke, num_timesteps=6 * SIZE, checkpoint_interval=2 * SIZE)

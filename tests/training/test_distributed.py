@@ -41,7 +41,7 @@ VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
 def tell(interrupted, *arguments):
-    ppo_trainer.ChunkSizer.learn = lambda self, steps, seconds: None
+    ppo_trainer.ChunkSizer.update = lambda self, steps, seconds: None
     report = ppo_trainer._report
 
     def reported(config, program, recorder, state, seconds):
@@ -61,7 +61,7 @@ def tell(interrupted, *arguments):
 
     ppo_trainer._report = reported
     if interrupted == "interrupted":
-        TrainerCallback.tell = interrupt
+        TrainerCallback.on_progress = interrupt
     cli.run_command(lambda _: train.main(arguments))
 
 
