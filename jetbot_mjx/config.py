@@ -547,7 +547,7 @@ def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Confi
       ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
         type, out of bounds or at odds with another.
     """
-    values = {} if path is None else _read_yaml(Path(path))
+    values = {} if path is None else read_yaml(Path(path))
     for override in overrides:
         _apply_override(values, override)
     return parse_config(
@@ -574,7 +574,12 @@ def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
         raise ConfigError(f"{source}: {_explain(error.errors()[0])}") from None
 
 
-def _read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Read a YAML file of settings; an empty file gives an empty dictionary.
+
+    Raises:
+      ConfigError: the file cannot be read, or does not hold `key: value` lines.
+    """
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:

@@ -1,0 +1,128 @@
+"""Write what a search found: the best configuration, tables of all trials, and Optuna's plots."""
+
+import csv
+import io
+import statistics
+import warnings
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import optuna
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.runs.run_dir import write_text, writing_to
+from jetbot_mjx.tuning.search import Entrant
+from jetbot_mjx.tuning.space import with_values
+
+_PLOTS = ("optimization_history", "param_importances", "slice", "parallel_coordinate")
+
+
+def best_entrant(entrants: Sequence[Entrant]) -> Entrant:
+    """Return the entrant that learned best from new seeds, on the goals of training."""
+    return max(entrants, key=lambda one: statistics.fmean(one.areas))
+
+
+def write_results(
+    folder: Path, config: Config, study: optuna.Study, entrants: Sequence[Entrant]
+) -> Path:
+    """Write `best.yaml`, `trials.csv`, `trials.md` and the plots.
+
+    Args:
+      folder: an existing folder.
+      config: the configuration that the search began from.
+      study: the finished study.
+      entrants: the final trainings.
+
+    Returns:
+      The path of `best.yaml`.
+
+    Raises:
+      UserError: a file cannot be written.
+    """
+    best = best_entrant(entrants)
+    path = folder / "best.yaml"
+    with writing_to(folder):
+        write_text(path, with_values(config, best.values, source="tune").to_yaml())
+        write_text(folder / "trials.csv", _csv(study))
+        write_text(folder / "trials.md", f"{entrants_table(entrants)}\n\n{_trials_table(study)}\n")
+        _plot(folder, study)
+    return path
+
+
+def entrants_table(entrants: Sequence[Entrant]) -> str:
+    """Return a Markdown table of the final trainings."""
+    best = best_entrant(entrants)
+    lines = [
+        "| | mean success while learning | success [%] | worst seed [%] | mean time [s] | values |",
+        "|---|---|---|---|---|---|",
+    ]
+    for one in entrants:
+        values = ", ".join(f"{name.split('.')[-1]} {_short(x)}" for name, x in one.values.items())
+        lines.append(
+            f"| {one.name}{' (best)' if one is best else ''}"
+            f" | {statistics.fmean(one.areas):.2%}"
+            f" | {100 * statistics.fmean(one.success_rates):.2f}"
+            f" | {100 * min(one.success_rates):.2f}"
+            f" | {statistics.fmean(one.mean_seconds):.3f} | {values} |"
+        )
+    return "\n".join(lines)
+
+
+def _trials_table(study: optuna.Study) -> str:
+    names = sorted({name for trial in study.trials for name in trial.params})
+    lines = [
+        f"| trial | mean success | last success [%] | mean time [s] | {' | '.join(names)} |",
+        "|" + "---|" * (4 + len(names)),
+    ]
+    for trial in sorted(_completed(study), key=lambda one: -(one.value or 0.0)):
+        values = " | ".join(_short(trial.params.get(name)) for name in names)
+        lines.append(
+            f"| {trial.number} | {trial.value:.2%} | {100 * trial.user_attrs['success_rate']:.2f}"
+            f" | {trial.user_attrs['mean_seconds']:.3f} | {values} |"
+        )
+    return "\n".join(lines)
+
+
+def _csv(study: optuna.Study) -> str:
+    names = sorted({name for trial in study.trials for name in trial.params})
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["trial", "state", "score", "success_rate", "mean_seconds", *names, "error"])
+    for trial in study.trials:
+        known: Mapping[str, Any] = trial.user_attrs
+        writer.writerow(
+            [trial.number, trial.state.name, trial.value]
+            + [known.get("success_rate"), known.get("mean_seconds")]
+            + [trial.params.get(name) for name in names]
+            + [known.get("error")]
+        )
+    return text.getvalue()
+
+
+def _plot(folder: Path, study: optuna.Study) -> None:
+    """Draw Optuna's plots; those that need more trials or settings than there are, are left out."""
+    for name in _PLOTS:
+        if len(_completed(study)) < 2:
+            return
+        with warnings.catch_warnings(), plt.ioff():
+            warnings.simplefilter("ignore")
+            draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
+            more: dict[str, Any] = {}
+            if name == "param_importances":
+                # Optuna's default evaluator needs scikit-learn.
+                more["evaluator"] = optuna.importance.PedAnovaImportanceEvaluator()
+            axes = draw(study, **more)
+            figure = (axes if hasattr(axes, "figure") else axes.flat[0]).figure
+            figure.set_size_inches(11, 6)
+            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+            plt.close("all")
+
+
+def _completed(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+    return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+
+
+def _short(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

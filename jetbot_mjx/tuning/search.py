@@ -1,0 +1,294 @@
+"""Run a hyperparameter search whose trials train side by side, with Optuna as the memory.
+
+A worker asks Optuna for a round of trials, trains them together, and tells Optuna what became of
+them; the next round is informed by all rounds before it. Several workers, on one host or many, may
+share one study through its storage. While a round runs, the worker renews a heartbeat in the
+storage. If a worker dies, the next one that looks marks its trials as failed and enqueues the same
+values again, so that nothing is lost.
+
+The best trials and the configuration as it was given are then trained anew with seeds that the
+search has not used, and evaluated on the report's goals, which chose nothing.
+"""
+
+import contextlib
+import threading
+import time
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, report_keys
+from jetbot_mjx.runs.run_dir import make_folder
+from jetbot_mjx.tuning.space import TRACED, Parameter, with_values
+from jetbot_mjx.tuning.trials import Outcome, Trials
+
+try:
+    import optuna
+except ModuleNotFoundError:
+    raise UserError("tune needs Optuna: pip install 'jetbot_mjx[tune]'") from None
+
+_BEAT_SECONDS = 5
+"""How often a worker renews its heartbeat [s]."""
+_STALE_SECONDS = 30
+"""After how long without a heartbeat a worker counts as dead [s]."""
+_POLL_SECONDS = 2.0
+_CONFIRM_SEED = 1_000_000
+"""The first seed of the final trainings, beyond those of the search."""
+
+
+class Entrant(NamedTuple):
+    """An `Entrant` holds the final trainings of one set of values."""
+
+    name: str
+    values: Mapping[str, Any]
+    areas: tuple[float, ...]
+    """Mean success over the training, for each seed, on the goals of training."""
+    success_rates: tuple[float, ...]
+    """After training, for each seed, on the report's goals."""
+    mean_seconds: tuple[float, ...]
+    """Mean duration of the report's episodes [s], for each seed; a failed one counts in full."""
+
+
+class Search:
+    """A `Search` runs trials of one study."""
+
+    def __init__(
+        self,
+        config: Config,
+        space: Sequence[Parameter],
+        folder: Path,
+        *,
+        storage: str | None = None,
+        evaluations: int = 8,
+        say: Callable[[str], None] = lambda text: None,
+    ) -> None:
+        """Open the study, or create it.
+
+        Args:
+          config: the configuration in which settings are changed.
+          space: the settings and their values.
+          folder: where the study and its results are stored.
+          storage: a database URL; None: SQLite in the folder.
+          evaluations: how often each trial is evaluated; their mean success is maximised.
+          say: called with one line about each round.
+
+        Raises:
+          UserError: the folder or the storage cannot be used, or the study has another space.
+        """
+        self._config = config
+        self._space = list(space)
+        self._evaluations = evaluations
+        self._say = say
+        self._batches: dict[tuple[Any, ...], Trials] = {}
+        make_folder(folder)
+        url = storage or f"sqlite:///{folder.absolute() / 'study.db'}"
+        name = folder.name
+        optuna.logging.set_verbosity(optuna.logging.ERROR)
+        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+        # Heartbeats are recorded here, for a whole round of trials.
+        warnings.filterwarnings("ignore", "Heartbeat of storage", UserWarning)
+        try:
+            self._storage = optuna.storages.RDBStorage(
+                url,
+                heartbeat_interval=_BEAT_SECONDS,
+                grace_period=_STALE_SECONDS,
+                heartbeat_stale_trial_callback=(optuna.storages.RetryHeartbeatStaleTrialCallback()),
+            )
+            self.study = optuna.create_study(
+                storage=self._storage,
+                study_name=name,
+                direction="maximize",
+                load_if_exists=True,
+            )
+            # Workers that join later draw other values than the first.
+            seed = config.seed + len(self.study.get_trials(deepcopy=False))
+            self.study.sampler = optuna.samplers.TPESampler(
+                seed=seed % 2**32, multivariate=True, group=True, n_startup_trials=16
+            )
+        # SQLAlchemy has many kinds of errors for a URL, a driver or a host that is wrong.
+        except Exception as error:
+            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            raise UserError(f"--storage {url} cannot be used: {reason}") from None
+        self._check_space()
+
+    def run(self, trials: int, round_size: int) -> None:
+        """Run rounds of trials until the study has enough.
+
+        Args:
+          trials: how many completed trials the study shall have, those of other workers included.
+          round_size: how many to train at once.
+        """
+        while (count := self._next_round(trials, round_size)) > 0:
+            began = time.perf_counter()
+            asked = [self.study.ask() for _ in range(count)]
+            with self._heartbeat(asked):
+                self._train(asked)
+            best = max((one.value for one in self._completed()), default=float("nan"))
+            self._say(
+                f"{len(self._completed())} of {trials} trials, best mean success {best:.2%};"
+                f" this round of {count} took {time.perf_counter() - began:.1f} s"
+            )
+
+    def confirm(self, count: int, seeds: int) -> list[Entrant]:
+        """Train the best trials and the given configuration anew, with new seeds.
+
+        Args:
+          count: how many of the best trials.
+          seeds: how many trainings of each.
+
+        Returns:
+          The given configuration first, then the best trials in the order of their score.
+        """
+        ranked = sorted(self._completed(), key=lambda trial: -(trial.value or 0.0))
+        chosen: dict[str, Mapping[str, Any]] = {"as given": {}}
+        for trial in ranked:
+            if len(chosen) <= count and trial.params not in chosen.values():
+                chosen[f"trial {trial.number}"] = trial.params
+        # Train all seeds of all entrants, grouped by their static settings.
+        work = [
+            (name, values, _CONFIRM_SEED + index)
+            for name, values in chosen.items()
+            for index in range(seeds)
+        ]
+        done: dict[str, list[tuple[Outcome, float, float]]] = {name: [] for name in chosen}
+        for batch, members in self._groups([values for _, values, _ in work]):
+            outcomes = batch.run(
+                [self._traced(work[i][1]) for i in members], [work[i][2] for i in members]
+            )
+            stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
+            episodes = batch.evaluate(stacked, report_keys(REPORT_GOALS))
+            success = np.asarray(episodes.success)
+            limit = self._config.task.episode_length
+            steps = np.where(success > 0, np.asarray(episodes.steps), limit)
+            for row, i in enumerate(members):
+                seconds = float(steps[row].mean() * self._config.physics.ctrl_dt)
+                done[work[i][0]].append((outcomes[row], float(success[row].mean()), seconds))
+        return [
+            Entrant(
+                name,
+                dict(chosen[name]),
+                tuple(one.area for one, _, _ in found),
+                tuple(rate for _, rate, _ in found),
+                tuple(seconds for _, _, seconds in found),
+            )
+            for name, found in done.items()
+        ]
+
+    def _check_space(self) -> None:
+        """Refuse a study that was begun with another space or configuration."""
+        given = {
+            "space": [str(one) for one in self._space],
+            "config": self._config.to_yaml(),
+        }
+        stored = self.study.user_attrs
+        for key, value in given.items():
+            if key not in stored:
+                self.study.set_user_attr(key, value)
+            elif stored[key] != value:
+                raise UserError(
+                    f"the study {self.study.study_name} was begun with another {key}: choose a"
+                    " new --output"
+                )
+        # Begin with the given configuration, if the space contains it.
+        own = {one.name: _setting(self._config, one.name) for one in self._space}
+        if not self.study.get_trials(deepcopy=False) and all(
+            one.contains(own[one.name]) for one in self._space
+        ):
+            self.study.enqueue_trial(own, skip_if_exists=True)
+
+    def _completed(self) -> list[Any]:
+        return self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+
+    def _next_round(self, trials: int, round_size: int) -> int:
+        """Return how many trials to ask for, after waiting for other workers' last ones."""
+        while True:
+            optuna.storages.fail_stale_trials(self.study)
+            running = self.study.get_trials(
+                deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)
+            )
+            missing = trials - len(self._completed()) - len(running)
+            if missing > 0 or not running:
+                return min(round_size, max(missing, 0))
+            time.sleep(_POLL_SECONDS)
+
+    @contextlib.contextmanager
+    def _heartbeat(self, trials: Sequence[Any]) -> Iterator[None]:
+        """Tell the storage that these trials are alive, from a thread."""
+        finished = threading.Event()
+
+        def beat() -> None:
+            while True:
+                for trial in trials:
+                    self._storage.record_heartbeat(trial._trial_id)
+                if finished.wait(_BEAT_SECONDS):
+                    return
+
+        thread = threading.Thread(target=beat, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            finished.set()
+            thread.join()
+
+    def _train(self, asked: Sequence[Any]) -> None:
+        """Train a round of trials, and tell the study of each group as soon as it is done."""
+        drawn = [{one.name: one.suggest(trial) for one in self._space} for trial in asked]
+        valid = []
+        for trial, values in zip(asked, drawn, strict=True):
+            try:
+                with_values(self._config, values, source=f"trial {trial.number}")
+                valid.append((trial, values))
+            # Values that do not fit together, such as a batch size and a number of environments.
+            except UserError as error:
+                trial.set_user_attr("error", str(error))
+                self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
+        for batch, members in self._groups([values for _, values in valid]):
+            outcomes = batch.run(
+                [self._traced(valid[i][1]) for i in members],
+                [self._config.seed + valid[i][0].number for i in members],
+            )
+            for i, outcome in zip(members, outcomes, strict=True):
+                trial, _ = valid[i]
+                trial.set_user_attr("success_rate", outcome.success_rates[-1])
+                trial.set_user_attr("mean_seconds", outcome.mean_seconds)
+                for step, rate in enumerate(outcome.success_rates):
+                    trial.report(rate, step)
+                self.study.tell(trial, outcome.area)
+
+    def _groups(self, drawn: Sequence[Mapping[str, Any]]) -> Iterator[tuple[Trials, list[int]]]:
+        """Yield the programs and the indices of the trials that each of them trains."""
+        groups: dict[tuple[Any, ...], list[int]] = {}
+        static = [one.name for one in self._space if one.name not in TRACED]
+        for index, values in enumerate(drawn):
+            key = tuple(values.get(name, _setting(self._config, name)) for name in static)
+            groups.setdefault(key, []).append(index)
+        for key, members in groups.items():
+            if key not in self._batches:
+                config = with_values(
+                    self._config, dict(zip(static, key, strict=True)), source="tune"
+                )
+                self._batches[key] = Trials(config, self._traced_names(), self._evaluations)
+            yield self._batches[key], members
+
+    def _traced_names(self) -> list[str]:
+        return [one.name for one in self._space if one.name in TRACED]
+
+    def _traced(self, values: Mapping[str, Any]) -> dict[str, float]:
+        return {
+            name: values.get(name, _setting(self._config, name)) for name in self._traced_names()
+        }
+
+
+def _setting(config: Config, name: str) -> Any:
+    """Return the value of a setting, such as `ppo.learning_rate`."""
+    value: Any = config
+    for part in name.split("."):
+        value = getattr(value, part)
+    return value

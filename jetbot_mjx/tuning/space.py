@@ -1,0 +1,154 @@
+"""Describe what a search may change: a YAML file with one entry for each setting.
+
+    ppo.learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}
+    ppo.discounting: {low: 0.9, high: 0.99}
+    ppo.unroll_length: {choices: [8, 16, 32]}
+
+An entry with whole numbers as `low` and `high` draws whole numbers.
+"""
+
+import difflib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple, TypeGuard
+
+from jetbot_mjx.config import Config, ConfigError, parse_config, read_yaml
+
+TRACED = (
+    "ppo.learning_rate",
+    "ppo.desired_kl",
+    "ppo.discounting",
+    "ppo.gae_lambda",
+    "ppo.entropy_cost",
+    "ppo.clipping_epsilon",
+    "ppo.vf_loss_coefficient",
+    "ppo.max_grad_norm",
+    "ppo.reward_scaling",
+)
+"""Settings that only enter the arithmetic: trials with other values share one compiled program."""
+
+_KEYS = ("low", "high", "log", "choices")
+
+
+class Parameter(NamedTuple):
+    """A `Parameter` holds the values that one setting may take: a range or a list."""
+
+    name: str
+    """The setting, such as `ppo.learning_rate`."""
+    low: float | int | None = None
+    high: float | int | None = None
+    log: bool = False
+    """Whether the logarithm is drawn uniformly."""
+    choices: tuple[Any, ...] = ()
+
+    @property
+    def whole(self) -> bool:
+        """Return whether the range holds whole numbers only."""
+        return isinstance(self.low, int) and isinstance(self.high, int)
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """Return the values that must be valid for all others to be: both ends, or all choices."""
+        return self.choices or (self.low, self.high)
+
+    def contains(self, value: Any) -> bool:
+        """Return whether the setting may take this value."""
+        if self.choices:
+            return value in self.choices
+        low, high = self.low, self.high
+        if low is None or high is None or not isinstance(value, int | float):
+            return False
+        return low <= value <= high
+
+    def suggest(self, trial: Any) -> Any:
+        """Ask an Optuna trial for a value."""
+        if self.choices:
+            return trial.suggest_categorical(self.name, list(self.choices))
+        suggest = trial.suggest_int if self.whole else trial.suggest_float
+        return suggest(self.name, self.low, self.high, log=self.log)
+
+
+def read_space(path: str | Path, config: Config) -> list[Parameter]:
+    """Read the file that describes a search.
+
+    Args:
+      path: the YAML file.
+      config: the configuration in which the settings are changed.
+
+    Returns:
+      The parameters, in the order of the file.
+
+    Raises:
+      ConfigError: the file cannot be read, an entry is malformed, or a setting does not accept an
+        end of its range or one of its choices.
+    """
+    values = read_yaml(Path(path))
+    if not values:
+        raise ConfigError(
+            f"{path} is empty: write lines such as ppo.discounting: {{low: 0.9, high: 0.99}}"
+        )
+    return [_parameter(name, entry, path, config) for name, entry in values.items()]
+
+
+def _parameter(name: Any, entry: Any, path: str | Path, config: Config) -> Parameter:
+    where = f"{path}: {name}"
+    if not isinstance(entry, Mapping):
+        raise ConfigError(
+            f"{where} = {entry!r} is wrong: write {{low: A, high: B}} or {{choices: [...]}}"
+        )
+    for key in entry:
+        if key not in _KEYS:
+            close = difflib.get_close_matches(str(key), _KEYS, n=1)
+            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(_KEYS)}"
+            raise ConfigError(f"{where}.{key} is unknown: {hint}")
+    choices, low, high = entry.get("choices"), entry.get("low"), entry.get("high")
+    log = entry.get("log", False)
+    if choices is not None:
+        if not isinstance(choices, list) or not choices or len(entry) > 1:
+            raise ConfigError(f"{where} is wrong: choices should be a list, without other keys")
+        found = Parameter(str(name), choices=tuple(choices))
+    else:
+        if not (_is_number(low) and _is_number(high) and low < high):
+            raise ConfigError(f"{where} is wrong: low and high should be numbers, low the smaller")
+        if not isinstance(log, bool) or (log and low <= 0):
+            raise ConfigError(f"{where}.log = {log!r} is wrong: true needs a low above 0")
+        found = Parameter(str(name), low, high, log)
+    for value in found.ends:
+        with_values(config, {found.name: value}, source=str(path), alone=True)
+    return found
+
+
+def _is_number(value: Any) -> TypeGuard[int | float]:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def with_values(
+    config: Config, values: Mapping[str, Any], *, source: str, alone: bool = False
+) -> Config:
+    """Return a configuration with some settings changed.
+
+    Args:
+      config: the configuration.
+      values: the new values by setting, such as `ppo.learning_rate`.
+      source: the origin of the values, for error messages.
+      alone: whether to accept values that only fit together with others, such as a batch size
+        that needs another number of environments.
+
+    Raises:
+      ConfigError: a setting is unknown, or its value is not accepted.
+    """
+    changed = config.model_dump(mode="json")
+    for name, value in values.items():
+        *sections, key = name.split(".")
+        section = changed
+        for part in sections:
+            section = section.get(part) if isinstance(section, dict) else None
+        if not isinstance(section, dict):
+            raise ConfigError(f"{source}: {name} is unknown: write section.key")
+        section[key] = value
+    try:
+        return parse_config(changed, source)
+    except ConfigError as error:
+        if alone and not any(f"{name} = " in str(error) for name in values):
+            return config
+        raise

@@ -1,0 +1,147 @@
+"""Train several policies with different hyperparameters in one compiled program.
+
+Settings that only enter the arithmetic of PPO, such as the learning rate, are arguments of the
+program and carry an axis of trials, as do the seeds; `jax.vmap` runs over both. Settings that
+change shapes, such as the number of environments, belong to the program: trials that differ in them
+run one group after the other.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree, UInt32
+
+from jetbot_mjx.agents.ppo import PPO, TrainState
+from jetbot_mjx.compiler.xla_options import compiler_options
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.domain_randomization import maybe_randomize
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.evaluation.evaluator import policy_controller, training_keys
+from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
+from jetbot_mjx.tuning.space import TRACED
+
+SECTION = "ppo."
+
+
+class Outcome(NamedTuple):
+    """An `Outcome` holds how one trial learned."""
+
+    success_rates: tuple[float, ...]
+    """After each interval of the training, on the goals of evaluations during training."""
+    mean_seconds: float
+    """Mean duration of the last evaluation's episodes [s]; a failed one counts in full."""
+    params: PyTree
+    """The last parameters of the policy, on the host."""
+
+    @property
+    def area(self) -> float:
+        """Return the mean of the success rates, which rewards learning early and well."""
+        return float(np.mean(self.success_rates))
+
+
+class Trials:
+    """A `Trials` trains groups of policies under one configuration's static settings."""
+
+    def __init__(self, config: Config, names: Sequence[str], evaluations: int) -> None:
+        """Prepare the programs, which compile at their first use.
+
+        Args:
+          config: the run; the values of its traced settings do not matter.
+          names: the settings among `TRACED` that differ between the trials.
+          evaluations: how often each policy is evaluated, at equal distances.
+        """
+        assert set(names) <= set(TRACED), names
+        self._config = config
+        self._names = tuple(names)
+        env = make_env(config)
+        self._env = wrap_for_training(env, config.task.episode_length)
+        self._ctrl_dt = env.dt
+        ppo = PPO(config.ppo, self._env)
+        episodes = rollout_fn(
+            maybe_randomize(env), [policy_controller(ppo.networks)], config.task.episode_length
+        )
+        steps = np.linspace(0, config.ppo.training_steps, evaluations + 1).round().astype(np.int32)
+        self._steps = np.diff(steps)
+        options = compiler_options(config)
+        # `jax.jit` compiles anew for each number of trials.
+        self._init = jax.jit(jax.vmap(self._init_one), compiler_options=options)
+        self._advance = jax.jit(
+            jax.vmap(self._advance_one, in_axes=(0, 0, None)),
+            donate_argnums=1,
+            compiler_options=options,
+        )
+        self._episodes: Callable[..., Episodes] = jax.jit(
+            jax.vmap(episodes, in_axes=(None, 0, None)), compiler_options=options
+        )
+
+    def run(self, values: Sequence[Mapping[str, float]], seeds: Sequence[int]) -> list[Outcome]:
+        """Train one policy for each trial, all at once.
+
+        Args:
+          values: the traced settings of each trial.
+          seeds: the seed of each trial.
+
+        Returns:
+          The outcome of each trial.
+        """
+        count = len(values)
+        # Pad to a power of two, so that few widths are compiled.
+        width = 1 << (count - 1).bit_length()
+        padded = [values[min(i, count - 1)] for i in range(width)]
+        traced = {
+            name.removeprefix(SECTION): jnp.asarray([one[name] for one in padded], jnp.float32)
+            for name in self._names
+        }
+        keys = jnp.asarray([seeds[min(i, count - 1)] for i in range(width)], jnp.uint32)
+        # Train, and evaluate after each interval.
+        state = self._init(traced, keys)
+        goals = training_keys(self._config.evaluation.episodes)
+        rates, episodes = [], None
+        for steps in self._steps:
+            state = self._advance(traced, state, np.int32(steps))
+            episodes = self.evaluate(state.policy_params, goals)
+            rates.append(np.asarray(episodes.success).mean(axis=1))
+        assert episodes is not None
+        # A failed episode counts with the full time limit.
+        limit = self._config.task.episode_length
+        lasted = np.where(np.asarray(episodes.success) > 0, np.asarray(episodes.steps), limit)
+        seconds = lasted.mean(axis=1) * self._ctrl_dt
+        params = jax.device_get(state.policy_params)
+        return [
+            Outcome(
+                tuple(float(rate[i]) for rate in rates),
+                float(seconds[i]),
+                jax.tree.map(lambda x, i=i: x[i], params),
+            )
+            for i in range(count)
+        ]
+
+    def evaluate(self, params: PyTree, keys: UInt32[Array, "n 2"]) -> Episodes:
+        """Run deterministic episodes of several policies.
+
+        Args:
+          params: parameters of the policies, stacked.
+          keys: one reset key for each episode.
+
+        Returns:
+          The episodes, with the axes (policies, n).
+        """
+        return self._episodes(0, params, keys)
+
+    def _ppo(self, traced: Mapping[str, Float[Array, ""]]) -> PPO:
+        # `model_copy` does not validate, so that traced values pass.
+        return PPO(self._config.ppo.model_copy(update=dict(traced)), self._env)
+
+    def _init_one(
+        self, traced: Mapping[str, Float[Array, ""]], seed: UInt32[Array, ""]
+    ) -> TrainState:
+        return self._ppo(traced).init(jax.random.PRNGKey(seed))
+
+    def _advance_one(
+        self, traced: Mapping[str, Float[Array, ""]], state: TrainState, steps: Any
+    ) -> TrainState:
+        return self._ppo(traced).advance(state, steps, jnp.ones((), bool))[0]
