@@ -123,12 +123,20 @@ class Search:
         Args:
           trials: how many completed trials the study shall have, those of other workers included.
           round_size: how many to train at once.
+
+        Raises:
+          UserError: the values of no trial of a round fit together.
         """
         while (count := self._next_round(trials, round_size)) > 0:
             began = time.perf_counter()
             asked = [self.study.ask() for _ in range(count)]
             with self._heartbeat(asked):
                 self._train(asked)
+            errors = [one.user_attrs.get("error") for one in self._stored(asked)]
+            if all(errors):
+                raise UserError(
+                    f"none of the last {count} trials could be trained, such as: {errors[0]}"
+                )
             best = max((one.value for one in self._completed()), default=float("nan"))
             self._say(
                 f"{len(self._completed())} of {trials} trials, best mean success {best:.2%};"
@@ -204,6 +212,11 @@ class Search:
 
     def _completed(self) -> list[Any]:
         return self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+
+    def _stored(self, asked: Sequence[Any]) -> list[Any]:
+        """Return trials as the storage has them."""
+        numbers = {trial.number for trial in asked}
+        return [one for one in self.study.get_trials(deepcopy=False) if one.number in numbers]
 
     def _next_round(self, trials: int, round_size: int) -> int:
         """Return how many trials to ask for, after waiting for other workers' last ones."""

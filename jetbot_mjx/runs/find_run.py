@@ -1,0 +1,163 @@
+"""Find runs by name, and list them.
+
+A run may be named by its path, by its folder's name in `runs/`, as `latest`, or, if it comes with
+the package, as `pretrained:NAME`.
+"""
+
+import difflib
+import os
+import sys
+import time
+from pathlib import Path
+from typing import NamedTuple
+
+from jetbot_mjx.config import ConfigError, load_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.metrics import read_history
+from jetbot_mjx.runs.run_dir import CONFIG
+
+ROOT = Path("runs")
+"""The folder in which trainings create their run folders, relative to the current folder."""
+
+PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
+"""Runs that come with the package, each named after its configuration."""
+
+_LATEST = "latest"
+_PREFIX = "pretrained:"
+
+
+class RunInfo(NamedTuple):
+    """A `RunInfo` holds what a list of runs says about one of them."""
+
+    path: Path
+    task: str
+    """Name of the task, with the robot's preset and the observation."""
+    env_steps: int
+    """Environment steps of the last line of its log."""
+    num_timesteps: int
+    """Environment steps it was asked to train for."""
+    success_rate: float | None
+    """Of the best evaluation; None before the first one."""
+    changed: float
+    """Time of the last line of its log [s since 1970]."""
+
+    @property
+    def name(self) -> str:
+        """Return the shortest name by which commands find the run."""
+        if self.path.parent == PRETRAINED:
+            return _PREFIX + self.path.name
+        return self.path.name if self.path.parent == ROOT else str(self.path)
+
+
+def find_run(name: str | Path, root: Path = ROOT) -> Path:
+    """Return the path of a run or of a checkpoint, which need not hold a usable one.
+
+    Args:
+      name: a path; the name of a folder in `root`; `latest`; or `pretrained:NAME`.
+      root: the folder of runs.
+
+    Raises:
+      UserError: there is no such run.
+    """
+    text = str(name)
+    if text.startswith(_PREFIX):
+        return _find_pretrained(text.removeprefix(_PREFIX))
+    if os.path.lexists(text):
+        return Path(name)
+    if text == _LATEST:
+        runs = list_runs(root)
+        if not runs:
+            raise UserError(f"{_LATEST}: there is no run in {root}/: train one first")
+        return runs[0].path
+    if os.sep not in text and os.path.lexists(root / text):
+        return root / text
+    raise UserError(f"there is no run {text}: {_suggest(text, root)}")
+
+
+def list_runs(root: Path = ROOT) -> list[RunInfo]:
+    """Return the runs in a folder and in its direct subfolders, the latest first.
+
+    Args:
+      root: the folder, which may be missing.
+
+    Raises:
+      UserError: the folder cannot be read.
+    """
+    try:
+        found = [path.parent for path in root.glob(f"*/{CONFIG}")]
+    except OSError as error:
+        raise UserError(f"{root} cannot be read: {error.strerror}") from None
+    runs = [info for path in found if (info := read_info(path)) is not None]
+    return sorted(runs, key=lambda run: -run.changed)
+
+
+def read_info(run_dir: Path) -> RunInfo | None:
+    """Return what a list says about the run in a folder; None if it cannot be read."""
+    try:
+        config = load_config(run_dir / CONFIG)
+        # Of several seeds, show the first.
+        seeds = sorted(run_dir.glob("seed-*/metrics.jsonl"))
+        log = seeds[0] if seeds else run_dir / "metrics.jsonl"
+        history = read_history(log, sys.maxsize)
+        changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
+    except (ConfigError, OSError):
+        return None
+    rates = [line.metrics.get("eval/success_rate") for line in history]
+    task = config.task
+    return RunInfo(
+        path=run_dir,
+        task=f"{task.name} {config.robot.preset} {task.observation}",
+        env_steps=history[-1].env_steps if history else 0,
+        num_timesteps=config.ppo.num_timesteps,
+        success_rate=max((rate for rate in rates if rate is not None), default=None),
+        changed=changed,
+    )
+
+
+def runs_table(runs: list[RunInfo]) -> str:
+    """Return a list of runs as text, one line each, or a line that says there are none."""
+    if not runs:
+        return "no runs here: train one, or use one that comes with the package: pretrained:NAME"
+    rows = [("run", "task", "steps", "success", "age")]
+    rows += [
+        (
+            run.name,
+            run.task,
+            f"{run.env_steps:,}" + (" *" if run.env_steps < run.num_timesteps else ""),
+            "-" if run.success_rate is None else f"{run.success_rate:.1%}",
+            _age(time.time() - run.changed),
+        )
+        for run in runs
+    ]
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    lines = [
+        f"{row[0]:{widths[0]}}  {row[1]:{widths[1]}}  {row[2]:>{widths[2]}}"
+        f"  {row[3]:>{widths[3]}}  {row[4]:>{widths[4]}}"
+        for row in rows
+    ]
+    if any(run.env_steps < run.num_timesteps for run in runs):
+        lines.append("* stopped before its last step, or reached stop_at_success")
+    return "\n".join(lines)
+
+
+def _find_pretrained(name: str) -> Path:
+    known = sorted(path.name for path in PRETRAINED.iterdir())
+    if name in known:
+        return PRETRAINED / name
+    raise UserError(f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}")
+
+
+def _suggest(text: str, root: Path) -> str:
+    """Return a remedy for a name that no run has."""
+    names = [run.path.name for run in list_runs(root)]
+    if close := difflib.get_close_matches(Path(text).name, names, n=1):
+        return f"did you mean {close[0]}?"
+    return "python -m jetbot_mjx runs lists those there are"
+
+
+def _age(seconds: float) -> str:
+    """Return a duration in the largest unit of which there is at least one."""
+    for unit, size in (("d", 86_400), ("h", 3_600), ("min", 60)):
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(seconds, 0):.0f} s"

@@ -1,0 +1,207 @@
+"""Begin a training with the networks and the normaliser of another run.
+
+The first layer of a network multiplies each number of the observation with one row of weights. The
+observation's layout names those numbers, so that the rows can be matched between two tasks:
+
+  field in both layouts    its rows, mean and deviation are taken over
+  field of the new one     its rows begin at zero, so that the policy acts as it did; its mean and
+                           deviation are measured while that policy drives in the new task
+  field of the old one     its rows are dropped, and it is named
+
+All later layers are taken over as they are. The optimizer begins anew.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from brax.training.types import UInt64
+from jaxtyping import Array, Float, Int, PyTree
+
+from jetbot_mjx.agents.networks import PolicyParams, make_networks, make_policy
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.task import layout_data
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint import Checkpoint
+
+# Pyright does not follow flax's dataclasses.
+_UInt64: Any = UInt64
+
+_MEASURED_ENVS = 256
+"""Environments in which the statistics of new fields are measured, for one episode each."""
+
+LayoutData = Sequence[Mapping[str, Any]]
+"""The fields of an observation, as checkpoints store them."""
+
+
+class WarmStart(NamedTuple):
+    """A `WarmStart` holds the parameters to begin with, and what became of each field."""
+
+    params: PolicyParams
+    """On the host."""
+    kept: list[str]
+    """Names of the fields in both layouts."""
+    new: list[str]
+    dropped: list[str]
+
+
+def warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmStart:
+    """Fit another run's policy to a new task.
+
+    Args:
+      source: a checkpoint of the other run.
+      config: the new run.
+      env: its environment, unwrapped.
+
+    Returns:
+      The parameters to begin with, which make the same actions as the other run's policy wherever
+      both tasks observe the same.
+
+    Raises:
+      UserError: the networks differ in more than the observation, or no field is in both layouts.
+    """
+    _check_networks(source, config, env)
+    old, new = source.about["layout"], layout_data(env.task.layout)
+    rows = match_rows(old, new)
+    if (rows < 0).all():
+        raise UserError(
+            f"init_from {source.path}: no field of its observation"
+            f" ({', '.join(field['name'] for field in old)}) is one of {config.task.name}"
+            f" ({', '.join(field['name'] for field in new)})"
+        )
+    # Take over the networks and the statistics, row by row.
+    params = PolicyParams(
+        _match_statistics(source.params.normalizer, rows),
+        _match_first_layer(source.params.policy, rows),
+        _match_first_layer(source.params.value, rows),
+    )
+    # Measure the statistics of new fields while this policy drives.
+    if (rows < 0).any():
+        params = params._replace(normalizer=_measure(params, config, env, rows))
+    names = {field["name"] for field in old}, {field["name"] for field in new}
+    taken = _taken(new, rows)
+    return WarmStart(
+        params=jax.device_get(params),
+        kept=[name for name in taken if taken[name]],
+        new=[name for name in taken if not taken[name]],
+        dropped=sorted(names[0] - {name for name in taken if taken[name]}),
+    )
+
+
+def match_rows(old: LayoutData, new: LayoutData) -> Int[np.ndarray, " new"]:
+    """Return for each number of the new observation its index in the old one, or -1.
+
+    A field is the same if its name, size, unit and frame are.
+    """
+
+    def key(field: Mapping[str, Any]) -> tuple[Any, ...]:
+        return tuple(field[name] for name in ("name", "size", "unit", "frame"))
+
+    starts, at = {}, 0
+    for field in old:
+        starts[key(field)] = at
+        at += field["size"]
+    rows: list[int] = []
+    for field in new:
+        start = starts.get(key(field))
+        size = field["size"]
+        rows += [-1] * size if start is None else range(start, start + size)
+    return np.asarray(rows, np.int64)
+
+
+def _taken(new: LayoutData, rows: Int[np.ndarray, " new"]) -> dict[str, bool]:
+    """Return for each field of the new layout whether the old one has it."""
+    ends = np.cumsum([field["size"] for field in new])
+    return {field["name"]: bool(rows[end - 1] >= 0) for field, end in zip(new, ends, strict=True)}
+
+
+def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv) -> None:
+    ours, theirs = config.ppo.network.model_dump(), source.config.ppo.network.model_dump()
+    for name, value in ours.items():
+        if theirs[name] != value:
+            raise UserError(
+                f"init_from {source.path}: its network has {name} = {_text(theirs[name])}, and"
+                f" ppo.network.{name} = {_text(value)}: they must be equal"
+            )
+    if source.about["action_size"] != env.action_size:
+        raise UserError(
+            f"init_from {source.path}: its policy has {source.about['action_size']} actions, and"
+            f" {config.task.name} has {env.action_size}"
+        )
+    normalize = config.ppo.normalize_observations
+    if source.config.ppo.normalize_observations != normalize:
+        raise UserError(
+            f"init_from {source.path}: it was trained with ppo.normalize_observations ="
+            f" {_text(not normalize)}: set the same here"
+        )
+
+
+def _text(value: Any) -> str:
+    return str(value).lower() if isinstance(value, bool) else str(value)
+
+
+def _match_first_layer(params: PyTree, rows: Int[np.ndarray, " new"]) -> PyTree:
+    """Return a network whose first layer has a row for each number of the new observation."""
+    layers = dict(params["params"])
+    first = dict(layers["hidden_0"])
+    kernel = np.asarray(first["kernel"])
+    first["kernel"] = np.where((rows >= 0)[:, None], kernel[rows], np.float32(0.0))
+    return {**params, "params": {**layers, "hidden_0": first}}
+
+
+def _match_statistics(normalizer: Any, rows: Int[np.ndarray, " new"]) -> Any:
+    """Return the running statistics of the new observation; new fields: mean 0, deviation 1."""
+    known = rows >= 0
+    count = float(normalizer.count.to_numpy() if hasattr(normalizer.count, "to_numpy") else 0)
+    mean, std = np.asarray(normalizer.mean), np.asarray(normalizer.std)
+    variance = np.asarray(normalizer.summed_variance)
+    return normalizer.replace(
+        mean=np.where(known, mean[rows], np.float32(0.0)),
+        std=np.where(known, std[rows], np.float32(1.0)),
+        summed_variance=np.where(known, variance[rows], np.float32(count)),
+    )
+
+
+def _measure(
+    params: PolicyParams, config: Config, env: JetBotEnv, rows: Int[np.ndarray, " new"]
+) -> Any:
+    """Return statistics whose new fields have the mean and deviation that a policy meets.
+
+    Running statistics have one count for all fields. It becomes that of the measurement, so that
+    training changes all of them from there on, and the sums of squares are scaled with it.
+    """
+    networks = make_networks(
+        config.ppo.network,
+        env.observation_size,
+        env.action_size,
+        normalize=config.ppo.normalize_observations,
+    )
+    batched: Any = wrap_for_training(env, config.task.episode_length)
+    policy = make_policy(networks, params)
+
+    def step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], Float[Array, "n obs"]]:
+        state, key = carry
+        key, action_key = jax.random.split(key)
+        return (batched.step(state, policy(state.obs, action_key)), key), state.obs
+
+    @jax.jit
+    def drive(key: Array) -> tuple[Float[Array, " obs"], Float[Array, " obs"]]:
+        keys = jax.random.split(key, _MEASURED_ENVS)
+        start = batched.reset(keys), key
+        _, seen = jax.lax.scan(step, start, length=config.task.episode_length)
+        return seen.mean(axis=(0, 1)), seen.std(axis=(0, 1))
+
+    measured_mean, measured_std = jax.device_get(drive(jax.random.PRNGKey(config.seed)))
+    old: Any = params.normalizer
+    known, count = rows >= 0, _MEASURED_ENVS * config.task.episode_length
+    floor = env.observation_min_std if config.ppo.normalizer == "physical" else 1e-6
+    std = np.where(known, old.std, np.maximum(measured_std, floor)).astype(np.float32)
+    return old.replace(
+        count=_UInt64(hi=np.uint32(0), lo=np.uint32(count)),
+        mean=np.where(known, old.mean, measured_mean).astype(np.float32),
+        std=std,
+        summed_variance=(np.square(std) * count).astype(np.float32),
+    )

@@ -1,0 +1,69 @@
+"""The file that describes a search: what it accepts, and what each mistake is told."""
+
+import pytest
+
+from jetbot_mjx.config import ConfigError, parse_config
+from jetbot_mjx.tuning.space import Parameter, read_space, with_values
+
+CONFIG = parse_config({})
+
+
+def write(folder, text):
+    path = folder / "space.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_ranges_and_choices_are_read(tmp_path):
+    path = write(
+        tmp_path,
+        "ppo.learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}\n"
+        "ppo.num_updates_per_batch: {low: 1, high: 8}\n"
+        "ppo.unroll_length: {choices: [8, 16]}\n",
+    )
+    assert read_space(path, CONFIG) == [
+        Parameter("ppo.learning_rate", 1e-4, 1e-2, log=True),
+        Parameter("ppo.num_updates_per_batch", 1, 8),
+        Parameter("ppo.unroll_length", choices=(8, 16)),
+    ]
+    assert [one.whole for one in read_space(path, CONFIG)] == [False, True, False]
+
+
+@pytest.mark.parametrize(
+    ("line", "told"),
+    [
+        ("", "is empty: write lines such as"),
+        ("ppo.learning_rate: 3", "write {low: A, high: B} or {choices: [...]}"),
+        ("ppo.learning_rate: {low: 0.1, hihg: 0.2}", "hihg is unknown: did you mean high?"),
+        ("ppo.learning_rate: {low: 2, high: 1}", "low the smaller"),
+        ("ppo.learning_rate: {low: true, high: 1}", "should be numbers"),
+        ("ppo.learning_rate: {low: 0, high: 1, log: true}", "true needs a low above 0"),
+        ("ppo.learning_rate: {choices: []}", "choices should be a list"),
+        ("ppo.learning_rate: {choices: [1.0], low: 1}", "without other keys"),
+        ("ppo.learning_rate: {low: -1.0, high: 1.0}", "ppo.learning_rate = -1.0"),
+        ("ppo.learning_rat: {low: 0.1, high: 1.0}", "did you mean learning_rate?"),
+        ("rate: {low: 0.1, high: 1.0}", "rate = 0.1 is unknown"),
+        ("pqo.rate: {low: 0.1, high: 1.0}", "pqo.rate is unknown: write section.key"),
+    ],
+)
+def test_a_mistake_is_told_in_one_line(tmp_path, line, told):
+    with pytest.raises(ConfigError) as caught:
+        read_space(write(tmp_path, line), CONFIG)
+    assert told in str(caught.value)
+    assert str(tmp_path) in str(caught.value)
+
+
+def test_values_that_fit_only_together_pass_alone(tmp_path):
+    # 96 unrolls are no multiple of 512 environments: another number of environments may come too.
+    path = write(tmp_path, "ppo.batch_size: {choices: [128, 24]}")
+    assert read_space(path, CONFIG)
+    with pytest.raises(ConfigError, match="not a multiple"):
+        with_values(CONFIG, {"ppo.batch_size": 24}, source="trial 3")
+    assert with_values(CONFIG, {"ppo.discounting": 0.9}, source="it").ppo.discounting == 0.9
+
+
+def test_a_range_says_what_it_contains():
+    rate = Parameter("ppo.learning_rate", 1e-4, 1e-2)
+    assert [rate.contains(x) for x in (1e-3, 1e-5, 1.0, None)] == [True, False, False, False]
+    assert Parameter("x", choices=(8, 16)).contains(16)
+    assert not Parameter("x", choices=(8, 16)).contains(12)

@@ -1,0 +1,86 @@
+"""Trials side by side are the trainings that they would be alone."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.evaluation.evaluator import report_keys
+from jetbot_mjx.tuning.space import with_values
+from jetbot_mjx.tuning.trials import Trials
+
+CONFIG = parse_config(
+    {
+        "task": {"observation": "egocentric", "episode_length": 40},
+        "ppo": {
+            "num_timesteps": 1024,
+            "num_envs": 16,
+            "unroll_length": 8,
+            "batch_size": 16,
+            "num_minibatches": 4,
+            "network": {"policy_hidden_layer_sizes": [16], "value_hidden_layer_sizes": [16]},
+        },
+        "evaluation": {"episodes": 8},
+    }
+)
+NAMES = ("ppo.learning_rate", "ppo.discounting")
+VALUES = (
+    {"ppo.learning_rate": 1e-3, "ppo.discounting": 0.95},
+    {"ppo.learning_rate": 1e-2, "ppo.discounting": 0.9},
+    {"ppo.learning_rate": 1e-3, "ppo.discounting": 0.95},
+)
+
+
+@pytest.fixture(scope="module")
+def trials():
+    return Trials(CONFIG, NAMES, evaluations=2)
+
+
+@pytest.fixture(scope="module")
+def outcomes(trials):
+    return trials.run(VALUES, [3, 3, 4])
+
+
+def leaves(params):
+    return [np.asarray(x) for x in jax.tree.leaves(params)]
+
+
+def test_a_trial_is_the_training_that_its_values_give(outcomes):
+    # The same training with the values as constants of the program.
+    from jetbot_mjx.agents.ppo import PPO
+    from jetbot_mjx.envs.jetbot_env import make_env
+    from jetbot_mjx.envs.wrappers import wrap_for_training
+
+    config = with_values(CONFIG, VALUES[1], source="it")
+    ppo = PPO(config.ppo, wrap_for_training(make_env(config), config.task.episode_length))
+
+    @jax.jit
+    def train(key):
+        steps = jnp.asarray(config.ppo.training_steps, jnp.int32)
+        return ppo.advance(ppo.init(key), steps, jnp.ones((), bool))[0]
+
+    alone = train(jax.random.PRNGKey(3)).policy_params
+    for ours, theirs in zip(leaves(outcomes[1].params), leaves(alone), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=2e-4)
+
+
+def test_values_and_seeds_make_a_difference(outcomes):
+    first, other_values, other_seed = (leaves(one.params) for one in outcomes)
+    for other in (other_values, other_seed):
+        assert any(not np.array_equal(a, b) for a, b in zip(first, other, strict=True))
+
+
+def test_a_trial_does_not_depend_on_its_neighbours(trials, outcomes):
+    again = trials.run([VALUES[1], VALUES[0], VALUES[1]], [9, 3, 9])
+    for ours, theirs in zip(leaves(outcomes[0].params), leaves(again[1].params), strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
+def test_outcomes_are_measured(trials, outcomes):
+    for one in outcomes:
+        assert len(one.success_rates) == 2
+        assert one.area == pytest.approx(np.mean(one.success_rates))
+        assert 0 < one.mean_seconds <= 40 / 60 + 1e-6
+    stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
+    assert trials.evaluate(stacked, report_keys(5)).success.shape == (3, 5)
