@@ -27,8 +27,8 @@ $(SB3_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sb3]'
 	@touch $@
 
-# Trains the tutorial's task on whatever JAX finds, then judges it and shows it. A machine without
-# OpenGL still gets its policy and its figures: render then says what to install.
+# Trains the tutorial's task on whatever device JAX finds, then evaluates and renders it. A machine
+# without OpenGL still gets its policy and its metrics: render then says what to install.
 train: RUN := $(RUN)
 train: setup
 	$(BIN)/python -m jetbot_mjx.train --config $(CONFIG) --run-dir $(RUN)

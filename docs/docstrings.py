@@ -1,7 +1,7 @@
-"""Makes Markdown of docstrings that are written for the eye: an extension of Griffe.
+"""Convert docstrings into Markdown: a Griffe extension.
 
-Google's style lets an editor show what Markdown would lose: lists set in columns, units in
-brackets, and `<name>` for a place to fill in.
+Docstrings in Google's style are written for editors. They contain what Markdown would lose: lists
+set in columns, units in brackets, and `<name>` for a placeholder.
 """
 
 import re
@@ -11,10 +11,10 @@ import griffe
 
 
 class Docstrings(griffe.Extension):
-    """Changes docstrings before mkdocstrings renders them; the source stays as it is."""
+    """A `Docstrings` extension converts docstrings before mkdocstrings renders them."""
 
     def on_object(self, *, obj: griffe.Object, **kwargs: Any) -> None:
-        """Changes the docstring of a module, class, function or attribute."""
+        """Convert the docstring of a module, class, function or attribute."""
         del kwargs
         if obj.docstring is not None:
             lines = "\n".join(map(_escape, obj.docstring.value.split("\n")))
@@ -22,7 +22,7 @@ class Docstrings(griffe.Extension):
 
 
 def _escape(line: str) -> str:
-    """Outside of code: `[0, π] [rad]` is no link named `rad`, and `<env_steps>` no HTML."""
+    """Escape outside of code: `[0, π] [rad]` is not a link, and `<env_steps>` is not HTML."""
     if line.startswith("    "):
         return line
     parts = re.split(r"(`[^`]*`)", line)
@@ -31,7 +31,7 @@ def _escape(line: str) -> str:
 
 
 def _columns(text: str) -> str:
-    """Lines indented by two spaces, below others, are columns: a block of code."""
+    """Convert lines that are indented by two spaces, which are columns, into a block of code."""
 
     def block(found: re.Match[str]) -> str:
         body = re.sub(r"^  ", "    ", found[0], flags=re.MULTILINE)

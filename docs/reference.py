@@ -1,13 +1,16 @@
 """Write pages while the site is built, from the package itself: an MkDocs hook.
 
-`configuration.md`: types, bounds, defaults and explanations come from the schema of `Config`, the
-refusals from its checks, the values of the shipped files from the files. `api/ROOM.md`: the modules
-of each room. Nothing of it is written by hand.
+- `configuration.md`: The types, bounds, defaults and explanations come from the schema of `Config`,
+  the refusals from its checks, and the values of the shipped files from the files.
+- `api/ROOM.md`: The public names and the modules of each room come from its folder.
+
+Nothing on these pages is written by hand.
 """
 
 import ast
 import json
 import math
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -31,19 +34,22 @@ PAGE = "configuration.md"
 _INTRODUCTION = """\
 # Configuration reference
 
-This page is written by the build of this site, out of `jetbot_mjx.config`: it is what the code
-checks.
+On this page you look up every setting: its type and bounds, its default, and its meaning. A YAML
+file names only what differs from the defaults below, and `--set` changes one setting:
 
-A YAML file names only what differs from the defaults below; `--set ppo.num_envs=256` changes
-one setting on the command line, the value read as YAML, the last one winning. Everything is
-checked before anything else happens. The run folder's `config.yaml` holds every key, written
-out.
+```sh
+python -m jetbot_mjx.train --config configs/jetbot.yaml --set ppo.learning_rate=3e-4 --seed 7
+```
 
-YAML here is version 1.2: `1e-3` and `2_621_440` are numbers, `3e7` may stand for a count, and a
+The value after `--set` is read as YAML, and the last one wins. All settings are checked before
+anything else happens. The run folder's `config.yaml` holds every key, written out. The build of
+this site generates this page from `jetbot_mjx.config`, so it shows what the code checks.
+
+YAML here is version 1.2: `1e-3` and `2_621_440` are numbers, `3e7` is accepted as a count, and a
 key that is given twice is an error.
 
-Settings marked ↻ may change when a run is [continued](stop-and-resume.md); all others belong to
-the run.
+Settings marked ↻ may change when a run is [resumed](stop-and-resume.md#what-may-change); all others
+are fixed for the run.
 """
 
 _REFUSAL = """\
@@ -73,30 +79,30 @@ _REFUSED = (
     ),
     ("trainer=brax", "ppo.learning_rate_schedule=LINEAR"),
 )
-"""Settings that do not fit; each is tried while the page is written."""
+"""Settings that do not fit; the page shows the answer of `parse_config` to each."""
 
 
 class Setting(NamedTuple):
-    """One key of the configuration."""
+    """A `Setting` holds one key of the configuration."""
 
     key: str
-    """With its sections, such as `ppo.num_envs`."""
+    """The key with its sections, such as `ppo.num_envs`."""
     kind: str
     default: Any
     meaning: str
 
 
 class Section(NamedTuple):
-    """One section, nested ones apart."""
+    """A `Section` holds the settings of one section, without those of nested sections."""
 
     name: str
-    """With those around it, such as `ppo.network`; empty at the top."""
+    """The name with those of the sections around it, such as `ppo.network`; empty at the top."""
     meaning: str
     settings: list[Setting]
 
 
 def sections() -> list[Section]:
-    """The whole configuration, section by section."""
+    """Return the whole configuration, section by section."""
     schema = Config.model_json_schema()
     defaults = Config().model_dump(mode="json")
     return list(_walk("", Config, schema, schema["$defs"], defaults))
@@ -126,7 +132,7 @@ def _walk(
 
 
 def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
-    """A type and its bounds in words."""
+    """Return a type and its bounds in words."""
     if "anyOf" in schema:
         return ", or ".join(_kind(one, bounds) for one in schema["anyOf"])
     if "enum" in schema:
@@ -151,7 +157,7 @@ def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
 
 
 def _range(schema: Mapping[str, Any]) -> str | None:
-    """A range [low, high] in words; None where the setting is none."""
+    """Return a range [low, high] in words, or None if the setting is not a range."""
     if not {"low", "high", "whole"} <= schema.keys():
         return None
     numbers = "whole numbers" if schema["whole"] else "numbers"
@@ -159,7 +165,7 @@ def _range(schema: Mapping[str, Any]) -> str | None:
 
 
 def _bounds(annotated: Any) -> Iterator[str]:
-    """The bounds of the numbers in a type; the schema lacks those behind a validator."""
+    """Yield the bounds of the numbers in a type; the schema lacks those behind a validator."""
     words = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
     for one in getattr(annotated, "metadata", getattr(annotated, "__metadata__", ())):
         for name, word in words.items():
@@ -179,7 +185,7 @@ def _bound(value: float) -> str:
 
 
 def as_yaml(value: Any) -> str:
-    """A value as one would write it in YAML."""
+    """Return a value as it is written in YAML."""
     match value:
         case int() if not isinstance(value, bool):
             return f"{value:_}" if value >= 10_000 else str(value)
@@ -190,7 +196,7 @@ def as_yaml(value: Any) -> str:
 
 
 def _default(value: Any) -> str:
-    """The value, and the round figure that it stands for."""
+    """Return the value, and the round number that it stands for."""
     text = f"`{as_yaml(value)}`"
     if value == math.pi:
         return f"{text} (π)"
@@ -216,7 +222,7 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _shipped() -> Iterator[str]:
-    """A table of what the files in `configs/` say, as they say it."""
+    """Yield the lines of a table of the values in the files of `configs/`, as written there."""
     files = sorted((ROOT / "configs").glob("*.yaml"))
     said = []
     for path in files:
@@ -232,7 +238,7 @@ def _shipped() -> Iterator[str]:
 
 
 def _refusals() -> Iterator[str]:
-    """What settings that do not fit are answered with."""
+    """Yield the lines of a table of settings that do not fit, with the answers to them."""
     yield "| settings | answer |"
     yield "|---|---|"
     for overrides in _REFUSED:
@@ -254,15 +260,15 @@ def _refusals() -> Iterator[str]:
 
 
 def page() -> str:
-    """The whole page, as Markdown."""
+    """Return the whole page as Markdown."""
     lines = [_INTRODUCTION]
     for section in sections():
-        title = f"`{section.name}`" if section.name else "At the top"
+        title = f"`{section.name}`" if section.name else "Top level"
         anchor = section.name.replace(".", "-") or "top"
         lines += [f"## {title} {{ #{anchor} }}", "", section.meaning, "", *_table(section), ""]
-    lines += ["## What the shipped files say { #shipped }", ""]
-    lines += ["A blank means the default.", "", *_shipped(), ""]
-    lines += ["## What is refused, and how { #refused }", ""]
+    lines += ["## The shipped files { #shipped }", ""]
+    lines += ["A blank cell means the default.", "", *_shipped(), ""]
+    lines += ["## Refused settings { #refused }", ""]
     lines += [_REFUSAL, "", *_refusals(), ""]
     return "\n".join(lines)
 
@@ -280,14 +286,26 @@ def _room_page(room: str, face: Path) -> str:
     found = face.parent.rglob("*.py") if room else face.parent.glob("*.py")
     paths = sorted(path for path in found if path.name != "__init__.py")
     names = (".".join(path.relative_to(face.parent).with_suffix("").parts) for path in paths)
-    told = ast.get_docstring(ast.parse(face.read_text("utf-8"))) or ""
+    text = face.read_text("utf-8")
+    first, _, rest = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")
     title = f"`{room}`" if room else "Configuration and commands"
     modules = (f"::: jetbot_mjx.{prefix}{name}\n" for name in names)
-    return "\n".join([f"# {title}\n", f"{told}\n", *modules])
+    return "\n".join(
+        [f"# {title}\n", f"{first}\n", _import_line(room, text), f"{rest}\n", *modules]
+    )
+
+
+def _import_line(room: str, text: str) -> str:
+    """Return how the public names of a room are imported, from the text of its `__init__.py`."""
+    public = (name for name in re.findall(r" as (\w+),?$", text, re.MULTILINE) if name[0] != "_")
+    if not (imported := "".join(f"    {name},\n" for name in sorted(public))):
+        return ""
+    home = f"jetbot_mjx.{room}" if room else "jetbot_mjx"
+    return f"```python\nfrom {home} import (\n{imported})\n```\n"
 
 
 def on_files(files: Any, *, config: Any) -> Any:
-    """MkDocs asks which files there are: some more."""
+    """Add the generated pages to the files of the site; MkDocs calls this."""
     from mkdocs.structure.files import File
 
     for name, text in {PAGE: page(), **room_pages()}.items():
