@@ -866,7 +866,7 @@ def test_a_log_that_was_cut_off_is_read_to_its_end(driven, tmp_path):
     cut = read_log(path)
     assert (cut.outcome, len(cut.times) > 20) == ("interrupted", True)
     (tmp_path / "no.jsonl").write_bytes(b"\xff\xfe")
-    with pytest.raises(UserError, match="it is no text"):
+    with pytest.raises(UserError, match="it is not text"):
         read_log(tmp_path / "no.jsonl")
     with pytest.raises(UserError, match="cannot be read: No such file"):
         read_log(tmp_path / "nothing.jsonl")
