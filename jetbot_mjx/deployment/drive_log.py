@@ -86,12 +86,7 @@ def read_log(path: Path) -> DriveLog:
     Raises:
       UserError: The file is missing, is not a log, or has fewer than two poses.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
+    lines = _read_lines(path)
 
     # Parse the header and one line per control period; the number tells where a log is wrong.
     periods: list[_Period] = []
@@ -134,6 +129,15 @@ def read_log(path: Path) -> DriveLog:
         latencies=np.array([one.latency for one in periods if one.latency is not None]),
         stale_ticks=sum(not one.fresh for one in periods),
     )
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
 
 
 class _Period(NamedTuple):

@@ -265,7 +265,7 @@ def test_robots_are_drawn_side_by_side(needs_opengl):
 
 
 @pytest.mark.parametrize("num_envs", [1, 4])
-def test_the_examples_train_and_judge(num_envs, root, tmp_path, monkeypatch, capsys):
+def test_the_examples_train_and_evaluate(num_envs, root, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(root / "examples"))
     for name in ("sb3_train", "sb3_eval"):
         monkeypatch.delitem(sys.modules, name, raising=False)
