@@ -109,6 +109,48 @@ def _ask() -> tuple:
             print("  please enter a number")
 
 
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--output",
+        default="calibration.json",
+        metavar="FILE",
+        help="file to write (default: calibration.json)",
+    )
+    parser.add_argument(
+        "--values",
+        nargs=2,
+        type=at_least(0.05),
+        default=(0.3, 0.5),
+        metavar="M",
+        help="motor values of the two drives (default: 0.3 0.5)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=at_least(0.5),
+        default=2.0,
+        metavar="S",
+        help="duration of a drive [s] (default: 2)",
+    )
+    parser.add_argument(
+        "--separation",
+        type=float,
+        default=DEFAULT_SEPARATION,
+        metavar="M",
+        help="distance between the wheels [m] (default: 0.114)",
+    )
+    parser.add_argument(
+        "--lag",
+        type=float,
+        default=DEFAULT_LAG,
+        metavar="S",
+        help="lag of the motors [s] (default: 0.1)",
+    )
+    return parser
+
+
 def main(
     arguments: Optional[list] = None,
     robot: Any = None,
@@ -127,14 +169,7 @@ def main(
       The exit code: 0, 2 after a mistake, or 130 after Ctrl-C.
     """
     # Check all arguments before the robot drives.
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", default="calibration.json", metavar="FILE")
-    parser.add_argument("--values", nargs=2, type=at_least(0.05), default=(0.3, 0.5), metavar="M")
-    parser.add_argument("--seconds", type=at_least(0.5), default=2.0, metavar="S")
-    parser.add_argument("--separation", type=float, default=DEFAULT_SEPARATION, metavar="M")
-    parser.add_argument("--lag", type=float, default=DEFAULT_LAG, metavar="S")
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.values[0] == options.values[1] or max(options.values) > 1:
         parser.error("--values needs two different motor values, at most 1")

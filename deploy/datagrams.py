@@ -24,22 +24,22 @@ from typing import Any, NamedTuple, Optional
 
 from motors import DriveError
 
-LONGEST = 1024
+MAX_DATAGRAM_SIZE = 1024
 """[bytes] A longer datagram is not parsed."""
 
-_SHORTEST_KEY = 16
-_LONGEST_KEY = 4096
+_MIN_KEY_SIZE = 16
+_MAX_KEY_SIZE = 4096
 _SIGNATURE = hashlib.sha256().digest_size
 
 # [s], [m], [m] and [rad]; an int of any length compares with these without becoming a float.
 _BOUNDS = (("time", 1e12), ("x", 1000.0), ("y", 1000.0), ("yaw", 1e6))
 
 
-class Refused(Exception):
+class RejectedDatagram(Exception):
     """Raised when a datagram is rejected; the message says why."""
 
 
-class Sighting(NamedTuple):
+class TrackedPose(NamedTuple):
     """The pose in one datagram."""
 
     time: float
@@ -71,7 +71,7 @@ class Key:
         # Save it once now, so that an error comes before the drive and not after it.
         self.close()
 
-    def check(self, datagram: bytes) -> Sighting:
+    def check(self, datagram: bytes) -> TrackedPose:
         """Return the pose in a signed datagram.
 
         Args:
@@ -81,19 +81,19 @@ class Key:
           The pose, which is newer than all before.
 
         Raises:
-          Refused: The datagram is not signed with this key, is not a pose, or is not newer.
+          RejectedDatagram: It is not signed with this key, is not a pose, or is not newer.
         """
         signature, body = datagram[:_SIGNATURE], datagram[_SIGNATURE:]
         if not hmac.compare_digest(hmac.new(self._secret, body, "sha256").digest(), signature):
-            raise Refused("it is not signed with " + self._path)
-        sighting = parse(body)
-        if not sighting.time > self._newest:
-            raise Refused(
-                f"its time {sighting.time!r} is not later than {self._newest!r}, the newest so far:"
+            raise RejectedDatagram("it is not signed with " + self._path)
+        tracked = parse(body)
+        if not tracked.time > self._newest:
+            raise RejectedDatagram(
+                f"its time {tracked.time!r} is not later than {self._newest!r}, the newest so far:"
                 f" a replay, or the tracker's clock was set back (then remove {self._newest_path})"
             )
-        self._newest = sighting.time
-        return sighting
+        self._newest = tracked.time
+        return tracked
 
     def close(self) -> None:
         """Save the newest time for the next drive.
@@ -113,16 +113,16 @@ class Key:
         try:
             with open(self._path, "rb") as file:
                 mode = os.fstat(file.fileno()).st_mode
-                secret = file.read(_LONGEST_KEY).strip()
+                secret = file.read(_MAX_KEY_SIZE).strip()
         except (OSError, ValueError) as error:
             raise DriveError(f"--tracker-key {self._path}: {getattr(error, 'strerror', error)}")
         if os.name == "posix" and stat.S_IMODE(mode) & 0o077:
             raise DriveError(
                 f"--tracker-key {self._path} can be read by others: chmod 600 {self._path}"
             )
-        if len(secret) < _SHORTEST_KEY:
+        if len(secret) < _MIN_KEY_SIZE:
             raise DriveError(
-                f"--tracker-key {self._path} has {len(secret)} bytes: use at least {_SHORTEST_KEY}"
+                f"--tracker-key {self._path} has {len(secret)} bytes: use at least {_MIN_KEY_SIZE}"
             )
         return secret
 
@@ -137,7 +137,7 @@ class Key:
             raise DriveError(f"--tracker-key: {self._newest_path}: {reason}")
 
 
-def parse(body: bytes) -> Sighting:
+def parse(body: bytes) -> TrackedPose:
     """Return the pose in the JSON of a datagram.
 
     Args:
@@ -147,24 +147,24 @@ def parse(body: bytes) -> Sighting:
       The pose, of finite numbers within bounds.
 
     Raises:
-      Refused: The bytes are not a pose.
+      RejectedDatagram: The bytes are not a pose.
     """
-    if len(body) > LONGEST:
-        raise Refused(f"it is longer than {LONGEST} bytes")
+    if len(body) > MAX_DATAGRAM_SIZE:
+        raise RejectedDatagram(f"it is longer than {MAX_DATAGRAM_SIZE} bytes")
     try:
         values: Any = json.loads(body.decode("utf-8"))
     except (ValueError, RecursionError):
-        raise Refused("it is not JSON")
+        raise RejectedDatagram("it is not JSON")
     if not isinstance(values, dict):
-        raise Refused("it is not a JSON object")
+        raise RejectedDatagram("it is not a JSON object")
     numbers = []
     for name, bound in _BOUNDS:
         value: Any = values.get(name)
         # This excludes bool, which is a subclass of int.
         if type(value) not in (int, float) or not -bound <= value <= bound:
-            raise Refused(f"its {name} is not a number between -{bound:g} and {bound:g}")
+            raise RejectedDatagram(f"its {name} is not a number between -{bound:g} and {bound:g}")
         numbers.append(float(value))
-    return Sighting(*numbers)
+    return TrackedPose(*numbers)
 
 
 def main(arguments: Optional[list] = None) -> int:

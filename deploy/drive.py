@@ -292,7 +292,7 @@ def _log_file(path: Optional[str]) -> Iterator[Optional[Log]]:
         yield lambda line: file.write(json.dumps(line) + "\n")
 
 
-def _leave(number: int, frame: Any) -> None:
+def _exit_on_signal(number: int, frame: Any) -> None:
     # A second signal must not interrupt the stopping of the motors.
     for one in _SIGNALS:
         signal.signal(one, signal.SIG_IGN)
@@ -300,8 +300,8 @@ def _leave(number: int, frame: Any) -> None:
 
 
 @contextlib.contextmanager
-def _leaving_by_signals() -> Iterator[None]:
-    before = {one: signal.signal(one, _leave) for one in _SIGNALS}
+def _exiting_on_signals() -> Iterator[None]:
+    before = {one: signal.signal(one, _exit_on_signal) for one in _SIGNALS}
     try:
         yield
     finally:
@@ -422,7 +422,7 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
         )
         robot = NoRobot() if options.dry_run else make_robot()
         poses = _pose_source(options, calibration)
-        with contextlib.closing(poses), _log_file(options.log) as log, _leaving_by_signals():
+        with contextlib.closing(poses), _log_file(options.log) as log, _exiting_on_signals():
             if log is not None:
                 log(log_header(policy, calibration, settings, poses.name))
             outcome = drive(robot, clock or WallClock(), poses, policy, calibration, settings, log)

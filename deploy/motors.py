@@ -12,7 +12,7 @@ DEFAULT_LAG = 0.1
 DEFAULT_SEPARATION = 0.114
 
 # Below this speed [m/s] a wheel stands: it would jump back and forth over its dead-band.
-_STILL = 0.005
+_STANDSTILL = 0.005
 
 # The bus of the motor driver sometimes fails to write, but rarely several times in a row.
 _STOP_TRIES = 5
@@ -121,7 +121,7 @@ def motor_value(speed: float, wheel: Wheel) -> float:
     Returns:
       The motor value m in [-1, 1]; zero where the wheel should stand.
     """
-    if abs(speed) < _STILL:
+    if abs(speed) < _STANDSTILL:
         return 0.0
     share = min(abs(speed) / wheel.full_speed, 1.0)
     return math.copysign(wheel.dead_band + (1.0 - wheel.dead_band) * share, speed)

@@ -9,7 +9,7 @@ from motors import DriveError
 from poses import Pose
 
 # Least distance by which `goal_direction` divides, as in training [m].
-_NEAR = 1e-3
+_MIN_DISTANCE = 1e-3
 
 
 class Observer:
@@ -51,7 +51,7 @@ class Observer:
         x, y = goal[0] - pose.x, goal[1] - pose.y
         ahead, left = cos * x + sin * y, cos * y - sin * x
         distance = math.hypot(ahead, left)
-        length = max(distance, _NEAR)
+        length = max(distance, _MIN_DISTANCE)
         # Product of heading and attitude at rest; as in MuJoCo, its sign changes with every turn.
         c, s = math.cos(0.5 * pose.yaw), math.sin(0.5 * pose.yaw)
         w, i, j, k = self._spec["rest_quaternion"]

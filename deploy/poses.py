@@ -20,7 +20,7 @@ import math
 import socket
 from typing import Callable, NamedTuple, Optional
 
-from datagrams import LONGEST, Key, Refused, Sighting, parse
+from datagrams import MAX_DATAGRAM_SIZE, Key, RejectedDatagram, TrackedPose, parse
 from motors import Calibration, DriveError
 
 # [s] time constant of a low-pass filter of the speeds: a millimetre of noise between two poses is
@@ -28,12 +28,12 @@ from motors import Calibration, DriveError
 SMOOTHING = 0.03
 
 # [s] without a new pose after which a tracker may restart its clock.
-_FORGET_AFTER = 0.5
+_RESTART_AFTER = 0.5
 
-_LONGEST_DATAGRAM = 2 * LONGEST
+_RECEIVE_SIZE = 2 * MAX_DATAGRAM_SIZE
 """[bytes] Longer datagrams are truncated here, and are still rejected as too long."""
 
-_MOST_AT_ONCE = 256
+_MAX_DATAGRAMS = 256
 """Number of datagrams read in one period, so that a flood of them cannot block the driver."""
 
 
@@ -141,12 +141,12 @@ class Tracker:
         """Return the newest pose; None before the first. No datagram raises an exception."""
         for datagram in self._receive():
             try:
-                sighting = parse(datagram) if self._key is None else self._key.check(datagram)
-            except Refused as error:
+                tracked = parse(datagram) if self._key is None else self._key.check(datagram)
+            except RejectedDatagram as error:
                 self.rejected += 1
                 self.reason = str(error)
             else:
-                self._update(now, sighting)
+                self._update(now, tracked)
         return self._pose
 
     def commanded(self, now: float, left: float, right: float) -> None:
@@ -162,16 +162,16 @@ class Tracker:
         if self._key is not None:
             self._key.close()
 
-    def _update(self, now: float, seen: Sighting) -> None:
+    def _update(self, now: float, seen: TrackedPose) -> None:
         last = self._pose
         # With a key, `Key.check` has already verified that time increases.
-        if last is None or now - last.time > _FORGET_AFTER:
+        if last is None or now - last.time > _RESTART_AFTER:
             self._pose, self._sent = Pose(now, seen.x, seen.y, seen.yaw, 0.0, 0.0), seen.time
             return
         dt = seen.time - self._sent
         if dt <= 0.0:
             return
-        turned = _nearest(seen.yaw - last.yaw)
+        turned = _wrap_angle(seen.yaw - last.yaw)
         heading = last.yaw + 0.5 * turned
         moved = (seen.x - last.x) * math.cos(heading) + (seen.y - last.y) * math.sin(heading)
         # Multiplied in this order, the rate stays finite however close the two poses are in time.
@@ -188,7 +188,7 @@ class Tracker:
         self._sent = seen.time
 
 
-def _nearest(angle: float) -> float:
+def _wrap_angle(angle: float) -> float:
     """Return the same angle in [-π, π)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
@@ -229,9 +229,9 @@ def udp_tracker(port: int, host: str = "127.0.0.1", key: Optional[Key] = None) -
 
     def receive() -> list:
         found = []
-        while len(found) < _MOST_AT_ONCE:
+        while len(found) < _MAX_DATAGRAMS:
             try:
-                found.append(listener.recv(_LONGEST_DATAGRAM))
+                found.append(listener.recv(_RECEIVE_SIZE))
             except BlockingIOError:
                 break
         return found

@@ -20,7 +20,7 @@ Source = Config | Mapping[str, Any] | str | Path | None
 
 
 @contextlib.contextmanager
-def an_extra(extra: str) -> Iterator[None]:
+def requires_extra(extra: str) -> Iterator[None]:
     """Replace a failing import by one line that says how to install the package.
 
     Args:

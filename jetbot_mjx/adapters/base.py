@@ -6,13 +6,13 @@ from typing import Any, Protocol, TypeVar
 import numpy as np
 from jaxtyping import UInt8
 
-from jetbot_mjx.adapters.arguments import Source, an_extra, resolve
+from jetbot_mjx.adapters.arguments import Source, requires_extra, resolve
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 
-with an_extra("gymnasium"):
+with requires_extra("gymnasium"):
     import gymnasium
     from gymnasium import spaces
 

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import ResetKeys, Source, an_extra, as_actions
+from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.errors import UserError
 
-with an_extra("gymnasium"):
+with requires_extra("gymnasium"):
     import gymnasium
 
 ENV_ID = "JetBot-v0"

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Source, an_extra
+from jetbot_mjx.adapters.arguments import Source, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv
 from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.errors import UserError
 
-with an_extra("sb3"):
+with requires_extra("sb3"):
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 Indices = None | int | Iterable[int]

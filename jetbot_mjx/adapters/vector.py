@@ -5,12 +5,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Seed, Source, an_extra
+from jetbot_mjx.adapters.arguments import Seed, Source, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
 
-with an_extra("gymnasium"):
+with requires_extra("gymnasium"):
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
