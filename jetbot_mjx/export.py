@@ -24,7 +24,7 @@ from jetbot_mjx.deployment.numpy_policy import (
     portable_policy,
     record,
 )
-from jetbot_mjx.deployment.policy_spec import FILE, contract
+from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
 from jetbot_mjx.runs.run_dir import write_json, writing_to
@@ -98,7 +98,7 @@ def run(
             name: {"file": FORMATS[name].file, "largest_difference": found}
             for name, found in differences.items()
         }
-        about = contract(checkpoint, env, policy)
+        about = policy_spec(checkpoint, env, policy)
         about["files"] = files
         about["recording"] = {"file": RECORDING, "observations": len(recording.obs)}
         write_json(unfinished / FILE, about)

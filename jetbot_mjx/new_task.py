@@ -1,12 +1,11 @@
-"""Writes a task to start from: `python -m jetbot_mjx.new_task my_task.py`.
+"""Write a task to start from: `python -m jetbot_mjx.new_task my_task.py`.
 
-A small one that is complete, and its settings as YAML beside it. Both pass `check_env` and train
-as they are. Nothing is overwritten.
+It is the example `examples/obstacle_task.py` under your name, with its settings as YAML beside it.
+Both pass `check_env` and train as they are. No file is overwritten.
 """
 
 import importlib.util
 import keyword
-import string
 from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
@@ -14,6 +13,9 @@ from typing import NamedTuple
 
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
+
+_EXAMPLE = ("obstacle_task.py", "obstacle.yaml")
+"""The files that are copied; in a checkout they are links to the examples."""
 
 
 class Written(NamedTuple):
@@ -27,35 +29,41 @@ def run(path: Path) -> Written:
     """Write a task and its settings.
 
     Args:
-      path: path of the module; the class is named after it, and the settings are in its folder.
+      path: Path of the module; the class is named after it, and the settings are in its folder.
 
     Returns:
       The files.
 
     Raises:
-      UserError: the name is not valid or belongs to another module, or a file exists already.
+      UserError: The name is not valid or belongs to another module, or a file exists already.
     """
+    # Refuse a name that Python could not import, and one that would hide another module.
     name = path.stem
     if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name):
         raise UserError(f"{path}: name a Python module, such as my_task.py")
     files = Written(path, path.with_suffix(".yaml"))
     for file in files:
         if file.exists():
-            raise UserError(f"{file} is there already: choose another name")
+            raise UserError(f"{file} exists already: choose another name")
     if importlib.util.find_spec(name) is not None:
-        raise UserError(f"{path}: there is a module {name} already: choose another name")
-    words = {
-        "stem": name,
-        "Class": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
-        "title": name.replace("_", " ").strip().capitalize(),
+        raise UserError(f"{path}: a module {name} exists already: choose another name")
+
+    # Copy the example under the new names.
+    renamed = {
+        "examples/obstacle.yaml": files.config.name,
+        "PYTHONPATH=examples": "PYTHONPATH=.",
+        "obstacle_task": name,
+        "ObstacleTask": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for file, kind in zip(files, ("task.py", "task.yaml"), strict=True):
-            template = resources.files("jetbot_mjx").joinpath(f"assets/{kind}.template")
+        for file, example in zip(files, _EXAMPLE, strict=True):
+            text = resources.files("jetbot_mjx").joinpath(f"assets/{example}").read_text("utf-8")
+            for old, new in renamed.items():
+                text = text.replace(old, new)
             # Mode "x" does not overwrite a file that was created in the meantime.
             with file.open("x", encoding="utf-8") as out:
-                out.write(string.Template(template.read_text("utf-8")).substitute(words))
+                out.write(text)
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
     return files

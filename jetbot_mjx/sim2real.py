@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jetbot_mjx import cli
-from jetbot_mjx.deployment.drive_log import figures, plot, read_log, replay
+from jetbot_mjx.deployment.drive_log import metrics, plot, read_log, replay
 from jetbot_mjx.evaluation.plots import theme, to_png
 from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, writing_to
 
@@ -51,7 +51,7 @@ def run(
     files = Compared(
         picture=folder / f"{path.stem}.sim2real.png",
         json=folder / f"{path.stem}.sim2real.json",
-        figures=figures(compared),
+        figures=metrics(compared),
     )
     with theme("light"):
         picture = to_png(plot(compared))
