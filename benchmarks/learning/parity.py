@@ -47,6 +47,7 @@ Student, Biometrika 6 (1908), 1-25, doi:10.1093/biomet/6.1.1.
 # First, because MJX prints when Brax imports it.
 import jetbot_mjx  # noqa: F401  isort: skip
 
+import argparse
 import itertools
 import math
 import os
@@ -310,15 +311,31 @@ def _table(curves: Sequence[Curve], comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, trains, prints the tables and writes the JSON file.
+def _measure_task(config: Config, env: JetBotEnv, options: argparse.Namespace) -> dict[str, Any]:
+    """Train and compare both trainers on one task, print the tables, and return the results."""
+    curves = run(config, env, options.seeds, options.episodes)
+    until = min(curve.env_steps[-1] for curve in curves)
+    areas = {
+        trainer: [curve.area(until) for curve in curves if curve.trainer == trainer]
+        for trainer in TRAINERS
+    }
+    found = compare(areas["brax"], areas["resumable"], options.margin)
+    print(
+        f"{_table(curves, found)}\n"
+        f"difference of mean success {found.difference:+.2%} (95 % interval"
+        f" {found.low:+.2%} .. {found.high:+.2%}), p = {found.p:.3f};"
+        f" margin ± {found.margin:.0%}: {found.verdict}",
+        flush=True,
+    )
+    return {
+        "config": config.model_dump(mode="json"),
+        "areas": areas,
+        "comparison": found._asdict(),
+        "curves": [curve._asdict() for curve in curves],
+    }
 
-    Args:
-      arguments: The command line without the program's name; None: that of the process.
 
-    Returns:
-      0, or 1 where the trainers were not found to learn the same.
-    """
+def _parser() -> argparse.ArgumentParser:
     parser = cli.Parser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--config", type=Path, default=CONFIGS / "jetbot_egocentric.yaml")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
@@ -328,11 +345,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--margin", type=cli.fraction, default=0.05, help="of the mean success (default: 0.05)"
     )
     parser.add_argument("--output", type=Path, default=RESULTS / "parity-cpu.json")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train and compare both trainers, print the tables and write the JSON file.
+
+    Args:
+      arguments: The command line without the program's name; None: that of the process.
+
+    Returns:
+      0, or 1 unless both trainers were found to learn equally well on every task.
+    """
+    # Parse the command line and check it before minutes of training.
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.seeds < 2:
         parser.error("--seeds: a comparison needs at least 2")
     cli.require_device()
     use_compilation_cache()
+    # Build both tasks with settings that both trainers have.
     config, probe = load_config(options.config, options.overrides), parse_config(PROBE)
     values = config.model_dump(mode="json")
     values["ppo"] |= ADAPTIVE_KL if config.ppo.learning_rate_schedule == "LINEAR" else {}
@@ -341,29 +373,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     tasks = {"probe": (probe, Unicycle(probe)), options.config.name: (config, make_env(config))}
     for trainer in TRAINERS:
         _with_trainer(config, trainer, config.seed).check_devices(jax.device_count())
+    # Train and compare on each task.
     results: dict[str, Any] = {}
     for name, (task_config, env) in tasks.items():
         print(f"{name}: {task_config.ppo.num_timesteps:,} steps", flush=True)
-        curves = run(task_config, env, options.seeds, options.episodes)
-        until = min(curve.env_steps[-1] for curve in curves)
-        areas = {
-            trainer: [curve.area(until) for curve in curves if curve.trainer == trainer]
-            for trainer in TRAINERS
-        }
-        found = compare(areas["brax"], areas["resumable"], options.margin)
-        print(
-            f"{_table(curves, found)}\n"
-            f"difference of mean success {found.difference:+.2%} (95 % interval"
-            f" {found.low:+.2%} .. {found.high:+.2%}), p = {found.p:.3f};"
-            f" margin ± {found.margin:.0%}: {found.verdict}",
-            flush=True,
-        )
-        results[name] = {
-            "config": task_config.model_dump(mode="json"),
-            "areas": areas,
-            "comparison": found._asdict(),
-            "curves": [curve._asdict() for curve in curves],
-        }
+        results[name] = _measure_task(task_config, env, options)
+    # Write all results.
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_json(
         options.output,

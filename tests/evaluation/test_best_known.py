@@ -1,8 +1,6 @@
 """The best-known times: counted as a policy's, told where they hold, and a policy's gap to them."""
 
 import json
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,6 +8,8 @@ import pytest
 from gliding import Gliding
 from test_report import make_episodes, make_report, polar
 
+from benchmarks import ROOT
+from benchmarks.learning import best_known as benchmark
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import best_known
@@ -18,11 +18,6 @@ from jetbot_mjx.evaluation.html_report import write_report
 from jetbot_mjx.evaluation.report import SECTORS, compare_with_best_known
 from jetbot_mjx.evaluation.rollout import rollout_fn
 from jetbot_mjx.evaluation.tables import best_known_lines, policies_table
-
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "benchmarks"))
-
-import best_known as benchmark
 
 DT = 1 / 60
 CONFIG = parse_config({})
