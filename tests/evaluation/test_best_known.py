@@ -240,7 +240,7 @@ def test_its_times_are_those_of_the_reports_own_count(found):
 
 def test_a_search_that_finds_nothing_is_one_line():
     settings = benchmark.Settings(knots=2, samples=2, rounds=1, starts=1)
-    with pytest.raises(UserError, match="no way was found to 2 goals, such as 0: more --samples"):
+    with pytest.raises(UserError, match="2 goals were not reached, such as 0: try more --samples"):
         benchmark.run(Gliding(CONFIG), settings, goals=2, chunk=2)
 
 
@@ -260,6 +260,6 @@ def test_a_file_of_something_else_is_refused_before_the_search(tmp_path, monkeyp
     monkeypatch.setattr(benchmark, "run", lambda *args, **kwargs: pytest.fail("it searches"))
     file = tmp_path / "mine.json"
     file.write_text(text)
-    with pytest.raises(UserError, match=r"mine\.json is no file of best-known times: name another"):
+    with pytest.raises(UserError, match=r"mine\.json is not a file of best-known times: name another"):
         benchmark.main(["--goals", "1", "--output", str(file)])
     assert file.read_text() == text
