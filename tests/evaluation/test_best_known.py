@@ -260,6 +260,8 @@ def test_a_file_of_something_else_is_refused_before_the_search(tmp_path, monkeyp
     monkeypatch.setattr(benchmark, "run", lambda *args, **kwargs: pytest.fail("it searches"))
     file = tmp_path / "mine.json"
     file.write_text(text)
-    with pytest.raises(UserError, match=r"mine\.json is not a file of best-known times: name another"):
+    with pytest.raises(
+        UserError, match=r"mine\.json is not a file of best-known times: name another"
+    ):
         benchmark.main(["--goals", "1", "--output", str(file)])
     assert file.read_text() == text
