@@ -1,31 +1,34 @@
-"""Measures how fast robots step: `python benchmarks/steps_per_second.py --num-envs 256,1024`.
+"""Measure steps per second: `python benchmarks/steps_per_second.py --num-envs 256,1024`.
 
-Six rates, each of a program of its own, for each number of environments:
+Six rates for each number of environments, each of a program of its own:
   physics   `JetBotEnv.step_physics` alone, under random actions
-  switched  the same under commands of ±1 that each robot holds for 1 to 24 steps
-  env       the whole training environment: observation, reward, books, resets to new goals
-  rollout   the same under the exploring policy, with the transitions that PPO stores
+  switched  `physics` under commands of ±1 that each robot holds for 1 to 24 steps
+  env       the training environment: observation, reward, episode statistics, resets to new goals
+  rollout   `env` under the exploring policy, with the transitions that PPO stores
   training  PPO by the trainer of `python -m jetbot_mjx.train`: rollouts and updates
-  stock     the same hyperparameters by Brax's own `ppo.train`, for comparison
-README.md beside this file says how each is measured and how to read the table.
+  brax      PPO by Brax's own `ppo.train` with the same hyperparameters
+benchmarks/README.md explains how each is measured and how to read the table.
 """
 
 import argparse
+import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
-from measurements import MEASUREMENTS, Sizes, training_config
-from rate_plots import draw
-from regressions import MOST_SLOWDOWN, Change, changes, read_baseline
-from results import check_output, conditions, counts, default_output, write
-from timing import Row
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from benchmarks import CONFIGS
+from benchmarks.harness.formatting import format_spread
+from benchmarks.harness.measurements import MEASUREMENTS, Sizes, training_config
+from benchmarks.harness.results import check_output, conditions, counts, default_output, write
+from benchmarks.harness.timing import Row
+from benchmarks.reliability.regressions import MOST_SLOWDOWN, Change, changes, read_baseline
+from benchmarks.throughput.rate_plots import draw
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
-
-_CONFIG = Path(__file__).resolve().parents[1] / "configs" / "jetbot.yaml"
 
 
 def run(
@@ -36,20 +39,21 @@ def run(
     rates: Sequence[str] = tuple(MEASUREMENTS),
     report: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """Measures.
+    """Measure every rate at every number of environments.
 
     Args:
-      config: robot, task, physics and networks; its own number of environments is not used.
-      num_envs: numbers of environments.
-      sizes: how much is measured.
-      rates: which, by their names in `MEASUREMENTS`.
-      report: called with every row as soon as it is there.
+      config: The robot, task, physics and networks; its number of environments is not used.
+      num_envs: The numbers of environments.
+      sizes: How much is measured.
+      rates: The names of the rates in `MEASUREMENTS`.
+      report: A callback that receives each row as soon as it is measured.
 
     Returns:
       The rows.
 
     Raises:
-      UserError: the environments cannot be dealt out, or worlds blew up.
+      UserError: The environments cannot be divided among minibatches or devices, or states are
+        not finite.
     """
     rows = []
     for count in num_envs:
@@ -67,8 +71,7 @@ _TABLE_HEAD = (
 
 
 def _table_row(row: Row) -> str:
-    low, high = (end / row.env_steps_per_second - 1 for end in (min(row.repeats), max(row.repeats)))
-    spread = f"{low:+.1%} .. {high:+.1%}"
+    spread = format_spread(row.env_steps_per_second, row.repeats)
     return (
         f"| {row.rate:8} | {row.num_envs:8,} | {row.env_steps_per_second:20,.0f} |"
         f" {row.physics_steps_per_second:24,.0f} | {row.microseconds_per_step:9,.1f} |"
@@ -81,7 +84,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--config",
         type=Path,
-        default=_CONFIG,
+        default=CONFIGS / "jetbot.yaml",
         help="default: configs/jetbot.yaml",
     )
     parser.add_argument(
@@ -108,22 +111,22 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         choices=list(MEASUREMENTS),
-        help="leave one rate out; may be given again",
+        help="a rate that is not measured; may be given again",
     )
     parser.add_argument("--output", type=Path, help="default: benchmarks/results/<device>.json")
     parser.add_argument(
         "--compare",
         type=Path,
         metavar="OLD.json",
-        help=f"an earlier file; exit code 1 where a rate is {MOST_SLOWDOWN:.0%}% slower than there",
+        help=f"an earlier file; exit code 1 if a rate is more than {MOST_SLOWDOWN:.0%}% slower",
     )
     return parser
 
 
 _SIZES_HELP = {
-    "repeats": "timings of each rate",
-    "unroll": "environment steps in one compiled call, rounded up to whole unrolls in rollout",
-    "training_steps": "training steps in one timing of training and of stock",
+    "repeats": "number of timings of each rate",
+    "unroll": "environment steps in one compiled call; `rollout` rounds up to whole unrolls",
+    "training_steps": "training steps in one timing of `training` and `brax`",
 }
 
 
@@ -136,26 +139,26 @@ def _change_line(change: Change) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, measures, prints the table and writes the JSON file.
+    """Measure the rates, print the table, and write the JSON file and the plot.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where a rate is slower than in the file that it is compared with.
+      0, or 1 if a rate is slower than in the file given by `--compare`.
 
     Raises:
-      UserError: as for `run`, or a file cannot be written or compared with.
+      UserError: As for `run`, or a file cannot be written or compared with.
     """
+    # Check all arguments before minutes of measuring.
     options = _parser().parse_args(arguments)
     config = load_config(options.config, options.overrides)
     sizes = Sizes(options.repeats, options.unroll, options.training_steps)
     num_envs = options.num_envs or [config.ppo.num_envs]
     rates = [rate for rate in MEASUREMENTS if rate not in options.skip]
     if not rates:
-        raise UserError("--skip leaves nothing to measure: leave out fewer rates")
+        raise UserError("--skip leaves nothing to measure: skip fewer rates")
     if "training" in rates:
-        # Said before minutes of measuring, not after them.
         for count in num_envs:
             training_config(config, count, sizes, config.trainer)
     output = options.output or default_output()
@@ -169,12 +172,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"--compare {options.compare} has none of these rates: it has"
             f" {', '.join(f'{rate} at {count}' for rate, count in baseline) or 'no rate at all'}"
         )
+    # Measure; the file is written after every row, so that an interrupted sweep keeps its rows.
     rows: list[Row] = []
 
     def report(row: Row) -> None:
         rows.append(row)
         print(_table_row(row), flush=True)
-        # After every row, so that a sweep that runs out of memory keeps what it had.
         write(output, {**measured, "results": [row._asdict() for row in rows]})
 
     print(
@@ -185,9 +188,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     run(config, num_envs, sizes, rates=rates, report=report)
     for row in rows:
         if row.nonfinite_envs:
-            print(f"{row.rate} at {row.num_envs}: {row.nonfinite_envs} worlds blew up")
-    picture = draw(output, {**measured, "results": [row._asdict() for row in rows]})
-    print(f"results: {output}, {picture.name}")
+            print(f"{row.rate} at {row.num_envs}: {row.nonfinite_envs} non-finite states")
+    # Draw the plot and compare with the earlier file.
+    plot = draw(output, {**measured, "results": [row._asdict() for row in rows]})
+    print(f"results: {output}, {plot.name}")
     found = changes(rows, baseline)
     for change in found:
         print(_change_line(change))

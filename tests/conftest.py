@@ -25,7 +25,7 @@ if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
 # Tests borrow from each other and from `helpers`, whichever folder they are in, also in processes
 # of their own: this checkout first, and whatever else there was, for the libraries may lie there.
 _FOLDERS = [str(folder) for folder in sorted((ROOT / "tests").iterdir()) if folder.is_dir()]
-sys.path += _FOLDERS
+sys.path += [str(ROOT), *_FOLDERS]
 _PATHS = [str(ROOT), str(ROOT / "tests"), *_FOLDERS, *filter(None, [os.environ.get("PYTHONPATH")])]
 os.environ["PYTHONPATH"] = os.pathsep.join(_PATHS)
 

@@ -73,7 +73,7 @@ COMMANDS = [
     Command(f"python -c {shlex.quote(_LIVE)}"),
     Command(f"python -c {shlex.quote(_LIVE.replace('mine', 'ptx'))}"),
     Command(
-        "python benchmarks/steps_per_second.py --num-envs 256 --repeats 1 --skip stock"
+        "python benchmarks/steps_per_second.py --num-envs 256 --repeats 1 --skip brax"
         " --output {runs}/rates.json"
     ),
 ]

@@ -1,9 +1,9 @@
 """Look up the best-known time to each of the report's goals, as a reference for a policy's time.
 
-The file in the package holds the results of `benchmarks/best_known.py`. It searched commands for
-each goal with the true model and drove them open-loop, so their time is an upper bound of the
-shortest time. Each search states the settings that it is valid for; there are no times for any
-other task, robot or time step.
+The file in the package holds the results of `benchmarks/learning/best_known.py`. It searched
+commands for each goal with the true model and drove them open-loop, so their time is an upper
+bound of the shortest time. Each search states the settings that it is valid for; there are no
+times for any other task, robot or time step.
 """
 
 import json

@@ -191,8 +191,7 @@ def test_the_contract_holds_the_summary_of_a_report(run_dir, tmp_path):
 
 
 def test_the_time_of_an_action_is_told_for_every_file(exported, monkeypatch, capsys):
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import action_latency
+    from benchmarks.throughput import action_latency
 
     cores = os.sched_getaffinity(0)
     assert action_latency.main([str(exported), "--calls", "5"]) == 0

@@ -254,8 +254,7 @@ def test_every_documented_target_is_made_by_continuous_integration(page, words):
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "benchmarks/steps_per_second.py"))
 def test_a_documented_benchmark_measures(page, words, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(ROOT)
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
-    import steps_per_second
+    from benchmarks import steps_per_second
 
     counts = ["16,32" if re.fullmatch(r"[\d,]+", word) else word for word in words[2:]]
     assert steps_per_second.main([*counts, "--output", str(tmp_path / "out.json")]) == 0
@@ -286,7 +285,7 @@ def real_run(reader, monkeypatch):
 def test_the_page_about_real_robots_leads_to_a_comparison(reader, real_run, monkeypatch, capsys):
     # In order, as a reader would: the stand-in is the robot and its clock, and copies are links.
     monkeypatch.syspath_prepend(ROOT / "deploy")
-    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    monkeypatch.syspath_prepend(ROOT / "benchmarks" / "throughput")
     import calibrate
     import drive
     from poses import Tracker

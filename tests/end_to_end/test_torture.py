@@ -1,18 +1,13 @@
 """A training that is killed again and again ends as if it had never been."""
 
 import random
-import sys
-from pathlib import Path
 from types import SimpleNamespace
 
 import gliding
 import pytest
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
-import torture
-from torture import SETTINGS, Aim
-
+from benchmarks.reliability import torture
+from benchmarks.reliability.torture import SETTINGS, Aim
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 
 # A robot that glides needs more steps for the kills to fall into.
@@ -62,7 +57,7 @@ def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undi
     ],
 )
 def test_a_start_from_elsewhere_is_seen(said):
-    with pytest.raises(torture.Broken):
+    with pytest.raises(torture.RecoveryError):
         torture.check_start(SimpleNamespace(stdout=said, stderr=""), [0, 8_192])
 
 

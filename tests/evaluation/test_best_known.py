@@ -1,8 +1,6 @@
 """The best-known times: counted as a policy's, told where they hold, and a policy's gap to them."""
 
 import json
-import sys
-from pathlib import Path
 
 import jax
 import numpy as np
@@ -10,6 +8,8 @@ import pytest
 from gliding import Gliding
 from test_report import make_episodes, make_report, polar
 
+from benchmarks import ROOT
+from benchmarks.learning import best_known as benchmark
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import best_known
@@ -18,11 +18,6 @@ from jetbot_mjx.evaluation.html_report import write_report
 from jetbot_mjx.evaluation.report import SECTORS, compare_with_best_known
 from jetbot_mjx.evaluation.rollout import rollout_fn
 from jetbot_mjx.evaluation.tables import best_known_lines, policies_table
-
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "benchmarks"))
-
-import best_known as benchmark
 
 DT = 1 / 60
 CONFIG = parse_config({})
@@ -245,7 +240,7 @@ def test_its_times_are_those_of_the_reports_own_count(found):
 
 def test_a_search_that_finds_nothing_is_one_line():
     settings = benchmark.Settings(knots=2, samples=2, rounds=1, starts=1)
-    with pytest.raises(UserError, match="no way was found to 2 goals, such as 0: more --samples"):
+    with pytest.raises(UserError, match="2 goals were not reached, such as 0: try more --samples"):
         benchmark.run(Gliding(CONFIG), settings, goals=2, chunk=2)
 
 
@@ -265,6 +260,8 @@ def test_a_file_of_something_else_is_refused_before_the_search(tmp_path, monkeyp
     monkeypatch.setattr(benchmark, "run", lambda *args, **kwargs: pytest.fail("it searches"))
     file = tmp_path / "mine.json"
     file.write_text(text)
-    with pytest.raises(UserError, match=r"mine\.json is no file of best-known times: name another"):
+    with pytest.raises(
+        UserError, match=r"mine\.json is not a file of best-known times: name another"
+    ):
         benchmark.main(["--goals", "1", "--output", str(file)])
     assert file.read_text() == text

@@ -1,8 +1,9 @@
-"""What the benchmarks say: of an earlier file, of a compiled program, of the files of results."""
+"""The benchmarks: help texts, comparison with earlier files, kernel counts, tables and plots."""
 
 import importlib
 import json
 import re
+import runpy
 import sys
 from pathlib import Path
 
@@ -11,26 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-
-ROOT = Path(__file__).parents[2]
-sys.path.append(str(ROOT / "benchmarks"))
-
-import adapters
-import compare
-import contenders
-import kernels
-import one_robot
-import randomization
-import randomization_cost
-import rate_plots
-import readme_table
-import regressions
-import results
-import steps_per_second
 from gliding import everywhere
-from measurements import Sizes
-from timing import make_row
 
+from benchmarks import RESULTS, ROOT, steps_per_second
+from benchmarks.harness import readme_table, results, timing
+from benchmarks.harness.measurements import Sizes
+from benchmarks.harness.timing import make_row
+from benchmarks.learning import randomization
+from benchmarks.reliability import regressions
+from benchmarks.throughput import (
+    adapters,
+    baselines,
+    compare,
+    kernels,
+    one_robot,
+    randomization_cost,
+    rate_plots,
+)
 from jetbot_mjx.compiler import llvm_backend, ptx_backend
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.state import robot_state
@@ -39,19 +37,32 @@ from jetbot_mjx.errors import UserError
 SMALL = Sizes(repeats=2, unroll=4, training_steps=1)
 
 COMMANDS = sorted(
-    path.stem
-    for path in (ROOT / "benchmarks").glob("*.py")
+    path.relative_to(ROOT)
+    for path in (ROOT / "benchmarks").rglob("*.py")
     if "def main(" in path.read_text("utf-8")
 )
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_says_what_was_meant(capsys, name):
+@pytest.mark.parametrize("path", COMMANDS, ids=str)
+def test_help_is_complete_and_names_the_command(capsys, path):
+    module = importlib.import_module(".".join(path.with_suffix("").parts))
+    assert f"python {path.as_posix()}" in module.__doc__
     with pytest.raises(SystemExit) as caught:
-        importlib.import_module(name).main(["--help"])
+        module.main(["--help"])
     out, err = capsys.readouterr()
     assert (caught.value.code, err) == (0, "")
-    assert "option_strings" not in out  # what a lone percent sign turns into
+    assert "option_strings" not in out  # a lone percent sign is expanded to this
+
+
+@pytest.mark.parametrize("path", COMMANDS, ids=str)
+def test_a_command_starts_from_any_folder(path, tmp_path, monkeypatch):
+    # As Python does for a script: its own folder is first on the path, the repository is not on it.
+    elsewhere = [entry for entry in sys.path if Path(entry or ".").resolve() != ROOT]
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [str((ROOT / path).parent), *elsewhere])
+    for name in [name for name in sys.modules if name.partition(".")[0] == "benchmarks"]:
+        monkeypatch.delitem(sys.modules, name)
+    assert callable(runpy.run_path(str(ROOT / path), run_name="script")["main"])
 
 
 def rate(name, num_envs, steps_per_second):
@@ -90,10 +101,10 @@ def test_a_rate_that_lost_more_than_five_percent_is_slower(old, measured, now, s
         ({"device": "another"}, f"device = another, this is {jax.devices()[0].device_kind}:"),
         ({"config": {}}, "seed = None, this is 0"),
         ({"conditions": {}}, "unroll = None, this is 4"),
-        ({"results": [{"rate": "physics"}]}, "holds no rates"),
+        ({"results": [{"rate": "physics"}]}, "contains no rates"),
     ],
 )
-def test_a_file_of_something_else_is_refused_in_one_line(old, measured, changed, said):
+def test_an_incomparable_file_is_refused_in_one_line(old, measured, changed, said):
     with pytest.raises(UserError, match=re.escape(said)) as refused:
         regressions.read_baseline(old(**changed), measured)
     assert "\n" not in str(refused.value)
@@ -122,15 +133,15 @@ def test_a_slower_rate_ends_in_one_and_a_figure_lies_beside_the_file(monkeypatch
     assert measure(990) == 0
     assert measure(900) == 1
     assert capsys.readouterr().out.count("-10.0%, SLOWER") == 2
-    picture = tmp_path / "900.png"
-    drawn = picture.read_bytes()
-    picture.unlink()
+    image = tmp_path / "900.png"
+    drawn = image.read_bytes()
+    image.unlink()
     assert rate_plots.main([str(tmp_path / "900.json")]) == 0
-    assert picture.read_bytes() == drawn
+    assert image.read_bytes() == drawn
 
 
 def test_a_figure_shows_what_a_device_tells_of_its_memory():
-    values = json.loads((ROOT / "benchmarks" / "results" / "nvidia-h200-sweep.json").read_text())
+    values = json.loads((RESULTS / "nvidia-h200-sweep.json").read_text())
     _, _, memory = rate_plots.plot_rates(values).axes
     (line,) = memory.lines
     largest = max(row["num_envs"] for row in values["results"])
@@ -139,7 +150,7 @@ def test_a_figure_shows_what_a_device_tells_of_its_memory():
 
 
 def test_a_figure_has_a_line_for_every_rate():
-    values = json.loads((ROOT / "benchmarks" / "results" / "nvidia-h200.json").read_text())
+    values = json.loads((RESULTS / "nvidia-h200.json").read_text())
     # A CPU does not tell of its memory.
     values["results"] = [{**row, "peak_device_bytes": None} for row in values["results"]]
     steps, times = rate_plots.plot_rates(values).axes
@@ -155,24 +166,24 @@ def test_a_figure_has_a_line_for_every_rate():
         )
 
 
-def test_the_readmes_hold_what_the_results_say():
-    measured = readme_table.read_results(ROOT / "benchmarks" / "results")
+def test_the_tables_in_the_documentation_are_up_to_date():
+    measured = readme_table.read_results(RESULTS)
     for name in readme_table.BLOCKS:
         text = (ROOT / name).read_text(encoding="utf-8")
         assert readme_table.with_tables(text, name, measured) == text, (
-            "run python benchmarks/readme_table.py"
+            "run python benchmarks/harness/readme_table.py"
         )
 
 
 def test_the_table_holds_the_median_time_and_the_worst_success_of_all_seeds():
-    values = json.loads((ROOT / "benchmarks" / "results" / "gpu-egocentric-stock.json").read_text())
+    values = json.loads((RESULTS / "gpu-egocentric-brax.json").read_text())
     runs = [{**values["runs"][0], "start": "warm"} for _ in range(3)]
     for run, seconds, success in zip(runs, (50.0, 70.0, 300.0), (0.5, 1.0, 0.9), strict=True):
         run |= {"process_seconds": seconds, "policy": {"success_rate": success}}
     runs[2]["target_reached_seconds"] = None
     row = readme_table.success_table({"one.json": {**values, "runs": runs}}).splitlines()[-1]
     assert row == (
-        "| 1 NVIDIA H200, warm cache | egocentric | `gpu.yaml` | brax | 3 | 50.00% | 70 s | - |"
+        "| 1 NVIDIA H200, warm cache | `egocentric` | `gpu.yaml` | brax | 3 | 50.00% | 70 s | - |"
         " not by all |"
     )
 
@@ -298,24 +309,24 @@ def test_goals_of_one_robot_are_the_tasks(world_config, world_env):
 
 
 def test_robots_of_mujocos_rollout_hold_their_actions_and_drive(world_config):
-    contender = contenders.MujocoRollout(world_config, 4, SMALL)
-    controls = contender._controls
+    benchmark = baselines.MujocoRollout(world_config, 4, SMALL)
+    controls = benchmark._controls
     np.testing.assert_array_equal(controls[:, ::2], controls[:, 1::2])
     assert controls.shape == (4, SMALL.unroll * 2, 2)
-    rates = [contender.repeat(), contender.repeat()]
-    row = contender.row(rates)
+    rates = [benchmark.repeat(), benchmark.repeat()]
+    row = benchmark.row(rates)
     assert row.rate == "mujoco"
     assert row.physics_steps_per_second == 2 * row.env_steps_per_second
-    start = contender._states[:, 1:3].copy()
-    contender.repeat()
-    assert (np.abs(contender._states[:, 1:3] - start).max(axis=1) > 1e-3).all()
-    contender._states[0, 3] = 1.0
+    start = benchmark._states[:, 1:3].copy()
+    benchmark.repeat()
+    assert (np.abs(benchmark._states[:, 1:3] - start).max(axis=1) > 1e-3).all()
+    benchmark._states[0, 3] = 1.0
     with pytest.raises(UserError, match="no longer on the floor"):
-        contender.row(rates)
+        benchmark.row(rates)
 
 
 class Fake:
-    """A contender whose rates are known."""
+    """A benchmark with given rates."""
 
     def __init__(self, rate, num_envs, rates, order):
         self.rate, self.num_envs = rate, num_envs
@@ -348,7 +359,7 @@ def test_physics_and_mujoco_take_turns_and_are_compared_at_their_best(world_conf
         world_config,
         [64, 128],
         SMALL._replace(repeats=3),
-        contenders=["physics", "mujoco"],
+        names=["physics", "mujoco"],
         report=found.extend,
     )
     assert order[: len(order) // 3] * 3 == order
@@ -367,7 +378,7 @@ def test_physics_and_mujoco_take_turns_and_are_compared_at_their_best(world_conf
     assert compare.ratios(found[:2], "mujoco") == compare.ratios(found, "warp") == []
 
 
-def test_a_contender_without_its_package_is_left_out_in_one_line(monkeypatch):
+def test_a_benchmark_without_its_package_is_skipped_in_one_line(monkeypatch):
     monkeypatch.setattr(compare.importlib.util, "find_spec", lambda name: None)
     monkeypatch.setattr(compare.jax, "default_backend", lambda: "gpu")
     for name in ("sb3", "playground", "warp"):
@@ -376,15 +387,15 @@ def test_a_contender_without_its_package_is_left_out_in_one_line(monkeypatch):
         assert "\n" not in line
     assert compare.missing("physics") is None
     monkeypatch.setattr(compare.jax, "default_backend", lambda: "cpu")
-    assert compare.missing("warp") == "warp left out: MJX-Warp needs an NVIDIA GPU"
+    assert compare.missing("warp") == "warp skipped: MJX-Warp needs an NVIDIA GPU"
 
 
 def test_every_adapter_is_timed_in_turn(world_config, monkeypatch, tmp_path, capsys):
     for name in ("torch", "stable_baselines3", "gymnasium"):
         pytest.importorskip(name)
-    monkeypatch.setattr(adapters, "REPEAT_SECONDS", 0.01)
-    monkeypatch.setattr(adapters, "WARM_UP_CALLS", 1)
-    monkeypatch.setattr(contenders, "_SB3_STEPS", 64)
+    monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
+    monkeypatch.setattr(timing, "WARM_UP_CALLS", 1)
+    monkeypatch.setattr(baselines, "_SB3_STEPS", 64)
     output = tmp_path / "a.json"
     with everywhere():
         arguments = ["--num-envs", "2", "--repeats", "2", "--output", str(output)]
@@ -403,12 +414,12 @@ def test_every_adapter_is_timed_in_turn(world_config, monkeypatch, tmp_path, cap
     assert capsys.readouterr().out.count("| sb3") == 3
 
 
-def test_the_cost_of_randomisation_is_told_round_by_round():
+def test_the_cost_of_randomization_is_the_median_over_the_rounds():
     rates = {"off": [100.0, 50.0, 90.0], "on": [80.0, 40.0, 90.0]}
     assert randomization_cost.cost(rates) == pytest.approx(0.25)
 
 
-def judged(way, seed, rates):
+def evaluated(setting, seed, rates):
     sweep = [
         {
             "label": "friction",
@@ -420,15 +431,15 @@ def judged(way, seed, rates):
         }
     ]
     one = {"success_rate": rates[-1]}
-    return {"way": way, "seed": seed, "preset": one, "ranges": one, "sweep": sweep}
+    return {"setting": setting, "seed": seed, "preset": one, "ranges": one, "sweep": sweep}
 
 
-def test_both_ways_stand_side_by_side_with_mean_and_worst_seed():
-    rows = [judged("nominal", "0", (0.5, 1.0)), judged("nominal", "1", (0.7, 1.0))]
+def test_both_settings_are_tabulated_with_mean_and_worst_seed():
+    rows = [evaluated("nominal", "0", (0.5, 1.0)), evaluated("nominal", "1", (0.7, 1.0))]
     table = randomization.table(rows)
     assert "| the full ranges | 100.00% (100.00%) | - |" in table
     assert "| friction, its hardest value | 60.00% (50.00%) at 0.4 | - |" in table
-    rows.append(judged("randomised", "0", (0.9, 1.0)))
+    rows.append(evaluated("randomised", "0", (0.9, 1.0)))
     assert "| 90.00% (90.00%) at 0.4 |" in randomization.table(rows)
     (axes,) = randomization.plot(rows).axes
     lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}

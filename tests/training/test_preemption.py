@@ -14,10 +14,7 @@ from pathlib import Path
 import gliding
 import pytest
 
-sys.path.append(str(Path(__file__).parents[2] / "benchmarks"))
-
-import torture
-
+from benchmarks.reliability import torture
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.training import preemption
 from jetbot_mjx.training.preemption import STOPPED, Preemption

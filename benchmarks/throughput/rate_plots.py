@@ -1,6 +1,7 @@
-"""Plot rates: `python benchmarks/rate_plots.py FILE...` draws them again from their JSON."""
+"""Plot rates from files of results: `python benchmarks/throughput/rate_plots.py FILE...`."""
 
 import json
+import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -9,6 +10,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.harness.formatting import format_count
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.plots import theme, to_png
@@ -16,21 +20,23 @@ from jetbot_mjx.runs.run_dir import write_bytes
 
 
 def plot_rates(values: Mapping[str, Any]) -> Figure:
-    """Steps per second, the time of one step, and memory, against the number of environments.
+    """Plot steps per second, the time of one step and memory over the number of environments.
 
-    Memory is drawn where the device tells it; its peak is that of the process until then, so that
-    sizes are to be measured in ascending order.
+    Memory is plotted if the device reports it. Its peak is that of the whole process so far, so
+    that sizes should be measured in ascending order.
 
     Args:
-      values: content of a file that `steps_per_second.py` wrote.
+      values: The content of a file that `steps_per_second.py` wrote.
 
     Returns:
-      The figure; its colours are those of the theme in which it is drawn.
+      The figure, in the colours of the active theme.
     """
+    # Create two axes, or three if memory was measured.
     rows = values["results"]
-    remembered = any(row.get("peak_device_bytes") for row in rows)
-    figure = Figure(figsize=(15.0 if remembered else 10.4, 4.4), layout="constrained")
-    rates, times, *others = figure.subplots(1, 3 if remembered else 2)
+    has_memory = any(row.get("peak_device_bytes") for row in rows)
+    figure = Figure(figsize=(15.0 if has_memory else 10.4, 4.4), layout="constrained")
+    rates, times, *others = figure.subplots(1, 3 if has_memory else 2)
+    # Plot one line for each rate, with a band from its slowest to its fastest repeat.
     for index, rate in enumerate(dict.fromkeys(row["rate"] for row in rows)):
         points = sorted((row for row in rows if row["rate"] == rate), key=lambda x: x["num_envs"])
         num_envs = [row["num_envs"] for row in points]
@@ -48,6 +54,7 @@ def plot_rates(values: Mapping[str, Any]) -> Figure:
         times.plot(num_envs, [row["microseconds_per_step"] for row in points], **style)
     rates.set(title="environment steps per second", ylabel="steps/s")
     times.set(title="time in which all environments make one step", ylabel="µs")
+    # Plot the largest memory peak at each number of environments.
     for memory in others:
         peaks: dict[int, float] = {}
         for row in rows:
@@ -58,6 +65,7 @@ def plot_rates(values: Mapping[str, Any]) -> Figure:
             *zip(*sorted(peaks.items()), strict=True), color="0.4", marker="o", markersize=4
         )
         memory.set(title="peak of the device's memory so far", ylabel="GiB")
+    # Label the axes.
     for axes in (rates, times, *others):
         _make_readable(axes, sorted({row["num_envs"] for row in rows}))
     rates.legend(loc="best", fontsize="small")
@@ -68,19 +76,19 @@ def plot_rates(values: Mapping[str, Any]) -> Figure:
 
 
 def draw(path: Path, values: Mapping[str, Any]) -> Path:
-    """Draws the rates of a file beside it.
+    """Plot the rates of a file into a PNG file beside it.
 
     Args:
-      path: of the file.
-      values: its content.
+      path: The path of the JSON file.
+      values: Its content.
 
     Returns:
-      Where the figure lies.
+      The path of the PNG file.
     """
-    picture = path.with_suffix(".png")
+    image = path.with_suffix(".png")
     with theme("light"):
-        write_bytes(picture, to_png(plot_rates(values)))
-    return picture
+        write_bytes(image, to_png(plot_rates(values)))
+    return image
 
 
 def _make_readable(axes: Axes, num_envs: Sequence[int]) -> None:
@@ -89,29 +97,22 @@ def _make_readable(axes: Axes, num_envs: Sequence[int]) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
     axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.yaxis.set_minor_locator(NullLocator())
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: _short(value)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: format_count(value)))
     axes.grid()
     axes.set_axisbelow(True)
 
 
-def _short(count: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if count >= size:
-            return f"{count / size:g} {letter}"
-    return f"{count:g}"
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and draws.
+    """Plot the rates of the given files.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
       The exit code.
 
     Raises:
-      UserError: a file holds no rates.
+      UserError: A file contains no rates.
     """
     parser = cli.Parser(description=__doc__)
     parser.add_argument("files", type=Path, nargs="+", help="JSON of steps_per_second.py")
@@ -120,7 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             print(draw(path, json.loads(path.read_text(encoding="utf-8"))))
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             raise UserError(
-                f"{path} holds no rates: give a file that steps_per_second.py wrote"
+                f"{path} contains no rates: give a file that steps_per_second.py wrote"
             ) from None
     return 0
 

@@ -1,11 +1,10 @@
-"""What this project's rates are put beside: other ways to step the same robot, or one of its size.
+"""Run other simulators and trainers, with which this project's rates are compared.
 
-Each is prepared once, compiled and warm, and then timed as often as `repeat` is called, so that
-several can take turns. What a package of its own is needed for is imported only there.
+Each benchmark is compiled and warmed up once, and timed by every call of `repeat`, so that several
+can be timed in turn. Optional packages are imported only where they are used.
 """
 
 import importlib
-import math
 import time
 from typing import Any, Protocol
 
@@ -15,24 +14,23 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float
-from measurements import Sizes
 from mujoco import mjx
-from one_robot import OneRobot, make_physics_model, wheel_targets
-from timing import (
-    REPEAT_SECONDS,
-    WARM_UP_CALLS,
+
+from benchmarks.harness.measurements import Sizes
+from benchmarks.harness.timing import (
     Z_RANGE,
     Carry,
     Row,
     Tally,
-    Timed,
+    TimedProgram,
     available_cores,
     env_keys,
     make_row,
     random_actions,
-    sums,
+    sum_per_env,
+    warm_up,
 )
-
+from benchmarks.throughput.one_robot import OneRobot, make_physics_model, wheel_targets
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import PhysicsState
@@ -41,7 +39,7 @@ from jetbot_mjx.errors import UserError
 PLAYGROUND_ENV = "CartpoleBalance"
 _PLAYGROUND_EPISODE = 1000
 
-# The tutorial's, as the comments of configs/isaac_sb3.yaml have them.
+# The tutorial's hyperparameters; the comments in configs/isaac_sb3.yaml name their source.
 _SB3_STEPS = 2560
 _SB3: dict[str, Any] = {
     "n_steps": _SB3_STEPS,
@@ -58,38 +56,39 @@ _SB3: dict[str, Any] = {
 _SB3_LAYERS = [16, 128, 128, 128]
 
 
-class Contender(Protocol):
-    """What can be timed in turn with others."""
+class Benchmark(Protocol):
+    """A `Benchmark` can be timed in turn with others."""
 
     rate: str
     num_envs: int
 
     def repeat(self) -> float:
-        """Environment steps per second over one repeat."""
+        """Return the environment steps per second of one repeat."""
         ...
 
     def row(self, repeats: list[float]) -> Row:
-        """What was measured, from what `repeat` returned."""
+        """Return the measured row, given the values that `repeat` returned."""
         ...
 
 
 class MujocoRollout:
     """C MuJoCo's own thread pool, `mujoco.rollout`, with one thread for each core.
 
-    The controls are drawn before the clock starts, and every state comes back, as its interface
-    has it.
+    The controls are drawn before the timing starts. Every state is returned, because the interface
+    of `mujoco.rollout` requires it.
     """
 
     rate = "mujoco"
 
     def __init__(self, config: Config, num_envs: int, sizes: Sizes) -> None:
-        """Starts the threads and takes the robots through some seconds of driving.
+        """Start the threads and warm up.
 
         Args:
-          config: robot and physics.
-          num_envs: robots.
-          sizes: how many environment steps one call makes.
+          config: The robot and physics.
+          num_envs: The number of robots.
+          sizes: The number of environment steps in one call.
         """
+        # One MjData for each thread, and one state for each robot.
         self.num_envs = num_envs
         self._n_substeps = config.physics.n_substeps
         self._env_steps = sizes.unroll
@@ -103,58 +102,56 @@ class MujocoRollout:
         mujoco.mj_getState(self._model, self._data[0], first, kind)
         self._states = np.tile(first, (num_envs, 1))
         self._all_states = np.zeros((num_envs, sizes.unroll * self._n_substeps, size))
+        # Each action is held for the physics steps of an environment step.
         actions = np.random.default_rng(0).uniform(-1.0, 1.0, (num_envs, sizes.unroll, 2))
         self._controls = np.repeat(wheel_targets(config, actions), self._n_substeps, axis=1)
-        seconds = math.inf
-        for _ in range(WARM_UP_CALLS):
-            seconds = self._clocked(1)
-        self._calls = max(1, math.ceil(REPEAT_SECONDS / seconds))
+        self._calls = warm_up(self._time_calls)
 
     def repeat(self) -> float:
-        """Environment steps per second over one repeat."""
-        seconds = self._clocked(self._calls)
+        """Return the environment steps per second of one repeat."""
+        seconds = self._time_calls(self._calls)
         return self.num_envs * self._env_steps * self._calls / seconds
 
     def row(self, repeats: list[float]) -> Row:
-        """What was measured.
+        """Return the measured row.
 
         Raises:
-          UserError: robots are no longer on the floor.
+          UserError: Robots are no longer on the floor.
         """
-        z = self._states[:, 1 + 2]  # after the time come x and y
+        z = self._states[:, 1 + 2]  # the state begins with time, x, y, z
         if not (np.isfinite(self._states).all() and ((z > Z_RANGE[0]) & (z < Z_RANGE[1])).all()):
             raise UserError(f"{self.rate} at {self.num_envs}: robots are no longer on the floor")
         steps = self._calls * self._env_steps
         return make_row(self.rate, self._n_substeps, self.num_envs, 0.0, repeats, steps)
 
-    def _clocked(self, calls: int) -> float:
-        lasted = 0.0
+    def _time_calls(self, calls: int) -> float:
+        seconds = 0.0
         for _ in range(calls):
-            begun = time.perf_counter()
+            start = time.perf_counter()
             self._pool.rollout(
                 self._model, self._data, self._states, self._controls, state=self._all_states
             )
-            lasted += time.perf_counter() - begun
+            seconds += time.perf_counter() - start
             self._states = self._all_states[:, -1].copy()
-        return lasted
+        return seconds
 
 
 class Sb3:
     """Stable-Baselines3's PPO with the tutorial's hyperparameters, one robot in C MuJoCo.
 
-    A repeat is one of its iterations: 2,560 steps, and the learning from them.
+    A repeat is one iteration of PPO: 2,560 steps and the update.
     """
 
     def __init__(self, config: Config, env: Any = None, *, rate: str = "sb3") -> None:
-        """Builds environment and trainer, and makes one iteration.
+        """Build the environment and the trainer, and run one iteration.
 
         Args:
-          config: robot, task and physics.
-          env: a `gymnasium.Env` or `VecEnv` to learn from; None: the robot of `one_robot.py`.
-          rate: what the row is called.
+          config: The robot, task and physics.
+          env: A `gymnasium.Env` or `VecEnv`; None: the robot of `one_robot.py`.
+          rate: The name of the row.
         """
         sb3, torch = (importlib.import_module(name) for name in ("stable_baselines3", "torch"))
-        # Networks of this size gain nothing from more, and lose much where other programs run.
+        # More threads do not speed up networks of this size, and slow them down on a busy machine.
         torch.set_num_threads(1)
         self.rate, self.num_envs = rate, getattr(env, "num_envs", 1)
         self._n_substeps = config.physics.n_substeps
@@ -170,19 +167,19 @@ class Sb3:
         self.repeat()
 
     def repeat(self) -> float:
-        """Environment steps per second over one iteration."""
-        begun = time.perf_counter()
+        """Return the environment steps per second of one iteration."""
+        start = time.perf_counter()
         self._ppo.learn(_SB3_STEPS, reset_num_timesteps=False)
-        return _SB3_STEPS / (time.perf_counter() - begun)
+        return _SB3_STEPS / (time.perf_counter() - start)
 
     def row(self, repeats: list[float]) -> Row:
-        """What was measured."""
+        """Return the measured row."""
         calls = _SB3_STEPS // self.num_envs
         return make_row(self.rate, self._n_substeps, self.num_envs, 0.0, repeats, calls)
 
 
 def as_gymnasium(robot: OneRobot) -> Any:
-    """One robot in NumPy as a `gymnasium.Env`."""
+    """Wrap one robot in NumPy as a `gymnasium.Env`."""
     gymnasium = importlib.import_module("gymnasium")
 
     class Env(gymnasium.Env):
@@ -200,46 +197,49 @@ def as_gymnasium(robot: OneRobot) -> Any:
     return Env()
 
 
-def prepare_warp(config: Config, num_envs: int, sizes: Sizes) -> Timed:
-    """MJX-Warp on the same C model, under random actions.
+def prepare_warp(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
+    """Compile MJX-Warp's physics with the same C model, under random actions.
 
-    Contacts of all robots share one buffer, which holds as many as MJX has.
+    The contacts of all robots share one buffer of as many contacts as MJX has.
     """
+    # Build Warp's model and data; its messages about loaded kernels and overflows are disabled.
     warp = importlib.import_module("warp")
-    # It tells of every kernel that it loads.
     warp.config.log_level = warp.LOG_WARNING
     env, model = make_env(config), make_physics_model(config)
     n_substeps = config.physics.n_substeps
-    most = mjx.make_data(model)._impl
+    sizes_in_mjx = mjx.make_data(model)._impl
     warp_model = mjx.put_model(model, impl="warp")
-    # Otherwise a GPU prints a line for every robot whose solver used all iterations of the preset.
+    # A GPU would print a line for every robot whose solver used all iterations.
     warp_model = warp_model.tree_replace({"opt._impl.warn_overflow": 0})
     data = mjx.make_data(
-        model, impl="warp", naconmax=num_envs * int(most.ncon), njmax=int(most.nefc)
+        model,
+        impl="warp",
+        naconmax=num_envs * int(sizes_in_mjx.ncon),
+        njmax=int(sizes_in_mjx.nefc),
     )
 
+    # Step all robots under random actions.
+
     def step_robot(physics: PhysicsState, ctrl: Float[Array, " nu"]) -> PhysicsState:
-        world = data.replace(**vars(physics), ctrl=ctrl)
+        stepped = data.replace(**vars(physics), ctrl=ctrl)
         for _ in range(n_substeps):
-            world = mjx.step(warp_model, world)
-        return PhysicsState(*(getattr(world, name) for name in vars(physics)))
+            stepped = mjx.step(warp_model, stepped)
+        return PhysicsState(*(getattr(stepped, name) for name in vars(physics)))
 
     def step(carry: Carry) -> Carry:
         key, actions = random_actions(carry.key, num_envs)
         physics = jax.vmap(step_robot)(carry.state, jax.vmap(env.wheel_targets)(actions))
-        return Carry(
-            physics, key, carry.tally._replace(checksum=carry.tally.checksum + sums(physics))
-        )
+        checksum = carry.tally.checksum + sum_per_env(physics)
+        return Carry(physics, key, carry.tally._replace(checksum=checksum))
 
     first = jax.jit(jax.vmap(env.reset))(env_keys(num_envs)).pipeline_state
-    return Timed("warp", step, first, n_substeps=n_substeps, calls=sizes.unroll)
+    return TimedProgram("warp", step, first, n_substeps=n_substeps, calls=sizes.unroll)
 
 
-def prepare_playground(num_envs: int, sizes: Sizes) -> Timed:
-    """An environment of MuJoCo Playground as its trainers see it, under random actions.
+def prepare_playground(num_envs: int, sizes: Sizes) -> TimedProgram:
+    """Compile an environment of MuJoCo Playground with its training wrappers, random actions.
 
-    The cart and its pole have two degrees of freedom and no contact; the JetBot has eight and
-    four.
+    The cart-pole has two degrees of freedom and no contacts; the JetBot has eight and four.
     """
     playground = importlib.import_module("mujoco_playground")
     env = playground.registry.load(PLAYGROUND_ENV, config_overrides={"impl": "jax"})
@@ -248,7 +248,9 @@ def prepare_playground(num_envs: int, sizes: Sizes) -> Timed:
     def step(carry: Carry) -> Carry:
         key, actions = random_actions(carry.key, num_envs, env.action_size)
         state = batch.step(carry.state, actions)
-        checksum = sums((state.obs, state.reward, state.done, state.data.qpos, state.data.qvel))
+        checksum = sum_per_env(
+            (state.obs, state.reward, state.done, state.data.qpos, state.data.qvel)
+        )
         tally = carry.tally
         return Carry(
             state,
@@ -257,7 +259,7 @@ def prepare_playground(num_envs: int, sizes: Sizes) -> Timed:
         )
 
     first = jax.jit(batch.reset)(env_keys(num_envs))
-    return Timed(
+    return TimedProgram(
         "playground",
         step,
         first,
@@ -268,6 +270,6 @@ def prepare_playground(num_envs: int, sizes: Sizes) -> Timed:
 
 
 def _check_playground(rate: str, carry: Carry) -> None:
-    sound: Float[Array, ""] = jnp.isfinite(carry.tally.checksum).all()
-    if not sound:
-        raise UserError(f"{rate}: worlds are not finite, so that the rate means nothing")
+    finite: Float[Array, ""] = jnp.isfinite(carry.tally.checksum).all()
+    if not finite:
+        raise UserError(f"{rate}: states are not finite, so that the rate means nothing")

@@ -1,10 +1,11 @@
-"""Measures how long success takes: `python benchmarks/time_to_success.py --config FILE`.
+"""Measure the time until a policy succeeds.
+
+    python benchmarks/learning/time_to_success.py --config configs/jetbot.yaml --output FILE
 
 For each seed a new process trains from a cold start (an empty compilation cache), and another
-judges its best policy on the report's fixed goals; with `--warm` the same follows once more with
-the cache as the first left it. The clock is that of whole processes, imports and compilation
-included; what the trainer says of itself stands beside it. `--set trainer=brax` measures the
-stock trainer.
+evaluates its best policy on the fixed goals of the report; `--warm` repeats both with the cache
+that the first training filled. The times are those of whole processes, including imports and
+compilation. `--set trainer=brax` measures Brax's own `ppo.train`.
 """
 
 import argparse
@@ -12,7 +13,6 @@ import json
 import os
 import re
 import statistics
-import subprocess
 import sys
 import tempfile
 import time
@@ -20,49 +20,50 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.harness.processes import run_module
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import write_json
-
-_FOLDER = Path(__file__).resolve().parent
 
 
 def measure(
     config: Path, overrides: Sequence[str], seed: int, target: float, cache: Path
 ) -> dict[str, Any]:
-    """Trains and judges one seed.
+    """Train and evaluate one seed.
 
     Args:
-      config: YAML file.
-      overrides: as for `--set`.
-      seed: of the run.
-      target: success rate that the evaluations during training are watched for.
-      cache: folder of compiled programs; cold where it is empty.
+      config: The YAML file.
+      overrides: The settings, as for `--set`.
+      seed: The seed of the run.
+      target: The success rate whose first evaluation is recorded.
+      cache: The folder of the compilation cache; an empty one makes a cold start.
 
     Returns:
-      Times, success and the two processes' own output, as JSON.
+      Times, success and the output of both processes, as JSON.
 
     Raises:
-      UserError: one of the processes failed.
+      UserError: One of the processes failed.
     """
+    # Train and evaluate in processes of their own, and read what they wrote.
     start = "warm" if cache.is_dir() and any(cache.iterdir()) else "cold"
     with tempfile.TemporaryDirectory() as folder:
         run_dir = Path(folder) / "run"
         environment = {**os.environ, "JAX_COMPILATION_CACHE_DIR": str(cache)}
         settings = [argument for override in overrides for argument in ("--set", override)]
-        train = ["train", "--config", str(config), "--seed", str(seed), *settings]
+        arguments = ["--config", str(config), "--seed", str(seed), *settings]
         began = time.perf_counter()
-        printed = _run([*train, "--run-dir", str(run_dir)], environment)
+        printed = run_module("train", [*arguments, "--run-dir", str(run_dir)], environment)
         seconds = time.perf_counter() - began
-        printed += _run(["evaluate", str(run_dir)], environment)
+        printed += run_module("evaluate", [str(run_dir)], environment)
         report = json.loads(next(run_dir.glob("evaluations/*/report.json")).read_text())
         lines = (run_dir / "metrics.jsonl").read_text().splitlines()
         history = [json.loads(line) for line in lines]
-        # From the run: asking JAX here would take the GPU's memory away from the trainings.
+        # Read from the run: JAX in this process would take the GPU's memory from the trainings.
         versions = json.loads((run_dir / "versions.json").read_text())
+    # Convert the trainer's clock to that of the process: imports pass before it starts.
     reached = [line for line in history if line["eval/success_rate"] >= target]
-    # What passes before the trainer's own clock starts is mostly imports.
     before = seconds - history[-1]["time/wall_seconds"]
     first_step = re.search(r"first training step done ([\d.]+) s", printed)
     return {
@@ -77,19 +78,6 @@ def measure(
         "versions": versions,
         "output": printed.replace(folder, "").splitlines(),
     }
-
-
-def _run(command: Sequence[str], environment: dict[str, str]) -> str:
-    module, *arguments = command
-    done = subprocess.run(
-        [sys.executable, "-m", f"jetbot_mjx.{module}", *arguments],
-        env=environment,
-        capture_output=True,
-        text=True,
-    )
-    if done.returncode:
-        raise UserError(f"{module} failed: {(done.stderr.strip() or 'no word').splitlines()[-1]}")
-    return done.stdout
 
 
 def _row(run: dict[str, Any]) -> str:
@@ -107,20 +95,21 @@ def _row(run: dict[str, Any]) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, measures, prints the table and writes the JSON file.
+    """Measure all seeds, print the table and write the JSON file.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where a seed's success rate on the fixed goals is below the target.
+      0, or 1 if a seed's success rate on the fixed goals is below the target.
     """
+    # Parse the command line and print the head of the table.
     parser = cli.Parser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--seeds", type=cli.positive_int, default=1, help="seeds 0 to N-1")
     parser.add_argument("--target", type=cli.fraction, default=0.99, help="default: 0.99")
-    parser.add_argument("--warm", action="store_true", help="once more with a warm cache")
+    parser.add_argument("--warm", action="store_true", help="repeat with a warm cache")
     parser.add_argument("--output", type=Path, required=True, help="JSON file")
     options = parser.parse_args(arguments)
     config = load_config(options.config, options.overrides)
@@ -132,6 +121,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "|:------------------:|",
         flush=True,
     )
+    # Measure; the file is written after every row, so that an interrupted run keeps its rows.
     options.output.parent.mkdir(parents=True, exist_ok=True)
     runs = []
     for seed in range(options.seeds):
@@ -140,13 +130,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
                 run = measure(options.config, options.overrides, seed, options.target, Path(cache))
                 runs.append(run)
                 print(_row(run), flush=True)
-                # After every row, so that what is cut short keeps what it had.
                 write_json(options.output, _results(options, config, runs))
+    # Print the median times.
     machine = runs[0]["versions"]
     for start in dict.fromkeys(run["start"] for run in runs):
         seconds = [run["process_seconds"] for run in runs if run["start"] == start]
         print(
-            f"{start}: median of the process's time {statistics.median(seconds):.1f} s on"
+            f"{start}: median time of the process {statistics.median(seconds):.1f} s on"
             f" {machine['device_count']} x {machine['device']}, {os.cpu_count()} CPU cores"
         )
     print(f"results: {options.output}")

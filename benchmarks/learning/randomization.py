@@ -1,12 +1,13 @@
-"""What training on ever other robots is worth: `python benchmarks/randomization.py`.
+"""Measure the benefit of domain randomization: `python benchmarks/learning/randomization.py`.
 
-Trains several seeds under a configuration with `randomization`, and as many without, and judges
-the last policy of each on the report's fixed goals: on the preset's robot, on robots drawn from
-the full ranges, and over every quantity of the robustness sweep. Every policy is written down as
-soon as it is judged; a figure is drawn beside the file of results.
+Trains several seeds with the configuration's `randomization`, and as many without, and evaluates
+the last policy of each on the fixed goals of the report: on the preset's robot, on robots drawn
+from the full ranges, and with each parameter of the robustness evaluation changed. The results of
+each policy are written as soon as it is evaluated; a plot is drawn beside the file of results.
 """
 
 import argparse
+import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
@@ -16,8 +17,12 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
-from results import check_output, conditions, default_output, write
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import CONFIGS
+from benchmarks.harness.measurements import Sizes
+from benchmarks.harness.results import check_output, conditions, default_output, write
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
@@ -31,21 +36,20 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.run_dir import seed_folders
 from jetbot_mjx.training import session
 
-_CONFIG = Path(__file__).resolve().parents[1] / "configs" / "real_jetbot.yaml"
-WAYS = ("nominal", "randomised")
+SETTINGS = ("nominal", "randomised")
 _COLOURS = {"nominal": "tab:orange", "randomised": "C0"}
 
 
-class Judge:
-    """The programs that every policy of both ways is judged by."""
+class PolicyEvaluator:
+    """Evaluates policies; all policies share its compiled programs."""
 
     def __init__(self, config: Config, episodes: int, goals: int) -> None:
-        """Prepares them; they compile at their first use.
+        """Build the evaluators; they compile at their first use.
 
         Args:
-          config: with the ranges to draw from.
-          episodes: of the report's fixed goals, for the preset's robot and the full ranges.
-          goals: the same for each robot of the sweep.
+          config: A configuration with randomization.
+          episodes: The number of the report's goals for the preset's robot and the full ranges.
+          goals: The number of the report's goals for each robot of the robustness evaluation.
         """
         env = make_env(config)
         self._dt, self._keys = env.dt, report_keys(episodes)
@@ -63,67 +67,70 @@ class Judge:
         }
         self._sweeper = Sweeper(env, networks, report_keys(goals))
 
-    def judge(self, folder: Path) -> dict[str, Any]:
-        """All figures of the last policy of a run, as JSON.
+    def evaluate(self, folder: Path) -> dict[str, Any]:
+        """Evaluate the last policy of a run.
 
         Args:
-          folder: of the run, of one seed.
+          folder: The run folder of one seed.
 
         Returns:
-          Summaries under `preset` and `ranges`, and `sweep` as in a report.
+          The metrics as JSON: summaries under `preset` and `ranges`, and `sweep` as in a report.
         """
         params = load_checkpoint(folder, "last").params
-        told: dict[str, Any] = {
+        metrics: dict[str, Any] = {
             name: summarize(one.run(params, self._keys), self._dt)._asdict()
             for name, one in self._evaluators.items()
         }
-        return {**told, "sweep": as_json(self._sweeper.run(params))["quantities"]}
+        return {**metrics, "sweep": as_json(self._sweeper.run(params))["quantities"]}
 
 
-def run(config: Config, folder: Path, judge: Judge) -> Iterator[dict[str, Any]]:
-    """Trains both ways, and judges seed by seed.
+def run(config: Config, folder: Path, evaluator: PolicyEvaluator) -> Iterator[dict[str, Any]]:
+    """Train without and with randomization, and evaluate seed by seed.
 
     Args:
-      config: with ranges to draw from, and the seeds to train at once.
-      folder: where the runs go; what lies there already trained is judged as it is.
-      judge: of the policies.
+      config: A configuration with randomization and with the seeds to train at once.
+      folder: The folder of the runs; runs that exist are evaluated without training.
+      evaluator: Evaluates the policies.
 
     Yields:
       A row for each policy.
     """
-    for way in WAYS:
-        ranges = config.randomization if way == "randomised" else RandomizationConfig()
-        run_dir, begun = folder / way, time.perf_counter()
+    for setting in SETTINGS:
+        ranges = config.randomization if setting == "randomised" else RandomizationConfig()
+        run_dir, start = folder / setting, time.perf_counter()
         if not run_dir.exists():
             trained = config.model_copy(update={"randomization": ranges})
             session.run(trained, run_dir)
-        seconds = time.perf_counter() - begun
+        seconds = time.perf_counter() - start
         for one in seed_folders(run_dir) or [run_dir]:
-            row = {"way": way, "seed": one.name, "training_seconds": seconds}
-            yield {**row, **judge.judge(one)}
+            row = {"setting": setting, "seed": one.name, "training_seconds": seconds}
+            yield {**row, **evaluator.evaluate(one)}
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """Both ways side by side: mean over the seeds, and the worst seed.
+    """Return a table of the success of both settings: mean over the seeds, and the worst seed.
 
     Args:
-      rows: of all policies.
+      rows: The rows of all policies.
 
     Returns:
-      A Markdown table: success on the preset, under the full ranges, and where each quantity is
-      hardest on the way's own policies.
+      A Markdown table: success on the preset, under the full ranges, and at the value of each
+      parameter that is hardest for the policies of that setting.
     """
     lines = [
         "| success, mean (worst seed) | nominal | randomised |",
         "| --- | --: | --: |",
     ]
     for title, name in (("the preset's robot", "preset"), ("the full ranges", "ranges")):
-        cells = [_cell([row[name]["success_rate"] for row in _of(rows, way)]) for way in WAYS]
+        cells = [
+            _cell([row[name]["success_rate"] for row in _rows_of(rows, setting)])
+            for setting in SETTINGS
+        ]
         lines.append(f"| {title} | {' | '.join(cells)} |")
     for index, quantity in enumerate(rows[0]["sweep"]):
         cells = []
-        for way in WAYS:
-            rates = _rates(_of(rows, way), index)
+        for setting in SETTINGS:
+            rates = _rates(_rows_of(rows, setting), index)
             at = int(rates.mean(axis=0).argmin()) if len(rates) else 0
             where = f" at {quantity['values'][at]:g}" if len(rates) and rates.min() < 1 else ""
             cells.append(f"{_cell(rates[:, at] if len(rates) else [])}{where}")
@@ -131,12 +138,12 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def _of(rows: Sequence[dict[str, Any]], way: str) -> list[dict[str, Any]]:
-    return [row for row in rows if row["way"] == way]
+def _rows_of(rows: Sequence[dict[str, Any]], setting: str) -> list[dict[str, Any]]:
+    return [row for row in rows if row["setting"] == setting]
 
 
 def _rates(rows: Sequence[dict[str, Any]], index: int) -> np.ndarray:
-    """Success by seed and value of one quantity."""
+    """Return success by seed and value of one parameter."""
     return np.array(
         [[one["success_rate"] for one in row["sweep"][index]["policy"]] for row in rows]
     )
@@ -147,10 +154,10 @@ def _cell(rates: Sequence[float] | np.ndarray) -> str:
 
 
 def plot(rows: Sequence[dict[str, Any]]) -> Figure:
-    """Success over every quantity: lines are means over the seeds, bands reach to worst and best.
+    """Plot success over every parameter: means over the seeds, with bands from worst to best.
 
     Args:
-      rows: of all policies.
+      rows: The rows of all policies.
 
     Returns:
       The figure.
@@ -163,19 +170,19 @@ def plot(rows: Sequence[dict[str, Any]]) -> Figure:
         axes = figure.add_subplot(lines, columns, index + 1)
         scripted = [one["success_rate"] for one in quantity["scripted"]]
         axes.plot(quantity["values"], scripted, color="tab:gray", linewidth=1, label="scripted")
-        for way in WAYS:
-            rates = _rates(_of(rows, way), index)
+        for setting in SETTINGS:
+            rates = _rates(_rows_of(rows, setting), index)
             if not len(rates):
                 continue
             ends = rates.min(axis=0), rates.max(axis=0)
-            axes.fill_between(quantity["values"], *ends, color=_COLOURS[way], alpha=0.25, lw=0)
+            axes.fill_between(quantity["values"], *ends, color=_COLOURS[setting], alpha=0.25, lw=0)
             axes.plot(
                 quantity["values"],
                 rates.mean(axis=0),
                 marker="o",
                 markersize=3,
-                color=_COLOURS[way],
-                label=way,
+                color=_COLOURS[setting],
+                label=setting,
             )
         axes.axvline(quantity["nominal"], color="black", linestyle="--", linewidth=0.8)
         axes.axhline(CARRIES_AT, color="black", linestyle=":", linewidth=0.8)
@@ -189,28 +196,33 @@ def plot(rows: Sequence[dict[str, Any]]) -> Figure:
 
 def _parser() -> argparse.ArgumentParser:
     parser = cli.Parser(description=__doc__)
-    parser.add_argument("--config", type=Path, default=_CONFIG)
+    parser.add_argument("--config", type=Path, default=CONFIGS / "real_jetbot.yaml")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--seeds", type=cli.positive_int, default=5)
     parser.add_argument(
-        "--episodes", type=cli.positive_int, default=1024, help="on preset and full ranges"
+        "--episodes", type=cli.positive_int, default=1024, help="for the preset and the full ranges"
     )
-    parser.add_argument("--goals", type=cli.positive_int, default=128, help="for each swept robot")
     parser.add_argument(
-        "--runs", type=Path, help="folder of the trainings, taken as they are where they exist"
+        "--goals",
+        type=cli.positive_int,
+        default=128,
+        help="for each robot of the robustness evaluation",
+    )
+    parser.add_argument(
+        "--runs", type=Path, help="folder of the runs; runs that exist are not trained again"
     )
     parser.add_argument("--output", type=Path, help="JSON file")
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, trains, judges and prints.
+    """Train, evaluate and print.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where a randomised policy is below 95 % under the full ranges.
+      0, or 1 if a randomised policy is below 95 % under the full ranges.
     """
     options = _parser().parse_args(arguments)
     config = load_config(options.config, [*options.overrides, f"seeds={options.seeds}"])
@@ -222,24 +234,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     check_output(output)
     rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as temporary:
-        judge = Judge(config, options.episodes, options.goals)
-        for row in run(config, options.runs or Path(temporary), judge):
+        evaluator = PolicyEvaluator(config, options.episodes, options.goals)
+        for row in run(config, options.runs or Path(temporary), evaluator):
             rows.append(row)
             print(
-                f"{row['way']} {row['seed']}: preset {row['preset']['success_rate']:.2%}, full"
+                f"{row['setting']} {row['seed']}: preset {row['preset']['success_rate']:.2%}, full"
                 f" ranges {row['ranges']['success_rate']:.2%}",
                 flush=True,
             )
             write(output, {**_about(config, options), "rows": rows})
             plot(rows).savefig(output.with_suffix(".png"), dpi=100)
     print(f"\n{table(rows)}\n\n{output}\n{output.with_suffix('.png')}")
-    worst = min(row["ranges"]["success_rate"] for row in _of(rows, "randomised"))
+    worst = min(row["ranges"]["success_rate"] for row in _rows_of(rows, "randomised"))
     return 1 if worst < CARRIES_AT else 0
 
 
 def _about(config: Config, options: argparse.Namespace) -> dict[str, Any]:
-    from measurements import Sizes
-
     return {
         **conditions(config, Sizes()),
         "episodes": options.episodes,

@@ -1,12 +1,14 @@
-"""Measures what logging and saving cost: `python benchmarks/logging_cost.py --config FILE`.
+"""Measure the cost of logs and checkpoints.
 
-The same compiled training runs again and again, in turn with nobody listening; with what
-`python -m jetbot_mjx.train` logs at a report: metrics.jsonl, TensorBoard, the terminal (on one, the
-dashboard too); and with the whole state saved to disk in the background as well. Evaluations are
-left out of all: they are no logging.
+    python benchmarks/throughput/logging_cost.py --config configs/jetbot_egocentric.yaml
+
+The same compiled training runs repeatedly and in turn in three modes: without a recorder; with the
+logs of `python -m jetbot_mjx.train` (metrics.jsonl, TensorBoard, the terminal and its dashboard);
+and with logs and checkpoints, which are saved in the background. No mode runs evaluations.
 """
 
 import statistics
+import sys
 import tempfile
 import time
 from collections.abc import Mapping, Sequence
@@ -14,8 +16,10 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from measurements import Listener
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.harness.measurements import IntervalTimer
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.config import Config, load_config
@@ -28,41 +32,45 @@ from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import RunRecorder
 
-_UNJUDGED = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
+_NO_EVALUATION = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
 
-
-WAYS = {"off": "nobody listens", "logs": "logs", "saved": "logs, checkpoints"}
+MODES = {"off": "no recorder", "logs": "logs", "saved": "logs, checkpoints"}
+"""The description of each mode, by its name."""
 
 
 class _Timed(TrainerCallback):
-    """Passes reports on, and notes when they have been dealt with."""
+    """A callback that forwards reports, and records when their processing has ended."""
 
     def __init__(self, recorder: TrainerCallback) -> None:
         self._recorder = recorder
         self.began = self.ended = 0.0
 
     def on_interval(self, progress: Sequence[Progress]) -> bool:
-        going_on = self._recorder.on_interval(progress)
-        # From the end of the first report: what compiles comes before it.
+        should_continue = self._recorder.on_interval(progress)
+        # Timing starts at the end of the first report, after all compilation.
         self.ended = time.perf_counter()
         self.began = self.began or self.ended
-        return going_on
+        return should_continue
 
     def on_progress(self, env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
         self._recorder.on_progress(env_steps, metrics, seconds)
 
 
-class _Unjudged(RunRecorder):
+class _LogsAndCheckpoints(RunRecorder):
+    """A recorder that runs no evaluations."""
+
     def judge(self, params: PolicyParams) -> Summary:
         del params
-        return _UNJUDGED
+        return _NO_EVALUATION
 
 
-def _save_nothing(progress: Progress, judged: Mapping[str, Any], wall_seconds: float) -> None:
-    del progress, judged, wall_seconds
+def _save_nothing(*_: Any, **__: Any) -> None:
+    """Replace the method that saves a checkpoint."""
 
 
-class _Unsaved(_Unjudged):
+class _LogsOnly(_LogsAndCheckpoints):
+    """A recorder that runs no evaluations and saves no checkpoints."""
+
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
         for seed in self._seeds:
@@ -70,29 +78,29 @@ class _Unsaved(_Unjudged):
 
 
 def measure(config: Config, repeats: int) -> dict[str, list[float]]:
-    """Times all `WAYS`.
+    """Time the training in all modes.
 
     Args:
-      config: the run.
-      repeats: trainings of each.
+      config: The configuration of the run.
+      repeats: The number of trainings in each mode; one more is a warm-up.
 
     Returns:
-      Seconds of every training from its first report to its last, all of that on disk.
+      The seconds of each training from its first report until its last is written, by mode.
     """
     env = make_env(config)
     program = ppo_trainer.CompiledTrainer(config, env)
     compiled = program.compile()
     program.compile = lambda: compiled
-    seconds: dict[str, list[float]] = {name: [] for name in WAYS}
+    seconds: dict[str, list[float]] = {name: [] for name in MODES}
     for repeat in range(repeats + 1):
         for name in seconds:
-            lasted = _once(config, env, program, name)
+            duration = _train_once(config, env, program, name)
             if repeat > 0:
-                seconds[name].append(lasted)
+                seconds[name].append(duration)
     return seconds
 
 
-def _once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, way: str) -> float:
+def _train_once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, mode: str) -> float:
     with tempfile.TemporaryDirectory() as folder, CompileClock() as clock:
 
         def train(recorder: TrainerCallback) -> _Timed:
@@ -100,31 +108,33 @@ def _once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, way: s
             ppo_trainer.train(config, program, timed, Preemption(config.preemption_notice))
             return timed
 
-        if way == "off":
-            timed = train(Listener(clock))
+        if mode == "off":
+            timed = train(IntervalTimer(clock))
         else:
-            kind = _Unjudged if way == "saved" else _Unsaved
+            kind = _LogsAndCheckpoints if mode == "saved" else _LogsOnly
             with kind(config, env, [Path(folder)], clock) as recorder:
-                recorder.begin(WAYS[way])
+                recorder.begin(MODES[mode])
                 timed = train(recorder)
             timed.ended = time.perf_counter()
     return timed.ended - timed.began
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, measures and prints.
+    """Measure and print the cost of each mode.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where logs cost more than `--most`.
+      0, or 1 if logs cost more than `--most`.
     """
     parser = cli.Parser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--repeats", type=cli.positive_int, default=5)
-    parser.add_argument("--most", type=cli.fraction, default=0.02, help="default: 0.02")
+    parser.add_argument(
+        "--most", type=cli.fraction, default=0.02, help="exit code 1 above (default: 0.02)"
+    )
     parser.add_argument("--output", type=Path, help="JSON file")
     options = parser.parse_args(arguments)
     config = load_config(options.config, options.overrides)
@@ -134,7 +144,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     steps = config.ppo.training_steps * config.ppo.steps_per_training_step
     for name, median in medians.items():
         spread = f"{min(seconds[name]):.3f} .. {max(seconds[name]):.3f} s"
-        print(f"{WAYS[name]:18} {steps / median:12,.0f} steps/s {costs[name]:+8.2%}  ({spread})")
+        print(f"{MODES[name]:18} {steps / median:12,.0f} steps/s {costs[name]:+8.2%}  ({spread})")
     reports = steps // config.checkpoint_interval
     print(f"a report every {config.checkpoint_interval:,} steps, {medians['off'] / reports:.1f} s")
     if options.output:

@@ -1,9 +1,9 @@
-"""What a step compiles to: `python benchmarks/kernels.py --config configs/jetbot.yaml`.
+"""Count kernels: `python benchmarks/throughput/kernels.py --config configs/jetbot.yaml`.
 
-Counts the instructions of the compiled programs that become kernels (on a CPU: loops and calls of
-their own), for one environment step of physics, one of the training environment and one training
-step, and the arithmetic of one physics step written out number by number, which is what a kernel
-does. No clock: a regression shows on any machine, however busy.
+Counts the instructions of compiled programs that become kernels (on a CPU: separate loops and
+calls) in one environment step of physics, one environment step with the training wrappers and one
+training step. Also counts the scalar operations of one physics step, of which the physics kernel
+consists. Nothing is timed, so that a regression is visible on any machine, however busy.
 """
 
 import collections
@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from timing import env_keys
 
 from jetbot_mjx import cli
 from jetbot_mjx.agents.ppo import PPO
@@ -28,7 +27,7 @@ PROGRAMS = ("physics", "env", "training")
 
 _FREE = {"parameter", "constant", "tuple", "get-tuple-element", "bitcast", "after-all"}
 _FREE |= {"partition-id", "replica-id", "opt-barrier", "add-dependency"}
-"""Instructions that only name what is there."""
+"""Instructions that only name or group existing values."""
 
 _COMPUTATION = re.compile(r"^(ENTRY )?%?([\w.-]+) .*->.* \{$")
 _INSTRUCTION = re.compile(r"^\s+(?:ROOT )?%?[\w.-]+ = (?:\(.*?\)|\S+) ([a-z][\w-]*)\(")
@@ -40,24 +39,24 @@ _TRIPS = re.compile(r'"known_trip_count":\{"n":"(\d+)"')
 
 
 class Count(NamedTuple):
-    """What a compiled program consists of."""
+    """A `Count` holds the numbers of kernels of a compiled program."""
 
     kernels: Mapping[str, int]
-    """Instructions that become kernels, by their operation."""
+    """The number of instructions that become kernels, by their operation."""
     launches: int
-    """The same, each as often as its loops turn; loops of unknown length count once."""
+    """The number of kernel launches; a loop of unknown length counts once."""
     unknown_loops: int
-    """Loops whose length is known only when the program runs."""
+    """The number of loops whose length is known only at run time."""
 
 
 def count_kernels(text: str) -> Count:
-    """Counts what a compiled program launches.
+    """Count the kernels of a compiled program.
 
     Args:
-      text: of the program after all of XLA's passes, `compiled.as_text()`.
+      text: The program after all of XLA's passes, `compiled.as_text()`.
 
     Returns:
-      The counts over the entry and all that it calls; what is fused counts as one.
+      The counts over the entry computation and all that it calls; a fusion counts as one.
     """
     computations, entry = _computations(text)
     kernels: collections.Counter[str] = collections.Counter()
@@ -82,7 +81,7 @@ def count_kernels(text: str) -> Count:
 
 
 def _computations(text: str) -> tuple[dict[str, list[tuple[str, str]]], str]:
-    """(operation, line) of every instruction, by the computation it is in; the entry's name."""
+    """Return the (operation, line) pairs of each computation, and the name of the entry."""
     found: dict[str, list[tuple[str, str]]] = {}
     entry, current = "", ""
     for line in text.splitlines():
@@ -103,18 +102,16 @@ def _called(line: str) -> list[str]:
 
 
 def compiled_text(config: Config, program: str) -> str:
-    """What XLA makes of a step.
+    """Compile a step and return the text of the compiled program.
 
     Args:
-      config: the run.
-      program: one of `PROGRAMS`.
-
-    Returns:
-      The text of the compiled program.
+      config: The configuration of the run.
+      program: One of `PROGRAMS`.
     """
     env = make_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
-    keys, actions = env_keys(config.ppo.num_envs), jnp.zeros((config.ppo.num_envs, 2))
+    keys = jax.random.split(jax.random.PRNGKey(0), config.ppo.num_envs)
+    actions = jnp.zeros((config.ppo.num_envs, 2))
     if program == "physics":
         first = jax.eval_shape(jax.vmap(env.reset), keys).pipeline_state
         lowered = jax.jit(jax.vmap(env.step_physics)).lower(first, actions)
@@ -129,7 +126,7 @@ def compiled_text(config: Config, program: str) -> str:
 
 
 def count_scalars(config: Config) -> dict[str, int]:
-    """Operations on single numbers in one physics step of one robot, by their kind."""
+    """Count the scalar operations in one physics step of one robot, by their kind."""
     values = config.model_dump(mode="json")
     values["physics"] |= {"impl": "xla", "ctrl_dt": config.physics.sim_dt}
     env = make_env(parse_config(values))
@@ -139,10 +136,10 @@ def count_scalars(config: Config) -> dict[str, int]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, compiles and prints.
+    """Compile the programs and print their counts.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
       The exit code.

@@ -1,23 +1,25 @@
-"""Searches for the shortest time to each of the report's goals: `python benchmarks/best_known.py`.
+"""Search for the shortest time to each goal: `python benchmarks/learning/best_known.py`.
 
-No policy: commands of one goal, found with the true model and driven without looking. A command
-is a polyline of --knots points over the time that the goal takes; the cross-entropy method draws
---samples of them around a mean, keeps the best sixteenth, moves mean and deviation to those, and
-does so --rounds times, from --starts beginnings. Each begins anew, with its knots over the time
-of the best so far. A sample is driven by the report's own rollout from the goal's own reset key,
-so that its time is counted as a policy's is; what it is judged by are the environment steps until
-the end, and those that the rest of the way to the goal would take at full speed.
+The search finds open-loop commands for each of the report's goals with the true model. The
+commands are a polyline of --knots points over the duration of the episode. The cross-entropy
+method draws --samples polylines around a mean, selects the best sixteenth, updates mean and
+standard deviation to theirs, and repeats this --rounds times. The search restarts --starts times;
+each restart spreads its knots over the best duration so far. The report's own rollout simulates
+each sample from the reset key of the goal, so that times are counted as for a policy. The cost of
+a sample is its number of environment steps, plus the steps that the remaining distance to the
+goal would take at full speed.
 
-What is found is an upper bound of the shortest time, and reports show it as "best known".
+The result is an upper bound of the shortest time; reports show it as "best known".
 
 Source: R. Y. Rubinstein, The Cross-Entropy Method for Combinatorial and Continuous Optimization,
 Methodology and Computing in Applied Probability 1 (1999), 127-190, doi:10.1023/A:1010091220143.
 """
 
-# First, before Brax imports MJX and lets it print.
+# First, because MJX prints when Brax imports it.
 import jetbot_mjx  # noqa: F401  isort: skip
 
 import json
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -27,8 +29,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt32
-from results import check_output
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import CONFIGS
+from benchmarks.harness.results import check_output
 from jetbot_mjx import cli
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, load_config
@@ -40,14 +45,13 @@ from jetbot_mjx.evaluation.evaluator import BASELINES, GOAL_SET_VERSION, REPORT_
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 from jetbot_mjx.runs.run_dir import versions, write_text, writing_to
 
-_ROOT = Path(__file__).resolve().parents[1]
 _ELITE_SHARE = 16
 _FIRST_STD = 1.0
 _LEAST_STD = 0.02
 
 
 class Settings(NamedTuple):
-    """How thoroughly is searched."""
+    """`Settings` holds the parameters of the search."""
 
     knots: int = 16
     samples: int = 512
@@ -57,26 +61,26 @@ class Settings(NamedTuple):
 
 
 class Commands(NamedTuple):
-    """A polyline of actions, held beyond its end."""
+    """`Commands` holds a polyline of actions; the last one is held after its end."""
 
     knots: Float[Array, "*batch knots 2"]
-    """Actions, clipped to [-1, 1] only where the environment does."""
+    """Actions; only the environment clips them to [-1, 1]."""
     steps: Float[Array, "*batch"]
     """Environment steps over which the knots are spread evenly."""
 
 
 class Found(NamedTuple):
-    """The best of all samples of one goal."""
+    """`Found` holds the best of all samples of one goal."""
 
     rank: Float[Array, "*batch"]
-    """Environment steps to the goal, and a thousandth of what elites are chosen by."""
+    """Environment steps to the goal, plus a thousandth of the cost of the search."""
     steps: Float[Array, "*batch"]
-    """Environment steps to the goal; not finite where it was never reached."""
+    """Environment steps to the goal; infinite if it was never reached."""
     commands: Commands
 
 
 def play(params: Commands, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-    """The controller that plays commands."""
+    """Return the action of the polyline at the current step; a controller for rollouts."""
     del key
     count = params.knots.shape[-2]
     place = jnp.minimum(state.info["steps"] / params.steps, 1.0) * (count - 1)
@@ -85,11 +89,11 @@ def play(params: Commands, state: State, key: UInt32[Array, "2"]) -> Float[Array
 
 
 def drive_fn(env: JetBotEnv, longest: int) -> Callable[..., Episodes]:
-    """Make the report's rollout one of a command and a reset key each.
+    """Build a rollout of one command from one reset key for each sample.
 
     Args:
-      env: one environment, unwrapped.
-      longest: environment steps after which an episode is cut off.
+      env: The environment without wrappers.
+      longest: The number of environment steps after which an episode is truncated.
 
     Returns:
       A function of (commands of n samples, reset keys (n, 2)) to their episodes.
@@ -104,16 +108,16 @@ def drive_fn(env: JetBotEnv, longest: int) -> Callable[..., Episodes]:
 
 
 def search_fn(env: JetBotEnv, settings: Settings, longest: int) -> Callable[..., Found]:
-    """Make the search for one goal.
+    """Build the search for one goal.
 
     Args:
-      env: one environment, unwrapped.
-      settings: how thoroughly.
-      longest: environment steps after which a sample is given up.
+      env: The environment without wrappers.
+      settings: The parameters of the search.
+      longest: The number of environment steps after which a sample is truncated.
 
     Returns:
-      A function of (goal's number, its reset key, environment steps that it takes at most) to the
-      best commands; to be batched by `jax.vmap`.
+      A function of (index of the goal, its reset key, largest number of environment steps) to the
+      best commands; batch it with `jax.vmap`.
     """
     drive = drive_fn(env, longest)
     elites = max(2, settings.samples // _ELITE_SHARE)
@@ -124,7 +128,7 @@ def search_fn(env: JetBotEnv, settings: Settings, longest: int) -> Callable[...,
     ) -> tuple[tuple[Array, Array, Found], None]:
         mean, std, best = carry
         noise = jax.random.normal(key, (settings.samples, settings.knots, 2))
-        # The mean itself is among them.
+        # The first sample is the mean itself.
         knots = mean + std * noise.at[0].set(0.0)
         commands = Commands(knots, jnp.broadcast_to(spread, settings.samples))
         driven = drive(commands, jnp.broadcast_to(reset_key, (settings.samples, 2)))
@@ -160,45 +164,45 @@ def search_fn(env: JetBotEnv, settings: Settings, longest: int) -> Callable[...,
 
 
 def run(env: JetBotEnv, settings: Settings, goals: int, chunk: int) -> tuple[Found, Episodes]:
-    """Search all goals, and print how far it is.
+    """Search all goals and print the progress.
 
     Args:
-      env: one environment, unwrapped.
-      settings: how thoroughly.
-      goals: how many of the report's, from the first on.
-      chunk: goals at once.
+      env: The environment without wrappers.
+      settings: The parameters of the search.
+      goals: The number of the report's goals, from the first on.
+      chunk: The number of goals that are searched at once.
 
     Returns:
-      The best of each goal, and the scripted baseline's episodes, all on the host.
+      The best of each goal, and the episodes of the scripted baseline, all on the host.
 
     Raises:
-      UserError: to a goal no way was found.
+      UserError: A goal was never reached.
     """
     keys = report_keys(goals)
     scripted: Controller = BASELINES["scripted"](env)
     rollout = jax.jit(rollout_fn(env, [scripted], env.config.task.episode_length))
-    beside = jax.device_get(rollout(0, None, keys))
-    longest = int(beside.steps.max())
+    baseline = jax.device_get(rollout(0, None, keys))
+    longest = int(baseline.steps.max())
     search = jax.jit(jax.vmap(search_fn(env, settings, longest)))
     found, began = [], time.perf_counter()
     for start in range(0, goals, chunk):
-        # The last chunk is as large as the others: one program serves all.
+        # The last chunk is filled up, so that all have one size and one compiled program.
         which = np.arange(start, start + chunk) % goals
-        one = search(which, np.asarray(keys)[which], beside.steps[which])
+        one = search(which, np.asarray(keys)[which], baseline.steps[which])
         found.append(jax.device_get(one))
         done = min(start + chunk, goals)
         print(f"{done:>5} goals  {time.perf_counter() - began:7.1f} s", flush=True)
     best: Found = jax.tree.map(lambda *parts: np.concatenate(parts)[:goals], *found)
     if missed := np.flatnonzero(~np.isfinite(best.steps)).tolist():
         raise UserError(
-            f"no way was found to {len(missed)} goals, such as {missed[0]}: more --samples,"
-            " --rounds or --starts may find one"
+            f"{len(missed)} goals were not reached, such as {missed[0]}: try more --samples,"
+            " --rounds or --starts"
         )
-    return best, beside
+    return best, baseline
 
 
-def to_json(config: Config, settings: Settings, best: Found, beside: Episodes) -> dict[str, Any]:
-    """Return a search as it stands in the file."""
+def to_json(config: Config, settings: Settings, best: Found, baseline: Episodes) -> dict[str, Any]:
+    """Return a search as JSON."""
     return {
         "settings": settings_of(config),
         "goal_set_version": GOAL_SET_VERSION,
@@ -206,16 +210,16 @@ def to_json(config: Config, settings: Settings, best: Found, beside: Episodes) -
         "search": settings._asdict(),
         "versions": versions(),
         # Whole millimetres on the floor.
-        "goals": np.rint(1e3 * beside.goal_w[:, :2].astype(float)).astype(int).tolist(),
+        "goals": np.rint(1e3 * baseline.goal_w[:, :2].astype(float)).astype(int).tolist(),
         "steps": best.steps.astype(int).tolist(),
     }
 
 
 def read(path: Path) -> list[dict[str, Any]]:
-    """Return the searches in a file, none where there is no file.
+    """Return the searches in a file; an empty list if there is no file.
 
     Raises:
-      UserError: it is a file of something else.
+      UserError: The file is not one of best-known times.
     """
     if not path.exists():
         return []
@@ -225,18 +229,20 @@ def read(path: Path) -> list[dict[str, Any]]:
             raise ValueError(values["format"])
         return list(values["searches"])
     except (OSError, ValueError, LookupError, TypeError):
-        raise UserError(f"--output {path} is no file of best-known times: name another") from None
+        raise UserError(
+            f"--output {path} is not a file of best-known times: name another"
+        ) from None
 
 
 def store(path: Path, search: dict[str, Any]) -> None:
-    """Write a search into the file, in the place of an earlier one for the same settings.
+    """Write a search into the file; it replaces an earlier one for the same settings.
 
     Raises:
-      UserError: the file cannot be written, or is one of something else.
+      UserError: The file cannot be written, or is not one of best-known times.
     """
-    kept = [one for one in read(path) if one["settings"] != search["settings"]]
-    searches = sorted([*kept, search], key=lambda one: json.dumps(one["settings"]))
-    # A line for each key: indented as other files are, these numbers would be thousands of lines.
+    others = [one for one in read(path) if one["settings"] != search["settings"]]
+    searches = sorted([*others, search], key=lambda one: json.dumps(one["settings"]))
+    # One line for each key: with the usual indentation the lists would take thousands of lines.
     texts = [
         "{\n"
         + ",\n".join(f'   "{key}": {json.dumps(value)}' for key, value in one.items())
@@ -249,22 +255,22 @@ def store(path: Path, search: dict[str, Any]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, searches, prints what it found and writes the JSON file.
+    """Search, print the best times and write the JSON file.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
       The exit code.
     """
     defaults = Settings()
     parser = cli.Parser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--config", type=Path, default=_ROOT / "configs" / "jetbot.yaml")
+    parser.add_argument("--config", type=Path, default=CONFIGS / "jetbot.yaml")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument(
-        "--goals", type=cli.positive_int, default=REPORT_GOALS, help="of the report"
+        "--goals", type=cli.positive_int, default=REPORT_GOALS, help="number of the report's goals"
     )
-    parser.add_argument("--chunk", type=cli.positive_int, help="goals at once")
+    parser.add_argument("--chunk", type=cli.positive_int, help="goals that are searched at once")
     for name in ("knots", "samples", "rounds", "starts"):
         default = getattr(defaults, name)
         parser.add_argument(f"--{name}", type=cli.positive_int, default=default)
@@ -281,14 +287,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     settings = Settings(*(getattr(options, name) for name in Settings._fields))
     chunk = options.chunk or (8 if jax.default_backend() == "cpu" else 1024)
     env = make_env(config)
-    best, beside = run(env, settings, options.goals, min(chunk, options.goals))
-    for name, steps in (("best known", best.steps), ("scripted", beside.steps)):
+    best, baseline = run(env, settings, options.goals, min(chunk, options.goals))
+    for name, steps in (("best known", best.steps), ("scripted", baseline.steps)):
         seconds = steps * env.dt
         print(
             f"{name:>10}: median {np.median(seconds):.3f} s, mean {seconds.mean():.4f} s,"
             f" p95 {np.percentile(seconds, 95):.3f} s"
         )
-    store(options.output, to_json(config, settings, best, beside))
+    store(options.output, to_json(config, settings, best, baseline))
     print(f"results: {options.output}")
     return 0
 

@@ -1,23 +1,22 @@
-"""Rates against those of an earlier file, which must have been measured in the same way."""
+"""Compare rates with those of an earlier file, measured under the same conditions."""
 
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from timing import Row
-
+from benchmarks.harness.timing import Row
 from jetbot_mjx.errors import UserError
 
 MOST_SLOWDOWN = 0.05
-"""What a rate may lose before it counts as slower."""
+"""The relative loss above which a rate counts as slower."""
 
 _SAME = ("device", "platform", "device_count", "cpu_cores", "xla_flags")
 _SAME_CONDITIONS = ("unroll", "training_steps", "matmul_precision")
 
 
 class Change(NamedTuple):
-    """One rate, then and now, in environment steps per second."""
+    """A `Change` holds one rate, before and after, in environment steps per second."""
 
     rate: str
     num_envs: int
@@ -26,27 +25,27 @@ class Change(NamedTuple):
 
     @property
     def relative(self) -> float:
-        """How much faster, as a share of what it was."""
+        """Return the relative change of the rate; positive: faster."""
         return self.after / self.before - 1
 
     @property
     def is_slower(self) -> bool:
-        """Whether it lost more than it may."""
+        """Return whether the loss is larger than `MOST_SLOWDOWN`."""
         return self.relative < -MOST_SLOWDOWN
 
 
 def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[tuple[str, int], float]:
-    """Reads an earlier file.
+    """Return the rates of an earlier file.
 
     Args:
-      path: of the file.
-      conditions: of the measurement that is compared with it.
+      path: The path of the file.
+      conditions: The conditions of the measurement that is compared with it.
 
     Returns:
       Environment steps per second by (rate, num_envs).
 
     Raises:
-      UserError: it is no file of rates, or of another device or configuration.
+      UserError: The file contains no rates, or those of another device or configuration.
     """
     try:
         values = json.loads(path.read_text(encoding="utf-8"))
@@ -57,7 +56,7 @@ def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[tuple[str, 
         raise UserError(f"--compare {path} cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):
         raise UserError(
-            f"--compare {path} holds no rates: give a file that steps_per_second.py wrote"
+            f"--compare {path} contains no rates: give a file that steps_per_second.py wrote"
         ) from None
     for name, before, after in _differences(values, conditions):
         raise UserError(
@@ -68,7 +67,7 @@ def read_baseline(path: Path, conditions: Mapping[str, Any]) -> dict[tuple[str, 
 
 
 def changes(rows: Sequence[Row], baseline: Mapping[tuple[str, int], float]) -> list[Change]:
-    """Every rate that both have."""
+    """Return the changes of all rates that were measured both times."""
     return [
         Change(row.rate, row.num_envs, before, row.env_steps_per_second)
         for row in rows
@@ -77,7 +76,7 @@ def changes(rows: Sequence[Row], baseline: Mapping[tuple[str, int], float]) -> l
 
 
 def _differences(before: Any, after: Any) -> list[tuple[str, Any, Any]]:
-    """(name, before, after) of what must be the same and is not."""
+    """Return (name, before, after) for each condition that must be equal and differs."""
     pairs = [(name, before.get(name), after[name]) for name in _SAME]
     old, new = before.get("conditions", {}), after["conditions"]
     pairs += [(name, old.get(name), new[name]) for name in _SAME_CONDITIONS]

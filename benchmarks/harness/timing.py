@@ -1,6 +1,8 @@
-"""The clock that programs are held to, and what it says of one.
+"""Time compiled programs.
 
-Of the robots nothing is known here but that they must still stand at the end.
+`TimedProgram` compiles a step, warms it up and times it. Every call continues from the state that
+the last one returned, and every step adds all its outputs to a checksum, so that the compiler
+can remove no part of it.
 """
 
 import math
@@ -25,40 +27,41 @@ Z_RANGE = (0.5 * WHEEL_RADIUS, 1.5 * WHEEL_RADIUS)  # [m] axle of a robot on its
 
 
 class Row(NamedTuple):
-    """One rate at one number of environments."""
+    """A `Row` holds one rate at one number of environments."""
 
     rate: str
     num_envs: int
     env_steps_per_second: float
     """Median of the repeats, summed over the environments."""
     physics_steps_per_second: float
-    """The same, times the physics steps in an environment step."""
+    """`env_steps_per_second` times the physics steps in an environment step."""
     microseconds_per_step: float
     """Median time in which all environments together make one step [µs]."""
     compile_seconds: float
-    """Tracing, lowering and compiling [s]; no part of the rates."""
+    """Time of tracing, lowering and compiling [s]; it is not part of the rates."""
     repeats: list[float]
     """`env_steps_per_second` of each repeat."""
     steps_per_repeat: int
-    """Steps that each environment made in one repeat."""
+    """Steps that each environment makes in one repeat."""
     episodes_per_env_step: float | None = None
     """Share of the steps that ended an episode; None: not counted."""
     nonfinite_envs: int | None = None
-    """Worlds that blew up and were reset, warm-up included; None: not counted."""
+    """Non-finite states that were reset, warm-up included; None: not counted."""
     peak_device_bytes: int | None = None
-    """Most memory that one device had in use so far in this process; None: it does not tell."""
+    """Peak memory of one device so far in this process; None: the device does not report it."""
 
 
 class Tally(NamedTuple):
-    """What every step adds to, so that the compiler can leave no part of a step out."""
+    """A `Tally` holds the sums to which every step adds, one value for each environment."""
 
     checksum: Float[Array, " n"]
+    """Sum of all outputs, so that the compiler cannot remove any part of a step."""
     episodes: Float[Array, " n"]
     nonfinite: Float[Array, " n"]
 
 
 class Carry(NamedTuple):
-    """What one call hands to the next: a state, a key, and the sums."""
+    """A `Carry` holds what one step passes to the next: a state, a key and the sums."""
 
     state: Any
     key: UInt32[Array, "2"]
@@ -68,10 +71,10 @@ class Carry(NamedTuple):
 Step = Callable[[Carry], Carry]
 
 
-class Timed:
-    """A program that is compiled and warm, and is timed once for every call of `repeat`.
+class TimedProgram:
+    """A compiled and warmed-up program, timed once by every call of `repeat`.
 
-    What it returns goes into its next call: robots drive on.
+    The output of each call is the input of the next, so that the robots continue to drive.
     """
 
     def __init__(
@@ -85,16 +88,16 @@ class Timed:
         length: int = 1,
         check: Callable[[str, Carry], None] | None = None,
     ) -> None:
-        """Compiles `calls` of a step of `length` environment steps into one program.
+        """Compile a scan over `step` into one program and warm it up.
 
         Args:
-          rate: its name.
-          step: of all environments.
-          first: the state to begin with; its leaves begin with the axis of the environments.
-          n_substeps: physics steps in an environment step.
-          calls: of `step` in the program.
-          length: environment steps in one of them.
-          check: refuses a state at the end that means nothing; None: of the robots.
+          rate: The name of the rate.
+          step: A step of all environments; it makes `length` environment steps.
+          first: The initial state; the first axis of its leaves is that of the environments.
+          n_substeps: The number of physics steps in an environment step.
+          calls: The number of calls of `step` in the program.
+          length: The number of environment steps in one call of `step`.
+          check: Raises an error for an invalid final state; None: checks that the robots stand.
         """
         self.rate = rate
         self.num_envs = jax.tree.leaves(first)[0].shape[0]
@@ -108,27 +111,24 @@ class Timed:
         def run(carry: Carry) -> Carry:
             return jax.lax.scan(lambda carry, _: (step(carry), None), carry, length=calls)[0]
 
-        begun = time.perf_counter()
+        start = time.perf_counter()
         self._program = jax.jit(run).lower(self._carry).compile()
-        self.compile_seconds = time.perf_counter() - begun
-        seconds = math.inf
-        for _ in range(WARM_UP_CALLS):
-            seconds = self._clocked(1)
-        self._calls = max(1, math.ceil(REPEAT_SECONDS / seconds))
+        self.compile_seconds = time.perf_counter() - start
+        self._calls = warm_up(self._time_calls)
 
     def repeat(self) -> float:
-        """Environment steps per second over one repeat, summed over the environments."""
-        seconds = self._clocked(self._calls)
+        """Return the environment steps per second of one repeat, summed over the environments."""
+        seconds = self._time_calls(self._calls)
         return self.num_envs * self._calls * self._steps_per_call / seconds
 
     def row(self, repeats: list[float]) -> Row:
-        """What was measured.
+        """Return the measured row.
 
         Args:
-          repeats: what `repeat` returned.
+          repeats: The values that `repeat` returned.
 
         Raises:
-          UserError: worlds blew up, so that the rates mean nothing.
+          UserError: A state is not finite, or a robot has left the floor.
         """
         self._check(self.rate, self._carry)
         row = make_row(
@@ -145,14 +145,27 @@ class Timed:
             nonfinite_envs=int(tally.nonfinite.sum()),
         )
 
-    def _clocked(self, calls: int) -> float:
-        """Calls the program, each time on what it last returned, and takes the time [s]."""
-        begun = time.perf_counter()
+    def _time_calls(self, calls: int) -> float:
+        """Call the program, each time on its last output, and return the time [s]."""
+        start = time.perf_counter()
         for _ in range(calls):
             self._carry = self._program(self._carry)
         jax.block_until_ready(self._carry)
         self._steps += calls * self._steps_per_call
-        return time.perf_counter() - begun
+        return time.perf_counter() - start
+
+
+def warm_up(time_calls: Callable[[int], float], at_least: int = 1) -> int:
+    """Warm up and return how many calls fill a repeat of `REPEAT_SECONDS`.
+
+    Args:
+      time_calls: Makes the given number of calls and returns their time [s].
+      at_least: The smallest number of calls, also in the warm-up.
+    """
+    seconds = math.inf
+    for _ in range(WARM_UP_CALLS):
+        seconds = time_calls(at_least) / at_least
+    return max(at_least, math.ceil(REPEAT_SECONDS / seconds))
 
 
 def make_row(
@@ -163,7 +176,7 @@ def make_row(
     repeats: list[float],
     steps_per_repeat: int,
 ) -> Row:
-    """A row from its repeats, as `Row` describes them; what else it may hold is not counted."""
+    """Return a row computed from its repeats; `Row` describes the arguments."""
     median = statistics.median(repeats)
     return Row(
         rate=rate,
@@ -184,47 +197,50 @@ def _peak_device_bytes() -> int | None:
 
 
 def _check_robots(rate: str, carry: Carry) -> None:
-    """Refuses the rate of robots that no longer exist: what is not a number steps fast."""
+    """Raise an error unless all states are finite and all robots stand on their wheels.
+
+    Steps of non-finite states can be faster, so that their rate would be misleading.
+    """
     state = carry.state
     physics = state if isinstance(state, PhysicsState) else state.pipeline_state
     z = np.asarray(physics.qpos[:, 2])
-    sound = (z > Z_RANGE[0]) & (z < Z_RANGE[1])
+    valid = (z > Z_RANGE[0]) & (z < Z_RANGE[1])
     for leaf in jax.tree.leaves((physics, carry.tally)):
-        sound &= np.isfinite(np.asarray(leaf).reshape(z.size, -1)).all(axis=1)
-    if not sound.all():
+        valid &= np.isfinite(np.asarray(leaf).reshape(z.size, -1)).all(axis=1)
+    if not valid.all():
         raise UserError(
-            f"{rate} at {z.size} environments: {z.size - sound.sum()} worlds are not finite, or"
+            f"{rate} at {z.size} environments: {z.size - valid.sum()} states are not finite, or"
             " their robots not on the floor, so that the rate means nothing"
         )
 
 
 def available_cores() -> int:
-    """CPU cores that this process may run on."""
+    """Return the number of CPU cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def env_keys(num_envs: int) -> UInt32[Array, "n 2"]:
-    """Keys for the first reset of every environment."""
+    """Return one key for the first reset of each environment."""
     return jax.random.split(jax.random.PRNGKey(0), num_envs)
 
 
 def random_actions(
     key: UInt32[Array, "2"], num_envs: int, size: int = 2
 ) -> tuple[UInt32[Array, "2"], Float[Array, "n a"]]:
-    """Actions of this size, uniform in [-1, 1], and the key for the next ones."""
+    """Return the next key, and actions of the given size that are uniform in [-1, 1]."""
     key, action_key = jax.random.split(key)
     return key, jax.random.uniform(action_key, (num_envs, size), minval=-1.0, maxval=1.0)
 
 
-def sums(tree: PyTree) -> Float[Array, " n"]:
-    """One sum for each environment over everything in a tree."""
+def sum_per_env(tree: PyTree) -> Float[Array, " n"]:
+    """Return for each environment the sum over all leaves of a tree."""
     leaves = [leaf.reshape(leaf.shape[0], -1) for leaf in jax.tree.leaves(tree)]
     zeros = jnp.zeros(leaves[0].shape[0])
     return sum((leaf.astype(jnp.float32).sum(axis=1) for leaf in leaves), zeros)
 
 
-def add(total: Tally, step: Tally) -> Tally:
-    """The sums, one step further."""
+def add_tallies(total: Tally, step: Tally) -> Tally:
+    """Return the sums after one more step."""
     return jax.tree.map(jnp.add, total, step)

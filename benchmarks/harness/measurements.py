@@ -1,9 +1,9 @@
-"""What is measured: six programs, each held to the clock of `timing.py`.
+"""Measure six rates, each of a program of its own.
 
-Nothing here prints or parses; `steps_per_second.py` beside this file is the command.
+`benchmarks/steps_per_second.py` is the command; this module neither prints nor parses.
 """
 
-# First, before Brax imports MJX and lets it print.
+# First, because MJX prints when Brax imports it.
 import jetbot_mjx  # noqa: F401  isort: skip
 
 import math
@@ -17,8 +17,18 @@ from brax.training import acting
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, PyTree
-from timing import Carry, Row, Tally, Timed, add, env_keys, make_row, random_actions, sums
 
+from benchmarks.harness.timing import (
+    Carry,
+    Row,
+    Tally,
+    TimedProgram,
+    add_tallies,
+    env_keys,
+    make_row,
+    random_actions,
+    sum_per_env,
+)
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
@@ -30,11 +40,11 @@ from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 
 _LONGEST_HOLD = 24  # environment steps
-WARM_UP_INTERVALS = 2  # the first compiles; the second, the little that runs between intervals
+WARM_UP_INTERVALS = 2  # the first compiles; the second compiles what runs between intervals
 
 
 class Sizes(NamedTuple):
-    """How much is measured."""
+    """`Sizes` holds how much is measured."""
 
     repeats: int = 5
     unroll: int = 64
@@ -43,36 +53,39 @@ class Sizes(NamedTuple):
     """Training steps in one repeat of `training`."""
 
 
-def _measure(timed: Timed, sizes: Sizes) -> Row:
+def _measure(timed: TimedProgram, sizes: Sizes) -> Row:
     return timed.row([timed.repeat() for _ in range(sizes.repeats)])
 
 
-def prepare_physics(config: Config, num_envs: int, sizes: Sizes) -> Timed:
-    """The physics of robots that drive about, each under random actions of its own."""
+def _measure_physics(timed: TimedProgram, sizes: Sizes) -> Row:
+    # Without a wrapper no episode ends and no state is reset, so nothing is counted.
+    return _measure(timed, sizes)._replace(episodes_per_env_step=None, nonfinite_envs=None)
+
+
+def prepare_physics(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
+    """Compile the physics alone, under random actions in every step."""
     env = make_env(config)
 
     def step(carry: Carry) -> Carry:
         key, actions = random_actions(carry.key, num_envs)
         physics = jax.vmap(env.step_physics)(carry.state, jax.vmap(env.wheel_targets)(actions))
-        checksum = carry.tally.checksum + sums(physics)
+        checksum = carry.tally.checksum + sum_per_env(physics)
         return Carry(physics, key, carry.tally._replace(checksum=checksum))
 
     first = jax.jit(jax.vmap(env.reset))(env_keys(num_envs)).pipeline_state
     n_substeps = config.physics.n_substeps
-    return Timed("physics", step, first, n_substeps=n_substeps, calls=sizes.unroll)
+    return TimedProgram("physics", step, first, n_substeps=n_substeps, calls=sizes.unroll)
 
 
 def measure_physics(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times the physics alone."""
-    row = _measure(prepare_physics(config, num_envs, sizes), sizes)
-    # Here no wrapper ends episodes or mends worlds; only the last look tells of them.
-    return row._replace(episodes_per_env_step=None, nonfinite_envs=None)
+    """Time the physics alone under random actions."""
+    return _measure_physics(prepare_physics(config, num_envs, sizes), sizes)
 
 
 def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Time the physics alone under commands of ±1, as trained policies give them.
 
-    Each robot holds its commands for as many steps as it has drawn, 1 to 24.
+    Each robot holds every command for a fixed number of steps, drawn from 1 to 24.
     """
     env = make_env(config)
     robots = env_keys(num_envs)
@@ -85,39 +98,39 @@ def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
     def step(carry: Carry) -> Carry:
         actions = jax.vmap(action)(robots, holds, carry.state.time)
         physics = jax.vmap(env.step_physics)(carry.state, jax.vmap(env.wheel_targets)(actions))
-        checksum = carry.tally.checksum + sums(physics)
+        checksum = carry.tally.checksum + sum_per_env(physics)
         return Carry(physics, carry.key, carry.tally._replace(checksum=checksum))
 
     first = jax.jit(jax.vmap(env.reset))(robots).pipeline_state
     n_substeps = config.physics.n_substeps
-    timed = Timed("switched", step, first, n_substeps=n_substeps, calls=sizes.unroll)
-    row = _measure(timed, sizes)
-    return row._replace(episodes_per_env_step=None, nonfinite_envs=None)
+    timed = TimedProgram("switched", step, first, n_substeps=n_substeps, calls=sizes.unroll)
+    return _measure_physics(timed, sizes)
 
 
-def prepare_env(config: Config, num_envs: int, sizes: Sizes) -> Timed:
-    """The environment as trainers see it, under random actions."""
+def prepare_env(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram:
+    """Compile the environment with the training wrappers, under random actions."""
     env = make_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
 
     def step(carry: Carry) -> Carry:
         key, actions = random_actions(carry.key, num_envs)
         state = batch.step(carry.state, actions)
-        told = (state.obs, state.reward, state.done, state.metrics, state.info)
-        return Carry(state, key, add(carry.tally, Tally(sums(told), *_ended(state.info))))
+        outputs = (state.obs, state.reward, state.done, state.metrics, state.info)
+        tally = Tally(sum_per_env(outputs), *_count_ends(state.info))
+        return Carry(state, key, add_tallies(carry.tally, tally))
 
     first = jax.jit(batch.reset)(env_keys(num_envs))
     n_substeps = config.physics.n_substeps
-    return Timed("env", step, first, n_substeps=n_substeps, calls=sizes.unroll)
+    return TimedProgram("env", step, first, n_substeps=n_substeps, calls=sizes.unroll)
 
 
 def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times the environment as trainers see it."""
+    """Time the environment with the training wrappers under random actions."""
     return _measure(prepare_env(config, num_envs, sizes), sizes)
 
 
 def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times Brax's own collection of data, under fresh networks of the configured sizes."""
+    """Time Brax's `generate_unroll` with untrained networks of the configured sizes."""
     env = make_env(config)
     batch = wrap_for_training(env, config.task.episode_length)
     policy = _exploring_policy(config, env)
@@ -127,74 +140,76 @@ def measure_rollout(config: Config, num_envs: int, sizes: Sizes) -> Row:
     def unroll(carry: Carry) -> Carry:
         key, unroll_key = jax.random.split(carry.key)
         state, data = acting.generate_unroll(batch, carry.state, policy, unroll_key, length, fields)
-        checksum = sums(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data))
-        ended = _ended(data.extras["state_extras"])
-        tally = Tally(checksum, *(each.sum(axis=0) for each in ended))
-        return Carry(state, key, add(carry.tally, tally))
+        checksum = sum_per_env(jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), data))
+        ends = _count_ends(data.extras["state_extras"])
+        tally = Tally(checksum, *(each.sum(axis=0) for each in ends))
+        return Carry(state, key, add_tallies(carry.tally, tally))
 
     first = jax.jit(batch.reset)(env_keys(num_envs))
     calls = math.ceil(sizes.unroll / length)
     n_substeps = config.physics.n_substeps
-    timed = Timed("rollout", unroll, first, n_substeps=n_substeps, calls=calls, length=length)
+    timed = TimedProgram(
+        "rollout", unroll, first, n_substeps=n_substeps, calls=calls, length=length
+    )
     return _measure(timed, sizes)
 
 
-class Listener(TrainerCallback):
-    """Keeps neither logs nor checkpoints, only times."""
+class IntervalTimer(TrainerCallback):
+    """A callback that records the times of the training intervals and writes nothing."""
 
     def __init__(self, clock: CompileClock) -> None:
-        """Prepares an empty list.
+        """Start without recorded intervals.
 
         Args:
-          clock: of the compiler.
+          clock: Measures the time that JAX compiles.
         """
         self._clock = clock
         self.rows: list[tuple[int, float, float]] = []
-        """Environment steps, seconds since the last report, compilation among them."""
+        """For each interval: environment steps so far, its seconds, its compile seconds."""
         self.finite = True
 
     def on_interval(self, progress: Sequence[Progress]) -> bool:
-        """Notes the times."""
+        """Record the times of one interval."""
         one = progress[0]
         compiling = self._clock.lap()
-        # The resumable trainer's seconds are those of its compiled step alone.
-        inside = compiling if one.state is None else 0.0
-        self.rows.append((one.env_steps, one.seconds - inside, compiling))
+        # The resumable trainer reports the seconds of its compiled step without compilation.
+        included = compiling if one.state is None else 0.0
+        self.rows.append((one.env_steps, one.seconds - included, compiling))
         self.finite &= all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(one.params))
         return True
 
 
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times the resumable trainer by its own reports, the first intervals left out."""
+    """Time the resumable trainer by its own reports, without the first intervals."""
     config = training_config(config, num_envs, sizes, trainer="resumable")
     program = ppo_trainer.CompiledTrainer(config, make_env(config))
     preemption = Preemption(config.preemption_notice)
     return _time_trainer(
-        "training", config, lambda to: ppo_trainer.train(config, program, to, preemption)
+        "training", config, lambda timer: ppo_trainer.train(config, program, timer, preemption)
     )
 
 
-def measure_stock(config: Config, num_envs: int, sizes: Sizes) -> Row:
-    """Times Brax's own `ppo.train` under the same hyperparameters in the same way."""
+def measure_brax(config: Config, num_envs: int, sizes: Sizes) -> Row:
+    """Time Brax's own `ppo.train` with the same hyperparameters in the same way."""
     config = training_config(config, num_envs, sizes, trainer="brax")
     env = make_env(config)
-    return _time_trainer("stock", config, lambda to: brax_trainer.train(config, env, to))
+    return _time_trainer("brax", config, lambda timer: brax_trainer.train(config, env, timer))
 
 
-def _time_trainer(rate: str, config: Config, train: Callable[[Listener], None]) -> Row:
+def _time_trainer(rate: str, config: Config, train: Callable[[IntervalTimer], None]) -> Row:
     num_envs = config.ppo.num_envs
     with CompileClock() as clock:
-        reports = Listener(clock)
-        train(reports)
-    if not reports.finite:
+        timer = IntervalTimer(clock)
+        train(timer)
+    if not timer.finite:
         raise UserError(f"training at {num_envs} environments: the parameters are not finite")
-    steps = np.diff([env_steps for env_steps, _, _ in reports.rows])
-    rates = (steps / [seconds for _, seconds, _ in reports.rows[1:]]).tolist()
+    steps = np.diff([env_steps for env_steps, _, _ in timer.rows])
+    rates = (steps / [seconds for _, seconds, _ in timer.rows[1:]]).tolist()
     return make_row(
         rate,
         config.physics.n_substeps,
         num_envs,
-        sum(compiling for _, _, compiling in reports.rows),
+        sum(compiling for _, _, compiling in timer.rows),
         rates[WARM_UP_INTERVALS:],
         int(steps[-1]) // num_envs,
     )
@@ -206,34 +221,34 @@ MEASUREMENTS: dict[str, Callable[[Config, int, Sizes], Row]] = {
     "env": measure_env,
     "rollout": measure_rollout,
     "training": measure_training,
-    "stock": measure_stock,
+    "brax": measure_brax,
 }
-"""By the name of the rate: each takes a configuration and a number of environments."""
+"""The functions that measure the rates, by the name of the rate."""
 
 
 def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -> Config:
-    """The configuration with which `training` and `stock` are measured.
+    """Return the configuration with which `training` and `brax` are measured.
 
-    One training step learns from one unroll of every environment. The number of minibatches
-    stays; their size follows the number of environments.
+    One training step learns from one unroll of every environment. The number of minibatches is
+    unchanged; their size depends on the number of environments.
 
     Args:
-      config: the run's.
-      num_envs: environments, over all devices.
-      sizes: repeats, and training steps in each.
-      trainer: as in the configuration.
+      config: The configuration of the run.
+      num_envs: The number of environments on all devices together.
+      sizes: The number of repeats, and of training steps in each.
+      trainer: The trainer, as in the configuration.
 
     Returns:
       The adapted configuration.
 
     Raises:
-      UserError: the environments cannot be dealt into the minibatches or over the devices.
+      UserError: The environments cannot be divided among the minibatches or the devices.
     """
     minibatches = config.ppo.num_minibatches
     if num_envs % minibatches:
         fit = minibatches * max(1, round(num_envs / minibatches))
         raise UserError(
-            f"--num-envs {num_envs} cannot be dealt into ppo.num_minibatches = {minibatches}:"
+            f"--num-envs {num_envs} cannot be divided by ppo.num_minibatches = {minibatches}:"
             f" for example {fit}, or --skip training"
         )
     interval = num_envs * config.ppo.unroll_length * sizes.training_steps
@@ -245,7 +260,7 @@ def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -
         "num_timesteps": interval * (WARM_UP_INTERVALS + sizes.repeats),
     }
     if trainer == "brax":
-        # What it does not know, and costs nothing that could be timed.
+        # Brax has neither setting, and their cost is too small to be measured.
         values["ppo"]["normalizer"] = "brax"
         if config.ppo.learning_rate_schedule == "LINEAR":
             values["ppo"]["learning_rate_schedule"] = "NONE"
@@ -255,7 +270,7 @@ def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -
 
 
 def _exploring_policy(config: Config, env: JetBotEnv) -> Callable[..., Any]:
-    """Brax's sampling policy, as its trainer builds it, on freshly initialised networks."""
+    """Return Brax's sampling policy, as its trainer builds it, with untrained networks."""
     networks = make_networks(
         config.ppo.network,
         env.observation_size,
@@ -269,7 +284,7 @@ def _exploring_policy(config: Config, env: JetBotEnv) -> Callable[..., Any]:
     return ppo_networks.make_inference_fn(networks)((normalizer, weights))
 
 
-def _ended(info: PyTree) -> tuple[Array, Array]:
-    """Where episodes ended, and where they did because the world blew up."""
+def _count_ends(info: PyTree) -> tuple[Array, Array]:
+    """Return masks of the episodes that ended and of those that ended in a non-finite state."""
     done = info["episode_done"]
     return done, done * info["episode_metrics"]["nonfinite_envs"]

@@ -1,4 +1,4 @@
-"""Files of results: the conditions that they hold for, and where they lie."""
+"""Write files of results together with the conditions under which they were measured."""
 
 import datetime
 import os
@@ -8,19 +8,18 @@ from pathlib import Path
 from typing import Any
 
 import jax
-from measurements import WARM_UP_INTERVALS, Sizes
-from timing import WARM_UP_CALLS, available_cores
 
+from benchmarks import RESULTS
+from benchmarks.harness.measurements import WARM_UP_INTERVALS, Sizes
+from benchmarks.harness.timing import WARM_UP_CALLS, available_cores
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import versions, write_json
 
-FOLDER = Path(__file__).resolve().parent / "results"
-
 
 def conditions(config: Config, sizes: Sizes) -> dict[str, Any]:
-    """What rates hold for, as JSON."""
+    """Return as JSON under which conditions rates are measured: device, versions, configuration."""
     device = jax.devices()[0]
     return {
         "device": device.device_kind,
@@ -35,26 +34,26 @@ def conditions(config: Config, sizes: Sizes) -> dict[str, Any]:
             **sizes._asdict(),
             "warm_up_calls": WARM_UP_CALLS,
             "warm_up_intervals": WARM_UP_INTERVALS,
-            # Of the networks; null is the back end's own choice. Physics sets its own.
+            # For the networks; null is the back end's default. Physics sets its own precision.
             "matmul_precision": jax.config.values["jax_default_matmul_precision"],
-            # Where there is one, a compile time may be that of reading from it.
+            # With a cache, a compile time may be the time to read from it.
             "compilation_cache": jax.config.values["jax_compilation_cache_dir"] is not None,
         },
     }
 
 
 def default_output(prefix: str = "") -> Path:
-    """`results/<prefix><device>.json`, with the number of devices if there are more."""
+    """Return `results/<prefix><device>.json`, with the number of devices if there are several."""
     name = re.sub(r"[^a-z0-9]+", "-", jax.devices()[0].device_kind.lower()).strip("-")
     count = jax.device_count()
-    return FOLDER / (prefix + (f"{name}-x{count}.json" if count > 1 else f"{name}.json"))
+    return RESULTS / (prefix + (f"{name}-x{count}.json" if count > 1 else f"{name}.json"))
 
 
 def check_output(path: Path) -> None:
-    """Finds out before minutes of measuring whether the file can be written.
+    """Check before minutes of measuring that the file can be written.
 
     Raises:
-      UserError: it cannot.
+      UserError: It cannot be written.
     """
     if path.is_dir():
         raise UserError(f"--output {path} is a folder: name a file in it")
@@ -65,10 +64,10 @@ def check_output(path: Path) -> None:
 
 
 def write(path: Path, values: dict[str, Any]) -> None:
-    """Writes a file of results.
+    """Write a file of results.
 
     Raises:
-      UserError: it cannot be written.
+      UserError: The file cannot be written.
     """
     try:
         write_json(path, values)
@@ -77,5 +76,5 @@ def write(path: Path, values: dict[str, Any]) -> None:
 
 
 def counts(text: str) -> Sequence[int]:
-    """An argument that counts several things, as in 256,1024."""
+    """Parse an argument that lists several counts, as in `256,1024`."""
     return [cli.positive_int(part) for part in text.split(",")]

@@ -1,20 +1,20 @@
-"""What the adapters make of the robot, in one run: `python benchmarks/adapters.py`.
+"""Measure the Gymnasium and Stable-Baselines3 adapters: `python benchmarks/throughput/adapters.py`.
 
-  numpy     one robot as people write it for Gymnasium: C MuJoCo and NumPy (`one_robot.py`)
-  gym       `JetBotGymEnv`: C MuJoCo and the task's own code
-  vector    `JetBotVectorEnv`, the batch in MJX
-  vecenv    `JetBotVecEnv`, the same for Stable-Baselines3
-  sb3       Stable-Baselines3's PPO with the tutorial's hyperparameters, on numpy
-  sb3-gym   the same on gym
-  sb3-vec   the same on vecenv: as many steps between two updates, of all robots together
+  numpy     one robot in C MuJoCo and NumPy, without this package (`one_robot.py`)
+  gym       `JetBotGymEnv`: one robot in C MuJoCo with the task's own code
+  vector    `JetBotVectorEnv`: a batch of robots in MJX
+  vecenv    `JetBotVecEnv`: the same batch for Stable-Baselines3
+  sb3       Stable-Baselines3's PPO with the tutorial's hyperparameters, on `numpy`
+  sb3-gym   the same PPO on `gym`
+  sb3-vec   the same PPO on `vecenv`, with equally many steps of all robots between two updates
 
-All rates are environment steps per second, from Python, resets included; the first four are under
-random actions. All take turns. PyTorch has one thread, which is the fastest for such networks.
+All rates are environment steps per second as called from Python, including resets; the first four
+use random actions. All are timed in turn. PyTorch uses one thread, the fastest for such networks.
 """
 
 import argparse
 import importlib
-import math
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,69 +22,66 @@ from typing import Any
 
 import jax
 import numpy as np
-from compare import TABLE_HEAD, in_turns, missing, table_row
-from contenders import Contender, Sb3, as_gymnasium
-from measurements import Sizes
-from one_robot import OneRobot
-from results import check_output, conditions, counts, default_output, write
-from timing import REPEAT_SECONDS, WARM_UP_CALLS, Row, make_row
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import CONFIGS
+from benchmarks.harness.measurements import Sizes
+from benchmarks.harness.results import check_output, conditions, counts, default_output, write
+from benchmarks.harness.timing import Row, make_row, warm_up
+from benchmarks.throughput.baselines import Benchmark, Sb3, as_gymnasium
+from benchmarks.throughput.compare import TABLE_HEAD, in_turns, missing, table_row
+from benchmarks.throughput.one_robot import OneRobot
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
 
-_CONFIG = Path(__file__).resolve().parents[1] / "configs" / "jetbot.yaml"
 _ACTIONS = 1024
+_LEAST_CALLS = 64
 
 
-class Stepped:
-    """An environment under random actions, one call at a time."""
+class SteppedEnv:
+    """An environment that is stepped from Python under random actions."""
 
     def __init__(self, rate: str, env: Any, config: Config) -> None:
-        """Takes it through some seconds of driving.
+        """Draw the actions and warm up.
 
         Args:
-          rate: what the row is called.
-          env: a `gymnasium.Env`, `VectorEnv` or `VecEnv`.
-          config: robot, task and physics.
+          rate: The name of the row.
+          env: A `gymnasium.Env`, `VectorEnv` or `VecEnv`.
+          config: The robot, task and physics.
         """
         self.rate, self.num_envs = rate, getattr(env, "num_envs", 1)
         self._env, self._n_substeps = env, config.physics.n_substeps
-        self._resets = not hasattr(env, "num_envs")
-        shape = (_ACTIONS, 2) if self._resets else (_ACTIONS, self.num_envs, 2)
+        self._is_single = not hasattr(env, "num_envs")  # batches reset themselves
+        shape = (_ACTIONS, 2) if self._is_single else (_ACTIONS, self.num_envs, 2)
         self._actions = np.random.default_rng(0).uniform(-1.0, 1.0, shape).astype(np.float32)
         env.reset()
-        seconds = math.inf
-        for _ in range(WARM_UP_CALLS):
-            seconds = self._clocked(64) / 64
-        self._calls = max(64, math.ceil(REPEAT_SECONDS / seconds))
+        self._calls = warm_up(self._time_calls, at_least=_LEAST_CALLS)
 
     def repeat(self) -> float:
-        """Environment steps per second over one repeat."""
-        return self.num_envs * self._calls / self._clocked(self._calls)
+        """Return the environment steps per second of one repeat."""
+        return self.num_envs * self._calls / self._time_calls(self._calls)
 
     def row(self, repeats: list[float]) -> Row:
-        """What was measured."""
+        """Return the measured row."""
         return make_row(self.rate, self._n_substeps, self.num_envs, 0.0, repeats, self._calls)
 
-    def _clocked(self, calls: int) -> float:
-        begun = time.perf_counter()
+    def _time_calls(self, calls: int) -> float:
+        start = time.perf_counter()
         for index in range(calls):
             result = self._env.step(self._actions[index % _ACTIONS])
-            if self._resets and (result[2] or result[3]):
+            if self._is_single and (result[2] or result[3]):
                 self._env.reset()
-        return time.perf_counter() - begun
+        return time.perf_counter() - start
 
 
-def prepare(config: Config, num_envs: Sequence[int]) -> list[Contender]:
-    """Builds all that takes turns.
+def prepare(config: Config, num_envs: Sequence[int]) -> list[Benchmark]:
+    """Build all benchmarks.
 
     Args:
-      config: robot, task and physics.
-      num_envs: sizes of the batches; PPO takes the last.
-
-    Returns:
-      The contenders.
+      config: The robot, task and physics.
+      num_envs: The sizes of the batches; PPO uses the last one.
     """
     adapters = importlib.import_module("jetbot_mjx.adapters")
     sb3 = importlib.import_module("jetbot_mjx.adapters.stable_baselines3")
@@ -92,15 +89,15 @@ def prepare(config: Config, num_envs: Sequence[int]) -> list[Contender]:
         "vector": adapters.JetBotVectorEnv,
         "vecenv": sb3.JetBotVecEnv,
     }
-    contenders: list[Contender] = [
-        Stepped("numpy", as_gymnasium(OneRobot(config)), config),
-        Stepped("gym", adapters.JetBotGymEnv(config=config), config),
+    benchmarks: list[Benchmark] = [
+        SteppedEnv("numpy", as_gymnasium(OneRobot(config)), config),
+        SteppedEnv("gym", adapters.JetBotGymEnv(config=config), config),
     ]
     for rate, make in makers.items():
-        contenders += [Stepped(rate, make(count, config=config), config) for count in num_envs]
+        benchmarks += [SteppedEnv(rate, make(count, config=config), config) for count in num_envs]
     vec_env = sb3.JetBotVecEnv(num_envs[-1], config=config)
     return [
-        *contenders,
+        *benchmarks,
         Sb3(config),
         Sb3(config, adapters.JetBotGymEnv(config=config), rate="sb3-gym"),
         Sb3(config, vec_env, rate="sb3-vec"),
@@ -109,7 +106,9 @@ def prepare(config: Config, num_envs: Sequence[int]) -> list[Contender]:
 
 def _parser() -> argparse.ArgumentParser:
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--config", type=Path, default=_CONFIG, help="default: configs/jetbot.yaml")
+    parser.add_argument(
+        "--config", type=Path, default=CONFIGS / "jetbot.yaml", help="default: configs/jetbot.yaml"
+    )
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--num-envs", type=counts, default=(16, 64), metavar="N,N,...")
     parser.add_argument("--repeats", type=cli.positive_int, default=5, help="rounds (default: 5)")
@@ -118,16 +117,16 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, measures, prints the table and writes the JSON file.
+    """Measure, print the table and write the JSON file.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
       The exit code.
 
     Raises:
-      UserError: a package is missing, or the file cannot be written.
+      UserError: A package is missing, or the file cannot be written.
     """
     options = _parser().parse_args(arguments)
     if line := missing("sb3"):

@@ -1,37 +1,37 @@
-"""Writes the measured tables of the READMEs: `python benchmarks/readme_table.py`.
+"""Write the measured tables of the documentation: `python benchmarks/harness/readme_table.py`.
 
-All comes from benchmarks/results/*.json, whatever files are there: those of `time_to_success.py`,
-`steps_per_second.py`, `compare.py` and `adapters.py` are known by what is in them, others are
-passed over. Each table stands between two comments, `<!-- NAME: begin ... -->` and
-`<!-- NAME: end -->`.
+The tables contain the numbers of all files `benchmarks/results/*.json` that `time_to_success.py`,
+`steps_per_second.py`, `compare.py` or `adapters.py` wrote; their keys identify them. Each table
+stands between two comments, `<!-- NAME: begin ... -->` and `<!-- NAME: end -->`.
 """
 
 import json
 import re
 import statistics
+import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import RESULTS, ROOT
+from benchmarks.harness.formatting import format_count, format_spread
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import write_text
 
-ROOT = Path(__file__).resolve().parents[1]
-_RATES = ("physics", "switched", "env", "rollout", "training", "stock")
+_RATES = ("physics", "switched", "env", "rollout", "training", "brax")
 
 Results = Mapping[str, Mapping[str, Any]]
-"""Content of every file of results, by its name."""
+"""The content of each file of results, by the name of the file."""
 
 
 def read_results(folder: Path) -> Results:
-    """Reads all files of results.
+    """Return the content of all files of results, in the order of their names.
 
     Args:
-      folder: where they lie.
-
-    Returns:
-      Their content, in the order of their names.
+      folder: The folder of the files.
     """
     return {
         path.name: json.loads(path.read_text(encoding="utf-8"))
@@ -40,7 +40,7 @@ def read_results(folder: Path) -> Results:
 
 
 def success_table(results: Results) -> str:
-    """How long success takes: a row for each file of `time_to_success.py` and each start."""
+    """Return the times to success: a row for each file of `time_to_success.py` and each start."""
     head = (
         "machine",
         "observation",
@@ -48,14 +48,14 @@ def success_table(results: Results) -> str:
         "trainer",
         "seeds",
         "success",
-        "process, start to end",
-        "first training step after",
-        "{target} reached after",
+        "whole process",
+        "time to the first training step",
+        "time to {target}",
     )
     rows, targets = [], set()
-    for values in _holding(results, "runs"):
+    for values in _files_with(results, "runs"):
         targets.add(values["target"])
-        # Files of the stock trainer's first days do not say that each start was cold.
+        # The oldest files do not say that each start was cold.
         for start in dict.fromkeys(run.get("start", "cold") for run in values["runs"]):
             runs = [run for run in values["runs"] if run.get("start", "cold") == start]
             rows.append(_success_row(values, runs, warm=start == "warm"))
@@ -65,9 +65,9 @@ def success_table(results: Results) -> str:
 
 
 def summary_table(results: Results) -> str:
-    """How long success takes from a warm start: a row for each machine and observation."""
+    """Return the times to success from a warm start: a row for each machine and observation."""
     rows = []
-    for values in _holding(results, "runs"):
+    for values in _files_with(results, "runs"):
         runs = [run for run in values["runs"] if run.get("start") == "warm"]
         if not runs or values["config"]["trainer"] != "resumable":
             continue
@@ -75,7 +75,7 @@ def summary_table(results: Results) -> str:
             values, runs, warm=False
         )
         rows.append([machine, observation, success, f"{len(runs)}", reached])
-    head = ("machine", "observation", "success", "seeds", "99 % reached after")
+    head = ("machine", "observation", "success", "seeds", "time to 99 %")
     return _table(head, "llrrr", rows)
 
 
@@ -87,7 +87,7 @@ def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) 
     impl = values["config"]["physics"].get("impl")
     return [
         _machine(values, runs[0]["versions"]) + (", warm cache" if warm else ""),
-        "16 numbers (`world`)" if observation == "world" else observation,
+        f"`{observation}`",
         f"`{values['command'].split('/')[-1]}`",
         values["config"]["trainer"] + (", XLA's physics" if impl == "xla" else ""),
         str(len(runs)),
@@ -104,27 +104,27 @@ def _seconds(times: Iterable[float]) -> str:
 
 
 def best_rates_table(results: Results) -> str:
-    """The best of every rate, with the environments it takes: a row for each machine."""
+    """Return the best of each rate with its number of environments: a row for each machine."""
     best: dict[str, dict[str, Any]] = {}
-    for values in _holding(results, "results"):
+    for values in _files_with(results, "results"):
         found = best.setdefault(_machine(values, values), {})
         for row in values["results"]:
-            rival = found.setdefault(row["rate"], row)
-            if row["env_steps_per_second"] > rival["env_steps_per_second"]:
+            fastest = found.setdefault(row["rate"], row)
+            if row["env_steps_per_second"] > fastest["env_steps_per_second"]:
                 found[row["rate"]] = row
     rows = [
         [machine, *(_best(found[rate]) if rate in found else "-" for rate in _RATES)]
         for machine, found in best.items()
     ]
-    return _table(["environment steps/s at the best batch", *_RATES], "l" + "r" * len(_RATES), rows)
+    return _table(["environment steps/s (at num_envs)", *_RATES], "l" + "r" * len(_RATES), rows)
 
 
 def _best(row: Mapping[str, Any]) -> str:
-    return f"{_short(row['env_steps_per_second'])} ({row['num_envs']:,})"
+    return f"{format_count(row['env_steps_per_second'], 3)} ({row['num_envs']:,})"
 
 
 def rates_tables(results: Results) -> str:
-    """All rates of every machine, each table under its conditions."""
+    """Return all rates of all machines, each table below its conditions."""
     head = ("rate", "num_envs", "env_steps_per_second", "physics_steps_per_second")
     head = (*head, "µs/step", "compile", "min .. max", "peak memory")
     parts = []
@@ -166,21 +166,21 @@ def _comparison(values: Mapping[str, Any]) -> str:
     table = _table(head, "lrrrr", rows)
     units = ("", "second"), ("_per_core", "second of processor time")
     for other in ("mujoco", "warp"):
-        told = []
+        sentences = []
         for key, unit in units:
             if ratios := values.get(f"physics_over_{other}{key}"):
                 ends = f"{min(ratios):.2f} .. {max(ratios):.2f}"
-                told.append(f"{statistics.median(ratios):.2f} ({ends}) per {unit}")
-        if told:
+                sentences.append(f"{statistics.median(ratios):.2f} ({ends}) per {unit}")
+        if sentences:
             table += (
                 f"\n\n`physics` over `{other}`, each at its best, median over rounds:"
-                f" {', '.join(told)}."
+                f" {', '.join(sentences)}."
             )
     return table
 
 
 def adapters_table(results: Results) -> str:
-    """What the adapters make of the robot, every table under its conditions."""
+    """Return the rates of the adapters, each table below its conditions."""
     head = ("", "robots", "steps/s", "per second of processor time", "min .. max")
     parts = []
     for name, values in results.items():
@@ -190,15 +190,15 @@ def adapters_table(results: Results) -> str:
             [
                 f"`{row['rate']}`",
                 f"{row['num_envs']:,}",
-                _short(row["env_steps_per_second"]),
-                _short(row["env_steps_per_second"] / statistics.median(row["busy_cores"])),
+                format_count(row["env_steps_per_second"], 3),
+                format_count(row["env_steps_per_second"] / statistics.median(row["busy_cores"]), 3),
                 _spread(row),
             ]
             for row in values["adapters"]
         ]
         packages, repeats = values["versions"]["packages"], values["conditions"]["repeats"]
-        told = f"{_machine(values, values)}, JAX {packages['jax']}, MuJoCo {packages['mujoco']}"
-        parts += [f"`{name}`: {told}, median of {repeats}", _table(head, "lrrrr", rows)]
+        machine = f"{_machine(values, values)}, JAX {packages['jax']}, MuJoCo {packages['mujoco']}"
+        parts += [f"`{name}`: {machine}, median of {repeats}", _table(head, "lrrrr", rows)]
     return "\n\n".join(parts)
 
 
@@ -214,9 +214,7 @@ def _caption(name: str, values: Mapping[str, Any]) -> str:
 
 
 def _spread(row: Mapping[str, Any]) -> str:
-    ends = (min(row["repeats"]), max(row["repeats"]))
-    low, high = (end / row["env_steps_per_second"] - 1 for end in ends)
-    return f"{low:+.1%} .. {high:+.1%}"
+    return format_spread(row["env_steps_per_second"], row["repeats"])
 
 
 def _memory(size: int | None) -> str:
@@ -229,14 +227,7 @@ def _machine(values: Mapping[str, Any], device: Mapping[str, Any]) -> str:
     return f"{device['device_count']} {device['device']}"
 
 
-def _short(count: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if count >= size:
-            return f"{count / size:.3g} {letter}"
-    return f"{count:.3g}"
-
-
-def _holding(results: Results, key: str) -> list[Mapping[str, Any]]:
+def _files_with(results: Results, key: str) -> list[Mapping[str, Any]]:
     return [values for values in results.values() if isinstance(values.get(key), list)]
 
 
@@ -251,22 +242,19 @@ BLOCKS: Mapping[str, Mapping[str, Callable[[Results], str]]] = {
     "benchmarks/README.md": {"results": rates_tables},
     "docs/from-the-tutorial.md": {"adapters": adapters_table},
 }
-"""By file and by the name of the block: what stands there."""
+"""The function that makes each table, by file and by the name of its block."""
 
 
 def with_tables(text: str, name: str, results: Results) -> str:
-    """A README with its tables as the results have them.
+    """Return the text of a file with its tables replaced.
 
     Args:
-      text: of the README.
-      name: a file in `BLOCKS`.
-      results: of `read_results`.
-
-    Returns:
-      The text, the same where nothing changed.
+      text: The text of the file.
+      name: The name of the file in `BLOCKS`.
+      results: The output of `read_results`.
 
     Raises:
-      UserError: a block has no comments to stand between.
+      UserError: The comments around a block are missing.
     """
     for block, make in BLOCKS[name].items():
         pattern = rf"(<!-- {block}: begin[^>]*-->\n).*?(<!-- {block}: end -->)"
@@ -278,23 +266,23 @@ def with_tables(text: str, name: str, results: Results) -> str:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line and writes.
+    """Write the tables into the files.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
       The exit code.
     """
     cli.Parser(description=__doc__).parse_args(arguments)
-    results = read_results(ROOT / "benchmarks" / "results")
+    results = read_results(RESULTS)
     for name in BLOCKS:
         path = ROOT / name
         before = path.read_text(encoding="utf-8")
         after = with_tables(before, name, results)
         if after != before:
             write_text(path, after)
-        print(f"{name}: {'written' if after != before else 'as it was'}")
+        print(f"{name}: {'written' if after != before else 'unchanged'}")
     return 0
 
 

@@ -1,9 +1,10 @@
-"""Kills a training again and again: `python benchmarks/torture.py --kills 50`.
+"""Kill a training repeatedly: `python benchmarks/reliability/torture.py --kills 50`.
 
-One training runs undisturbed. Another of the same configuration is ended by SIGKILL at random
-moments of every phase, and the same command is given again, until it has been killed that often
-and may finish. After every kill all checkpoints must be whole, every start must go on from the
-newest, and at the end not a bit may differ between the two. On the CPU.
+One training runs undisturbed. Another one with the same configuration is killed by SIGKILL at
+random moments of every phase and restarted with the same command, until it has been killed --kills
+times; then it runs to its end. After every kill all checkpoints must be readable, every start must
+continue from the newest one, and at the end both trainings must be bit-identical. Both run on the
+CPU.
 """
 
 import collections
@@ -23,6 +24,9 @@ from typing import Any, NamedTuple
 
 import jax
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import CONFIGS
 from jetbot_mjx import cli
 from jetbot_mjx.agents.ppo import TrainState
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
@@ -39,9 +43,9 @@ from jetbot_mjx.runs.checkpoint_store import (
 from jetbot_mjx.runs.resume import to_trees
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
-CONFIG = Path(__file__).resolve().parents[1] / "configs" / "smoke.yaml"
+CONFIG = CONFIGS / "smoke.yaml"
 INTERVAL = 65_536
-"""Environment steps between two checkpoints: half a second."""
+"""Environment steps between two checkpoints; they take half a second."""
 SETTINGS = ("evaluation.episodes=16",)
 
 BEFORE_FIRST = "before the first save"
@@ -52,17 +56,17 @@ SAVING = "saving"
 PHASES = (BEFORE_FIRST, STARTING, TRAINING, EVALUATING, SAVING)
 
 TRAINER = ("-m", "jetbot_mjx.train")
-"""Arguments of Python for the training command."""
+"""The arguments of Python that start the trainer."""
 
-_PATIENCE = 300.0
+_TIMEOUT = 300.0  # [s]
 
 
-class Broken(Exception):
-    """What should survive a kill, and did not."""
+class RecoveryError(Exception):
+    """Raised when a training does not recover from a kill as it should."""
 
 
 class Process:
-    """A training in a process of its own, watched from outside; a context manager that ends it."""
+    """A training in a process of its own; a context manager that kills it at the end."""
 
     def __init__(
         self,
@@ -70,12 +74,12 @@ class Process:
         settings: Sequence[str],
         program: Sequence[str] = TRAINER,
     ) -> None:
-        """Starts it.
+        """Start the process.
 
         Args:
-          run_dir: the run folder; what is printed goes into two files beside it.
-          settings: as for `--set`.
-          program: arguments of Python that stand for the trainer.
+          run_dir: The run folder; stdout and stderr are written into two files beside it.
+          settings: The settings, as for `--set`.
+          program: The arguments of Python that start the trainer.
         """
         self.run_dir = run_dir
         self._out, self._err = (run_dir.with_suffix(suffix) for suffix in (".out", ".err"))
@@ -93,99 +97,103 @@ class Process:
 
     @property
     def stdout(self) -> str:
-        """What it has printed so far."""
+        """Return what the process has written to stdout so far."""
         return self._out.read_text(encoding="utf-8")
 
     @property
     def stderr(self) -> str:
-        """What it has complained of so far."""
+        """Return what the process has written to stderr so far."""
         return self._err.read_text(encoding="utf-8")
 
     @property
     def seconds_silent(self) -> float:
-        """How long ago it printed its last line."""
+        """Return the time since the process printed its last line."""
         return time.time() - self._out.stat().st_mtime
 
     @property
     def unfinished(self) -> set[str]:
-        """Names of the checkpoints that this process has begun and not finished."""
+        """Return the names of the checkpoints that this process has started and not finished."""
         return _unfinished(self.run_dir) - self._left_by_others
 
     @property
     def code(self) -> int | None:
-        """Its exit code; None while it runs."""
+        """Return the exit code; None while the process runs."""
         return self._process.poll()
 
     def send(self, number: int) -> None:
-        """Sends a signal."""
+        """Send a signal to the process."""
         self._process.send_signal(number)
 
     def wait(self) -> int:
-        """Waits for its end, and gives its exit code."""
-        return self._process.wait(_PATIENCE)
+        """Wait for the end of the process and return its exit code."""
+        return self._process.wait(_TIMEOUT)
 
     def until(self, condition: Callable[[], bool]) -> None:
-        """Waits until something is so.
+        """Wait until a condition is true.
 
         Raises:
-          Broken: the process ended before, or it took too long.
+          RecoveryError: The process ended before, or the wait timed out.
         """
         began = time.monotonic()
         while not condition():
-            # Cleared away by this process, seconds before the same name may come again.
+            # This process deletes them seconds before it may use the same name again.
             self._left_by_others &= _unfinished(self.run_dir)
             if self.code is not None:
-                raise Broken(f"ended too early with {self.code}:\n{self.stdout}{self.stderr}")
-            if time.monotonic() - began > _PATIENCE:
-                raise Broken(f"nothing came in {_PATIENCE:.0f} s:\n{self.stdout}{self.stderr}")
+                raise RecoveryError(
+                    f"ended too early with {self.code}:\n{self.stdout}{self.stderr}"
+                )
+            if time.monotonic() - began > _TIMEOUT:
+                raise RecoveryError(
+                    f"timed out after {_TIMEOUT:.0f} s:\n{self.stdout}{self.stderr}"
+                )
             time.sleep(0.001)
 
     def __enter__(self) -> "Process":
-        """Enters."""
+        """Return this process."""
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Ends the process if it still runs, and whatever it has started."""
-        # What is left alone by its parent, such as the probe of a library that MuJoCo imports,
-        # would complain into the files of the next process.
+        """Kill the process if it still runs, and all processes that it started."""
+        # Orphaned processes, such as one of a library that MuJoCo imports, would write into the
+        # files of the next process.
         with contextlib.suppress(ProcessLookupError):
             os.killpg(self._process.pid, signal.SIGKILL)
         self._process.wait()
 
 
 class Outcome(NamedTuple):
-    """What a training leaves that must not depend on how often it was stopped."""
+    """An `Outcome` holds results of a training that must not depend on interruptions."""
 
     fingerprint: str
-    """As printed at the end."""
+    """The SHA-256 of the parameters that the training prints at its end."""
     digests: Mapping[str, str]
-    """Of the trees of its last checkpoint: the whole training state."""
+    """The SHA-256 of each tree of the last checkpoint: the whole training state."""
     progress: Mapping[str, Any]
-    """Of the last checkpoint, without its clock."""
+    """The progress in the last checkpoint, without times."""
     metrics: Sequence[Mapping[str, Any]]
-    """The lines of `metrics.jsonl`, without their clocks."""
+    """The lines of `metrics.jsonl`, without times."""
 
 
 def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAINER) -> Outcome:
-    """Runs a training to its end, from wherever it stands.
+    """Run a training to its end, from its newest checkpoint if there is one.
 
     Args:
-      run_dir: the run folder.
-      settings: as for `--set`.
-      program: arguments of Python that stand for the trainer.
+      run_dir: The run folder.
+      settings: The settings, as for `--set`.
+      program: The arguments of Python that start the trainer.
 
     Returns:
-      What it leaves.
+      The outcome of the training.
 
     Raises:
-      Broken: it did not end well.
+      RecoveryError: The training failed.
     """
     known = checkpoint_steps(run_dir)
     with Process(run_dir, settings, program) as process:
         code = process.wait()
     check_start(process, known)
     if code != 0:
-        raise Broken(f"ended with {code}:\n{process.stdout}{process.stderr}")
+        raise RecoveryError(f"ended with {code}:\n{process.stdout}{process.stderr}")
     about = read_about(checkpoint_path(run_dir, checkpoint_steps(run_dir)[-1]))
     lines = (run_dir / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
     return Outcome(
@@ -204,58 +212,61 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
 
 
 def make_template(settings: Sequence[str]) -> TrainState:
-    """Shapes and dtypes of the state that such a training saves."""
+    """Return the shapes and dtypes of the state that a training with these settings saves."""
     config = load_config(CONFIG, settings)
     return CompiledTrainer(config, make_env(config)).template()
 
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:
-    """Reads one checkpoint whole, and raises where it is not as it was written."""
+    """Read a whole checkpoint; raise CheckpointError if it is not as it was written."""
     for name, tree in to_trees(template).items():
         read_tree(checkpoint_path(run_dir, env_steps), name, tree)
 
 
 def check_start(process: Process, known: Sequence[int]) -> None:
-    """Checks that a process went on from where it should.
+    """Check that a process continued from the newest checkpoint.
 
     Args:
-      process: it has ended.
-      known: environment steps of the checkpoints that it found.
+      process: A process that has ended.
+      known: The environment steps of the checkpoints at its start.
 
     Raises:
-      Broken: it went on from elsewhere, passed something over, or left a traceback.
+      RecoveryError: The process continued from elsewhere, skipped a checkpoint, or printed a
+        traceback.
     """
     printed = process.stdout + process.stderr
-    told = [
+    resumed = [
         int(steps.replace(",", "")) for steps in re.findall(r"going on after ([\d,]+)", printed)
     ]
     started = "run folder: " in printed or "best policy: " in printed
-    wanted = [known[-1]] if known and (started or told) else []
-    if told != wanted or "passed over" in printed or "Traceback" in printed:
-        raise Broken(f"found {list(known)}, should go on after {wanted}, and said:\n{printed}")
+    wanted = [known[-1]] if known and (started or resumed) else []
+    if resumed != wanted or "passed over" in printed or "Traceback" in printed:
+        raise RecoveryError(
+            f"found {list(known)}, should continue after {wanted}, and printed:\n{printed}"
+        )
 
 
 class Aim(NamedTuple):
-    """When to kill a process."""
+    """An `Aim` holds the moment at which a process is killed."""
 
     event: str
-    """What to wait for: `started`, `trained`, `reported`, `saving` or `saved`."""
+    """The event to wait for: `started`, `trained`, `reported`, `saving` or `saved`."""
     delay: float
-    """How long to wait after it [s]."""
+    """The time between the event and the kill [s]."""
     count: int = 1
-    """At which occurrence of it in this process, for the last three."""
+    """The number of occurrences in this process to wait for, for the last three events."""
 
 
 class Kill(NamedTuple):
-    """One kill."""
+    """A `Kill` holds the phase of a kill and the checkpoints after it."""
 
     phase: str
     known: int
-    """How many checkpoints there were afterwards."""
+    """The number of checkpoints after the kill."""
 
 
 def draw_aims(kills: int, rng: random.Random) -> list[Aim]:
-    """Draws when to kill, such that every phase gets its share."""
+    """Draw the moments of the kills, such that all phases occur."""
     early = [
         Aim("started", rng.uniform(0.2, 3.0)),
         Aim("saving", rng.uniform(0.0, 0.05)),
@@ -281,32 +292,35 @@ def kill(
     template: TrainState,
     program: Sequence[str] = TRAINER,
 ) -> Kill:
-    """Starts a training, kills it, and checks what it leaves.
+    """Start a training, kill it, and check its checkpoints.
 
     Args:
-      run_dir: the run folder.
-      settings: as for `--set`.
-      aim: when.
-      template: shapes and dtypes of a state.
-      program: arguments of Python that stand for the trainer.
+      run_dir: The run folder.
+      settings: The settings, as for `--set`.
+      aim: The moment of the kill.
+      template: The shapes and dtypes of a state.
+      program: The arguments of Python that start the trainer.
 
     Returns:
-      In which phase the kill fell.
+      The phase in which the process was killed.
 
     Raises:
-      Broken: the process ended by itself, or did not go on from where it should.
-      CheckpointError: a checkpoint is not whole.
+      RecoveryError: The process ended by itself, or did not continue from the newest checkpoint.
+      CheckpointError: A checkpoint is damaged.
     """
+    # Kill the process at its moment.
     known = checkpoint_steps(run_dir)
     with Process(run_dir, settings, program) as process:
         process.until(_condition(process, known, aim))
         moment = time.monotonic() + aim.delay
         process.until(lambda: time.monotonic() > moment)
         printed, silence = process.stdout, process.seconds_silent
+    # Check where it started from and what it left.
     check_start(process, known)
     left = checkpoint_steps(run_dir)
     for steps in left:
         check_checkpoint(run_dir, steps, template)
+    # Infer the phase in which it was killed.
     if process.unfinished:
         phase = SAVING
     elif not left:
@@ -336,11 +350,11 @@ def _condition(process: Process, known: Sequence[int], aim: Aim) -> Callable[[],
 
 
 def _phase(printed: str, silence: float) -> str:
-    """Where a process was that did not save, from what it has printed.
+    """Return the phase of a process that was not saving, inferred from its output.
 
     Args:
-      printed: until the kill.
-      silence: how long before that its last line came [s].
+      printed: The output until the kill.
+      silence: The time between its last line and the kill [s].
     """
     if "first training step done" not in printed:
         return STARTING
@@ -363,7 +377,7 @@ def _unfinished(run_dir: Path) -> set[str]:
 
 
 def table(kills: Sequence[Kill]) -> str:
-    """How many kills fell into which phase."""
+    """Return a table of the number of kills in each phase."""
     count = collections.Counter(one.phase for one in kills)
     rows = [f"| {phase:<24} | {count[phase]:>5} |" for phase in PHASES]
     return "\n".join(
@@ -372,22 +386,25 @@ def table(kills: Sequence[Kill]) -> str:
 
 
 def differences(one: Outcome, other: Outcome) -> list[str]:
-    """The names of what differs."""
+    """Return the names of the fields that differ."""
     return [name for name in Outcome._fields if getattr(one, name) != getattr(other, name)]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, kills, prints the table and the verdict.
+    """Kill the training repeatedly, print the table and the verdict.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where something did not survive.
+      0, or 1 if the training did not recover.
     """
+    # Both trainings run on the CPU, with settings that make checkpoints frequent.
     parser = cli.Parser(description=__doc__)
-    parser.add_argument("--kills", type=cli.positive_int, default=50, help="default: 50")
-    parser.add_argument("--seed", type=int, default=0, help="of the moments; default: 0")
+    parser.add_argument(
+        "--kills", type=cli.positive_int, default=50, help="number of kills (default: 50)"
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of the moments (default: 0)")
     options = parser.parse_args(arguments)
     jax.config.update("jax_platforms", "cpu")
     os.environ["JAX_PLATFORMS"] = "cpu"
@@ -398,8 +415,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         began = time.monotonic()
+        # The reference runs undisturbed.
         undisturbed = finish(folder / "undisturbed", settings)
         print(f"undisturbed: {timesteps:,} steps, {time.monotonic() - began:.0f} s", flush=True)
+        # The other is killed and restarted, and must end equal.
         kills: list[Kill] = []
         try:
             template = make_template(settings)
@@ -411,13 +430,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
                     flush=True,
                 )
             found = differences(undisturbed, finish(folder / "killed", settings))
-            verdict = f"not the same: {', '.join(found)}" if found else ""
-        except (Broken, UserError) as error:
+            verdict = f"different at the end: {', '.join(found)}" if found else ""
+        except (RecoveryError, UserError) as error:
             verdict = str(error)
     print(table(kills))
     print(
         f"{len(kills)} kills in {time.monotonic() - began:.0f} s: "
-        + (verdict or "every checkpoint whole, every start from the newest, every bit the same")
+        + (
+            verdict
+            or "all checkpoints readable, all starts from the newest, bit-identical at the end"
+        )
     )
     return 1 if verdict else 0
 

@@ -1,22 +1,24 @@
-"""Shows what one seed gives twice: `python benchmarks/determinism.py --config configs/gpu.yaml`.
+"""Check determinism: `python benchmarks/reliability/determinism.py --config configs/gpu.yaml`.
 
-Trains in processes of their own: twice as the configuration says, twice with `deterministic:
-true`, and once more with `deterministic: true` to half the steps and then, resumed, to the end.
-Prints the SHA-256 of the last parameters, and what determinism costs in environment steps/s
-(median over the intervals of each run, compilation and evaluation apart).
+Trains one seed in several processes: twice with `deterministic: false`, twice with
+`deterministic: true`, and once more with `deterministic: true` to half the steps and then, resumed,
+to the end. Prints the SHA-256 of the final parameters, and the cost of determinism in environment
+steps/s (median over the intervals of each run, without compilation and evaluation).
 """
 
 import json
 import os
 import re
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.harness.processes import run_module
 from jetbot_mjx import cli
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
@@ -24,7 +26,7 @@ from jetbot_mjx.runs.run_dir import write_json
 
 
 class Row(NamedTuple):
-    """One training."""
+    """A `Row` holds the result of one training."""
 
     name: str
     sha256: str
@@ -32,29 +34,22 @@ class Row(NamedTuple):
 
 
 def measure(name: str, run_dir: Path, *trainings: Sequence[str]) -> Row:
-    """Trains into one run folder.
+    """Train in one run folder.
 
     Args:
-      name: of the row.
-      run_dir: the run folder.
-      trainings: arguments of one process after the other.
+      name: The name of the row.
+      run_dir: The run folder.
+      trainings: The arguments of each process, one after the other.
 
     Returns:
-      The last process's hash, and the rate over all.
+      The hash that the last process printed, and the rate over all processes.
 
     Raises:
-      UserError: a training failed.
+      UserError: A training failed.
     """
     printed = ""
     for arguments in trainings:
-        done = subprocess.run(
-            [sys.executable, "-m", "jetbot_mjx.train", *arguments], capture_output=True, text=True
-        )
-        if done.returncode:
-            raise UserError(
-                f"training failed: {(done.stderr.strip() or 'no word').splitlines()[-1]}"
-            )
-        printed = done.stdout
+        printed = run_module("train", arguments)
     lines = [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
     rates = [line["time/env_steps_per_second"] for line in lines if line["env_steps"]]
     found = re.search(r"sha256 ([0-9a-f]{64})", printed)
@@ -64,20 +59,20 @@ def measure(name: str, run_dir: Path, *trainings: Sequence[str]) -> Row:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, trains and prints.
+    """Train all variants, print their hashes and write the JSON file.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where deterministic trainings differ.
+      0, or 1 if deterministic trainings differ.
     """
     parser = cli.Parser(description=__doc__)
     parser.add_argument("--config", type=Path, required=True)
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--output", type=Path, help="JSON file")
     options = parser.parse_args(arguments)
-    # Half the steps must end at a checkpoint, and the step size must not depend on the end.
+    # Half the steps must end at a checkpoint, and the learning rate must not depend on the end.
     overrides = [*options.overrides, "ppo.learning_rate_schedule=ADAPTIVE_KL"]
     config = load_config(options.config, overrides)
     intervals = config.ppo.num_timesteps // config.checkpoint_interval
@@ -88,6 +83,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         settings = [part for one in (*overrides, *more) for part in ("--set", one)]
         return ["--config", str(options.config), "--run-dir", str(run_dir), *settings]
 
+    # Train all variants.
     rows = []
     with tempfile.TemporaryDirectory() as folder:
         for number, name in enumerate(["default", "default", "deterministic", "deterministic"]):
@@ -101,14 +97,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         rows.append(measure("deterministic, resumed", run_dir, begun, resumed))
         print(_line(rows[-1]))
         versions = json.loads((run_dir / "versions.json").read_text())
+    # Compare hashes and rates.
     rates = [
         statistics.median(row.env_steps_per_second for row in pair)
         for pair in (rows[:2], rows[2:4])
     ]
     same = len({row.sha256 for row in rows[2:]}) == 1
     print(
-        f"deterministic: {'the same bits' if same else 'DIFFERENT BITS'}, {rates[1] / rates[0]:.2f}"
-        f" x the speed, on {versions['device_count']} x {versions['device']},"
+        f"deterministic: {'bit-identical' if same else 'DIFFERENT BITS'}, {rates[1] / rates[0]:.2f}"
+        f" x the speed of the default, on {versions['device_count']} x {versions['device']},"
         f" {os.cpu_count()} CPU cores"
     )
     if options.output:

@@ -1,9 +1,9 @@
-"""How long one action takes, on one core: each file of an export.
+"""Measure the latency of one action on one core, for each file of an exported policy.
 
-    python benchmarks/action_latency.py runs/mine/policy
+    python benchmarks/throughput/action_latency.py runs/mine/policy
 
-The folder is one that `python -m jetbot_mjx.export RUN --format all` wrote. One observation a call,
-as on a robot, from NumPy to NumPy; StableHLO is compiled by `jax.jit`, so its row is JAX's.
+`python -m jetbot_mjx.export RUN --format all` writes the folder. Every call takes one observation,
+as on a robot, and includes the conversion from and to NumPy. StableHLO is compiled by `jax.jit`.
 """
 
 import argparse
@@ -26,7 +26,7 @@ _WARM_UP = 100
 
 
 class Latency(NamedTuple):
-    """Of one call [µs]."""
+    """A `Latency` holds the statistics of the time of one call [µs]."""
 
     name: str
     median: float
@@ -35,13 +35,13 @@ class Latency(NamedTuple):
 
 
 def measure(name: str, act: Act, observations: np.ndarray, calls: int = CALLS) -> Latency:
-    """Times single calls.
+    """Time single calls of a policy.
 
     Args:
-      name: of the row.
-      act: what is called.
-      observations: [n, obs]; one a call, over and over.
-      calls: how many, after a warm-up.
+      name: The name of the row.
+      act: The function from an observation to an action.
+      observations: Observations of shape (n, obs); every call takes the next one.
+      calls: The number of timed calls after the warm-up.
 
     Returns:
       Median, 99th percentile and worst.
@@ -53,29 +53,29 @@ def measure(name: str, act: Act, observations: np.ndarray, calls: int = CALLS) -
         for output in act(obs):
             np.asarray(output)
         times.append(1e-3 * (time.perf_counter_ns() - start))
-    kept = np.array(times[_WARM_UP:])
-    return Latency(name, *(float(np.percentile(kept, at)) for at in (50, 99, 100)))
+    timed = np.array(times[_WARM_UP:])
+    return Latency(name, *(float(np.percentile(timed, at)) for at in (50, 99, 100)))
 
 
 def run(folder: Path, calls: int = CALLS) -> Iterator[Latency]:
-    """Times every file of an export, on the core that this process is left with.
+    """Time every file of an export on the cores that this process may use.
 
     Args:
-      folder: of an export.
-      calls: of each.
+      folder: The folder of the export.
+      calls: The number of timed calls for each file.
 
     Yields:
       One row for each file.
 
     Raises:
-      UserError: it is no such folder, or a package is missing.
+      UserError: The folder is not an export, or a package is missing.
     """
     try:
         files = json.loads((folder / FILE).read_text("utf-8"))["files"]
         with np.load(folder / "recording.npz") as recording:
             observations = recording["obs"][:1000]
     except (OSError, ValueError, LookupError) as error:
-        raise UserError(f"{folder} is no export: {error}") from None
+        raise UserError(f"{folder} is not an export: {error}") from None
     for name, file in files.items():
         require(name)
         act = FORMATS[name].read(folder / file["file"])
@@ -83,21 +83,21 @@ def run(folder: Path, calls: int = CALLS) -> Iterator[Latency]:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, takes one core and prints the table.
+    """Restrict the process to one core, time all files and print the table.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 2 after a mistake.
+      0, or 2 after an error that the user can correct.
     """
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("policy", type=Path, help="the folder that jetbot_mjx.export wrote")
-    parser.add_argument("--calls", type=int, default=CALLS)
+    parser.add_argument("policy", type=Path, help="folder that jetbot_mjx.export wrote")
+    parser.add_argument("--calls", type=int, default=CALLS, help=f"default: {CALLS}")
     options = parser.parse_args(arguments)
     cores = os.sched_getaffinity(0)
     try:
-        # Threads that start from here on inherit it.
+        # Threads that start later inherit the restriction.
         os.sched_setaffinity(0, {min(cores)})
         print(f"{'one action [µs]':16} {'median':>8} {'p99':>8} {'worst':>8}")
         for row in run(options.policy, options.calls):

@@ -1,53 +1,57 @@
-"""Trains with both trainers and compares how they learn: `python benchmarks/parity.py --seeds 5`.
+"""Compare how both trainers learn: `python benchmarks/learning/parity.py --seeds 5`.
 
-The first training steps of both are equal to round-off, which `tests/agents/test_ppo.py` holds.
-Then trainings are chaotic, and after an interval Brax draws another key: only how they learn can be
-compared. On two tasks, with N seeds:
-  probe   the egocentric task with a robot that moves exactly as commanded: no physics
-  config  the given configuration; LINEAR and the physical normalizer, which Brax does not know,
-          give way to ADAPTIVE_KL and Brax's
-After every interval the deterministic policy drives to the same fixed goals, those of the final
-report. A training's figure is the area under its success curve over its length: its mean success
-while it learns. A seed's first networks decide most of that, so both trainers get the same seeds,
-and what is tested are the differences, seed by seed.
+The first training steps of both trainers are equal up to round-off, as `tests/agents/test_ppo.py`
+checks. Later, trainings are chaotic, and after each interval Brax draws another key, so that only
+the learning curves can be compared. There are two tasks, each with N seeds:
+  probe   the egocentric task with a robot that moves exactly as commanded, without physics
+  config  the given configuration; LINEAR and the physical normalizer, which Brax does not have,
+          are replaced by ADAPTIVE_KL and Brax's normalizer
+After every interval the deterministic policy is evaluated on the fixed goals of the report. The
+score of a training is its mean success while it learns: the area under the success curve divided
+by the length of the training. The initial networks of a seed determine most of it, so both
+trainers use the same seeds, and the differences are tested seed by seed.
 
-The test: turning the signs of the N differences in all 2^N ways (a random 100,000 of them where
-there are more) gives the two-sided p of their mean, at least 2^(1-N); Student's t gives its 95 %
-interval. The verdict is `same` where that interval lies within ± the margin (--margin, in success
-rate), `different` where it does not and excludes 0, and else `undecided`. The exit code is 0
-only where every verdict is `same`.
+The test: flipping the signs of the N differences in all 2^N ways (a random 100,000 of them if
+there are more) gives the two-sided p-value of their mean, at least 2^(1-N); Student's t gives its
+95 % confidence interval. The verdict is `same` if this interval lies within ± the margin
+(--margin, in success rate), `different` if it does not and excludes 0, and otherwise `undecided`.
+The exit code is 0 only if every verdict is `same`.
 
-What differs between the trainers, on purpose:
+These differences between the trainers are intended:
 
 | what                    | brax                          | resumable                          |
 |-------------------------|-------------------------------|------------------------------------|
-| next observation        | kept for every step           | kept where an unroll ends; the     |
+| next observation        | stored for every step         | stored at the end of an unroll; the|
 |                         |                               | loss reads no other                |
-| books of episodes       | shuffled with the data        | left out: the loss reads truncation|
-| gradient not finite     | spoils the parameters for good| skipped and counted, Adam and its  |
-|                         |                               | step size left as they were        |
-| keys after an interval  | a new one for each epoch      | one chain: the interval is not     |
-|                         |                               | felt by the bits                   |
+| episode statistics      | shuffled with the data        | not stored: the loss needs only    |
+|                         |                               | truncation                         |
+| non-finite gradient     | makes the parameters          | skipped and counted; Adam and its  |
+|                         | non-finite                    | step size are unchanged            |
+| keys after an interval  | a new one for each epoch      | one chain: results do not depend on|
+|                         |                               | the interval                       |
 | keys of devices         | split                         | the same key, folded in with the   |
-|                         |                               | device's index; one device: as is  |
-| total steps             | every interval rounded up to  | the whole rounded up to training   |
+|                         |                               | device's index if there are several|
+| total steps             | every interval rounded up to  | the sum rounded up to training     |
 |                         | training steps                | steps                              |
 | smallest deviation of   | 1e-6                          | by the observation's units, unless |
-| the normaliser          |                               | normalizer is brax, as it is here  |
-| learning rate           | NONE, ADAPTIVE_KL             | LINEAR as well, to zero at the end |
-| first reset             | on each device its own share  | all at once, then dealt out        |
+| the normalizer          |                               | normalizer is brax, as it is here  |
+| learning rate           | NONE, ADAPTIVE_KL             | also LINEAR, to zero at the end    |
+| first reset             | on each device its share      | of all environments at once, then  |
+|                         |                               | distributed over the devices       |
 | several seeds           | no                            | in one program                     |
 
 Sources: R. A. Fisher, The Design of Experiments (1935), section 21;
 Student, Biometrika 6 (1908), 1-25, doi:10.1093/biomet/6.1.1.
 """
 
-# First, before Brax imports MJX and lets it print.
+# First, because MJX prints when Brax imports it.
 import jetbot_mjx  # noqa: F401  isort: skip
 
+import argparse
 import itertools
 import math
 import os
+import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -59,6 +63,9 @@ import numpy as np
 import scipy.stats
 from jaxtyping import Array, Float
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import CONFIGS, RESULTS
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
@@ -79,17 +86,16 @@ from jetbot_mjx.training import brax_trainer, ppo_trainer
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 
-_FOLDER = Path(__file__).resolve().parent
 TRAINERS = ("brax", "resumable")
 _MOST_SIGNS = 100_000
 
-STEERED = {
+ADAPTIVE_KL = {
     "learning_rate_schedule": "ADAPTIVE_KL",
     "desired_kl": 0.03,
     "learning_rate_schedule_min_lr": 1e-4,
     "learning_rate_schedule_max_lr": 1e-3,
 }
-"""A schedule that both trainers know."""
+"""A learning-rate schedule that both trainers have."""
 
 PROBE = {
     "checkpoint_interval": 16_384,
@@ -99,13 +105,13 @@ PROBE = {
         "num_envs": 256,
         "batch_size": 64,
         "normalizer": "brax",
-        **STEERED,
+        **ADAPTIVE_KL,
     },
 }
 
 
 class Unicycle(JetBotEnv):
-    """A robot whose wheels neither slip nor lag."""
+    """An environment whose robot moves exactly as commanded, without slip or lag."""
 
     def step_physics(
         self,
@@ -113,7 +119,7 @@ class Unicycle(JetBotEnv):
         ctrl: Float[Array, "2"],
         mocap_pos: Float[Array, "nmocap 3"] | None = None,
     ) -> PhysicsState:
-        """Integrates one environment step of what the wheels command."""
+        """Integrate the commanded wheel speeds over one environment step."""
         left, right = CONTROLLER_WHEEL_RADIUS * ctrl
         speed, yaw_rate = 0.5 * (left + right), (right - left) / CONTROLLER_WHEEL_SEPARATION
         heading = kinematics.yaw(physics.qpos[QPOS_QUAT]) + yaw_rate * self.dt
@@ -129,72 +135,72 @@ class Unicycle(JetBotEnv):
 
 
 class Curve(NamedTuple):
-    """How one seed learnt."""
+    """A `Curve` holds the learning curve of one seed."""
 
     trainer: str
     seed: int
     env_steps: list[int]
     success: list[float]
-    """Of the deterministic policy on the fixed goals."""
+    """Success rates of the deterministic policy on the fixed goals."""
     seconds: float
-    """Of the whole training, evaluations and compilation included."""
+    """Time of the whole training, including evaluations and compilation."""
 
     def area(self, until: int) -> float:
-        """Mean success over the training up to a number of environment steps."""
+        """Return the mean success over the training up to a number of environment steps."""
         inside = [step for step in self.env_steps if step < until]
         steps = np.array([*inside, until])
         return float(np.trapezoid(np.interp(steps, self.env_steps, self.success), steps) / until)
 
 
 class Comparison(NamedTuple):
-    """Whether two samples of areas, paired by seed, are alike."""
+    """A `Comparison` holds the test of two samples of areas that are paired by seed."""
 
     means: dict[str, float]
     deviations: dict[str, float]
     """Standard deviations over the seeds."""
     difference: float
-    """Resumable minus Brax, mean over the seeds."""
+    """Mean over the seeds of resumable minus Brax."""
     low: float
-    """Lower end of its 95 % interval."""
+    """Lower end of the 95 % interval of the difference."""
     high: float
-    """Upper end of it."""
+    """Upper end of the interval."""
     p: float
-    """Two-sided, of the sign test by permutation."""
+    """Two-sided p-value of the sign-flip permutation test."""
     margin: float
     verdict: str
 
 
-class _Judge(TrainerCallback):
-    """Judges every policy that a trainer reports."""
+class _SuccessRecorder(TrainerCallback):
+    """A callback that evaluates the policy after every interval."""
 
-    def __init__(self, judge: Callable[[Any], float]) -> None:
-        self._judge = judge
+    def __init__(self, evaluate: Callable[[Any], float]) -> None:
+        self._evaluate = evaluate
         self.env_steps: list[int] = []
         self.success: list[float] = []
 
     def on_interval(self, progress: Sequence[Progress]) -> bool:
         self.env_steps.append(progress[0].env_steps)
-        self.success.append(self._judge(progress[0].params))
+        self.success.append(self._evaluate(progress[0].params))
         return True
 
 
 def train(
-    config: Config, env: JetBotEnv, trainer: str, seed: int, judge: Callable[[Any], float]
+    config: Config, env: JetBotEnv, trainer: str, seed: int, evaluate: Callable[[Any], float]
 ) -> Curve:
-    """Trains one seed with one trainer.
+    """Train one seed with one trainer.
 
     Args:
-      config: the run; its own trainer and seed are not used.
+      config: The configuration of the run; its trainer and seed are not used.
       env: its environment, unwrapped.
       trainer: one of `TRAINERS`.
-      seed: of the run.
-      judge: from a policy's parameters to its success rate.
+      seed: The seed of the run.
+      evaluate: Returns the success rate of a policy, given its parameters.
 
     Returns:
-      How it learnt.
+      The learning curve.
     """
     config = _with_trainer(config, trainer, seed)
-    recorder, began = _Judge(judge), time.perf_counter()
+    recorder, began = _SuccessRecorder(evaluate), time.perf_counter()
     if trainer == "brax":
         brax_trainer.train(config, env, recorder)
     else:
@@ -210,16 +216,16 @@ def _with_trainer(config: Config, trainer: str, seed: int) -> Config:
 
 
 def run(config: Config, env: JetBotEnv, seeds: int, episodes: int) -> list[Curve]:
-    """Trains all seeds with both trainers, and prints each.
+    """Train all seeds with both trainers and print a line for each.
 
     Args:
-      config: the run.
-      env: its environment, unwrapped.
-      seeds: how many for each trainer.
-      episodes: of every evaluation.
+      config: The configuration of the run.
+      env: Its environment without wrappers.
+      seeds: The number of seeds for each trainer.
+      episodes: The number of episodes of each evaluation.
 
     Returns:
-      The curves.
+      The learning curves.
     """
     networks = make_networks(
         config.ppo.network,
@@ -229,13 +235,13 @@ def run(config: Config, env: JetBotEnv, seeds: int, episodes: int) -> list[Curve
     )
     evaluator, keys = Evaluator(env, networks), report_keys(episodes)
 
-    def judge(params: Any) -> float:
+    def evaluate(params: Any) -> float:
         return summarize(evaluator.run(params, keys), env.dt).success_rate
 
     curves = []
     for trainer in TRAINERS:
         for seed in range(config.seed, config.seed + seeds):
-            curves.append(train(config, env, trainer, seed, judge))
+            curves.append(train(config, env, trainer, seed, evaluate))
             one = curves[-1]
             print(
                 f"{trainer:>9}  seed {seed:>3}  {one.seconds:6.1f} s  mean success"
@@ -246,12 +252,12 @@ def run(config: Config, env: JetBotEnv, seeds: int, episodes: int) -> list[Curve
 
 
 def compare(brax: Sequence[float], resumable: Sequence[float], margin: float) -> Comparison:
-    """Tests whether two samples that are paired by seed have the same mean.
+    """Test whether two samples that are paired by seed have the same mean.
 
     Args:
-      brax: one figure for each seed, at least two.
-      resumable: likewise, in the same order.
-      margin: difference of means that would not matter.
+      brax: The scores of Brax's trainer, one for each seed and at least two.
+      resumable: The scores of the resumable trainer in the same order.
+      margin: The largest difference of means that counts as equal.
 
     Returns:
       The comparison.
@@ -279,7 +285,7 @@ def compare(brax: Sequence[float], resumable: Sequence[float], margin: float) ->
 
 
 def _sign_flip_p(differences: np.ndarray) -> float:
-    """Share of all choices of signs under which the mean is at least as far from 0."""
+    """Return the share of all choices of signs whose mean is at least as far from 0."""
     count = differences.size
     if 2**count <= _MOST_SIGNS:
         signs = np.array(list(itertools.product((1.0, -1.0), repeat=count)))
@@ -291,7 +297,7 @@ def _sign_flip_p(differences: np.ndarray) -> float:
 
 
 def _table(curves: Sequence[Curve], comparison: Comparison) -> str:
-    """Success over steps, the mean over the seeds with their standard deviation."""
+    """Return a table of success over steps: mean and standard deviation over the seeds."""
     lines = ["| steps | brax | resumable |", "|------:|-----:|----------:|"]
     of = {name: [curve for curve in curves if curve.trainer == name] for name in TRAINERS}
     for step in of["resumable"][0].env_steps:
@@ -305,62 +311,74 @@ def _table(curves: Sequence[Curve], comparison: Comparison) -> str:
     return "\n".join(lines)
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, trains, prints the tables and writes the JSON file.
-
-    Args:
-      arguments: without the program's name; None: those of the process.
-
-    Returns:
-      0, or 1 where the trainers were not found to learn the same.
-    """
-    parser = cli.Parser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument(
-        "--config", type=Path, default=_FOLDER.parent / "configs" / "jetbot_egocentric.yaml"
+def _measure_task(config: Config, env: JetBotEnv, options: argparse.Namespace) -> dict[str, Any]:
+    """Train and compare both trainers on one task, print the tables, and return the results."""
+    curves = run(config, env, options.seeds, options.episodes)
+    until = min(curve.env_steps[-1] for curve in curves)
+    areas = {
+        trainer: [curve.area(until) for curve in curves if curve.trainer == trainer]
+        for trainer in TRAINERS
+    }
+    found = compare(areas["brax"], areas["resumable"], options.margin)
+    print(
+        f"{_table(curves, found)}\n"
+        f"difference of mean success {found.difference:+.2%} (95 % interval"
+        f" {found.low:+.2%} .. {found.high:+.2%}), p = {found.p:.3f};"
+        f" margin ± {found.margin:.0%}: {found.verdict}",
+        flush=True,
     )
+    return {
+        "config": config.model_dump(mode="json"),
+        "areas": areas,
+        "comparison": found._asdict(),
+        "curves": [curve._asdict() for curve in curves],
+    }
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = cli.Parser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--config", type=Path, default=CONFIGS / "jetbot_egocentric.yaml")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
     parser.add_argument("--seeds", type=cli.positive_int, default=5, help="for each trainer")
-    parser.add_argument("--episodes", type=cli.positive_int, default=256, help="an evaluation")
+    parser.add_argument("--episodes", type=cli.positive_int, default=256, help="of each evaluation")
     parser.add_argument(
         "--margin", type=cli.fraction, default=0.05, help="of the mean success (default: 0.05)"
     )
-    parser.add_argument("--output", type=Path, default=_FOLDER / "results" / "parity-cpu.json")
+    parser.add_argument("--output", type=Path, default=RESULTS / "parity-cpu.json")
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Train and compare both trainers, print the tables and write the JSON file.
+
+    Args:
+      arguments: The command line without the program's name; None: that of the process.
+
+    Returns:
+      0, or 1 unless both trainers were found to learn equally well on every task.
+    """
+    # Parse the command line and check it before minutes of training.
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.seeds < 2:
         parser.error("--seeds: a comparison needs at least 2")
     cli.require_device()
     use_compilation_cache()
+    # Build both tasks with settings that both trainers have.
     config, probe = load_config(options.config, options.overrides), parse_config(PROBE)
     values = config.model_dump(mode="json")
-    values["ppo"] |= STEERED if config.ppo.learning_rate_schedule == "LINEAR" else {}
+    values["ppo"] |= ADAPTIVE_KL if config.ppo.learning_rate_schedule == "LINEAR" else {}
     values["ppo"]["normalizer"] = "brax"
     config = parse_config(values)
     tasks = {"probe": (probe, Unicycle(probe)), options.config.name: (config, make_env(config))}
     for trainer in TRAINERS:
         _with_trainer(config, trainer, config.seed).check_devices(jax.device_count())
+    # Train and compare on each task.
     results: dict[str, Any] = {}
     for name, (task_config, env) in tasks.items():
         print(f"{name}: {task_config.ppo.num_timesteps:,} steps", flush=True)
-        curves = run(task_config, env, options.seeds, options.episodes)
-        until = min(curve.env_steps[-1] for curve in curves)
-        areas = {
-            trainer: [curve.area(until) for curve in curves if curve.trainer == trainer]
-            for trainer in TRAINERS
-        }
-        found = compare(areas["brax"], areas["resumable"], options.margin)
-        print(
-            f"{_table(curves, found)}\n"
-            f"difference of mean success {found.difference:+.2%} (95 % interval"
-            f" {found.low:+.2%} .. {found.high:+.2%}), p = {found.p:.3f};"
-            f" margin ± {found.margin:.0%}: {found.verdict}",
-            flush=True,
-        )
-        results[name] = {
-            "config": task_config.model_dump(mode="json"),
-            "areas": areas,
-            "comparison": found._asdict(),
-            "curves": [curve._asdict() for curve in curves],
-        }
+        results[name] = _measure_task(task_config, env, options)
+    # Write all results.
     options.output.parent.mkdir(parents=True, exist_ok=True)
     write_json(
         options.output,

@@ -1,7 +1,7 @@
-"""The tutorial's task on one robot in C MuJoCo, as people write it: NumPy, one step at a time.
+"""Provide the tutorial's task on one robot in C MuJoCo and NumPy, without this package's code.
 
-What Stable-Baselines3 is measured on. Observation, reward, goals, time limit and controller are
-those of `jetbot_mjx.envs.task.GoalTask` with `observation: world`; a test holds the two together.
+Stable-Baselines3 is measured on it. Observation, reward, goals, time limit and controller are
+those of `jetbot_mjx.envs.task.GoalTask` with `observation: world`; a test compares the two.
 """
 
 import math
@@ -26,12 +26,12 @@ from jetbot_mjx.envs.task import GOAL_HEIGHT
 
 
 def make_physics_model(config: Config) -> mujoco.MjModel:
-    """The C model that MJX is given: the same robot, time step, solver effort, nothing visual."""
+    """Return the C model from which MJX's is made: same robot, time step and solver settings."""
     return make_mj_model(ROBOTS[config.robot.preset], config.physics, visual=False)
 
 
 def wheel_targets(config: Config, actions: Float[np.ndarray, "*n 2"]) -> Float[np.ndarray, "*n 2"]:
-    """Wheel speeds (left, right) [rad/s] that actions in [-1, 1]² command."""
+    """Return the wheel speeds (left, right) [rad/s] that actions in [-1, 1]² command."""
     drive, turn = np.moveaxis(np.clip(actions, -1.0, 1.0), -1, 0)
     speed = 0.5 * (drive + 1.0) * config.task.max_speed
     difference = 0.5 * turn * config.task.max_yaw_rate * CONTROLLER_WHEEL_SEPARATION
@@ -39,13 +39,13 @@ def wheel_targets(config: Config, actions: Float[np.ndarray, "*n 2"]) -> Float[n
 
 
 class OneRobot:
-    """One robot and its goal."""
+    """An environment of one robot with the interface of Gymnasium."""
 
     def __init__(self, config: Config) -> None:
-        """Builds the model.
+        """Build the model.
 
         Args:
-          config: robot, task and physics.
+          config: The robot, task and physics.
         """
         self.config = config
         self.model = make_physics_model(config)
@@ -55,10 +55,10 @@ class OneRobot:
         self._distance = 0.0
 
     def reset(self, rng: np.random.Generator) -> Float[np.ndarray, "16"]:
-        """Begins an episode: the robot at rest at the origin, a new goal.
+        """Start an episode with the robot at rest at the origin and a new goal.
 
         Args:
-          rng: draws the goal.
+          rng: The generator that draws the goal.
 
         Returns:
           The first observation.
@@ -69,29 +69,29 @@ class OneRobot:
         distance = task.goal_distance_span * math.sqrt(rng.random()) + task.goal_distance_min
         self.goal[:] = distance * math.sin(angle), distance * math.cos(angle), GOAL_HEIGHT
         self._steps = 0
-        self._distance = self._distance_now()
+        self._distance = self._goal_distance()
         return self._observe()
 
     def step(
         self, action: Float[np.ndarray, "2"]
     ) -> tuple[Float[np.ndarray, "16"], float, bool, bool, dict[str, Any]]:
-        """Holds an action for one environment step.
+        """Hold an action for one environment step.
 
         Args:
-          action: in [-1, 1]².
+          action: Forward speed and yaw rate, each in [-1, 1].
 
         Returns:
-          Observation, progress [m], terminated, truncated, and nothing else.
+          Observation, reward (progress [m]), terminated, truncated and an empty info.
         """
         self.data.ctrl[:] = wheel_targets(self.config, action)
         mujoco.mj_step(self.model, self.data, self.config.physics.n_substeps)
         self._steps += 1
-        before, self._distance = self._distance, self._distance_now()
+        before, self._distance = self._distance, self._goal_distance()
         terminated = self._distance < self.config.task.success_radius
         truncated = not terminated and self._steps >= self.config.task.episode_length
         return self._observe(), before - self._distance, terminated, truncated, {}
 
-    def _distance_now(self) -> float:
+    def _goal_distance(self) -> float:
         return float(np.linalg.norm(self.goal - self.data.qpos[QPOS_XYZ]))
 
     def _observe(self) -> Float[np.ndarray, "16"]:

@@ -1,32 +1,36 @@
-"""What drawing a robot for every episode costs: `python benchmarks/randomization_cost.py`.
+"""Measure the cost of domain randomization: `python benchmarks/throughput/randomization_cost.py`.
 
-The environment alone (`env`) and the whole training (`training`) under one configuration, with
-its `randomization` and without, in turn, so that what else the machine does meets both. The cost
-of a round is the rate without over the rate with it, less one; told is the median over rounds.
+Times the environment alone (`env`) and the whole training (`training`) in turn with and without
+the configuration's `randomization`, so that other load on the machine affects both alike. The cost
+of a round is the rate without randomization divided by the rate with it, minus 1; the printed
+cost is the median over the rounds.
 """
 
 import argparse
 import statistics
+import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
-from measurements import Sizes, prepare_env, training_config
-from results import check_output, conditions, default_output, write
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks import CONFIGS
+from benchmarks.harness.measurements import Sizes, prepare_env, training_config
+from benchmarks.harness.results import check_output, conditions, default_output, write
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
-_CONFIG = Path(__file__).resolve().parents[1] / "configs" / "real_jetbot.yaml"
-WAYS = ("off", "on")
+SETTINGS = ("off", "on")
 
 Rates = dict[str, list[float]]
-"""Environment steps per second of each round, by way."""
+"""Environment steps per second of each round, by setting of randomization."""
 
 
 def _without(config: Config) -> Config:
@@ -34,12 +38,12 @@ def _without(config: Config) -> Config:
 
 
 def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Rates:
-    """Times the environment as trainers see it.
+    """Time the environment with the training wrappers, without and with randomization.
 
     Args:
-      config: with ranges to draw from.
-      num_envs: how many.
-      sizes: rounds, and steps of a call.
+      config: A configuration with randomization.
+      num_envs: The number of environments.
+      sizes: The number of rounds, and of environment steps in a call.
 
     Returns:
       The rates.
@@ -49,12 +53,12 @@ def measure_env(config: Config, num_envs: int, sizes: Sizes) -> Rates:
 
 
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Rates:
-    """Times training steps, updates included.
+    """Time training steps, including the updates, without and with randomization.
 
     Args:
-      config: with ranges to draw from.
-      num_envs: how many.
-      sizes: rounds, and training steps of each.
+      config: A configuration with randomization.
+      num_envs: The number of environments.
+      sizes: The number of rounds, and of training steps in each.
 
     Returns:
       The rates.
@@ -65,48 +69,51 @@ def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Rates:
 
 
 class _Training:
-    """A compiled training that goes on at every call."""
+    """A compiled training that continues with every call of `repeat`."""
 
     def __init__(self, config: Config, steps: int) -> None:
         program = CompiledTrainer(config, make_env(config))
         self._advance = program.compile()
         self._state = program.init()
         self._steps, self._size = steps, config.ppo.steps_per_training_step
-        self._clocked(1)
+        self._time_steps(1)  # warm-up
 
     def repeat(self) -> float:
-        return self._size * self._steps / self._clocked(self._steps)
+        return self._size * self._steps / self._time_steps(self._steps)
 
-    def _clocked(self, steps: int) -> float:
-        begun = time.perf_counter()
+    def _time_steps(self, steps: int) -> float:
+        start = time.perf_counter()
         self._state, _ = jax.block_until_ready(self._advance(self._state, steps, False))
-        return time.perf_counter() - begun
+        return time.perf_counter() - start
 
 
 def _in_turns(repeats: Sequence[Callable[[], float]], rounds: int) -> Rates:
-    found: Rates = {way: [] for way in WAYS}
+    rates: Rates = {setting: [] for setting in SETTINGS}
     for _ in range(rounds):
-        for way, repeat in zip(WAYS, repeats, strict=True):
-            found[way].append(repeat())
-    return found
+        for setting, repeat in zip(SETTINGS, repeats, strict=True):
+            rates[setting].append(repeat())
+    return rates
 
 
 def cost(rates: Mapping[str, Sequence[float]]) -> float:
-    """By how much more time a step takes: median over the rounds.
+    """Return the additional time of a step as a fraction of the time without randomization.
 
     Args:
-      rates: of both ways.
+      rates: The rates of both settings.
 
     Returns:
-      A fraction of the time without.
+      The median over the rounds.
     """
-    pairs = zip(rates["off"], rates["on"], strict=True)
-    return statistics.median(off / on for off, on in pairs) - 1.0
+    return statistics.median(_costs(rates))
+
+
+def _costs(rates: Mapping[str, Sequence[float]]) -> list[float]:
+    return [off / on - 1.0 for off, on in zip(rates["off"], rates["on"], strict=True)]
 
 
 def _line(name: str, rates: Rates) -> str:
-    costs = [off / on - 1.0 for off, on in zip(rates["off"], rates["on"], strict=True)]
-    medians = {way: statistics.median(values) for way, values in rates.items()}
+    costs = _costs(rates)
+    medians = {setting: statistics.median(values) for setting, values in rates.items()}
     return (
         f"{name:8}  {medians['off']:>12,.0f}  {medians['on']:>12,.0f}  {cost(rates):>7.1%}"
         f"  {min(costs):.1%} .. {max(costs):.1%}"
@@ -115,25 +122,29 @@ def _line(name: str, rates: Rates) -> str:
 
 def _parser() -> argparse.ArgumentParser:
     parser = cli.Parser(description=__doc__)
-    parser.add_argument("--config", type=Path, default=_CONFIG)
+    parser.add_argument("--config", type=Path, default=CONFIGS / "real_jetbot.yaml")
     parser.add_argument("--set", dest="overrides", action="append", default=[], metavar="KEY=VALUE")
-    parser.add_argument("--num-envs", type=cli.positive_int, help="default: the configuration's")
+    parser.add_argument(
+        "--num-envs", type=cli.positive_int, help="default: the config's ppo.num_envs"
+    )
     parser.add_argument("--repeats", type=cli.positive_int, default=9, help="rounds (default: 9)")
     parser.add_argument("--unroll", type=cli.positive_int, default=64)
     parser.add_argument("--training-steps", type=cli.positive_int, default=4)
-    parser.add_argument("--most", type=cli.fraction, default=0.15, help="default: 0.15")
+    parser.add_argument(
+        "--most", type=cli.fraction, default=0.15, help="exit code 1 above (default: 0.15)"
+    )
     parser.add_argument("--output", type=Path, help="JSON file")
     return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Parses the command line, measures and prints.
+    """Measure, print the table and write the JSON file.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: The command line without the program's name; None: that of the process.
 
     Returns:
-      0, or 1 where training costs more than `--most`.
+      0, or 1 if training costs more than `--most`.
     """
     options = _parser().parse_args(arguments)
     config = load_config(options.config, options.overrides)
