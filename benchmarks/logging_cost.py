@@ -12,21 +12,23 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 from measurements import Listener
 
 from jetbot_mjx import cli
-from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.runs.run_dir import write_json
-from jetbot_mjx.training import ppo_trainer
+from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
-from jetbot_mjx.training.run_recorder import RunRecorder
+from jetbot_mjx.training.run_recorder import RunRecorder, SeedRecorder
 
 _UNJUDGED = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
 
@@ -52,20 +54,20 @@ class _Timed(TrainerCallback):
         self._recorder.on_progress(env_steps, metrics, seconds)
 
 
-class _Unjudged(RunRecorder):
-    def judge(self, params: PolicyParams) -> Summary:
-        del params
-        return _UNJUDGED
+class _NotEvaluated(RunRecorder):
+    def __init__(self, seeds: Sequence[SeedRecorder], *arguments: Any, **options: Any) -> None:
+        super().__init__(seeds, *arguments, **options)
+        self._evaluate = lambda params: _UNJUDGED
 
 
-def _save_nothing(progress: Progress, judged: Mapping[str, Any], wall_seconds: float) -> None:
-    del progress, judged, wall_seconds
+def _save_nothing(progress: Progress, evaluation: Mapping[str, Any], wall_seconds: float) -> None:
+    del progress, evaluation, wall_seconds
 
 
-class _Unsaved(_Unjudged):
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        for seed in self._seeds:
+class _Unsaved(_NotEvaluated):
+    def __init__(self, seeds: Sequence[SeedRecorder], *arguments: Any, **options: Any) -> None:
+        super().__init__(seeds, *arguments, **options)
+        for seed in seeds:
             seed.save = _save_nothing
 
 
@@ -80,7 +82,7 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
       Seconds of every training from its first report to its last, all of that on disk.
     """
     env = make_env(config)
-    program = ppo_trainer.CompiledTrainer(config, env)
+    program = ppo_trainer.CompiledTrainer.from_config(config, env)
     compiled = program.compile()
     program.compile = lambda: compiled
     seconds: dict[str, list[float]] = {name: [] for name in WAYS}
@@ -97,14 +99,21 @@ def _once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, way: s
 
         def train(recorder: TrainerCallback) -> _Timed:
             timed = _Timed(recorder)
-            ppo_trainer.train(config, program, timed, Preemption(config.preemption_notice))
+            ppo_trainer.train(
+                program, timed, Preemption(config.preemption_notice), config.checkpoint_interval
+            )
             return timed
 
         if way == "off":
             timed = train(Listener(clock))
         else:
-            kind = _Unjudged if way == "saved" else _Unsaved
-            with kind(config, env, [Path(folder)], clock) as recorder:
+            kind = _NotEvaluated if way == "saved" else _Unsaved
+            run_dir, programs = Path(folder), ProgramCache(compiler_options(config))
+            parts = session.Training(config, run_dir, [run_dir], env, program.ppo, programs)
+            with (
+                mock.patch.object(session, "RunRecorder", kind),
+                session.open_recorder(parts, clock, None) as recorder,
+            ):
                 recorder.begin(WAYS[way])
                 timed = train(recorder)
             timed.ended = time.perf_counter()

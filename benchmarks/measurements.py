@@ -167,10 +167,12 @@ class Listener(TrainerCallback):
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Times the resumable trainer by its own reports, the first intervals left out."""
     config = training_config(config, num_envs, sizes, trainer="resumable")
-    program = ppo_trainer.CompiledTrainer(config, make_env(config))
+    program = ppo_trainer.CompiledTrainer.from_config(config, make_env(config))
     preemption = Preemption(config.preemption_notice)
     return _time_trainer(
-        "training", config, lambda to: ppo_trainer.train(config, program, to, preemption)
+        "training",
+        config,
+        lambda to: ppo_trainer.train(program, to, preemption, config.checkpoint_interval),
     )
 
 

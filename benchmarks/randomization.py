@@ -20,7 +20,8 @@ from results import check_output, conditions, default_output, write
 
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -55,10 +56,11 @@ class Judge:
             env.action_size,
             normalize=config.ppo.normalize_observations,
         )
+        programs = ProgramCache(compiler_options(config))
         self._evaluators = {
-            "preset": Evaluator(env, networks),
+            "preset": Evaluator(env, networks, programs),
             "ranges": Evaluator(
-                DomainRandomizationWrapper(env, ranges=config.randomization), networks
+                DomainRandomizationWrapper(env, ranges=config.randomization), networks, programs
             ),
         }
         self._sweeper = Sweeper(env, networks, report_keys(goals))

@@ -206,7 +206,7 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
 def make_template(settings: Sequence[str]) -> TrainState:
     """Shapes and dtypes of the state that such a training saves."""
     config = load_config(CONFIG, settings)
-    return CompiledTrainer(config, make_env(config)).template()
+    return CompiledTrainer.from_config(config, make_env(config)).template()
 
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:
@@ -227,11 +227,11 @@ def check_start(process: Process, known: Sequence[int]) -> None:
     """
     printed = process.stdout + process.stderr
     told = [
-        int(steps.replace(",", "")) for steps in re.findall(r"going on after ([\d,]+)", printed)
+        int(steps.replace(",", "")) for steps in re.findall(r"resuming after ([\d,]+)", printed)
     ]
     started = "run folder: " in printed or "best policy: " in printed
     wanted = [known[-1]] if known and (started or told) else []
-    if told != wanted or "passed over" in printed or "Traceback" in printed:
+    if told != wanted or "skipped: " in printed or "Traceback" in printed:
         raise Broken(f"found {list(known)}, should go on after {wanted}, and said:\n{printed}")
 
 

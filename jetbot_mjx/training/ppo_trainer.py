@@ -21,7 +21,7 @@ Protocol:
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ from jaxtyping import Array, UInt32
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -98,6 +99,20 @@ class CompiledTrainer:
         self._specs = replicated.replace(env_state=sharded)
         self._shardings = jax.tree.map(lambda spec: NamedSharding(self._mesh, spec), self._specs)
         self._replicated = NamedSharding(self._mesh, PartitionSpec())
+
+    @classmethod
+    def from_config(cls, config: Config, env: JetBotEnv) -> Self:
+        """Build the trainer of a configuration, without a cache of programs on disk.
+
+        Args:
+          config: the configuration of the run.
+          env: the environment, unwrapped.
+
+        Returns:
+          The trainer; nothing is compiled yet.
+        """
+        seeds = [one.seed for one in config.of_each_seed()]
+        return cls(build_ppo(config, env), seeds, ProgramCache(compiler_options(config)))
 
     def template(self) -> TrainState:
         """Return the shapes and dtypes of one seed's state."""
