@@ -88,7 +88,7 @@ class Dashboard(Terminal):
         self._rates: list[list[float]] = [[] for _ in seeds]
         self._metrics: list[dict[str, float | None]] = [{} for _ in seeds]
         self._nonfinite = 0.0
-        self._speed = ""
+        self._speed = "-"
         self._phase: str | None = None
         self._spent: dict[str, float] = {}
         self._began = self._phase_began = time.monotonic()
@@ -101,6 +101,7 @@ class Dashboard(Terminal):
             BarColumn(None),
             TextColumn("{task.percentage:.0f}%  {task.completed:,} of {task.total:,} steps"),
             TimeRemainingColumn(compact=True),
+            TextColumn("left"),
             console=console,
             expand=True,
             speed_estimate_period=_SPEED_SECONDS,
@@ -152,6 +153,8 @@ class Dashboard(Terminal):
         """Draw for the last time."""
         self.phase(None)
         with contextlib.suppress(OSError):
+            # Rich holds back a line without an end, and would lose it.
+            print(end="", flush=True)
             self._live.stop()
 
     def _add(self, metrics: Sequence[MetricValues]) -> None:
@@ -164,7 +167,7 @@ class Dashboard(Terminal):
 
     def _advance(self, env_steps: int, speed: float | None) -> None:
         self._progress.update(self._task, completed=env_steps)
-        self._speed = f"{speed:,.0f} environment steps/s   " if speed else ""
+        self._speed = f"{speed:,.0f} environment steps/s" if speed else "-"
 
     def _seconds_in(self, phase: str) -> float:
         running = time.monotonic() - self._phase_began if phase == self._phase else 0.0
@@ -172,11 +175,11 @@ class Dashboard(Terminal):
 
     def render(self) -> Group:
         """Lay out the dashboard; the empty line at its end is for the cursor."""
-        phases = Text(self._speed)
+        phases = Text()
         for name in self._spent:
             style = "bold cyan" if name == self._phase else ""
             phases.append(f"{name} {_clock(self._seconds_in(name))}", style).append("   ")
-        rows = [self._table(), "", self._progress, phases]
+        rows = [self._table(), "", self._progress, self._speed, phases]
         if self._nonfinite:
             rows.append(Text(f"{self._nonfinite:,.0f} non-finite states or gradients", "bold red"))
         elapsed = _clock(time.monotonic() - self._began)
