@@ -12,7 +12,8 @@ from typing import Any, Literal, NamedTuple, get_args
 import jax
 
 from jetbot_mjx import cli
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
@@ -281,10 +282,11 @@ def _judge(
         ranges = drawn.ranges if drawn else checkpoint.config.randomization
         # Build new evaluators only if the compiled programs do not fit this policy.
         if evaluator is None or (_program(checkpoint.config), ranges) != fits:
-            evaluator = Evaluator(env, checkpoint.networks, baselines=True, record=True)
+            programs = ProgramCache(compiler_options(checkpoint.config))
+            evaluator = Evaluator(env, checkpoint.networks, programs, baselines=True, record=True)
             if ranges.drawn:
                 varied = Evaluator(
-                    DomainRandomizationWrapper(env, ranges=ranges), checkpoint.networks
+                    DomainRandomizationWrapper(env, ranges=ranges), checkpoint.networks, programs
                 )
             if elsewhere:
                 mujoco = MujocoEvaluator(env, checkpoint.networks, ranges)

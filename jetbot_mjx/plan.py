@@ -16,6 +16,7 @@ from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training.memory import GIB, Footprint, device_memory, ladder, sizes
+from jetbot_mjx.training.ppo_trainer import build_ppo
 
 
 class Plan(NamedTuple):
@@ -52,7 +53,8 @@ def run(config: Config, memory: float | None = None) -> Plan:
     limit = device_memory() if memory is None else int(memory * GIB)
     if limit is None:
         raise UserError("this device does not tell its memory: give --memory GIB")
-    each = sizes(config, make_env(config))
+    env = make_env(config)
+    each = sizes(build_ppo(config, env), env)
     return Plan(config, device_count, limit, ladder(config, each, device_count, limit))
 
 

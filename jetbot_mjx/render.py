@@ -18,7 +18,8 @@ import numpy as np
 from PIL import Image
 
 from jetbot_mjx import cli
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
@@ -175,7 +176,8 @@ def _drive(
     checkpoints: Sequence[Checkpoint], env: JetBotEnv, goals: Sequence[int]
 ) -> list[Episodes]:
     """Run recorded episodes of several policies of one run with one compiled program."""
-    evaluator = Evaluator(env, checkpoints[0].networks, record=True)
+    programs = ProgramCache(compiler_options(env.config))
+    evaluator = Evaluator(env, checkpoints[0].networks, programs, record=True)
     keys = report_keys(max(goals) + 1)[np.asarray(goals)]
     return [jax.device_get(evaluator.run(each.params, keys)) for each in checkpoints]
 

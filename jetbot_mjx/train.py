@@ -1,7 +1,7 @@
-"""Trains a policy into a run folder: `python -m jetbot_mjx.train --config configs/jetbot.yaml`.
+"""Train a policy into a run folder: `python -m jetbot_mjx.train --config configs/jetbot.yaml`.
 
-The same command with the same `--run-dir`, or `--resume RUN`, goes on where a run was stopped.
-SIGTERM and Ctrl-C stop it: all is saved, and the exit code is 75. With `--distributed` several
+The same command with the same `--run-dir`, or `--resume RUN`, continues a run that was stopped.
+SIGTERM and Ctrl-C save and stop a training with exit code 75. With `--distributed` several
 processes, on one host or many, train one policy.
 """
 
@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     source = parser.add_mutually_exclusive_group(required=True)
     source.add_argument("--config", type=Path, help="YAML file, see configs/")
     source.add_argument(
-        "--resume", type=Path, metavar="RUN", help="go on with the run in this folder"
+        "--resume", type=Path, metavar="RUN", help="continue the run in this folder"
     )
     parser.add_argument(
         "--set",
@@ -72,16 +72,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     cli.require_device()
     use_compilation_cache()
-    programs = open_program_cache(config, keep=True)
+    programs = open_program_cache(config)
     programs.prefetch("advance", "init")
     from jetbot_mjx.training import session
 
-    result = session.run(config, run_dir, programs)
-    if distributed.is_first():
+    result = session.train(config, run_dir, programs)
+    if distributed.is_primary():
         print(
             session.summary(result)
             if result.finished
-            else f"stopped; to go on: python -m jetbot_mjx.train --resume {run_dir}",
+            else f"stopped; to resume: python -m jetbot_mjx.train --resume {run_dir}",
             flush=True,
         )
     distributed.leave()

@@ -182,10 +182,12 @@ class IntervalTimer(TrainerCallback):
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Time the resumable trainer by its own reports, without the first intervals."""
     config = training_config(config, num_envs, sizes, trainer="resumable")
-    program = ppo_trainer.CompiledTrainer(config, make_env(config))
+    program = ppo_trainer.CompiledTrainer.from_config(config, make_env(config))
     preemption = Preemption(config.preemption_notice)
     return _time_trainer(
-        "training", config, lambda timer: ppo_trainer.train(config, program, timer, preemption)
+        "training",
+        config,
+        lambda timer: ppo_trainer.train(program, timer, preemption, config.checkpoint_interval),
     )
 
 

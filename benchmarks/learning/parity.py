@@ -68,7 +68,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import CONFIGS, RESULTS
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
@@ -204,8 +205,10 @@ def train(
     if trainer == "brax":
         brax_trainer.train(config, env, recorder)
     else:
-        program = ppo_trainer.CompiledTrainer(config, env)
-        ppo_trainer.train(config, program, recorder, Preemption(config.preemption_notice))
+        program = ppo_trainer.CompiledTrainer.from_config(config, env)
+        ppo_trainer.train(
+            program, recorder, Preemption(config.preemption_notice), config.checkpoint_interval
+        )
     seconds = time.perf_counter() - began
     return Curve(trainer, seed, recorder.env_steps, recorder.success, seconds)
 
@@ -233,7 +236,10 @@ def run(config: Config, env: JetBotEnv, seeds: int, episodes: int) -> list[Curve
         env.action_size,
         normalize=config.ppo.normalize_observations,
     )
-    evaluator, keys = Evaluator(env, networks), report_keys(episodes)
+    evaluator, keys = (
+        Evaluator(env, networks, ProgramCache(compiler_options(config))),
+        report_keys(episodes),
+    )
 
     def evaluate(params: Any) -> float:
         return summarize(evaluator.run(params, keys), env.dt).success_rate

@@ -25,7 +25,8 @@ from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.results import check_output, conditions, default_output, write
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -59,10 +60,11 @@ class PolicyEvaluator:
             env.action_size,
             normalize=config.ppo.normalize_observations,
         )
+        programs = ProgramCache(compiler_options(config))
         self._evaluators = {
-            "preset": Evaluator(env, networks),
+            "preset": Evaluator(env, networks, programs),
             "ranges": Evaluator(
-                DomainRandomizationWrapper(env, ranges=config.randomization), networks
+                DomainRandomizationWrapper(env, ranges=config.randomization), networks, programs
             ),
         }
         self._sweeper = Sweeper(env, networks, report_keys(goals))

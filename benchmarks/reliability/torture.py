@@ -214,7 +214,7 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
 def make_template(settings: Sequence[str]) -> TrainState:
     """Return the shapes and dtypes of the state that a training with these settings saves."""
     config = load_config(CONFIG, settings)
-    return CompiledTrainer(config, make_env(config)).template()
+    return CompiledTrainer.from_config(config, make_env(config)).template()
 
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:
@@ -236,11 +236,11 @@ def check_start(process: Process, known: Sequence[int]) -> None:
     """
     printed = process.stdout + process.stderr
     resumed = [
-        int(steps.replace(",", "")) for steps in re.findall(r"going on after ([\d,]+)", printed)
+        int(steps.replace(",", "")) for steps in re.findall(r"resuming after ([\d,]+)", printed)
     ]
     started = "run folder: " in printed or "best policy: " in printed
     wanted = [known[-1]] if known and (started or resumed) else []
-    if resumed != wanted or "passed over" in printed or "Traceback" in printed:
+    if resumed != wanted or "skipped: " in printed or "Traceback" in printed:
         raise RecoveryError(
             f"found {list(known)}, should continue after {wanted}, and printed:\n{printed}"
         )

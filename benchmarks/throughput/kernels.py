@@ -16,12 +16,12 @@ import jax
 import jax.numpy as jnp
 
 from jetbot_mjx import cli
-from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.training.ppo_trainer import build_ppo
 
 PROGRAMS = ("physics", "env", "training")
 
@@ -119,7 +119,7 @@ def compiled_text(config: Config, program: str) -> str:
         step: Any = batch.step
         lowered = jax.jit(step).lower(jax.eval_shape(batch.reset, keys), actions)
     else:
-        ppo = PPO(config.ppo, batch)
+        ppo = PPO(config.ppo, batch, build_ppo(config, env).networks)
         state = jax.eval_shape(ppo.init, jax.random.PRNGKey(0))
         lowered = jax.jit(ppo.train_step).lower(state)
     return str(lowered.compile(compiler_options=compiler_options(config)).as_text())

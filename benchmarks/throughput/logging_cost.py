@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import jax
 
@@ -21,16 +22,17 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.harness.measurements import IntervalTimer
 from jetbot_mjx import cli
-from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.runs.run_dir import write_json
-from jetbot_mjx.training import ppo_trainer
+from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
-from jetbot_mjx.training.run_recorder import RunRecorder
+from jetbot_mjx.training.run_recorder import RunRecorder, SeedRecorder
 
 _NO_EVALUATION = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
 
@@ -59,9 +61,9 @@ class _Timed(TrainerCallback):
 class _LogsAndCheckpoints(RunRecorder):
     """A recorder that runs no evaluations."""
 
-    def judge(self, params: PolicyParams) -> Summary:
-        del params
-        return _NO_EVALUATION
+    def __init__(self, seeds: Sequence[SeedRecorder], *arguments: Any, **options: Any) -> None:
+        super().__init__(seeds, *arguments, **options)
+        self._evaluate = lambda params: _NO_EVALUATION
 
 
 def _save_nothing(*_: Any, **__: Any) -> None:
@@ -71,9 +73,9 @@ def _save_nothing(*_: Any, **__: Any) -> None:
 class _LogsOnly(_LogsAndCheckpoints):
     """A recorder that runs no evaluations and saves no checkpoints."""
 
-    def __init__(self, *arguments: Any) -> None:
-        super().__init__(*arguments)
-        for seed in self._seeds:
+    def __init__(self, seeds: Sequence[SeedRecorder], *arguments: Any, **options: Any) -> None:
+        super().__init__(seeds, *arguments, **options)
+        for seed in seeds:
             seed.save = _save_nothing
 
 
@@ -88,7 +90,7 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
       The seconds of each training from its first report until its last is written, by mode.
     """
     env = make_env(config)
-    program = ppo_trainer.CompiledTrainer(config, env)
+    program = ppo_trainer.CompiledTrainer.from_config(config, env)
     compiled = program.compile()
     program.compile = lambda: compiled
     seconds: dict[str, list[float]] = {name: [] for name in MODES}
@@ -105,14 +107,21 @@ def _train_once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, 
 
         def train(recorder: TrainerCallback) -> _Timed:
             timed = _Timed(recorder)
-            ppo_trainer.train(config, program, timed, Preemption(config.preemption_notice))
+            ppo_trainer.train(
+                program, timed, Preemption(config.preemption_notice), config.checkpoint_interval
+            )
             return timed
 
         if mode == "off":
             timed = train(IntervalTimer(clock))
         else:
             kind = _LogsAndCheckpoints if mode == "saved" else _LogsOnly
-            with kind(config, env, [Path(folder)], clock) as recorder:
+            run_dir, programs = Path(folder), ProgramCache(compiler_options(config))
+            parts = session.Training(config, run_dir, [run_dir], env, program.ppo, programs)
+            with (
+                mock.patch.object(session, "RunRecorder", kind),
+                session.open_recorder(parts, clock, None) as recorder,
+            ):
                 recorder.begin(MODES[mode])
                 timed = train(recorder)
             timed.ended = time.perf_counter()

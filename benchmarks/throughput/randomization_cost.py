@@ -72,7 +72,7 @@ class _Training:
     """A compiled training that continues with every call of `repeat`."""
 
     def __init__(self, config: Config, steps: int) -> None:
-        program = CompiledTrainer(config, make_env(config))
+        program = CompiledTrainer.from_config(config, make_env(config))
         self._advance = program.compile()
         self._state = program.init()
         self._steps, self._size = steps, config.ppo.steps_per_training_step

@@ -40,7 +40,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from jetbot_mjx.agents import gae
-from jetbot_mjx.agents.networks import PolicyParams, make_networks
+from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.config import PPOConfig
 
 # Pyright does not follow flax's dataclasses.
@@ -123,16 +123,18 @@ class PPO:
         self,
         config: PPOConfig,
         env: Env,
+        networks: ppo_networks.PPONetworks,
         *,
         num_envs: int | None = None,
         axis_name: str | None = None,
         device_count: int = 1,
     ) -> None:
-        """Build the networks and the optimizer.
+        """Build the optimizer and the loss.
 
         Args:
           config: the hyperparameters.
           env: wrapped for training: batched, resets itself, keeps `episode_metrics`.
+          networks: the policy and value networks, from `make_networks`.
           num_envs: environments, all devices together; `config.num_envs` by default.
           axis_name: mesh axis that the environments are sharded over; None: no sharding.
           device_count: its size.
@@ -142,12 +144,7 @@ class PPO:
         self._env: Any = env
         self._axis = axis_name
         self._device_count = device_count
-        self.networks = make_networks(
-            config.network,
-            self._env.observation_size,
-            env.action_size,
-            normalize=config.normalize_observations,
-        )
+        self.networks = networks
         self._min_std = (
             self._env.observation_min_std
             if config.normalize_observations and config.normalizer == "physical"

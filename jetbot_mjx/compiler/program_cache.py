@@ -1,8 +1,8 @@
-"""Compiled programs, kept from one process to the next without being traced again.
+"""Cache compiled programs on disk under a key, so that later processes need not trace them.
 
-JAX keeps what XLA compiled under the program that it was compiled from; to look there, a process
-must first trace and lower that program, which takes far longer than to load it. Here a program is
-kept under a key that its user computes from all that it depends on.
+JAX's own cache finds a program by its lowered code. To look there, a process must first trace and
+lower the program, which takes far longer than loading it. This cache finds a program by a key that
+its user computes from everything that the program depends on.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 class ProgramCache:
-    """The compiled programs of one configuration, by name."""
+    """A `ProgramCache` holds the compiled programs of one configuration, by name."""
 
     def __init__(self, options: Options, folder: Path | None = None, key: str = "") -> None:
         """Set the options, folder and key of the cache.
@@ -44,14 +44,15 @@ class ProgramCache:
         self._options = options
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
-        self._coming: dict[str, Future[jax.stages.Compiled | None]] = {}
+        self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
 
     def prefetch(self, *names: str) -> None:
         """Start to load programs in threads, and return at once."""
-        with_folder = names if self._folder else ()
-        for name in with_folder:
+        if self._folder is None:
+            return
+        for name in names:
             pool = ThreadPoolExecutor(1)
-            self._coming[name] = pool.submit(_load, self._path(name))
+            self._prefetched[name] = pool.submit(_load, self._path(name))
             pool.shutdown(wait=False)
 
     def find(self, name: str) -> jax.stages.Compiled | None:
@@ -65,15 +66,15 @@ class ProgramCache:
         """
         if self._folder is None:
             return None
-        coming = self._coming.pop(name, None)
-        return coming.result() if coming else _load(self._path(name))
+        prefetched = self._prefetched.pop(name, None)
+        return prefetched.result() if prefetched else _load(self._path(name))
 
     def compile(self, name: str, trace: Callable[[], jax.stages.Traced]) -> jax.stages.Compiled:
         """Return a program, and compile it if it is not cached.
 
         Args:
           name: name of the program.
-          trace: traces it.
+          trace: a function that traces the program.
 
         Returns:
           The program. It takes arguments of the shapes and shardings that it was traced with.
@@ -85,10 +86,10 @@ class ProgramCache:
         with _CacheHits() as hits:
             lowered = trace().lower()
             program = lowered.compile(compiler_options=self._options)
-        # What XLA loaded for a CPU it cannot write again: some functions would be missing.
+        # On a CPU, XLA cannot serialize a program that it loaded: functions would be missing.
         if self._folder and not (hits.count and jax.default_backend() == "cpu"):
             seconds = time.perf_counter() - began
-            _keep(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
+            _save(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
         return program
 
     def _path(self, name: str) -> Path:
@@ -173,21 +174,21 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:
         return None
-    seconds, kernels, ids, kept = pickle.loads(body)
+    seconds, kernels, ids, serialized = pickle.loads(body)
     llvm_backend.register(kernels)
     devices = {device.id: device for device in jax.devices()}
     try:
         program = serialize_executable.deserialize_and_load(
-            # Else it would be one program for all devices, whatever it was.
-            *kept,
+            # Without these, JAX would load it as one program for all devices.
+            *serialized,
             execution_devices=[devices[number] for number in ids],
         )
     except jax.errors.JaxRuntimeError:
-        # A driver that knows it no longer, say: compiling says what is wrong, if anything is.
+        # For example, a newer driver rejects the program: compile it again.
         return None
     with contextlib.suppress(OSError):
         path.touch()
-    # As JAX does when it finds a program in its own cache, for those who listen.
+    # Report the same events as JAX does when it finds a program in its own cache.
     loaded = time.perf_counter() - began
     monitoring = jax.monitoring
     monitoring.record_event(_CACHE_HIT)
@@ -198,21 +199,21 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     return program
 
 
-def _keep(
+def _save(
     path: Path, program: jax.stages.Compiled, kernels: dict[str, bytes], seconds: float
 ) -> None:
     """Write a program, the kernels that it calls and its compile time to a file.
 
-    A full folder only costs time.
+    An error while writing is ignored, because a missing file only costs time.
     """
     try:
-        kept = serialize_executable.serialize(program)
+        serialized = serialize_executable.serialize(program)
         loaded: Any = program.runtime_executable()
         ids = [device.id for device in loaded.local_devices()]
     except (NotImplementedError, ValueError):
-        # This kind of device cannot.
+        # Devices of this kind cannot serialize programs.
         return
-    body = pickle.dumps((seconds, kernels, ids, kept))
+    body = pickle.dumps((seconds, kernels, ids, serialized))
     with contextlib.suppress(OSError):
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:

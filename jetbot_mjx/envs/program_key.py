@@ -1,8 +1,8 @@
-"""Know what the compiled programs of a configuration depend on.
+"""Compute the cache key of a configuration's compiled programs.
 
-What is traced depends on the configuration, on the model, on this package's source and on what is
-installed: under these a command finds its programs at once. It does so only for tasks of this
-package, since nobody can say what a task of someone else's depends on.
+A traced program depends on the configuration, the model, this package's source and the installed
+libraries. With all of these in the key, a command loads its programs without tracing them. This
+holds only for the tasks of this package, because the dependencies of any other task are unknown.
 """
 
 import functools
@@ -21,31 +21,30 @@ from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
 
 _ROOT = Path(__file__).parents[1]
-"""Of the package, all of whose source is part of the key."""
+"""Folder of the package, whose complete source is part of the key."""
 
 TRUSTED = frozenset({f"{_ROOT.name}:GoalTask"})
-"""Tasks whose source is part of the key."""
+"""Tasks whose source is part of the package, and so of the key."""
 
 SOURCES = {".ll", ".py", ".xml"}
-"""Of what programs are made from, as files of this package end."""
+"""Suffixes of the files from which programs are made."""
 
 _LIBRARIES = ["brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx", "numpy", "optax"]
 
 
-def open_program_cache(config: Config, *, keep: bool) -> ProgramCache:
-    """Return the programs of a configuration on the devices of this process.
+def open_program_cache(config: Config) -> ProgramCache:
+    """Open the cache of a configuration's programs in JAX's folder of compiled programs.
 
     Args:
-      config: the run.
-      keep: whether to keep them in JAX's folder of compiled programs, if there is one.
+      config: the configuration of the run.
 
     Returns:
-      They, not compiled yet.
+      The cache. It is in memory only if there is no such folder, for other tasks than this
+      package's, and if several processes train together.
     """
     options = compiler_options(config)
     folder = jax.config.values["jax_compilation_cache_dir"]
-    own_task = config.task.name not in TRUSTED
-    if not keep or folder is None or own_task or jax.process_count() > 1:
+    if folder is None or config.task.name not in TRUSTED or jax.process_count() > 1:
         return ProgramCache(options)
     devices = jax.devices()
     settings = {
@@ -54,7 +53,7 @@ def open_program_cache(config: Config, *, keep: bool) -> ProgramCache:
         if not name.startswith(("jax_compilation_cache", "jax_persistent_cache", "jax_log"))
     }
     cache_key = [
-        # Seeds are arguments of programs.
+        # Leave out the seed, which is an argument of the programs.
         config.model_copy(update={"seed": 0}).model_dump(mode="json"),
         _own_source(),
         _model(config),
@@ -77,23 +76,23 @@ def _version(library: str) -> str | None:
 
 
 def _model(config: Config) -> str:
-    """Return a name for the model of a configuration, with all options of its solver."""
-    # A mistyped command says so before MuJoCo is loaded.
+    """Return a hash of a configuration's MuJoCo model, including the options of its solver."""
+    # Import MuJoCo late, so that a mistyped command reports its error at once.
     import mujoco
 
     from jetbot_mjx.envs import robot_model, task
 
     scene = task.make_task(config.task).build_scene
     robot = robot_model.ROBOTS[config.robot.preset]
-    made = robot_model.make_mj_model(robot, config.physics, build_scene=scene, visual=False)
-    content = np.zeros(mujoco.mj_sizeModel(made), np.uint8)
-    mujoco.mj_saveModel(made, None, content)
+    model = robot_model.make_mj_model(robot, config.physics, build_scene=scene, visual=False)
+    content = np.zeros(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, content)
     return hashlib.sha256(content.tobytes()).hexdigest()
 
 
 @functools.cache
 def _own_source() -> str:
-    """Return a name for all that this package consists of."""
+    """Return a hash of all source files of this package."""
     digest = hashlib.sha256()
     for path in sorted(_ROOT.rglob("*")):
         if path.suffix in SOURCES:

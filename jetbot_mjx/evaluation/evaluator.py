@@ -19,7 +19,6 @@ from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 
@@ -172,19 +171,19 @@ class Evaluator:
         self,
         env: JetBotEnv | DomainRandomizationWrapper,
         networks: ppo_networks.PPONetworks,
+        programs: ProgramCache,
         *,
         baselines: bool = False,
         record: bool = False,
-        programs: ProgramCache | None = None,
     ) -> None:
         """Prepare the program, which compiles at its first use.
 
         Args:
           env: one unwrapped environment, or one with domain randomization.
           networks: the networks of the policies to evaluate.
+          programs: the cache of compiled programs for the environment's configuration.
           baselines: whether `run_baselines` will be called.
           record: whether to record trajectories.
-          programs: cache for the programs of the environment's configuration; None: no cache.
         """
         self._env = env
         self._names = ["policy", *(BASELINES if baselines else ())]
@@ -195,7 +194,7 @@ class Evaluator:
         self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
         drawn = ", drawn" if isinstance(env, DomainRandomizationWrapper) else ""
         self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
-        self._programs = programs or open_program_cache(env.config, keep=False)
+        self._programs = programs
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:

@@ -23,6 +23,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, Int, UInt32
 
 from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
 from jetbot_mjx.config import RandomizationConfig
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
@@ -357,10 +358,11 @@ class MujocoEvaluator:
         """
         self._numerics, self._dt = numerics, env.dt
         simulator = in_mujoco(env, numerics)
-        self._preset = Evaluator(simulator, networks)
+        programs = ProgramCache(compiler_options(env.config))
+        self._preset = Evaluator(simulator, networks, programs)
         drawn = ranges is not None and ranges.drawn
         self._drawn = (
-            Evaluator(DomainRandomizationWrapper(simulator, ranges=ranges), networks)
+            Evaluator(DomainRandomizationWrapper(simulator, ranges=ranges), networks, programs)
             if drawn
             else None
         )

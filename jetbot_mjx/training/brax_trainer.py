@@ -1,7 +1,8 @@
-"""The stock trainer: `brax.training.agents.ppo.train.train` on our environment.
+"""Train with Brax's own `brax.training.agents.ppo.train.train`; `trainer: brax` selects it.
 
-Nothing of PPO is written here. This module translates the configuration, hands Brax our
-wrappers, and reports each epoch to a `TrainerCallback`. `trainer: brax` selects it.
+This module contains no PPO. It translates the configuration, passes this project's wrappers and
+network factory to Brax, and reports each epoch to a `TrainerCallback`. Such a training cannot be
+resumed, because Brax keeps its state in local variables.
 """
 
 import contextlib
@@ -24,25 +25,25 @@ from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 
 
 class _StopTraining(Exception):
-    """Brax's loop has no other way out."""
+    """Raised to leave Brax's training loop, which has no other way to stop early."""
 
 
 def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
-    """Train until the end, or until the recorder has enough.
+    """Train until the end, or until the callback asks to stop.
 
     Args:
-      config: the run; `check_devices` has passed it.
+      config: the configuration of the run, which has passed `check_devices`.
       env: the environment, unwrapped.
-      recorder: hears before the first step and after every interval.
+      recorder: the callback, which is invoked before the first step and after every interval.
     """
     ppo = config.ppo.model_dump(exclude={"network", "normalizer"})
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
     latest: dict[str, Any] = {}
-    # Brax annotates it as a function of the environment alone, and calls it with all four.
+    # Brax annotates it as a function of the environment alone, but passes four arguments.
     wrap_env_fn: Any = wrap_for_training
     clock = time.perf_counter()
 
-    # Brax calls back twice an epoch: first with the parameters, then with the metrics.
+    # Brax calls back twice in an epoch: first with the parameters, then with the metrics.
     def on_params(env_steps: int, make_policy: object, params: tuple[Any, Any, Any]) -> None:
         del make_policy
         latest["params"] = PolicyParams(*params)
@@ -55,12 +56,12 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
     def report(env_steps: int, metrics: Mapping[str, Any], seconds: float) -> None:
         nonlocal clock
         params = jax.device_get(latest["params"])
-        if not recorder.on_interval(
-            [Progress(env_steps, params, to_our_metrics(metrics, config.ppo.entropy_cost), seconds)]
-        ):
+        named = rename_metrics(metrics, config.ppo.entropy_cost)
+        if not recorder.on_interval([Progress(env_steps, params, named, seconds)]):
             raise _StopTraining
         clock = time.perf_counter()
 
+    # Run Brax's trainer without its own evaluations.
     with device_put_replicated(), contextlib.suppress(_StopTraining):
         brax_train.train(
             environment=env,
@@ -68,10 +69,10 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
             wrap_env_fn=wrap_env_fn,
             network_factory=network_factory(config.ppo.network),
             seed=config.seed,
-            # One initial report and one after every interval; the evaluations are ours.
+            # Report at the beginning and after every interval; the recorder evaluates.
             num_evals=num_intervals + 1,
             run_evals=False,
-            # Without evaluations Brax still resets an evaluation batch of this size.
+            # Brax resets an evaluation batch of this size even without evaluations.
             num_eval_envs=1,
             progress_fn=on_metrics,
             policy_params_fn=on_params,
@@ -79,7 +80,7 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
         )
 
 
-def to_our_metrics(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+def rename_metrics(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
     """Return Brax's metrics under this project's names."""
     brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     metrics = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
@@ -90,7 +91,7 @@ def to_our_metrics(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str,
 
 @contextlib.contextmanager
 def device_put_replicated() -> Iterator[None]:
-    """Lend JAX ≥ 0.10 the function that it dropped and that Brax 0.14.2 still calls.
+    """Add to JAX ≥ 0.10 the function that it removed and that Brax 0.14.2 still calls.
 
     The mesh axis is named `i`, as in Brax's `pmap`: under any other name the shardings of
     the first and the later epochs differ, and the epoch compiles twice.

@@ -1,4 +1,4 @@
-"""The interface between trainers and recorders: a trainer knows nothing of files."""
+"""Define the callback interface of the trainers, which themselves write no files."""
 
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -8,40 +8,59 @@ from jetbot_mjx.agents.ppo import NanDump, TrainState
 
 
 class Progress(NamedTuple):
-    """The progress of the training of one seed."""
+    """A `Progress` holds the state of one seed's training."""
 
     env_steps: int
     """Environment steps so far."""
     params: PolicyParams
-    """On the host."""
+    """The policy's parameters, on the host."""
     metrics: Mapping[str, float]
-    """Means and counts since the last complete report, by this project's names."""
+    """Means and counts since the last complete report, under this project's names."""
     seconds: float
-    """Time that training took since the last report, compilation apart where that is known."""
+    """Training time since the last report [s], without compilation where that is known."""
     state: TrainState | None = None
-    """All that is needed to go on from here, on the host; None: the trainer cannot."""
+    """The complete training state, on the host; None if the trainer cannot resume."""
 
 
 class TrainerCallback:
-    """A listener of a trainer; this one ignores everything."""
+    """A `TrainerCallback` receives a trainer's events; this base class ignores them all."""
 
     def on_interval(self, progress: Sequence[Progress]) -> bool:
-        """Take the state of every seed at the end of an interval.
+        """Handle the end of an interval.
+
+        Args:
+          progress: the progress of every seed.
 
         Returns:
-          Whether to go on.
+          Whether the training goes on.
         """
         del progress
         return True
 
     def on_preempt(self, progress: Sequence[Progress]) -> None:
-        """Take the state of every seed where training was asked to stop between two reports."""
+        """Handle a stop on request between two reports.
+
+        Args:
+          progress: the progress of every seed.
+        """
 
     def on_progress(self, env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
-        """Take what is known between two reports: the mean of all seeds, and the time spent."""
+        """Handle progress between two reports.
+
+        Args:
+          env_steps: environment steps so far.
+          metrics: means over all seeds since the last report.
+          seconds: training time since the last report [s].
+        """
 
     def on_nan_dump(self, seed_index: int, env_steps: int, nan_dump: NanDump) -> None:
-        """Take a world that blew up before that many environment steps."""
+        """Handle a non-finite state.
+
+        Args:
+          seed_index: index of the seed.
+          env_steps: environment steps at the end of the call in which it happened.
+          nan_dump: the dump, with arrays on the host.
+        """
 
     def on_compiled(self) -> None:
-        """Hear that the training step is compiled."""
+        """Handle the end of compilation: training begins."""

@@ -1,8 +1,8 @@
-"""Several processes that train one policy together, one for each host or each GPU.
+"""Train one policy with several processes, one for each host or each GPU.
 
-Every process holds the same parameters and steps its share of the environments. The first one
-alone writes, prints, judges and films; what the others do next it tells them, so that all make
-the same calls in the same order and none waits for one that has left.
+Every process holds the same parameters and steps its share of the environments. Only the first
+process, the primary, evaluates, writes and prints. It broadcasts the outcome, so that all processes
+make the same collective calls in the same order, and none waits for a process that has ended.
 """
 
 import os
@@ -20,26 +20,23 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 
 JOIN_SECONDS = 120
-"""How long processes wait for each other at the start [s]."""
+"""Longest time that the processes wait for each other at the start [s]."""
 
 _ADDRESS = "JAX_COORDINATOR_ADDRESS"
 _COUNT = "JAX_NUM_PROCESSES"
 _INDEX = "JAX_PROCESS_ID"
-_PART_SECONDS = 10
-"""How long a process that leaves waits for those that may not follow [s]."""
-
 _FAILED = -1
 _USER_ERROR = 2
 
 
 def check(config: Config) -> None:
-    """Refuse what several processes cannot do.
+    """Raise an error if several processes cannot train a configuration.
 
     Args:
-      config: the run.
+      config: the configuration of the run.
 
     Raises:
-      UserError: it asks for that.
+      UserError: its trainer or its number of seeds needs a single process.
     """
     if config.trainer == "brax":
         raise UserError("--distributed is not known to trainer = 'brax': take 'resumable'")
@@ -50,78 +47,79 @@ def check(config: Config) -> None:
 
 
 def join() -> None:
-    """Join the other processes; to be called before JAX is asked for a device.
+    """Connect to the other processes, before JAX is asked for a device.
 
-    Slurm and Open MPI tell JAX who they are; elsewhere three environment variables do:
-    `JAX_COORDINATOR_ADDRESS` (`host:port` of the first process), `JAX_NUM_PROCESSES` and
-    `JAX_PROCESS_ID`, counted from 0. Where not all come within `JOIN_SECONDS`, the process ends
-    with one line.
+    Under Slurm and Open MPI, JAX finds its place among the processes itself. Elsewhere three
+    environment variables give it: `JAX_COORDINATOR_ADDRESS` (`host:port` of the first process),
+    `JAX_NUM_PROCESSES` and `JAX_PROCESS_ID`, counted from 0. If not all processes have connected
+    after `JOIN_SECONDS`, this process ends with one line.
 
     Raises:
       UserError: a variable is missing or wrong.
     """
-    address, count, index = _whereabouts()
-    # JAX would take SIGTERM for itself; `preemption` listens to it.
+    address, count, index = _read_environment()
+    # Keep JAX from handling SIGTERM, which `preemption` handles.
     jax.config.update("jax_enable_preemption_service", False)
-    waiting = threading.Timer(JOIN_SECONDS, _give_up, [address])
-    waiting.daemon = True
-    waiting.start()
+    timeout = threading.Timer(JOIN_SECONDS, _exit_unconnected, [address])
+    timeout.daemon = True
+    timeout.start()
     try:
-        # Past its own limit JAX ends the process by a signal and a page of addresses.
+        # At its own time limit JAX aborts the process and prints a page of addresses.
         jax.distributed.initialize(address, count, index, initialization_timeout=JOIN_SECONDS + 60)
-    # Of what is missing here, and of what Slurm or Open MPI left half said.
+    # JAX raises these for missing variables, also for incomplete ones of Slurm or Open MPI.
     except (ValueError, LookupError) as error:
         raise UserError(
-            f"--distributed: neither Slurm nor Open MPI tells where this process belongs ({error}):"
+            f"--distributed: neither Slurm nor Open MPI started this process ({error}):"
             f" set {_ADDRESS} (host:port of the first process), {_COUNT} and {_INDEX}"
         ) from None
     finally:
-        waiting.cancel()
+        timeout.cancel()
 
 
 def leave() -> None:
-    """Wait until every process has come here, and parts; nothing where there is one alone."""
+    """Wait until every process has called this, and disconnect; do nothing in a single process."""
     jax.distributed.shutdown()
 
 
-def is_first() -> bool:
-    """Return whether this is the process that writes and prints."""
+def is_primary() -> bool:
+    """Return whether this is the first process, which alone writes and prints."""
     return jax.process_index() == 0
 
 
 def all_gather_ints(*values: int) -> Int[np.ndarray, "processes n"]:
-    """Tell all processes a few numbers, and hears theirs; every process must call it.
+    """Gather a few numbers from all processes; every process must call this.
 
     Args:
-      values: of this process.
+      values: the numbers of this process, each of which fits into 32 bits.
 
     Returns:
-      Those of each.
+      The numbers of each process.
     """
-    mine = np.array(values, np.int32)
+    local = np.array(values, np.int32)
     if jax.process_count() == 1:
-        return mine[None]
-    return np.asarray(multihost_utils.process_allgather(mine))
+        return local[None]
+    return np.asarray(multihost_utils.process_allgather(local))
 
 
 def run_on_primary(action: Callable[[], int]) -> int:
-    """Let the first process do something, and tells the others what came of it.
+    """Run a function in the first process, and return its result in all processes.
 
     Args:
-      action: done by the first process alone; returns no negative number.
+      action: the function, which only the first process calls; it returns a number that is not
+        negative.
 
     Returns:
-      What it returned there, in all processes.
+      The function's result.
 
     Raises:
-      UserError: in the others, where it failed in the first.
+      UserError: in the other processes, if the function raised an error in the first.
     """
     if jax.process_count() == 1:
         return action()
-    if not is_first():
+    if not is_primary():
         outcome = int(all_gather_ints(0)[0, 0])
         if outcome == _FAILED:
-            raise UserError("process 0 could not go on, and says why; this one leaves with it")
+            raise UserError("process 0 has failed and prints the reason; this process ends too")
         return outcome
     try:
         outcome = action()
@@ -133,41 +131,44 @@ def run_on_primary(action: Callable[[], int]) -> int:
 
 
 def broadcast_from_primary(trees: Sequence[PyTree], template: PyTree, count: int) -> list[PyTree]:
-    """Hand what the first process holds to all, bit by bit.
+    """Copy arrays of the first process to all processes, bit for bit.
 
     Args:
-      trees: arrays on the host; only the first process's count.
+      trees: arrays on the host; those of the other processes are ignored.
       template: shapes and dtypes of one tree.
-      count: of trees.
+      count: number of trees.
 
     Returns:
-      The trees, on every host.
+      The first process's trees, on every host.
     """
     if jax.process_count() == 1:
         return list(trees)
     shapes, structure = jax.tree.flatten([template] * count)
     sizes = [int(np.prod(x.shape, dtype=int)) * np.dtype(x.dtype).itemsize for x in shapes]
-    mine = np.zeros(sum(sizes), np.uint8)
-    if is_first():
+    local = np.zeros(sum(sizes), np.uint8)
+    if is_primary():
         leaves = jax.tree.leaves(list(trees))
-        mine = np.concatenate([np.ascontiguousarray(x).reshape(-1).view(np.uint8) for x in leaves])
-    # As bytes: a sum of floats with zero loses the sign of a zero.
-    theirs: Any = multihost_utils.broadcast_one_to_all(mine)
-    parts = np.split(np.asarray(theirs), np.cumsum(sizes)[:-1])
+        local = np.concatenate([np.ascontiguousarray(x).reshape(-1).view(np.uint8) for x in leaves])
+    # Broadcast bytes: JAX broadcasts by a sum, in which a float loses the sign of a zero.
+    content: Any = multihost_utils.broadcast_one_to_all(local)
+    parts = np.split(np.asarray(content), np.cumsum(sizes)[:-1])
     arrays = [
         part.view(np.dtype(x.dtype)).reshape(x.shape) for part, x in zip(parts, shapes, strict=True)
     ]
     return jax.tree.unflatten(structure, arrays)
 
 
-def _whereabouts() -> tuple[str | None, int | None, int | None]:
-    """Return what the environment says; None for what Slurm or Open MPI is to say."""
+def _read_environment() -> tuple[str | None, int | None, int | None]:
+    """Return the address, number of processes and index that the environment variables give.
+
+    Each is None if it is not set, so that JAX asks Slurm or Open MPI.
+    """
     address = os.environ.get(_ADDRESS)
     if address is not None:
         host, colon, port = address.rpartition(":")
         if not (host and colon and port.isdecimal() and 0 < int(port) < 65_536):
             raise UserError(f"{_ADDRESS} = {address!r} is wrong: write host:port")
-    count, index = _number(_COUNT), _number(_INDEX)
+    count, index = _read_number(_COUNT), _read_number(_INDEX)
     if (count is None) != (index is None):
         missing = _COUNT if count is None else _INDEX
         raise UserError(f"{missing} is missing: {_COUNT} and {_INDEX} belong together")
@@ -184,7 +185,7 @@ def _whereabouts() -> tuple[str | None, int | None, int | None]:
     return address, count, index
 
 
-def _number(name: str) -> int | None:
+def _read_number(name: str) -> int | None:
     text = os.environ.get(name)
     if text is None:
         return None
@@ -193,11 +194,13 @@ def _number(name: str) -> int | None:
     return int(text)
 
 
-def _give_up(address: str | None) -> None:
+def _exit_unconnected(address: str | None) -> None:
+    """End this process with one line, because not all processes have connected."""
     where = f" at {address}" if address else ""
     print(
-        f"error: --distributed: not all processes have met{where} within {JOIN_SECONDS} s: start as"
-        f" many as {_COUNT} says, each with its own {_INDEX}, where that address can be reached",
+        f"error: --distributed: not all processes have connected{where} within {JOIN_SECONDS} s:"
+        f" start as many as {_COUNT} says, each with its own {_INDEX}, where that address can be"
+        " reached",
         file=sys.stderr,
         flush=True,
     )

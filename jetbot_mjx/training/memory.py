@@ -1,8 +1,12 @@
 """Estimate a training's device memory from shapes, before anything is compiled.
 
-A device holds a copy of the parameters and its share of the environments. A training step then
-needs room for what it collects, and collects and learns one after the other: the larger of the
-two counts, or the evaluation where that is larger still.
+Each device holds a copy of the parameters P and its share of the environments E. A training step
+collects experience and then learns from it, and an evaluation runs between steps, so that only the
+largest of the three counts:
+
+    memory = 1.18 (P + E + max(collecting, learning, evaluation)) + 112 MiB
+
+The factor and the constant were measured on one NVIDIA H200.
 """
 
 import os
@@ -17,7 +21,6 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import make_mj_model
-from jetbot_mjx.envs.wrappers import wrap_for_training
 
 GIB = 2**30
 
@@ -26,127 +29,133 @@ _KEY = jax.ShapeDtypeStruct((2,), np.uint32)
 _FLOAT = 4
 
 _LAYERS = 1.6
-"""What a gradient keeps at once of the layers of a minibatch, as XLA was seen to need: all of
-them on the way there, and on the way back some once more."""
+"""Memory of a gradient, as a multiple of the activations of a minibatch, as measured with XLA: the
+forward pass stores all of them, the backward pass some of them again."""
 
-
-_TAKEN = 1.18
-"""What is taken for what is counted, at the most: for one size, programs that XLA compiled on two
-occasions took 15 and 17 GiB of an H200."""
+_OVERHEAD = 1.18
+"""Largest measured ratio of allocated to counted memory: for one size, programs that XLA compiled
+on two occasions took 15 and 17 GiB of an H200."""
 
 _PROGRAMS = 112 * 2**20
-"""What programs and the libraries that they call take besides, as it told of 256 [bytes]."""
+"""Memory of the programs and of the libraries that they call, as measured [bytes]."""
 
 
 class Sizes(NamedTuple):
-    """The memory that one of each takes [bytes]."""
+    """A `Sizes` holds the memory of one environment, one sample and so on [bytes]."""
 
     environment: int
     """The state of an environment."""
     physics: int
-    """What is computed on the way to its next state."""
+    """The intermediate results of one physics step of one environment."""
     sample: int
-    """An environment step as it is collected."""
-    learnt: int
-    """What learning looks at of it."""
+    """One collected environment step."""
+    learned: int
+    """The part of a collected step that the loss reads."""
     unroll: int
-    """What an unroll ends with."""
+    """The last observation of one unroll."""
     layers: int
-    """The networks' units, for one sample."""
+    """The activations of both networks for one sample."""
     parameters: int
-    """Networks, Adam's moments, normaliser, sums: a whole copy."""
+    """One copy of the networks, Adam's moments, the normaliser and the sums of metrics."""
 
 
 class Footprint(NamedTuple):
-    """The memory that a training takes on each device [bytes]."""
+    """A `Footprint` holds the memory that a training takes on each device [bytes]."""
 
     num_envs: int
-    """Environments, all devices together."""
+    """Number of environments over all devices."""
     batch_size: int
-    """Unrolls per minibatch, all devices together."""
+    """Unrolls per minibatch over all devices."""
     parameters: int
     """Networks, Adam's moments and the normaliser."""
     environments: int
-    """Their states."""
+    """The states of the environments."""
     collecting: int
-    """One step of all environments, and what is collected."""
+    """One physics step of all environments, and the collected steps."""
     learning: int
-    """What is collected, shuffled, and the networks' layers for a minibatch."""
+    """The collected steps, their shuffled copy, and the activations of a minibatch."""
     evaluation: int
     """The episodes of an evaluation, on the first device."""
 
     @property
     def counted(self) -> int:
-        """Return what its arrays take at the fullest moment."""
+        """Return the largest memory of all arrays at one time."""
         most = max(self.collecting, self.learning, self.evaluation)
         return self.parameters + self.environments + most
 
     @property
     def total(self) -> int:
-        """Return what a device has to have for it: all that is counted, and what comes on top."""
-        return int(_TAKEN * self.counted) + _PROGRAMS
+        """Return the memory that a device needs: the arrays, the overhead and the programs."""
+        return int(_OVERHEAD * self.counted) + _PROGRAMS
 
 
-def sizes(config: Config, env: JetBotEnv) -> Sizes:
-    """Ask JAX for the shapes of a training; nothing is computed.
+def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
+    """Trace a training for its shapes; nothing is computed.
 
     Args:
-      config: the run.
-      env: its environment, unwrapped.
+      ppo: PPO with the wrapped environment, from `build_ppo`.
+      env: the same environment, unwrapped.
 
     Returns:
-      What one of each takes.
+      The memory of one environment, one sample and so on.
     """
-    ppo = PPO(config.ppo, wrap_for_training(env, config.task.episode_length))
+    # Trace the state, and what one training step collects.
     state = jax.eval_shape(ppo.init, _KEY)
     _, data, _ = jax.eval_shape(ppo.collect, state, state.key)
-    unrolls = config.ppo.batch_size * config.ppo.num_minibatches
-    samples = unrolls * config.ppo.unroll_length
+    config = ppo.config
+    unrolls = config.batch_size * config.num_minibatches
+    samples = unrolls * config.unroll_length
+    # Of the episode statistics, the loss reads the truncation only.
     ends = _bytes(data.next_observation)
-    books = _bytes(data.extras["state_extras"])
-    everything = _bytes(data) - ends
-    learnt = everything - books + _bytes(data.extras["state_extras"]["truncation"])
+    statistics = _bytes(data.extras["state_extras"])
+    collected = _bytes(data) - ends
+    learned = collected - statistics + _bytes(data.extras["state_extras"]["truncation"])
     environments = _bytes(state.env_state)
-    network = config.ppo.network
+    network = config.network
     units = sum(network.policy_hidden_layer_sizes) + sum(network.value_hidden_layer_sizes)
     return Sizes(
-        environment=environments // config.ppo.num_envs,
-        physics=_physics(config, env),
-        sample=everything // samples,
-        learnt=learnt // samples,
+        environment=environments // config.num_envs,
+        physics=_physics(env),
+        sample=collected // samples,
+        learned=learned // samples,
         unroll=ends // unrolls,
         layers=_FLOAT * units,
         parameters=_bytes(state) - environments,
     )
 
 
-def _physics(config: Config, env: JetBotEnv) -> int:
+def _physics(env: JetBotEnv) -> int:
+    """Return the memory of one physics step of one environment [bytes]."""
     if env.physics.impl != "xla":
-        # One kernel keeps what it computes to itself: what comes in and what goes out.
+        # A single kernel stores its input and output only, no intermediate results.
         return 2 * _bytes(jax.eval_shape(env.reset, _KEY).pipeline_state)
-    world = make_mj_model(env.robot, config.physics, build_scene=env.task.build_scene, visual=False)
-    return _bytes(mjx.make_data(world))
+    build_scene = env.task.build_scene
+    model = make_mj_model(env.robot, env.config.physics, build_scene=build_scene, visual=False)
+    return _bytes(mjx.make_data(model))
 
 
 def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
-    """Return what a training takes on each device.
+    """Compute the memory that a training takes on each device.
 
     Args:
-      config: the run; `num_envs` and `batch_size` may be others than those of `each`.
-      each: what one of each takes.
-      device_count: devices of all processes together.
+      config: the configuration of the run; its `num_envs` and `batch_size` may differ from those
+        that `each` was computed with.
+      each: the memory of one environment, one sample and so on, from `sizes`.
+      device_count: number of devices over all processes.
 
     Returns:
       The memory, part by part.
     """
+    # Divide environments and samples among the devices, rounded up.
     ppo = config.ppo
     minibatch = -(-ppo.batch_size // device_count) * ppo.unroll_length
     unrolls = -(-ppo.batch_size * ppo.num_minibatches // device_count)
     samples = unrolls * ppo.unroll_length
     environments = -(-ppo.num_envs // device_count)
+    # Add up the parts; every seed takes all of them but the evaluation.
     stepped = environments * each.environment
     collected = samples * each.sample + unrolls * each.unroll
-    shuffled = samples * each.learnt + unrolls * each.unroll
+    shuffled = samples * each.learned + unrolls * each.unroll
     return Footprint(
         num_envs=ppo.num_envs,
         batch_size=ppo.batch_size,
@@ -166,14 +175,14 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
 
 
 def resized(config: Config, factor: float) -> Config | None:
-    """Return the same training with more or fewer environments, and minibatches that go with them.
+    """Return a configuration with `ppo.num_envs` and `ppo.batch_size` multiplied by a factor.
 
     Args:
-      config: the run.
-      factor: on `ppo.num_envs` and `ppo.batch_size`.
+      config: the configuration of the run.
+      factor: the factor.
 
     Returns:
-      The configuration; None where the numbers would not be whole.
+      The configuration; None if the products are not whole numbers.
     """
     num_envs, batch_size = config.ppo.num_envs * factor, config.ppo.batch_size * factor
     if not (num_envs.is_integer() and batch_size.is_integer()):
@@ -183,21 +192,21 @@ def resized(config: Config, factor: float) -> Config | None:
 
 
 def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[Footprint]:
-    """Yield sizes by factors of two, from a quarter up to the first that does not fit.
+    """Return footprints by factors of two, from a quarter up to the first that does not fit.
 
     Args:
-      config: the run.
-      each: what one of each takes.
-      device_count: devices of all processes together.
-      limit: a device's memory [bytes].
+      config: the configuration of the run.
+      each: the memory of one environment, one sample and so on, from `sizes`.
+      device_count: number of devices over all processes.
+      limit: memory of a device [bytes].
 
     Returns:
-      What they take, ascending, the configured size always among them.
+      The footprints in ascending order, always including that of the configured size.
     """
     found = []
     power = -2
     while power <= 0 or (found[-1].total <= limit and found[-1].num_envs < _MOST_ENVS):
-        if (changed := resized(config, 2.0**power)) is not None and _shared(changed, device_count):
+        if (changed := resized(config, 2.0**power)) is not None and _divides(changed, device_count):
             found.append(footprint(changed, each, device_count))
         power += 1
     return found
@@ -206,19 +215,19 @@ def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[F
 def next_that_fits(
     config: Config, each: Sizes, device_count: int, limit: int | None
 ) -> Footprint | None:
-    """Return the largest training that is smaller than this by a factor of two or more, and fits.
+    """Return the largest training that fits and is smaller by a power of two.
 
     Args:
-      config: the run.
-      each: what one of each takes.
-      device_count: devices of all processes together.
-      limit: a device's memory [bytes]; None: not known, and everything fits.
+      config: the configuration of the run.
+      each: the memory of one environment, one sample and so on, from `sizes`.
+      device_count: number of devices over all processes.
+      limit: memory of a device [bytes]; None: not known, and everything fits.
 
     Returns:
-      What it takes; None where none fits.
+      Its footprint; None if none fits.
     """
     power = -1
-    while (changed := resized(config, 2.0**power)) is not None and _shared(changed, device_count):
+    while (changed := resized(config, 2.0**power)) is not None and _divides(changed, device_count):
         found = footprint(changed, each, device_count)
         if limit is None or found.total <= limit:
             return found
@@ -226,38 +235,35 @@ def next_that_fits(
     return None
 
 
-def advice(config: Config, env: JetBotEnv, device_count: int, limit: int | None) -> str:
-    """Return what to say of a training that ran out of memory.
+def advice(config: Config, each: Sizes, device_count: int, limit: int | None) -> str:
+    """Return the error message for a training that ran out of memory.
 
     Args:
-      config: the run.
-      env: its environment, unwrapped.
-      device_count: devices of all processes together.
-      limit: a device's memory [bytes]; None: not known.
+      config: the configuration of the run.
+      each: the memory of one environment, one sample and so on, from `sizes`.
+      device_count: number of devices over all processes.
+      limit: memory of a device [bytes]; None: not known.
 
     Returns:
       One line that names the next smaller size that fits.
     """
-    each = sizes(config, env)
-    wanted, fits = (
-        footprint(config, each, device_count),
-        next_that_fits(config, each, device_count, limit),
-    )
-    has = "" if limit is None else f" ({limit / GIB:.2f} GiB)"
-    said = (
-        f"the device's memory{has} does not suffice for ppo.num_envs = {wanted.num_envs}, which"
-        f" takes about {wanted.total / GIB:.2f} GiB: "
+    wanted = footprint(config, each, device_count)
+    fits = next_that_fits(config, each, device_count, limit)
+    available = "" if limit is None else f" ({limit / GIB:.2f} GiB)"
+    problem = (
+        f"the device's memory{available} does not suffice for ppo.num_envs = {wanted.num_envs},"
+        f" which takes about {wanted.total / GIB:.2f} GiB: "
     )
     if fits is None:
-        return f"{said}choose smaller networks, ppo.unroll_length or evaluation.episodes"
+        return f"{problem}choose smaller networks, ppo.unroll_length or evaluation.episodes"
     return (
-        f"{said}--set ppo.num_envs={fits.num_envs} --set ppo.batch_size={fits.batch_size} takes"
-        f" {fits.total / GIB:.2f} GiB; python -m jetbot_mjx.plan tells more"
+        f"{problem}--set ppo.num_envs={fits.num_envs} --set ppo.batch_size={fits.batch_size} takes"
+        f" {fits.total / GIB:.2f} GiB; python -m jetbot_mjx.plan lists other sizes"
     )
 
 
 def device_memory() -> int | None:
-    """Return what this process's first device has for JAX [bytes]; None: it does not say."""
+    """Return the memory of this process's first device [bytes]; None if it does not report it."""
     device: Any = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
@@ -266,11 +272,12 @@ def device_memory() -> int | None:
         host = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
     except (ValueError, OSError):
         return None
-    # A CPU that stands for several devices has one memory.
+    # Several CPU devices share the memory of the host.
     return host // jax.local_device_count()
 
 
-def _shared(config: Config, device_count: int) -> bool:
+def _divides(config: Config, device_count: int) -> bool:
+    """Return whether the devices can share the environments and minibatches evenly."""
     return config.ppo.num_envs % device_count == 0 and config.ppo.batch_size % device_count == 0
 
 

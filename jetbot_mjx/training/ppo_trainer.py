@@ -1,62 +1,90 @@
-"""The resumable trainer: `ppo.PPO` compiled once, over all devices and all seeds.
+"""Train with `ppo.PPO`, compiled once for all devices and all seeds, so that it can be resumed.
 
-Each device holds its share of every seed's environments and a copy of the rest; the devices may
-be those of several processes, which then all run this, call for call. How many
-training steps one call makes is an argument of the compiled program: short calls answer
-signals and tell of progress, and since metrics are summed inside the state, what is logged and
-what is computed do not depend on how the steps were cut into calls.
+Motivation: a training must answer signals and show progress while the devices work, and a training
+that was stopped anywhere must continue with bit-identical results.
+
+Protocol:
+  Chunked calls. The compiled program `advance(state, steps, restart)` runs `steps` training steps
+    in one call. The number is an argument, so that one program serves calls of any length;
+    `ChunkSizer` chooses it such that a call takes about one second. Between two calls the loop
+    checks for signals and reports progress. The metrics are summed inside the state, so neither the
+    results nor the logged metrics depend on how the steps were divided into calls.
+  Exact resume. `TrainState` holds everything that the next step depends on. At the end of every
+    interval the callback receives it with its sums set to zero, as the next call would begin; where
+    a signal stops the training between two reports, `on_preempt` receives it with the sums so far.
+  Several processes. Each device holds its share of every seed's environments and a copy of all
+    other arrays. All processes run this module, call for call: before every call they gather
+    whether one of them was asked to stop, and all take the number of steps from the first process.
+    Only the first process invokes the callback for reports; the others receive what it returned.
 """
 
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
+from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.training import distributed
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
 
 _AXIS = "devices"
-_CALL_SECONDS = 1.0
+_MAX_CALL_SECONDS = 1.0
 _CALLS_PER_NOTICE = 10
+_POLL_SECONDS = 0.02
+
+Advance = Callable[[TrainState, int, bool], tuple[TrainState, NanDump]]
+"""The compiled training step: (state, training steps, whether to restart the sums)."""
+
+
+def build_ppo(config: Config, env: JetBotEnv) -> PPO:
+    """Build PPO over all devices, with its networks and the wrapped environment.
+
+    Args:
+      config: the configuration of the run, which has passed `check_devices`.
+      env: the environment, unwrapped.
+
+    Returns:
+      PPO; its `networks` are the only ones of the training.
+    """
+    networks = make_networks(
+        config.ppo.network,
+        env.observation_size,
+        env.action_size,
+        normalize=config.ppo.normalize_observations,
+    )
+    wrapped = wrap_for_training(env, config.task.episode_length)
+    return PPO(config.ppo, wrapped, networks, axis_name=_AXIS, device_count=jax.device_count())
 
 
 class CompiledTrainer:
-    """One configuration's training, over all devices and all its seeds."""
+    """A `CompiledTrainer` runs PPO as compiled programs, over all devices and all seeds."""
 
-    def __init__(
-        self, config: Config, env: JetBotEnv, programs: ProgramCache | None = None
-    ) -> None:
-        """Prepare the program; nothing is compiled yet.
+    def __init__(self, ppo: PPO, seeds: Sequence[int], programs: ProgramCache) -> None:
+        """Prepare the programs, which compile at their first use.
 
         Args:
-          config: the run; `check_devices` has passed it.
-          env: the environment, unwrapped.
-          programs: of that configuration; None: they are not kept.
+          ppo: PPO over all devices, from `build_ppo`.
+          seeds: the random seed of each policy that is trained.
+          programs: the cache of compiled programs of this configuration.
         """
-        self._programs = programs or open_program_cache(config, keep=False)
-        devices = jax.devices()
-        self._mesh = Mesh(np.array(devices), (_AXIS,))
-        # On the host, from where every process's devices can take them.
-        self._seeds = np.arange(config.seed, config.seed + config.seeds, dtype=np.uint32)
-        self._ppo = PPO(
-            config.ppo,
-            wrap_for_training(env, config.task.episode_length),
-            axis_name=_AXIS,
-            device_count=len(devices),
-        )
-        self._compiled_init = self._programs.find("init")
+        self.ppo = ppo
+        # Keep the seeds on the host, from where the devices of every process can read them.
+        self._seeds = np.array(seeds, np.uint32)
+        self._programs = programs
+        # Take the shapes from the cached program where there is one, because tracing takes longer.
+        self._compiled_init = programs.find("init")
         self._shapes = (
             jax.eval_shape(self._init, self._seeds)
             if self._compiled_init is None
@@ -64,30 +92,54 @@ class CompiledTrainer:
                 lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), self._compiled_init.out_info
             )
         )
-        # Seeds come first, and environments second.
+        # Shard the environments, which are the second axis after the seeds; replicate the rest.
+        self._mesh = Mesh(np.array(jax.devices()), (_AXIS,))
         replicated = jax.tree.map(lambda _: PartitionSpec(), self._shapes)
-        shared = jax.tree.map(lambda _: PartitionSpec(None, _AXIS), self._shapes.env_state)
-        self._specs = replicated.replace(env_state=shared)
+        sharded = jax.tree.map(lambda _: PartitionSpec(None, _AXIS), self._shapes.env_state)
+        self._specs = replicated.replace(env_state=sharded)
         self._shardings = jax.tree.map(lambda spec: NamedSharding(self._mesh, spec), self._specs)
-        self._whole = NamedSharding(self._mesh, PartitionSpec())
+        self._replicated = NamedSharding(self._mesh, PartitionSpec())
+
+    @classmethod
+    def from_config(cls, config: Config, env: JetBotEnv) -> Self:
+        """Build the trainer of a configuration, without a cache of programs on disk.
+
+        Args:
+          config: the configuration of the run.
+          env: the environment, unwrapped.
+
+        Returns:
+          The trainer; nothing is compiled yet.
+        """
+        seeds = [one.seed for one in config.of_each_seed()]
+        return cls(build_ppo(config, env), seeds, ProgramCache(compiler_options(config)))
 
     def template(self) -> TrainState:
-        """Return shapes and dtypes of one seed's state."""
+        """Return the shapes and dtypes of one seed's state."""
         return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._shapes)
 
     def init(self) -> TrainState:
         """Return the state before the first step, on the devices."""
         program = self._compiled_init
         if program is None:
-            jitted = jax.jit(self._init, in_shardings=self._whole, out_shardings=self._shardings)
+            jitted = jax.jit(
+                self._init, in_shardings=self._replicated, out_shardings=self._shardings
+            )
             program = self._programs.compile("init", lambda: jitted.trace(self._seeds))
         return program(self._seeds)
 
     def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
-        return jax.vmap(lambda seed: self._ppo.init(jax.random.PRNGKey(seed)))(seeds)
+        return jax.vmap(lambda seed: self.ppo.init(jax.random.PRNGKey(seed)))(seeds)
 
     def put(self, states: Sequence[TrainState]) -> TrainState:
-        """Put states of all seeds from the host onto the devices."""
+        """Copy the states of all seeds from the host to the devices.
+
+        Args:
+          states: the state of each seed, as arrays on the host.
+
+        Returns:
+          One state with the seeds as the first axis.
+        """
         stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
         return jax.tree.map(
             lambda x, sharding: jax.make_array_from_callback(x.shape, sharding, x.__getitem__),
@@ -96,19 +148,19 @@ class CompiledTrainer:
         )
 
     def get(self, state: TrainState) -> list[TrainState]:
-        """Return states of all seeds, on the host."""
+        """Copy the state from the devices to the host, and return that of each seed."""
         if jax.process_count() > 1:
-            # What lies on another process's devices cannot be fetched.
-            state = jax.jit(_identity, out_shardings=self._whole)(state)
+            # A process cannot read the devices of another: replicate everything first.
+            state = jax.jit(_identity, out_shardings=self._replicated)(state)
         host = jax.device_get(state)
         return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
 
-    def compile(self) -> Callable[[TrainState, int, bool], tuple[TrainState, NanDump]]:
-        """Compile the training step, for once and for all: another shape is an error, not a wait.
+    def compile(self) -> Advance:
+        """Compile the training step once; another shape is an error and never compiles again.
 
         Returns:
-          A function of (state, training steps, whether the tally starts anew), which takes the
-          state's memory for its result. Faults have the axes (devices, seeds).
+          A function of (state, training steps, whether to restart the sums). It donates the memory
+          of the state to its result. The dumps that it returns have the axes (devices, seeds).
         """
         program = self._programs.compile("advance", self.trace)
 
@@ -118,10 +170,10 @@ class CompiledTrainer:
         return call
 
     def trace(self) -> jax.stages.Traced:
-        """Return the training step for the devices, not yet compiled."""
+        """Trace the training step for all devices, without compiling it."""
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
-            state, nan_dump = jax.vmap(self._ppo.advance, in_axes=(0, None, None))(
+            state, nan_dump = jax.vmap(self.ppo.advance, in_axes=(0, None, None))(
                 state, steps, restart
             )
             return state, jax.tree.map(lambda x: x[None], nan_dump)
@@ -131,111 +183,118 @@ class CompiledTrainer:
             mesh=self._mesh,
             in_specs=(self._specs, PartitionSpec(), PartitionSpec()),
             out_specs=(self._specs, PartitionSpec(_AXIS)),
-            # Brax's utilities average gradients themselves, as under `pmap`.
+            # Brax's functions average the gradients over devices themselves, as under `pmap`.
             check_vma=False,
         )
         jitted = jax.jit(
             sharded,
             donate_argnums=0,
-            in_shardings=(self._shardings, self._whole, self._whole),
-            # Every process sees the nan_dumps of all.
-            out_shardings=(self._shardings, self._whole),
+            in_shardings=(self._shardings, self._replicated, self._replicated),
+            # Every process receives the dumps of all devices.
+            out_shardings=(self._shardings, self._replicated),
         )
         scalars = (np.zeros((), np.int32), np.zeros((), bool))
         return jitted.trace(self._shapes, *scalars)
 
 
 def train(
-    config: Config,
-    program: CompiledTrainer,
+    trainer: CompiledTrainer,
     recorder: TrainerCallback,
     preemption: Preemption,
+    checkpoint_interval: int,
     states: Sequence[TrainState] | None = None,
 ) -> None:
-    """Train until the end, until the recorder has enough, or until a signal comes.
+    """Train until the end, until the callback asks to stop, or until a signal arrives.
 
     Args:
-      config: the run.
-      program: of that run.
-      recorder: hears of everything.
-      preemption: asked before every call and while compiling.
-      states: where each seed stands, on the host; None: at the beginning.
+      trainer: the compiled trainer of the run.
+      recorder: the callback that receives every report.
+      preemption: the signal listener, which is checked while compiling and before every call.
+      checkpoint_interval: environment steps from one report to the next, at least.
+      states: the state of each seed to resume from, on the host; None: start from the beginning.
     """
-    compiling = _Background(program.compile)
+    # Compile in the background while the initial policy is evaluated.
+    compiling = _Background(trainer.compile)
     if states is None:
-        state = program.init()
-        if not _report(config, program, recorder, state, 0.0):
+        state, done = trainer.init(), 0
+        if not _report(trainer, recorder, state, 0.0):
             return
-        done = 0
     else:
-        state = program.put(states)
-        done = env_steps(states[0]) // config.ppo.steps_per_training_step
+        state = trainer.put(states)
+        done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step
+    # Wait until every process has compiled; leave if one of them was asked to stop.
     running = True
     while running:
-        heard = distributed.all_gather_ints(preemption.wait(0.02), compiling.running)
-        if heard[:, 0].any():
+        gathered = distributed.all_gather_ints(preemption.wait(_POLL_SECONDS), compiling.running)
+        if gathered[:, 0].any():
             return
-        running = heard[:, 1].any()
+        running = gathered[:, 1].any()
     advance = compiling.result()
     recorder.on_compiled()
+    _train_loop(trainer, advance, recorder, preemption, checkpoint_interval, state, done)
 
-    size = config.ppo.steps_per_training_step
-    interval = -(-config.checkpoint_interval // size)
-    pace = ChunkSizer(min(_CALL_SECONDS, config.preemption_notice / _CALLS_PER_NOTICE))
+
+def _train_loop(
+    trainer: CompiledTrainer,
+    advance: Advance,
+    recorder: TrainerCallback,
+    preemption: Preemption,
+    checkpoint_interval: int,
+    state: TrainState,
+    done: int,
+) -> None:
+    """Run the training steps from number `done` on, call by call; see the module's protocol."""
+    config = trainer.ppo.config
+    size = config.steps_per_training_step
+    interval = -(-checkpoint_interval // size)
+    sizer = ChunkSizer(min(_MAX_CALL_SECONDS, preemption.notice / _CALLS_PER_NOTICE))
     seconds, restart = 0.0, False
-    while done < config.ppo.training_steps:
-        goal = min(config.ppo.training_steps, (done // interval + 1) * interval)
-        heard = distributed.all_gather_ints(preemption.requested, min(pace.steps, goal - done))
-        if heard[:, 0].any():
+    while done < config.training_steps:
+        # Agree with the other processes on whether to go on, and on the length of the call.
+        goal = min(config.training_steps, (done // interval + 1) * interval)
+        gathered = distributed.all_gather_ints(preemption.requested, min(sizer.steps, goal - done))
+        if gathered[:, 0].any():
             break
-        count = int(heard[0, 1])
+        count = int(gathered[0, 1])
+        # Run the steps; reading a result waits until the devices have finished.
         began = time.perf_counter()
         state, nan_dumps = advance(state, count, restart)
         found = np.asarray(nan_dumps.found)
-        lasted = time.perf_counter() - began
-        pace.update(count, lasted)
-        done, seconds, restart = done + count, seconds + lasted, False
+        elapsed = time.perf_counter() - began
+        sizer.update(count, elapsed)
+        done, seconds, restart = done + count, seconds + elapsed, False
         for device, seed in np.argwhere(found):
             nan_dump = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
             recorder.on_nan_dump(int(seed), done * size, nan_dump)
+        # Show the progress within an interval, and report at its end.
         if done < goal:
-            tallies = jax.device_get(state.tally)
-            metrics = _metrics(config, jax.tree.map(np.mean, tallies))
-            recorder.on_progress(done * size, metrics, seconds)
+            sums = jax.tree.map(np.mean, jax.device_get(state.tally))
+            recorder.on_progress(done * size, _metrics(sums, config.entropy_cost), seconds)
             continue
-        if not _report(config, program, recorder, state, seconds):
+        if not _report(trainer, recorder, state, seconds):
             return
         seconds, restart = 0.0, True
-    # After a report there is nothing new to save.
+    # Save what was trained since the last report.
     if seconds > 0:
-        _pause(config, program, recorder, state, seconds)
+        _save_preempted(trainer, recorder, state, seconds)
 
 
 def _report(
-    config: Config,
-    program: CompiledTrainer,
-    recorder: TrainerCallback,
-    state: TrainState,
-    seconds: float,
+    trainer: CompiledTrainer, recorder: TrainerCallback, state: TrainState, seconds: float
 ) -> bool:
-    """At the end of an interval: whoever goes on from here begins a new tally."""
-    begins_anew = [
-        _progress(config, one, seconds)._replace(
-            state=one.replace(tally=jax.tree.map(np.zeros_like, one.tally))
-        )
-        for one in program.get(state)
-    ]
-    return bool(distributed.run_on_primary(lambda: recorder.on_interval(begins_anew)))
+    """Report the end of an interval; a training that resumes from here restarts the sums.
+
+    Returns:
+      Whether to go on, in all processes.
+    """
+    progress = _progress(trainer, state, seconds, restart=True)
+    return bool(distributed.run_on_primary(lambda: recorder.on_interval(progress)))
 
 
-def _pause(
-    config: Config,
-    program: CompiledTrainer,
-    recorder: TrainerCallback,
-    state: TrainState,
-    seconds: float,
+def _save_preempted(
+    trainer: CompiledTrainer, recorder: TrainerCallback, state: TrainState, seconds: float
 ) -> None:
-    progress = [_progress(config, one, seconds) for one in program.get(state)]
+    progress = _progress(trainer, state, seconds, restart=False)
 
     def save() -> int:
         recorder.on_preempt(progress)
@@ -244,24 +303,54 @@ def _pause(
     distributed.run_on_primary(save)
 
 
+def _progress(
+    trainer: CompiledTrainer, state: TrainState, seconds: float, *, restart: bool
+) -> list[Progress]:
+    """Return the progress of every seed, on the host.
+
+    Args:
+      trainer: the compiled trainer of the run.
+      state: the state on the devices.
+      seconds: training time since the last report [s].
+      restart: whether the state that is returned begins new sums.
+    """
+    entropy_cost = trainer.ppo.config.entropy_cost
+    progress = []
+    for one in trainer.get(state):
+        metrics = _metrics(one.tally, entropy_cost)
+        saved = one.replace(tally=jax.tree.map(np.zeros_like, one.tally)) if restart else one
+        progress.append(Progress(env_steps(one), one.policy_params, metrics, seconds, saved))
+    return progress
+
+
 def _identity(state: TrainState) -> TrainState:
     return state
 
 
 class ChunkSizer:
-    """The number of training steps that a call may make."""
+    """A `ChunkSizer` chooses how many training steps one call runs, by how long the last took."""
 
     def __init__(self, seconds: float) -> None:
+        """Begin with one step.
+
+        Args:
+          seconds: the desired duration of a call [s].
+        """
         self._seconds = seconds
         self.steps = 1
 
     def update(self, steps: int, seconds: float) -> None:
-        """Draw the consequence from the last call."""
+        """Set the number of steps of the next call.
+
+        Args:
+          steps: the steps of the last call.
+          seconds: the duration of the last call [s].
+        """
         self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
 
 
 class _Background:
-    """A function's result, computed in a thread of its own."""
+    """A `_Background` computes a function's result in a thread."""
 
     def __init__(self, function: Callable[[], Any]) -> None:
         self._outcome: list[Any] = []
@@ -282,30 +371,24 @@ class _Background:
     def _run(self, function: Callable[[], Any]) -> None:
         try:
             self._outcome.append(function())
-        except BaseException as error:  # handed on to who asks for the result
+        except BaseException as error:  # `result` raises it in the caller's thread.
             self._error = error
 
 
 def env_steps(state: TrainState) -> int:
-    """Environment steps of a state on the host."""
+    """Return the environment steps of a state on the host."""
     return int(state.env_steps.to_numpy())
 
 
-def _progress(config: Config, state: TrainState, seconds: float) -> Progress:
-    return Progress(
-        env_steps(state), state.policy_params, _metrics(config, state.tally), seconds, state
-    )
-
-
-def _metrics(config: Config, tally: Mapping[str, Any]) -> dict[str, float]:
-    """Return means and counts from sums; empty before the first step."""
-    sums = {name: float(value) for name, value in tally.items()}
+def _metrics(sums: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+    """Return means and counts from the sums of a state; empty before the first step."""
+    sums = {name: float(value) for name, value in sums.items()}
     steps, episodes = sums["training_steps"], sums["rollout/episodes"]
     if steps == 0:
         return {}
     metrics = {name: sums[name] / steps for name in LOSSES.values()}
-    if config.ppo.entropy_cost > 0:
-        metrics["policy/entropy"] = -metrics["loss/entropy"] / config.ppo.entropy_cost
+    if entropy_cost > 0:
+        metrics["policy/entropy"] = -metrics["loss/entropy"] / entropy_cost
     metrics["rollout/episodes"] = episodes
     if episodes > 0:
         metrics["rollout/success_rate"] = sums["rollout/successes"] / episodes

@@ -1,8 +1,8 @@
-"""Being asked to stop: SIGTERM from a scheduler, Ctrl-C from a person.
+"""Stop a training on request: on SIGTERM from a scheduler, and on Ctrl-C from the user.
 
-The first signal asks the training to finish what it is at, save and go. If that takes too long
-for the notice given, or a second signal comes, the process leaves at once: what was saved
-stays whole, because checkpoints appear under their name only when they are complete.
+After the first signal the training finishes its current call, saves and ends. If that takes longer
+than the configured notice, or at a second signal, the process exits at once. The earlier
+checkpoints stay complete, because a checkpoint gets its name only when it is complete.
 """
 
 import os
@@ -14,43 +14,45 @@ from types import FrameType
 from typing import Self
 
 STOPPED = 75
-"""Exit code: stopped on request before the end; the same command goes on (`EX_TEMPFAIL`)."""
+"""Exit code of a training that was stopped on request and can be resumed (`EX_TEMPFAIL`)."""
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT)
 _SHARE_OF_NOTICE = 0.8
+"""Share of the notice after which the process exits without saving."""
 _END = 0
-"""Through the pipe, where no signal has this number: nothing more will come."""
+"""Byte that ends the listener; no signal has this number."""
 
 
 class Preemption:
-    """Listens for the signals; a context manager that puts the former handlers back.
+    """A `Preemption` listens for signals; as a context manager it restores the former handlers.
 
-    Python runs a handler only between two of its own instructions, which a compiler's minute
-    is not: so the signal's number goes through a pipe to a thread, which keeps the clock.
+    Python runs a signal handler only between two of its own instructions, so not while a program
+    compiles. Therefore Python's wakeup file descriptor sends the signal's number through a pipe to
+    a thread, which also limits the time.
     """
 
     def __init__(self, notice: float) -> None:
         """Prepare to listen.
 
         Args:
-          notice: how long after a signal the process may still be there [s].
+          notice: time after a signal at which the process must have ended [s].
         """
-        self._notice = notice
+        self.notice = notice
         self._requested = threading.Event()
-        self._clock: threading.Timer | None = None
+        self._timer: threading.Timer | None = None
         self._listener: threading.Thread | None = None
 
     @property
     def requested(self) -> bool:
-        """Return whether a signal has come."""
+        """Return whether a signal has arrived."""
         return self._requested.is_set()
 
     def wait(self, seconds: float) -> bool:
-        """Wait for a signal, and tells whether one has come."""
+        """Wait for a signal for some seconds, and return whether one has arrived."""
         return self._requested.wait(seconds)
 
     def __enter__(self) -> Self:
-        """Begin to listen; does nothing outside the main thread, where Python allows none."""
+        """Begin to listen; do nothing outside the main thread, where Python allows no handlers."""
         self._former = {}
         if threading.current_thread() is not threading.main_thread():
             return self
@@ -58,15 +60,15 @@ class Preemption:
         os.set_blocking(self._writer, False)
         self._former_fd = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         for number in _SIGNALS:
-            # A shell lets its background jobs ignore Ctrl-C: so do they here.
+            # A shell makes its background jobs ignore Ctrl-C; keep it so.
             if signal.getsignal(number) is not signal.SIG_IGN:
-                self._former[number] = signal.signal(number, _do_nothing)
+                self._former[number] = signal.signal(number, _ignore)
         self._listener = threading.Thread(target=self._listen, daemon=True)
         self._listener.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Stop listening and puts the former handlers back."""
+        """Stop listening and restore the former handlers."""
         if self._listener is None:
             return
         for number, handler in self._former.items():
@@ -76,42 +78,45 @@ class Preemption:
         self._listener.join()
         os.close(self._reader)
         os.close(self._writer)
-        if self._clock is not None:
-            self._clock.cancel()
+        if self._timer is not None:
+            self._timer.cancel()
 
     def _listen(self) -> None:
-        """Read the numbers of the signals that come, until the end is told."""
+        """Read the numbers of the signals that arrive, until `_END`."""
         began = 0.0
         while (number := os.read(self._reader, 1)[0]) != _END:
-            # Python tells of every signal that has a handler, whoever set it.
+            # The wakeup file descriptor receives every signal that has a Python handler.
             if number not in _SIGNALS:
                 continue
             name = signal.Signals(number).name
             if not self._requested.is_set():
                 began = time.monotonic()
                 self._requested.set()
-                limit = min(_SHARE_OF_NOTICE * self._notice, threading.TIMEOUT_MAX)
-                self._clock = threading.Timer(limit, _leave, [f"{limit:.0f} s after {name}"])
-                self._clock.daemon = True
-                self._clock.start()
+                limit = min(_SHARE_OF_NOTICE * self.notice, threading.TIMEOUT_MAX)
+                self._timer = threading.Timer(
+                    limit, _exit_without_saving, [f"{limit:.0f} s after {name}"]
+                )
+                self._timer.daemon = True
+                self._timer.start()
                 print(
                     f"\n{name}: finishing this step and saving (once more to leave without saving)",
                     file=sys.stderr,
                     flush=True,
                 )
-            # Schedulers and terminals may send the same signal to a whole group, twice over.
+            # Ignore a repetition: schedulers and terminals also signal the whole process group.
             elif time.monotonic() - began > 0.5:
-                _leave(f"second {name}")
+                _exit_without_saving(f"second {name}")
 
 
-def _leave(reason: str) -> None:
+def _exit_without_saving(reason: str) -> None:
+    """End this process at once, whatever its threads do."""
     print(
-        f"{reason}: leaving without another save; the last complete checkpoint holds",
+        f"{reason}: leaving without another save; the last complete checkpoint is intact",
         file=sys.stderr,
         flush=True,
     )
     os._exit(STOPPED)
 
 
-def _do_nothing(number: int, frame: FrameType | None) -> None:
-    """Do nothing: the pipe has told the thread already."""
+def _ignore(number: int, frame: FrameType | None) -> None:
+    """Do nothing, because the thread has received the signal through the pipe."""

@@ -1,97 +1,260 @@
-"""A training from its configuration to its run folder, and what there is to say of it."""
+"""Compose a training from its configuration and run it into its run folder.
+
+This module is the composition root: `train` builds the environment, PPO with its networks, and the
+run folders once, `open_recorder` the evaluator, the video, the terminal and the logs. All other
+modules receive what they need as required arguments.
+"""
 
 import contextlib
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import jax
 
+from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.agents.ppo import PPO, TrainState
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
+from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
-from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.errors import UserError, ran_out
-from jetbot_mjx.evaluation.evaluator import Summary
-from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
-from jetbot_mjx.runs.metrics import CompileClock
+from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
+from jetbot_mjx.runs.checkpoint import about_policy
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
+from jetbot_mjx.runs.metrics import CompileClock, read_history
 from jetbot_mjx.runs.resume import Resumption, resume
 from jetbot_mjx.runs.run_dir import (
     changed_versions,
     occupied,
     seed_dirs,
     stored_config,
+    versions,
     write_run,
 )
 from jetbot_mjx.runs.wandb_sink import check_tracking
 from jetbot_mjx.training import distributed, ppo_trainer
 from jetbot_mjx.training.callbacks import TrainerCallback
-from jetbot_mjx.training.memory import advice, device_memory
+from jetbot_mjx.training.dashboard import open_terminal
+from jetbot_mjx.training.memory import advice, device_memory, sizes
 from jetbot_mjx.training.preemption import Preemption
-from jetbot_mjx.training.run_recorder import RunRecorder, Standing
+from jetbot_mjx.training.run_recorder import (
+    METRICS,
+    RunRecorder,
+    SeedRecorder,
+    Standing,
+    open_sinks,
+)
+from jetbot_mjx.viewers.video import EvaluationVideo
 
 _COMPLETE, _BEGINS, _RESUMES = range(3)
-"""How a training finds its folder."""
+"""What the run folder holds: a complete run, none, or one that can be resumed."""
 
 
 class Result(NamedTuple):
-    """The result of a training; of several processes only the first has all of it."""
+    """A `Result` holds the result of a training; of several processes only the first has it all."""
 
     run_dir: Path
     run_dirs: list[Path]
-    """The folder of each seed; of a single one, the run folder."""
+    """The folder of each seed, which is the run folder if there is only one seed."""
     standings: list[Standing]
     """How far each seed has come; empty in all processes but the first."""
     fingerprints: list[str]
-    """SHA-256 of each seed's last parameters; the same seed gives the same. Empty likewise."""
+    """SHA-256 of each seed's last parameters, which are the same for the same seed; empty in all
+    processes but the first."""
     finished: bool
-    """Whether it came to its end; otherwise the same command goes on."""
+    """Whether the training came to its end; otherwise the same command resumes it."""
     wall_seconds: float
-    """In all processes together."""
+    """Time spent on the training, in all processes [s]."""
 
     @property
     def best(self) -> Summary:
-        """Return metrics of the best checkpoint, of the first seed."""
+        """Return the metrics of the first seed's best checkpoint."""
         assert self.standings[0].best is not None
         return self.standings[0].best
 
     @property
     def best_steps(self) -> int:
-        """Environment steps of the best checkpoint, of the first seed."""
+        """Return the environment steps of the first seed's best checkpoint."""
         return self.standings[0].best_steps
 
 
-def run(config: Config, run_dir: Path, programs: ProgramCache | None = None) -> Result:
+class Training(NamedTuple):
+    """A `Training` holds the objects that a training is composed of, each built once."""
+
+    config: Config
+    run_dir: Path
+    run_dirs: list[Path]
+    """The folder of each seed."""
+    env: JetBotEnv
+    """The environment, unwrapped."""
+    ppo: PPO
+    """PPO over all devices; its networks are also those of the evaluations and videos."""
+    programs: ProgramCache
+
+
+def run(config: Config, run_dir: Path) -> Result:
     """Train a policy, from the beginning or from where the folder's run was stopped.
 
+    The programs are compiled, or found in JAX's own cache; `train` takes a cache that is loaded
+    without tracing.
+
     Args:
-      config: the run.
+      config: the configuration of the run.
       run_dir: the run folder: a new one, or that of a run with this configuration.
-      programs: of that configuration; None: they are compiled, or found in JAX's own cache. Those
-        that are kept know nothing of what was replaced or patched in this package.
 
     Returns:
-      Where it lies and how good it became.
+      The result.
+
+    Raises:
+      UserError: as for `train`.
+    """
+    return train(config, run_dir, ProgramCache(compiler_options(config)))
+
+
+def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
+    """Train a policy with a given cache of compiled programs.
+
+    Args:
+      config: the configuration of the run.
+      run_dir: the run folder: a new one, or that of a run with this configuration.
+      programs: the cache of compiled programs of this configuration. Programs that are loaded from
+        disk do not contain what was replaced or patched in this package.
+
+    Returns:
+      The result.
 
     Raises:
       UserError: the folder holds something else, belongs to another training or cannot be
-        written; the task cannot be built; the devices cannot share the environments, or their
-        memory does not suffice.
+        written; the task cannot be built; the environments cannot be divided among the devices,
+        or the devices have too little memory.
     """
+    # Refuse what cannot be trained before anything is built.
     if jax.process_count() > 1:
         distributed.check(config)
     config.check_devices(jax.device_count())
     check_tracking(config)
+    # Build every object once.
     env = make_env(config)
-    programs = programs or open_program_cache(config, keep=False)
+    ppo = ppo_trainer.build_ppo(config, env)
+    training = Training(config, run_dir, seed_dirs(run_dir, config), env, ppo, programs)
     try:
-        if config.trainer == "brax":
-            return _run_brax(config, env, run_dir, programs)
-        return _run_resumable(config, env, run_dir, programs)
+        return _train_with_brax(training) if config.trainer == "brax" else _train(training)
     except jax.errors.JaxRuntimeError as error:
         if not ran_out(error):
             raise
-        told = advice(config, env, jax.device_count(), device_memory())
-    raise UserError(told)
+        smaller = advice(config, sizes(ppo, env), jax.device_count(), device_memory())
+    raise UserError(smaller)
+
+
+def _train_with_brax(training: Training) -> Result:
+    # Brax's own trainer takes half a second to import.
+    from jetbot_mjx.training import brax_trainer
+
+    config, run_dir = training.config, training.run_dir
+    _check_folder(config, run_dir)
+    with occupied(run_dir), CompileClock() as clock:
+        write_run(run_dir, config)
+        with open_recorder(training, clock, None) as recorder:
+            recorder.begin(_headline(config, run_dir))
+            brax_trainer.train(config, training.env, recorder)
+    return _result(training, recorder, finished=True)
+
+
+def _train(training: Training) -> Result:
+    config = training.config
+    opened: list[tuple[RunRecorder, list[TrainState]]] = []
+    with contextlib.ExitStack() as stack:
+        clock = stack.enter_context(CompileClock())
+        preemption = stack.enter_context(Preemption(config.preemption_notice))
+        seeds = [one.seed for one in config.of_each_seed()]
+        trainer = ppo_trainer.CompiledTrainer(training.ppo, seeds, training.programs)
+
+        def begin() -> int:
+            resumption, messages = _open_folders(stack, training, trainer.template())
+            recorder = stack.enter_context(open_recorder(training, clock, resumption))
+            opened.append((recorder, resumption.states if resumption else []))
+            if recorder.complete:
+                recorder.say(*messages)
+                return _COMPLETE
+            recorder.begin("\n".join([*messages, _headline(config, training.run_dir)]))
+            return _RESUMES if resumption else _BEGINS
+
+        # The first process opens the folders, and sends the others the state to resume from.
+        found = distributed.run_on_primary(begin)
+        recorder, stored = opened[0] if opened else (None, [])
+        states = None
+        if found == _RESUMES:
+            states = distributed.broadcast_from_primary(stored, trainer.template(), len(seeds))
+        if found != _COMPLETE:
+            callback = recorder or TrainerCallback()
+            ppo_trainer.train(trainer, callback, preemption, config.checkpoint_interval, states)
+    # Tell the other processes whether the training came to its end.
+    complete = distributed.run_on_primary(lambda: recorder is not None and recorder.complete)
+    return _result(training, recorder, finished=bool(complete))
+
+
+def open_recorder(
+    training: Training, clock: CompileClock, resumption: Resumption | None
+) -> RunRecorder:
+    """Build the recorder of a training, with the evaluator, video, terminal and logs that it uses.
+
+    Args:
+      training: the objects of the training; its folders exist.
+      clock: measures the time that is spent on compilation.
+      resumption: the state to resume from; None: the training starts from the beginning.
+
+    Returns:
+      The recorder, which is a context manager.
+
+    Raises:
+      UserError: a folder cannot be written.
+    """
+    config, run_dirs, env = training.config, training.run_dirs, training.env
+    # Prepare the evaluation.
+    evaluate = _evaluation(training)
+    networks, programs = training.ppo.networks, training.programs
+    video = EvaluationVideo(env, networks, programs) if config.evaluation.video else None
+    # Open the terminal and the logs where the stored run ends.
+    resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
+    histories = [
+        read_history(folder / METRICS, resumed.env_steps) if resumption else []
+        for folder in run_dirs
+    ]
+    total_steps = config.ppo.training_steps * config.ppo.steps_per_training_step
+    terminal = open_terminal(run_dirs, total_steps, histories)
+    seeds = []
+    for index, seed_config in enumerate(config.of_each_seed()):
+        folder, history = run_dirs[index], histories[index]
+        sinks = open_sinks(seed_config, folder, history, terminal.say, len(run_dirs))
+        about = {**about_policy(seed_config, env), "versions": versions()}
+        standing = Standing.from_json(resumed.progress[index])
+        fingerprint = digest(resumed.states[index].policy_params) if resumption else ""
+        seeds.append(SeedRecorder(seed_config, folder, sinks, about, standing, fingerprint))
+    return RunRecorder(
+        seeds,
+        evaluate,
+        video,
+        terminal,
+        clock,
+        total_steps=total_steps,
+        stop_at_success=config.stop_at_success,
+    )
+
+
+def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
+    """Return a function that evaluates a policy on the fixed goals of training.
+
+    The robots vary as in training.
+    """
+    env, programs = training.env, training.programs
+    evaluator = Evaluator(maybe_randomize(env), training.ppo.networks, programs)
+    # Compile the keys as one program; operation by operation they would be half a dozen.
+    episodes = training.config.evaluation.episodes
+    jitted = jax.jit(training_keys, static_argnums=0)
+    keys = programs.compile(f"{episodes} keys", lambda: jitted.trace(episodes))()
+    return lambda params: summarize(evaluator.run(params, keys), env.dt)
 
 
 def _check_folder(config: Config, run_dir: Path) -> None:
@@ -102,83 +265,44 @@ def _check_folder(config: Config, run_dir: Path) -> None:
                 f"--run-dir {run_dir} is in use by a run of trainer = {stored.trainer!r}, which"
                 " cannot be continued: name a new folder"
             )
-        # What ended before its first checkpoint, such as for lack of memory, may begin as another.
+        # A run that ended before its first checkpoint, for example because memory was too small,
+        # may start again with another configuration.
         if stored.seeds != config.seeds or any(map(checkpoint_steps, seed_dirs(run_dir, stored))):
             stored.check_resume(config)
 
 
-def _run_brax(config: Config, env: JetBotEnv, run_dir: Path, programs: ProgramCache) -> Result:
-    # Brax's own trainer takes half a second to import.
-    from jetbot_mjx.training import brax_trainer
-
-    _check_folder(config, run_dir)
-    with occupied(run_dir), CompileClock() as clock:
-        write_run(run_dir, config)
-        with RunRecorder(config, env, [run_dir], clock, programs=programs) as recorder:
-            recorder.begin(_headline(config, run_dir))
-            brax_trainer.train(config, env, recorder)
-    return _result(run_dir, [run_dir], recorder, finished=True)
-
-
-def _run_resumable(config: Config, env: JetBotEnv, run_dir: Path, programs: ProgramCache) -> Result:
-    opened: list[tuple[RunRecorder, Resumption | None]] = []
-    with contextlib.ExitStack() as stack:
-        clock = stack.enter_context(CompileClock())
-        preemption = stack.enter_context(Preemption(config.preemption_notice))
-        program = ppo_trainer.CompiledTrainer(config, env, programs)
-
-        def begin() -> int:
-            resumption, welcome = _open_folders(stack, config, run_dir, program)
-            run_dirs = seed_dirs(run_dir, config)
-            recorder = RunRecorder(config, env, run_dirs, clock, resumption, programs)
-            opened.append((stack.enter_context(recorder), resumption))
-            if recorder.complete:
-                recorder.say(*welcome)
-                return _COMPLETE
-            recorder.begin("\n".join([*welcome, _headline(config, run_dir)]))
-            return _RESUMES if resumption else _BEGINS
-
-        outset = distributed.run_on_primary(begin)
-        recorder, resumption = opened[0] if opened else (TrainerCallback(), None)
-        states = None
-        if outset == _RESUMES:
-            stored = resumption.states if resumption else []
-            states = distributed.broadcast_from_primary(stored, program.template(), config.seeds)
-        if outset != _COMPLETE:
-            ppo_trainer.train(config, program, recorder, preemption, states)
-    first = recorder if isinstance(recorder, RunRecorder) else None
-    finished = bool(distributed.run_on_primary(lambda: first is not None and first.complete))
-    return _result(run_dir, seed_dirs(run_dir, config), first, finished=finished)
-
-
 def _open_folders(
-    stack: contextlib.ExitStack, config: Config, run_dir: Path, program: ppo_trainer.CompiledTrainer
+    stack: contextlib.ExitStack, training: Training, template: TrainState
 ) -> tuple[Resumption | None, list[str]]:
-    """Make the folders, and holds them until the stack ends.
+    """Create the run folders, and lock them until the stack ends.
+
+    Args:
+      stack: the context that holds the locks.
+      training: the objects of the training.
+      template: shapes and dtypes of one seed's state.
 
     Returns:
-      Where the seeds stand, and what there is to say of it.
+      The state to resume from, None if there is none, and the messages to print about it.
     """
+    config, run_dir, run_dirs = training.config, training.run_dir, training.run_dirs
     _check_folder(config, run_dir)
-    run_dirs, configs = seed_dirs(run_dir, config), config.of_each_seed()
+    configs = config.of_each_seed()
     for folder in dict.fromkeys([run_dir, *run_dirs]):
         stack.enter_context(occupied(folder))
-    resumption = resume(run_dirs, configs, program.template())
-    # Before this run's versions take the place of the stored ones.
-    welcome = [_welcome_back(run_dir, resumption)] if resumption else []
+    resumption = resume(run_dirs, configs, template)
+    # Compare the versions before those of this process replace the stored ones.
+    messages = [_resume_message(run_dir, resumption)] if resumption else []
     write_run(run_dir, config)
     if config.seeds > 1:
         for seed_dir, seed_config in zip(run_dirs, configs, strict=True):
             write_run(seed_dir, seed_config)
-    return resumption, welcome
+    return resumption, messages
 
 
-def _result(
-    run_dir: Path, run_dirs: list[Path], recorder: RunRecorder | None, *, finished: bool
-) -> Result:
+def _result(training: Training, recorder: RunRecorder | None, *, finished: bool) -> Result:
     return Result(
-        run_dir=run_dir,
-        run_dirs=run_dirs,
+        run_dir=training.run_dir,
+        run_dirs=training.run_dirs,
         standings=recorder.standings if recorder else [],
         fingerprints=recorder.fingerprints if recorder else [],
         finished=finished,
@@ -186,11 +310,11 @@ def _result(
     )
 
 
-def _welcome_back(run_dir: Path, resumption: Resumption) -> str:
-    lines = [f"passed over: {reason}" for reason in resumption.passed_over]
+def _resume_message(run_dir: Path, resumption: Resumption) -> str:
+    lines = [f"skipped: {reason}" for reason in resumption.passed_over]
     if changes := changed_versions(run_dir):
-        lines.append(f"not as it was, so the bits may differ: {'; '.join(changes)}")
-    lines.append(f"going on after {resumption.env_steps:,} steps")
+        lines.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
+    lines.append(f"resuming after {resumption.env_steps:,} steps")
     return "\n".join(lines)
 
 

@@ -21,6 +21,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
@@ -251,15 +252,18 @@ class EvaluationVideo:
 
     _SIDE, _FPS = 256, 12.5  # what a training can wait for
 
-    def __init__(self, env: JetBotEnv, networks: ppo_networks.PPONetworks) -> None:
+    def __init__(
+        self, env: JetBotEnv, networks: ppo_networks.PPONetworks, programs: ProgramCache
+    ) -> None:
         """Prepare the program; it compiles at its first use.
 
         Args:
           env: one environment, unwrapped.
           networks: of the policies.
+          programs: the cache of compiled programs of the environment's configuration.
         """
         self._env = env
-        self._evaluator = Evaluator(env, networks, record=True)
+        self._evaluator = Evaluator(env, networks, programs, record=True)
 
     def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
         """Drive and films.

@@ -20,7 +20,7 @@ from brax.training.types import Transition
 from gliding import Gliding
 
 from jetbot_mjx import evaluate
-from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer
+from jetbot_mjx.agents.ppo import LOSSES, make_optimizer
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import EGOCENTRIC, LAYOUTS, Field, GoalTask
@@ -30,6 +30,7 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import flatten
 from jetbot_mjx.runs.nan_dump import load_nan_dump
 from jetbot_mjx.training import brax_trainer, ppo_trainer, session
+from jetbot_mjx.training.ppo_trainer import build_ppo
 from jetbot_mjx.training.run_recorder import RunRecorder
 
 STEPS = 4
@@ -67,6 +68,12 @@ def with_ppo(config, **changes):
     return parse_config(values)
 
 
+def on_one_device(config, env):
+    """`PPO` that needs no mesh of devices."""
+    networks = build_ppo(config, env).networks
+    return PPO(config.ppo, wrap_for_training(env, config.task.episode_length), networks)
+
+
 class Jitted:
     """`PPO` on one device, compiled once for every number of training steps.
 
@@ -74,7 +81,7 @@ class Jitted:
     """
 
     def __init__(self, config, env):
-        self.ppo = PPO(config.ppo, wrap_for_training(env, config.task.episode_length))
+        self.ppo = on_one_device(config, env)
         self.init = jax.jit(self.ppo.init)
         self._jitted = jax.jit(self.ppo.advance)
 
@@ -284,7 +291,7 @@ def test_a_field_states_its_own_scale(smoke, settings, expected):
     config = with_ppo(smoke, num_envs=2, batch_size=2, **settings)
     env = Gliding(config)
     env.task.layout = (*env.task.layout[:-1], Field("yaw_rate", 1, "deg/s", "body", min_std=5.0))
-    ppo = PPO(config.ppo, wrap_for_training(env, config.task.episode_length))
+    ppo = on_one_device(config, env)
     std = jax.jit(ppo.init)(jax.random.PRNGKey(0)).normalizer.std
     np.testing.assert_array_equal(std, [1.0] * 6 + [expected])
 
@@ -297,7 +304,7 @@ def test_a_unit_without_a_scale_is_refused_before_anything_is_written(smoke, mon
         session.run(smoke, tmp_path / "run")
     assert list(tmp_path.iterdir()) == []
     config = with_ppo(smoke, normalizer="brax")
-    PPO(config.ppo, wrap_for_training(Gliding(config), config.task.episode_length))
+    on_one_device(config, Gliding(config))
 
 
 # Gradients that are not finite.
@@ -683,5 +690,5 @@ def test_several_seeds_resume_to_the_bit(several, glide, tmp_path, capsys):
     session.run(with_ppo(config, num_timesteps=SIZE), tmp_path / "run")
     capsys.readouterr()
     resumed = session.run(config, tmp_path / "run")
-    assert f"going on after {SIZE:,} steps" in capsys.readouterr().out
+    assert f"resuming after {SIZE:,} steps" in capsys.readouterr().out
     assert resumed.fingerprints == result.fingerprints

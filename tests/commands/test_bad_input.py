@@ -97,7 +97,7 @@ def test_a_checkpoint_of_more_digits_than_python_reads_is_refused(refused):
 
 def test_a_seed_of_32_bits_trains(root):
     config = load_config(root / "configs" / "smoke.yaml", ["seed=3000000000", "seeds=2"])
-    seeds = ppo_trainer.CompiledTrainer(config, make_env(config))._seeds
+    seeds = ppo_trainer.CompiledTrainer.from_config(config, make_env(config))._seeds
     keys = [jax.random.PRNGKey(seed) for seed in (3_000_000_000, 3_000_000_001)]
     assert jax.vmap(jax.random.PRNGKey)(seeds).tolist() == [key.tolist() for key in keys]
 

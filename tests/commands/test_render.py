@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx import evaluate, render
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
 from jetbot_mjx.runs.checkpoint import load_checkpoint
@@ -54,9 +55,9 @@ def test_the_cameras_show_the_robot_the_cube_and_where_they_are(world_env, needs
 def evaluator(smoke_run):
     """Every picture of this file is of two goals: their program is compiled once."""
     checkpoint = load_checkpoint(smoke_run)
-    evaluator = Evaluator(checkpoint.make_env(), checkpoint.networks, record=True)
+    evaluator = Evaluator(checkpoint.make_env(), checkpoint.networks, ProgramCache({}), record=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "Evaluator", lambda env, networks, record: evaluator)
+        patch.setattr(render, "Evaluator", lambda env, networks, programs, record: evaluator)
         yield evaluator
 
 

@@ -260,7 +260,7 @@ def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, m
     written = kernel_of(lambda x: x * 2.5, shape)
     x = np.ones((3, 2), np.float32)
     config = parse_config({})
-    program = open_program_cache(config, keep=True).compile(
+    program = open_program_cache(config).compile(
         "test", lambda: jax.jit(lambda x: llvm_backend.launch(written, [x])[0]).trace(x)
     )
     (name,) = llvm_backend.kernels_in(program.as_text())
@@ -268,7 +268,7 @@ def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, m
     monkeypatch.setattr(llvm_backend, "_loaded", {})
     told = []
     monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: told.append(name))
-    found = open_program_cache(config, keep=True).find("test")
+    found = open_program_cache(config).find("test")
     assert told == [name]
     np.testing.assert_array_equal(found(x), np.full((3, 2), 2.5))
 

@@ -22,7 +22,7 @@ from jetbot_mjx.envs import program_key, robot_model
 from jetbot_mjx.envs.program_key import open_program_cache
 from jetbot_mjx.envs.task import GoalTask, make_task
 from jetbot_mjx.runs.checkpoint import PRETRAINED
-from jetbot_mjx.training.ppo_trainer import ScalarProgram
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
 
 KEY = "all that it depends on"
 
@@ -157,8 +157,8 @@ def paths(tmp_path, monkeypatch):
     before = jax.config.values["jax_compilation_cache_dir"]
     jax.config.update("jax_compilation_cache_dir", str(tmp_path))
 
-    def paths(settings, *, keep=True):
-        found = open_program_cache(parse_config(settings), keep=keep)
+    def paths(settings):
+        found = open_program_cache(parse_config(settings))
         return found._path("advance") if found._folder else None
 
     yield paths
@@ -213,8 +213,9 @@ def test_the_packages_own_tasks_are_named_by_the_package_alone(paths):
         assert paths({"task": {"name": name}}) is not None
 
 
-def test_programs_are_kept_only_where_that_is_asked_for(paths):
-    assert paths({}, keep=False) is None
+def test_programs_are_cached_only_where_there_is_a_folder(paths):
+    jax.config.update("jax_compilation_cache_dir", None)
+    assert paths({}) is None
 
 
 def test_the_source_is_all_python_and_all_models():
@@ -245,13 +246,13 @@ def test_a_training_from_kept_programs_is_the_same_to_the_bit(root, folder, monk
         env = gliding.Gliding(config)
 
         def trained():
-            program = ScalarProgram(config, env, ProgramCache({}, folder, KEY))
+            program = CompiledTrainer(build_ppo(config, env), [0], ProgramCache({}, folder, KEY))
             state, _ = program.compile()(program.init(), 2, False)
             return program.template(), program.get(state)[0]
 
         shapes, first = trained()
-        monkeypatch.setattr(ScalarProgram, "trace", never)
-        monkeypatch.setattr(ScalarProgram, "_init", never)
+        monkeypatch.setattr(CompiledTrainer, "trace", never)
+        monkeypatch.setattr(CompiledTrainer, "_init", never)
         again, second = trained()
     assert jax.tree.structure(shapes) == jax.tree.structure(again)
     assert jax.tree.leaves(shapes) == jax.tree.leaves(again)

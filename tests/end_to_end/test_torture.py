@@ -51,8 +51,8 @@ def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undi
     "said",
     [
         "run folder: run",
-        "going on after 4,096 steps\nrun folder: run",
-        "passed over: checkpoint 8192\ngoing on after 8,192 steps\nrun folder: run",
+        "resuming after 4,096 steps\nrun folder: run",
+        "skipped: checkpoint 8192\nresuming after 8,192 steps\nrun folder: run",
         "Traceback (most recent call last):",
     ],
 )

@@ -8,6 +8,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
 from jetbot_mjx.envs import mujoco_simulator
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
@@ -268,7 +269,9 @@ def test_without_a_cpu_for_jax_it_says_what_to_set(world_env, monkeypatch):
 def test_the_shipped_policies_drive_there_too(run):
     checkpoint = load_checkpoint(PRETRAINED / run)
     env = in_mujoco(checkpoint.make_env())
-    driven = Evaluator(env, checkpoint.networks).run(checkpoint.params, report_keys(64))
+    driven = Evaluator(env, checkpoint.networks, ProgramCache({})).run(
+        checkpoint.params, report_keys(64)
+    )
     assert summarize(driven, env.dt).success_rate == 1.0
 
 

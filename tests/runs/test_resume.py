@@ -23,6 +23,8 @@ from test_wandb_sink import FakeWandb
 
 from jetbot_mjx import load_config, make_env, train
 from jetbot_mjx.agents.networks import make_networks
+from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator
@@ -40,7 +42,7 @@ from jetbot_mjx.runs.checkpoint_store import (
 )
 from jetbot_mjx.runs.resume import TRAINING, resume, to_trees
 from jetbot_mjx.runs.run_dir import write_run
-from jetbot_mjx.training import ppo_trainer, run_recorder, session
+from jetbot_mjx.training import ppo_trainer, session
 
 STEPS = [0, 16_384, 32_768, 49_152, 65_536]
 LAST, BEFORE = STEPS[-1], STEPS[-2]
@@ -61,7 +63,7 @@ def config(smoke):
 def program(config, smoke_run):
     """Every training of this file runs the same programs: they are traced once."""
     env = make_env(config)
-    original = ppo_trainer.CompiledTrainer(config, env)
+    original = ppo_trainer.CompiledTrainer.from_config(config, env)
     compiled = functools.cache(original.compile)
     first = functools.cache(lambda: original.get(original.init()))
 
@@ -75,10 +77,10 @@ def program(config, smoke_run):
     networks = make_networks(
         config.ppo.network, env.observation_size, env.action_size, normalize=True
     )
-    evaluator = Evaluator(env, networks)
+    evaluator = Evaluator(env, networks, ProgramCache(compiler_options(config)))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(ppo_trainer, "Program", Program)
-        patch.setattr(run_recorder, "Evaluator", lambda env, networks, **_: evaluator)
+        patch.setattr(ppo_trainer, "CompiledTrainer", Program)
+        patch.setattr(session, "Evaluator", lambda env, networks, programs: evaluator)
         yield original
 
 
@@ -169,15 +171,17 @@ def test_twice_as_long_is_resumed_half_way(smoke, tmp_path, same, capsys):
     assert train.main(["--resume", str(run_dir), "--set", "ppo.num_timesteps=65536"]) == 0
     same(run_dir)
     out, err = capsys.readouterr()
-    assert "going on after 32,768 steps" in out
-    assert "passed over" not in out
-    assert "the bits may differ" not in out
+    assert "resuming after 32,768 steps" in out
+    assert "skipped: " not in out
+    assert "the results may differ" not in out
     assert err == ""
     assert load_config(run_dir / "config.yaml").ppo.num_timesteps == 65_536
 
 
 class StopAfter:
     """Asks a training to stop after so many training steps."""
+
+    notice = 300.0
 
     def __init__(self, training_steps):
         self._left = training_steps
@@ -201,7 +205,7 @@ class StopAfter:
 @pytest.fixture
 def stop_after(monkeypatch):
     """Makes the next trainings stop after so many training steps, each a call of its own."""
-    pace = types.SimpleNamespace(steps=1, learn=lambda steps, seconds: None)
+    pace = types.SimpleNamespace(steps=1, update=lambda steps, seconds: None)
 
     def stop_after(training_steps):
         monkeypatch.setattr(session, "Preemption", lambda notice: StopAfter(training_steps))
@@ -607,8 +611,8 @@ def test_training_after_damage_ends_where_it_would_have(
     assert session.run(config, run_copy).finished
     same(run_copy)
     out, err = capfd.readouterr()
-    assert f"passed over: checkpoint {checkpoint_path(run_copy, LAST)} " in out
-    assert "going on after 49,152 steps" in out
+    assert f"skipped: checkpoint {checkpoint_path(run_copy, LAST)} " in out
+    assert "resuming after 49,152 steps" in out
     assert err == ""
 
 
@@ -629,9 +633,11 @@ def test_what_is_not_as_it_was_is_said(run_copy, config, capsys):
     found["packages"]["brax"] = "0.0.1"
     path.write_text(json.dumps(found))
     session.run(config, run_copy)
-    assert "not as it was, so the bits may differ: brax 0.0.1, now " in capsys.readouterr().out
+    assert (
+        "versions changed, so the results may differ: brax 0.0.1, now " in capsys.readouterr().out
+    )
     session.run(config, run_copy)
-    assert "the bits may differ" not in capsys.readouterr().out
+    assert "the results may differ" not in capsys.readouterr().out
 
 
 def refused(use, *arguments):

@@ -6,7 +6,7 @@ import types
 import pytest
 
 from jetbot_mjx.training import console
-from jetbot_mjx.training.console import EVALUATING, Lines
+from jetbot_mjx.training.console import EVALUATING, Terminal
 
 
 @pytest.fixture
@@ -15,7 +15,7 @@ def lines():
 
     def lines(*reports):
         stream = io.StringIO()
-        sink = Lines(10_000, stream)
+        sink = Terminal(10_000, stream)
         for env_steps, metrics in reports:
             sink.write(env_steps, [metrics])
         assert stream.getvalue().endswith("\n")
@@ -69,9 +69,9 @@ def test_a_line_between_two_reports_is_printed_where_the_last_one_is_old(monkeyp
     now = 0.0
     monkeypatch.setattr(console, "time", types.SimpleNamespace(monotonic=lambda: now))
     stream = io.StringIO()
-    sink = Lines(10_000, stream)
+    sink = Terminal(10_000, stream)
     for now in (0.0, 9.0, 11.0, 12.0, 20.0, 21.5):
-        sink.tell(int(now), {"rollout/success_rate": 0.5}, 100.0)
+        sink.update(int(now), {"rollout/success_rate": 0.5}, 100.0)
     shown = stream.getvalue().splitlines()
     assert [int(line.split()[0]) for line in shown] == [0, 11, 21]
     assert all("exploring  50.0%" in line and "100 steps/s" in line for line in shown)
@@ -79,19 +79,19 @@ def test_a_line_between_two_reports_is_printed_where_the_last_one_is_old(monkeyp
 
 
 def test_progress_goes_to_standard_output(capsys):
-    Lines(10).write(5, [{}])
+    Terminal(10).write(5, [{}])
     assert "5 steps" in capsys.readouterr().out
 
 
 def test_of_several_seeds_a_line_says_the_mean():
     stream = io.StringIO()
-    Lines(10_000, stream).write(5, [{"eval/success_rate": 0.25}, {"eval/success_rate": 0.5}])
+    Terminal(10_000, stream).write(5, [{"eval/success_rate": 0.25}, {"eval/success_rate": 0.5}])
     assert "success  37.5%" in stream.getvalue()
 
 
 def test_that_it_compiles_is_said_at_once_and_phases_are_not():
     stream = io.StringIO()
-    lines = Lines(10_000, stream)
+    lines = Terminal(10_000, stream)
     lines.begin()
     lines.phase(EVALUATING)
     lines.close()

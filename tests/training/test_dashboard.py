@@ -10,17 +10,26 @@ import time
 
 import pytest
 from rich.console import Console
-from test_dashboard_layout import REPORT, board
 from test_preemption import LISTENER
 
 from jetbot_mjx import train
 from jetbot_mjx.runs import metrics
+from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.training import dashboard as dashboard_module
-from jetbot_mjx.training.console import SAVING, Lines
-from jetbot_mjx.training.dashboard import Dashboard, open_terminal
-from jetbot_mjx.training.dashboard_layout import DashboardLayout
+from jetbot_mjx.training.console import EVALUATING, SAVING, TRAINING, Terminal
+from jetbot_mjx.training.dashboard import Dashboard, open_terminal, sparkline
 
 PATIENCE = 60
+
+REPORT = {
+    "eval/success_rate": 0.625,
+    "eval/episode_return": 0.81,
+    "eval/time_to_goal_median": 1.25,
+    "rollout/success_rate": 0.5,
+    "train/nonfinite_envs": 0.0,
+    "train/nonfinite_updates": 0.0,
+    "time/env_steps_per_second": 41_234.5,
+}
 
 
 class Screen:
@@ -105,20 +114,20 @@ def test_there_is_a_dashboard_where_people_watch_and_lines_elsewhere(
     for name, value in [("TERM", "dumb"), ("TTY_INTERACTIVE", "0")]:
         with monkeypatch.context() as patch:
             patch.setenv(name, value)
-            assert chosen() is Lines
+            assert chosen() is Terminal
     with monkeypatch.context() as patch:
         patch.setattr(dashboard_module.os, "tcgetpgrp", lambda file: os.getpgrp() + 1)
-        assert chosen() is Lines
+        assert chosen() is Terminal
     with (
         monkeypatch.context() as patch,
         open(screen.stream.fileno(), "w", encoding="ascii", closefd=False) as ascii_only,
     ):
         patch.setattr(sys, "stdout", ascii_only)
-        assert chosen() is Lines
+        assert chosen() is Terminal
     # Continuous integration often forces colours.
     monkeypatch.setenv("FORCE_COLOR", "1")
     monkeypatch.setattr(sys, "stdout", io.StringIO())
-    assert chosen() is Lines
+    assert chosen() is Terminal
 
 
 def test_the_clock_moves_while_the_program_compiles(screen, opened):
@@ -146,8 +155,8 @@ def test_what_is_said_stands_above_and_the_last_figures_stay(screen, opened):
     assert "before" in screen.text
     # Not broken, so that it can be copied.
     assert "[line] of /a/very/" + 30 * "long/" + "path\r\n" in screen.text
-    assert "printed\r\nin two lines\r\n" in screen.text
-    assert "and half a line\r\n" in screen.text
+    for line in ("printed\r\n", "in two lines\r\n", "and half a line\r\n"):
+        assert line in screen.text
     assert "at last\r\n" in screen.text
     assert "unfinished\r\n" in screen.text
     assert "2,500 of 10,000" in end
@@ -175,57 +184,20 @@ def test_what_goes_to_a_file_goes_there_still(screen, opened, monkeypatch):
     assert sys.stdout is not screen.stream
 
 
-def test_a_terminal_that_no_longer_reads_keeps_nobody(tmp_path, monkeypatch):
-    full = threading.Event()
-
-    class Stuck(io.StringIO):
-        encoding = "utf-8"
-
-        def isatty(self):
-            return True
-
-        def write(self, text):
-            full.wait()
-            return len(text)
-
-    console = Console(file=Stuck(), force_terminal=True)
-    dashboard = Dashboard(board(), console)
-    monkeypatch.setattr(sys, "stdout", console.file)
-    began = time.monotonic()
-    dashboard.begin()
-    for step in range(1_000):
-        dashboard.write(step, [REPORT])
-        dashboard.say("line")
-    assert time.monotonic() - began < 0.5
-    print("one more", flush=True)
-    dashboard.close()
-    assert time.monotonic() - began < 4
-    full.set()
-
-
-OF_A_THREAD = "ignore::pytest.PytestUnhandledThreadExceptionWarning"
-
-
-@pytest.mark.parametrize(
-    "error",
-    # A terminal that has gone away is nobody's mistake; anything else is, and shows.
-    [OSError, pytest.param(ZeroDivisionError, marks=pytest.mark.filterwarnings(OF_A_THREAD))],
-)
-def test_a_drawing_that_fails_ends_and_lines_come_instead(screen, opened, monkeypatch, error):
+def test_a_terminal_that_goes_away_does_not_stop_the_training(screen, opened, monkeypatch):
     def fail(*arguments):
-        raise error
+        raise OSError("gone")
 
     dashboard = opened()
     dashboard.begin()
     screen.until("╭")
-    monkeypatch.setattr(DashboardLayout, "render", fail)
-    deadline = time.monotonic() + PATIENCE
-    while sys.stdout is not screen.stream:
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-    dashboard.write(1, [REPORT])
-    dashboard.say("still there")
-    screen.until("still there")
+    with monkeypatch.context() as patch:
+        patch.setattr(screen.stream, "write", fail, raising=False)
+        time.sleep(1.2)
+        dashboard.write(1, [REPORT])
+        dashboard.say("lost")
+    dashboard.close()
+    assert sys.stdout is screen.stream
 
 
 def test_in_the_background_it_does_not_draw(screen, opened, monkeypatch):
@@ -244,7 +216,7 @@ from pathlib import Path
 from jetbot_mjx.training.dashboard import open_terminal
 terminal = open_terminal([Path("mine")], 100, [[]])
 terminal.begin()
-terminal.tell(42, {}, 1.0)
+terminal.update(42, {}, 1.0)
 print('listening', flush=True)
 send(); time.sleep(1); send(); time.sleep(3600)"""
 
@@ -284,3 +256,133 @@ def test_a_training_on_a_terminal_has_the_dashboard(screen, watch, root, tmp_pat
     logged = metrics.read_history(tmp_path / "mine" / "metrics.jsonl", 8_192)[-1].metrics
     assert f"{logged['time/env_steps_per_second']:,.0f} environment steps/s" in end
     assert end.index("╯") < end.index("best policy: ")
+
+
+# What it shows.
+
+
+@pytest.fixture
+def now(monkeypatch):
+    """The clock of the dashboard; set `now[0]`."""
+    now = [0.0]
+    fake = type("time", (), {"monotonic": staticmethod(lambda: now[0])})
+    monkeypatch.setattr(dashboard_module, "time", fake)
+    return now
+
+
+def dashboard_of(seeds=1, history=(), total=10_000, width=100):
+    console = Console(file=io.StringIO(), width=width)
+    names = [str(seed) for seed in range(seeds)]
+    return Dashboard("mine", total, names, [history] * seeds, console)
+
+
+def text_of(dashboard):
+    """The lines of a dashboard, without colours."""
+    console = dashboard._console
+    console.file = io.StringIO()
+    console.print(dashboard.render())
+    return console.file.getvalue().splitlines()
+
+
+def table(dashboard):
+    """The cells of the table of seeds, without the curves."""
+    lines = text_of(dashboard)[2:]
+    rows = lines[: next(number for number, line in enumerate(lines) if not line.strip("│ "))]
+    return [re.sub("[▁▂▃▄▅▆▇█]+", "", line).strip("│ ").split() for line in rows]
+
+
+def test_before_the_first_report_time_passes(now):
+    empty = dashboard_of()
+    empty.phase("compiling")
+    now[0] = 61.0
+    text = "\n".join(text_of(empty))
+    assert "compiling 1:01" in text
+    assert " 1:01 ─" in text
+    assert "0%  0 of 10,000 steps" in text
+    assert table(empty) == [["0", *["-"] * 5]]
+
+
+def test_the_last_report_and_what_is_known_since(now):
+    one = dashboard_of()
+    one.write(2_500, [REPORT])
+    assert table(one) == [["0", "62.5%", "62.5%", "50.0%", "0.81", "1.25", "s"]]
+    assert "25%  2,500 of 10,000 steps" in "".join(text_of(one))
+    assert "41,234 environment steps/s" in "".join(text_of(one))
+    one.update(3_000, {"rollout/success_rate": 0.75}, 20_000.0)
+    assert table(one)[0][1:4] == ["62.5%", "62.5%", "75.0%"]
+    assert "30%  3,000 of 10,000 steps" in "".join(text_of(one))
+    assert "20,000 environment steps/s" in "".join(text_of(one))
+    one.write(5_000, [{**REPORT, "eval/success_rate": 0.25}])
+    assert table(one)[0][1:4] == ["25.0%", "62.5%", "50.0%"]
+
+
+def test_the_time_left_counts_evaluating_and_saving_but_not_compiling(now):
+    one = dashboard_of()
+    now[0] = 100.0
+    one.update(1_000, {}, 99_999.0)
+    now[0] = 110.0  # 2,000 steps took 10 s, whatever was done in them
+    one.write(3_000, [REPORT])
+    assert re.search(r"00:35\s+left", "".join(text_of(one)))
+
+
+def test_each_phase_has_its_time(now):
+    one = dashboard_of()
+    for seconds, phase in [(10, TRAINING), (3, EVALUATING), (2, SAVING), (70, TRAINING)]:
+        one.phase(phase)
+        now[0] += seconds
+    one.phase(None)
+    now[0] += 100
+    assert "training 1:20   evaluating 0:03   saving 0:02" in "".join(text_of(one))
+
+
+def test_non_finite_states_are_counted_and_otherwise_not_mentioned():
+    two = dashboard_of(seeds=2)
+    two.write(1, [REPORT, REPORT])
+    assert "finite" not in "".join(text_of(two))
+    two.write(2, [{**REPORT, "train/nonfinite_envs": 2.0}, REPORT])
+    two.write(3, [REPORT, {**REPORT, "train/nonfinite_updates": 1.0}])
+    assert "3 non-finite states or gradients" in "".join(text_of(two))
+
+
+def test_a_few_seeds_have_a_row_each_and_many_their_range():
+    rates = [seed / 10 for seed in range(10)]
+    several, many = dashboard_of(seeds=3), dashboard_of(seeds=10)
+    several.write(1, [{**REPORT, "eval/success_rate": rate} for rate in rates[:3]])
+    assert [line[:2] for line in table(several)] == [["0", "0.0%"], ["1", "10.0%"], ["2", "20.0%"]]
+    many.write(1, [{**REPORT, "eval/success_rate": rate} for rate in rates])
+    many.write(2, [{**REPORT, "eval/success_rate": 0.5, "eval/time_to_goal_median": None}] * 10)
+    assert [line[:3] for line in table(many)] == [
+        ["mean", "50.0%", "50.0%"],
+        ["lowest", "50.0%", "50.0%"],
+        ["highest", "50.0%", "90.0%"],
+    ]
+    assert table(many)[0][-1] == "-"
+
+
+def test_a_resumed_training_shows_what_was_logged_before():
+    history = [History(0, 1.0, {"eval/success_rate": 0.0}), History(2_500, 2.0, REPORT)]
+    again = dashboard_of(history=history)
+    assert table(again)[0][1:4] == ["62.5%", "62.5%", "50.0%"]
+    assert "▁▆" in "".join(text_of(again))
+    assert "25%  2,500 of 10,000 steps" in "".join(text_of(again))
+
+
+@pytest.mark.parametrize("width", [1, 30, 50, 60, 80, 140])
+@pytest.mark.parametrize("seeds", [1, 3, 10])
+def test_a_dashboard_fits_into_the_terminal(seeds, width):
+    full = dashboard_of(seeds, total=10**10, width=width)
+    for step in range(200):
+        full.write(10**9 + step, [REPORT] * seeds)
+    full.phase(TRAINING)
+    lines = text_of(full)
+    assert max(map(len, lines)) <= width
+    assert len(lines) < 30 or width < 30
+    if width >= 80:
+        assert "…" not in "".join(lines)
+        assert lines[2].count("▆") >= min(width, 100) - 60
+
+
+def test_a_curve_is_the_whole_history_in_so_many_blocks():
+    assert sparkline([0.0, 0.13, 0.5, 0.99, 1.0], 8) == "▁▂▅██"
+    assert sparkline([0.0] * 500 + [1.0] * 500, 8) == "▁▁▁▁████"
+    assert sparkline([], 8) == ""

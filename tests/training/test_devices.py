@@ -25,7 +25,7 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, digest, read_about
 from jetbot_mjx.runs.resume import resume, to_trees
 from jetbot_mjx.training import session
-from jetbot_mjx.training.ppo_trainer import CompiledTrainer
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
 
 DEVICES = 8
 STEPS = 3
@@ -81,7 +81,7 @@ def said(*arguments):
 
 
 def trained_program(config):
-    program = CompiledTrainer(config, make_env(config))
+    program = CompiledTrainer.from_config(config, make_env(config))
     begun = program.init()
     (first,) = program.get(begun)
     advance = program.compile()
@@ -120,7 +120,9 @@ def robots(config):
     """What was drawn for the environments, and each one's key of noise."""
     drawn = {"friction": (0.4, 1.2), "motor_gain": (0.9, 1.1), "yaw_noise": (0.0, 0.1)}
     config = config.model_copy(update={"randomization": RandomizationConfig(**drawn)})
-    episode_params = CompiledTrainer(config, make_env(config)).init().env_state.episode_params
+    episode_params = (
+        CompiledTrainer.from_config(config, make_env(config)).init().env_state.episode_params
+    )
     return {
         "shards": [shard.data.shape for shard in episode_params.drawn.addressable_shards],
         "drawn": np.asarray(episode_params.drawn)[0].tolist(),
@@ -136,9 +138,9 @@ def averaging():
     settings = TINY | {"batch_size": 32, "num_minibatches": 1, "max_grad_norm": None}
     settings |= {"normalize_advantage": False, "entropy_cost": 0.0}
     config = parse_config({"task": {"observation": "egocentric"}, "ppo": settings})
+    among = build_ppo(config, make_env(config))
     env = wrap_for_training(make_env(config), config.task.episode_length)
-    alone = PPO(config.ppo, env)
-    among = PPO(config.ppo, env, axis_name="devices", device_count=2)
+    alone = PPO(config.ppo, env, among.networks)
     params, optimizer_state, normalizer = beginning(alone)
     assert normalizer.mean.shape == (OBS,)
     data, key = made_up(alone), jax.random.PRNGKey(0)
@@ -167,7 +169,7 @@ def averaging():
 def restored(run_dir):
     """SHA-256 of the last checkpoint's trees: as they were stored, and after the devices."""
     checkpoint = load_checkpoint(run_dir, "last")
-    program = CompiledTrainer(checkpoint.config, make_env(checkpoint.config))
+    program = CompiledTrainer.from_config(checkpoint.config, make_env(checkpoint.config))
     resumption = resume([run_dir], [checkpoint.config], program.template())
     (state,) = program.get(program.put(resumption.states))
     stored = read_about(checkpoint_path(run_dir, resumption.env_steps))["sha256"]
@@ -223,7 +225,7 @@ def test_eight_devices_learn(told, on_one):
 def test_what_one_device_saved_goes_on_on_eight(told, on_one):
     for stored, found in told["restored"].values():
         assert stored == found
-    assert f"going on after {SIZE:,} steps" in told["went_on"]
+    assert f"resuming after {SIZE:,} steps" in told["went_on"]
     assert "device_count 1, now 8" in told["went_on"]
     assert [line["env_steps"] for line in lines(on_one)] == [0, SIZE, 2 * SIZE]
 
@@ -233,7 +235,7 @@ def test_what_eight_devices_saved_goes_on_on_one(told, on_one):
     for stored, found in restored(run_dir).values():
         assert stored == found
     printed = said("--resume", run_dir, "--set", f"ppo.num_timesteps={65_536 + SIZE}")
-    assert "going on after 65,536 steps" in printed
+    assert "resuming after 65,536 steps" in printed
     assert "device_count 8, now 1" in printed
     assert lines(run_dir)[-1]["env_steps"] == 65_536 + SIZE
     state = jax.tree.leaves(load_checkpoint(run_dir, "last").params)

@@ -44,7 +44,7 @@ def tell(interrupted, *arguments):
     ppo_trainer.ChunkSizer.update = lambda self, steps, seconds: None
     report = ppo_trainer._report
 
-    def reported(config, program, recorder, state, seconds):
+    def reported(trainer, recorder, state, seconds):
         own = jax.tree.map(lambda x: np.asarray(x.addressable_data(0)), state)
         told = {
             "parameters": digest(own.params),
@@ -53,7 +53,7 @@ def tell(interrupted, *arguments):
             "devices": [jax.local_device_count(), jax.device_count()],
         }
         print("told:", json.dumps(told), flush=True)
-        return report(config, program, recorder, state, seconds)
+        return report(trainer, recorder, state, seconds)
 
     def interrupt(self, env_steps, metrics, seconds):
         os.kill(os.getpid(), signal.SIGTERM)
@@ -149,7 +149,7 @@ def test_a_signal_to_one_stops_all_at_the_same_step(stopped):
     (first, second), _, saved = stopped
     assert [first.code, second.code] == [STOPPED, STOPPED], first.err + second.err
     assert saved == [0, SIZE]
-    assert "stopped; to go on: python -m jetbot_mjx.train --resume" in first.said
+    assert "stopped; to resume: python -m jetbot_mjx.train --resume" in first.said
     assert "SIGTERM: finishing this step" in second.complained
 
 
@@ -171,7 +171,7 @@ def test_only_the_first_prints_and_writes(stopped, finished):
 def test_they_go_on_where_they_were_stopped(finished):
     (first, second), run_dir = finished
     assert (first.code, second.code) == (0, 0), first.err + second.err
-    assert f"going on after {SIZE:,} steps" in first.said
+    assert f"resuming after {SIZE:,} steps" in first.said
     assert checkpoint_steps(run_dir) == [0, SIZE, 2 * SIZE, 4 * SIZE]
     assert [line["env_steps"] for line in lines(run_dir)] == [0, 2 * SIZE, 4 * SIZE]
 
@@ -203,7 +203,7 @@ def test_they_end_with_the_bits_of_one_process_on_two_devices(alone, finished):
 
 
 def test_alone_nothing_is_exchanged():
-    assert distributed.is_first()
+    assert distributed.is_primary()
     assert distributed.all_gather_ints(3, 4).tolist() == [[3, 4]]
     assert distributed.run_on_primary(lambda: 5) == 5
 
@@ -234,7 +234,7 @@ def test_where_the_first_fails_all_leave(monkeypatch):
         distributed.run_on_primary(lambda: 1 // 0)
     assert told == [[distributed._FAILED]]
     heard(monkeypatch, 1, said=distributed._FAILED)
-    with pytest.raises(UserError, match="process 0 could not go on"):
+    with pytest.raises(UserError, match="process 0 has failed"):
         distributed.run_on_primary(lambda: 0)
 
 
@@ -306,7 +306,7 @@ def test_processes_that_do_not_come_are_not_waited_for_without_end(tmp_path, unu
     )
     assert process.returncode == 2
     assert len(process.stderr.splitlines()) == 1
-    assert "not all processes have met at 127.0.0.1" in process.stderr
+    assert "not all processes have connected at 127.0.0.1" in process.stderr
     assert "within 1 s" in process.stderr
 
 

@@ -12,7 +12,7 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import memory, session
 from jetbot_mjx.training.memory import GIB, footprint, ladder, next_that_fits, resized, sizes
-from jetbot_mjx.training.ppo_trainer import CompiledTrainer
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +27,7 @@ def env(config):
 
 @pytest.fixture(scope="module")
 def each(config, env):
-    return sizes(config, env)
+    return sizes(build_ppo(config, env), env)
 
 
 MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
@@ -46,8 +46,8 @@ MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
 def test_xla_sets_aside_what_was_told(root, settings, fullest):
     config = load_config(root / "configs" / "smoke.yaml", settings)
     env = make_env(config)
-    told = footprint(config, sizes(config, env), 1)
-    program = CompiledTrainer(config, env)
+    told = footprint(config, sizes(build_ppo(config, env), env), 1)
+    program = CompiledTrainer.from_config(config, env)
     stats = program.trace().lower().compile(compiler_options(config)).memory_analysis()
     taken = (
         stats.argument_size_in_bytes
@@ -64,7 +64,8 @@ def test_xla_sets_aside_what_was_told(root, settings, fullest):
 def test_what_a_gpu_had_in_use_was_foretold(root):
     measured = json.loads((root / "benchmarks/results/nvidia-h200-sweep.json").read_text("utf-8"))
     config = parse_config(measured["config"])
-    each = sizes(config, make_env(config))
+    env = make_env(config)
+    each = sizes(build_ppo(config, env), env)
     for row in measured["results"]:
         if row["rate"] == "training":
             size = resized(config, row["num_envs"] / config.ppo.num_envs)
@@ -74,7 +75,7 @@ def test_what_a_gpu_had_in_use_was_foretold(root):
 
 
 def test_sizes_are_those_of_the_arrays(config, env, each):
-    state = CompiledTrainer(config, env).template()
+    state = CompiledTrainer.from_config(config, env).template()
     size = {
         name: sum(np.prod(x.shape, dtype=int) * x.dtype.itemsize for x in jax.tree.leaves(tree))
         for name, tree in {"all": state, "environments": state.env_state}.items()

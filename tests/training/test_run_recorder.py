@@ -9,12 +9,14 @@ import pytest
 
 from jetbot_mjx import load_config, make_env
 from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps, read_about
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.training import run_recorder, session
 from jetbot_mjx.training.callbacks import Progress
+from jetbot_mjx.training.ppo_trainer import build_ppo
 from jetbot_mjx.viewers import offscreen, video
 
 PARAMS = PolicyParams(normalizer=np.zeros(1), policy=np.ones(2), value=np.zeros(1))
@@ -25,7 +27,7 @@ def recorder(root, tmp_path, monkeypatch):
     """Makes recorders that judge by heart."""
 
     class Evaluator:
-        def __init__(self, env, networks, **_):
+        def __init__(self, env, networks, programs):
             pass
 
         def run(self, params, keys):
@@ -45,7 +47,7 @@ def recorder(root, tmp_path, monkeypatch):
                 qpos=None,
             )
 
-    monkeypatch.setattr(run_recorder, "Evaluator", Evaluator)
+    monkeypatch.setattr(session, "Evaluator", Evaluator)
     clocks = []
 
     def recorder(*settings):
@@ -54,7 +56,10 @@ def recorder(root, tmp_path, monkeypatch):
         for folder in folders:
             folder.mkdir(exist_ok=True)
         clocks.append(CompileClock())
-        return run_recorder.RunRecorder(config, make_env(config), folders, clocks[-1])
+        env, programs = make_env(config), ProgramCache({})
+        ppo = build_ppo(config, env)
+        parts = session.Training(config, tmp_path, folders, env, ppo, programs)
+        return session.open_recorder(parts, clocks[-1], None)
 
     yield recorder
     for clock in clocks:
@@ -70,7 +75,7 @@ def events(monkeypatch, tmp_path):
         return len((run_dir / "metrics.jsonl").read_text().splitlines())
 
     class Film:
-        def __init__(self, env, networks, **_):
+        def __init__(self, env, networks, programs):
             pass
 
         def write(self, path, params, env_steps):
@@ -84,7 +89,7 @@ def events(monkeypatch, tmp_path):
             found.append(("save", env_steps, run_dir.name, lines(run_dir)))
             super().save(env_steps, *arguments)
 
-    monkeypatch.setattr(run_recorder, "EvaluationVideo", Film)
+    monkeypatch.setattr(session, "EvaluationVideo", Film)
     monkeypatch.setattr(run_recorder, "CheckpointStore", CheckpointStore)
     monkeypatch.setattr(run_recorder, "find_backend", lambda: "egl")
     return found
@@ -119,8 +124,8 @@ def test_nothing_is_prepared_where_nothing_is_asked_for(recorder, tmp_path, monk
     def refuse(*arguments):
         raise AssertionError("this was not asked for")
 
-    for name in ("EvaluationVideo", "find_backend"):
-        monkeypatch.setattr(run_recorder, name, refuse)
+    for module, name in ((session, "EvaluationVideo"), (run_recorder, "find_backend")):
+        monkeypatch.setattr(module, name, refuse)
     with recorder() as it:
         report(it, 0)
     assert not (tmp_path / "seed-0" / "videos").exists()
@@ -137,7 +142,7 @@ def test_without_opengl_training_goes_on_after_one_line(recorder, tmp_path, monk
         offscreen.find_backend.cache_clear()
     told = [line for line in capsys.readouterr().out.splitlines() if "OpenGL" in line]
     assert len(told) == 1
-    assert "evaluation.video: nothing is filmed" in told[0]
+    assert "evaluation.video: no videos are rendered" in told[0]
     assert "apt-get install" in told[0]
     assert not (tmp_path / "seed-0" / "videos").exists()
     assert checkpoint_steps(tmp_path / "seed-0") == [0, 4096, 8192]
