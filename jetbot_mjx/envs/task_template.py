@@ -1,0 +1,58 @@
+"""Write the module and the settings of a small, complete task to start from."""
+
+import importlib.util
+import keyword
+import string
+from importlib import resources
+from pathlib import Path
+from typing import NamedTuple
+
+from jetbot_mjx.errors import UserError
+
+
+class TaskFiles(NamedTuple):
+    """A `TaskFiles` tuple holds the paths of a task's two files."""
+
+    module: Path
+    config: Path
+
+
+def write_task_template(path: Path) -> TaskFiles:
+    """Write a task and its settings, without overwriting anything.
+
+    Args:
+      path: The path of the module. The class is named after it, and the settings are written to
+        the same folder.
+
+    Returns:
+      The files.
+
+    Raises:
+      UserError: the name is not valid or belongs to another module, or a file exists already.
+    """
+    # Check that the module can be imported by its name, and that nothing is overwritten.
+    name = path.stem
+    if path.suffix != ".py" or not name.isidentifier() or keyword.iskeyword(name):
+        raise UserError(f"{path}: name a Python module, such as my_task.py")
+    files = TaskFiles(path, path.with_suffix(".yaml"))
+    for file in files:
+        if file.exists():
+            raise UserError(f"{file} is there already: choose another name")
+    if importlib.util.find_spec(name) is not None:
+        raise UserError(f"{path}: there is a module {name} already: choose another name")
+    # Fill in the templates.
+    words = {
+        "stem": name,
+        "Class": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
+        "title": name.replace("_", " ").strip().capitalize(),
+    }
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for file, kind in zip(files, ("task.py", "task.yaml"), strict=True):
+            template = resources.files("jetbot_mjx").joinpath(f"assets/{kind}.template")
+            # Mode "x" does not overwrite a file that was created in the meantime.
+            with file.open("x", encoding="utf-8") as out:
+                out.write(string.Template(template.read_text("utf-8")).substitute(words))
+    except OSError as error:
+        raise UserError(f"{error.filename}: {error.strerror}") from None
+    return files
