@@ -1,8 +1,9 @@
-"""Measures the motors: `python3 calibrate.py --output calibration.json`.
+"""Calibrate the motors: `python3 calibrate.py --output calibration.json`.
 
-The robot drives straight twice, slowly and faster, and asks each time how far it came and how far
-it turned. That is enough for the dead-band and the full speed of either wheel. Give it 1 m of
-floor; measure from axle to axle in a straight line, and turns in degrees, positive to the left.
+The robot drives straight twice, slowly and faster, and the program asks after each drive how far it
+drove and turned. From that it computes the dead-band and the full speed of each wheel. The robot
+needs 1 m of free floor. Measure distances from axle to axle in a straight line, and turns in
+degrees, positive to the left.
 """
 
 import argparse
@@ -30,36 +31,34 @@ class Trial(NamedTuple):
 
     value: float
     seconds: float
-    """How long."""
+    """Duration [s]."""
     distance: float
-    """How far it came, in a straight line [m]."""
+    """Distance from start to end, in a straight line [m]."""
     turn: float
-    """How far it turned to the left [rad]."""
+    """Turn to the left [rad]."""
 
 
 def solve(trials: list, separation: float, lag: float) -> Calibration:
-    """The calibration that explains two drives.
+    """Return the calibration that explains two drives.
 
-    A wheel's speed is taken to be linear in the motor value above the dead-band. What the lag
-    costs at the start it gives back at the end, when the robot rolls out.
+    Above the dead-band a wheel's speed is assumed to be linear in the motor value. The distance
+    that the lag costs at the start is recovered at the end, when the robot rolls to a stop.
 
     Args:
-      trials: two, at different values.
-      separation: of the wheels [m].
-      lag: of the motors [s], kept as it is.
-
-    Returns:
-      The calibration.
+      trials: Two trials, at different motor values.
+      separation: Distance between the wheels [m].
+      lag: Lag of the motors [s]; it is not measured.
 
     Raises:
-      DriveError: no robot drives so.
+      DriveError: The measurements contradict each other.
     """
     wheels = []
     for side in (-1.0, 1.0):
+        # Compute the wheel's speed in each trial.
         points = []
         for trial in trials:
             half = 0.5 * trial.turn
-            # The way along the arc, whose chord was measured.
+            # The length of the arc, whose chord was measured.
             arc = trial.distance * (half / math.sin(half) if abs(half) > 1e-6 else 1.0)
             points.append((trial.value, (arc + side * half * separation) / trial.seconds))
         (slow, slow_speed), (fast, fast_speed) = sorted(points)
@@ -70,6 +69,8 @@ def solve(trials: list, separation: float, lag: float) -> Calibration:
                     "left" if side < 0 else "right", fast, fast_speed, slow, slow_speed
                 )
             )
+
+        # Fit a line through the two points; it crosses zero at the dead-band.
         slope = (fast_speed - slow_speed) / (fast - slow)
         dead_band = max(slow - slow_speed / slope, 0.0)
         wheels.append(Wheel(round(dead_band, 4), round(slope * (1.0 - dead_band), 4)))
@@ -77,17 +78,17 @@ def solve(trials: list, separation: float, lag: float) -> Calibration:
 
 
 def run_trial(robot: Any, clock: Any, value: float, seconds: float, measure: Callable) -> Trial:
-    """Drives straight and asks how it went.
+    """Drive straight, set the motors to zero, and ask for the measurements.
 
     Args:
-      robot: has `set_motors`.
-      clock: has `sleep`.
-      value: of both motors.
-      seconds: how long.
-      measure: returns distance [m] and turn [rad].
+      robot: A robot with `set_motors`.
+      clock: A clock with `sleep`.
+      value: Motor value of both motors.
+      seconds: Duration [s].
+      measure: Returns distance [m] and turn [rad].
 
     Returns:
-      What was measured. Whatever happens, the motors have been set to zero.
+      The trial. The motors are set to zero after an exception too.
     """
     try:
         robot.set_motors(value, value)
@@ -102,10 +103,52 @@ def run_trial(robot: Any, clock: Any, value: float, seconds: float, measure: Cal
 def _ask() -> tuple:
     while True:
         try:
-            distance = float(input("  how far did it come [m]? "))
+            distance = float(input("  how far did it drive [m]? "))
             return distance, math.radians(float(input("  how far did it turn left [degrees]? ")))
         except ValueError:
-            print("  a number, please")
+            print("  please enter a number")
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument(
+        "--output",
+        default="calibration.json",
+        metavar="FILE",
+        help="file to write (default: calibration.json)",
+    )
+    parser.add_argument(
+        "--values",
+        nargs=2,
+        type=at_least(0.05),
+        default=(0.3, 0.5),
+        metavar="M",
+        help="motor values of the two drives (default: 0.3 0.5)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=at_least(0.5),
+        default=2.0,
+        metavar="S",
+        help="duration of a drive [s] (default: 2)",
+    )
+    parser.add_argument(
+        "--separation",
+        type=float,
+        default=DEFAULT_SEPARATION,
+        metavar="M",
+        help="distance between the wheels [m] (default: 0.114)",
+    )
+    parser.add_argument(
+        "--lag",
+        type=float,
+        default=DEFAULT_LAG,
+        metavar="S",
+        help="lag of the motors [s] (default: 0.1)",
+    )
+    return parser
 
 
 def main(
@@ -114,33 +157,28 @@ def main(
     clock: Any = None,
     measure: Callable = _ask,
 ) -> int:
-    """Parses the command line, drives and writes the file.
+    """Parse the command line, drive and write the file.
 
     Args:
-      arguments: without the program's name; None: those of the process.
-      robot: has `set_motors`; None: NVIDIA's.
-      clock: has `sleep`; None: the wall's.
-      measure: returns distance [m] and turn [rad] of one drive.
+      arguments: Arguments without the program's name; None: those of the process.
+      robot: A robot with `set_motors`; None: NVIDIA's.
+      clock: A clock with `sleep`; None: real time.
+      measure: Returns distance [m] and turn [rad] of one drive.
 
     Returns:
       The exit code: 0, 2 after a mistake, or 130 after Ctrl-C.
     """
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--output", default="calibration.json", metavar="FILE")
-    parser.add_argument("--values", nargs=2, type=at_least(0.05), default=(0.3, 0.5), metavar="M")
-    parser.add_argument("--seconds", type=at_least(0.5), default=2.0, metavar="S")
-    parser.add_argument("--separation", type=float, default=DEFAULT_SEPARATION, metavar="M")
-    parser.add_argument("--lag", type=float, default=DEFAULT_LAG, metavar="S")
+    # Check all arguments before the robot drives.
+    parser = _parser()
     options = parser.parse_args(arguments)
     if options.values[0] == options.values[1] or max(options.values) > 1:
-        parser.error("--values wants two different ones, at most 1")
+        parser.error("--values needs two different motor values, at most 1")
     try:
-        # What is wrong is told before the robot drives.
         check_calibration(
             default_calibration()._replace(separation=options.separation, lag=options.lag)
         )
+
+        # Drive twice, and write what the measurements give.
         robot, clock, trials = robot or make_robot(), clock or WallClock(), []
         for value in options.values:
             print(f"both motors at {value:g} for {options.seconds:g} s")

@@ -1,15 +1,15 @@
-"""Checks what a tracker sends, and makes the key to sign it: `python3 datagrams.py tracker.key`.
+"""Check a tracker's datagrams, and make the key to sign them: `python3 datagrams.py tracker.key`.
 
-Python 3.6 and the standard library. A datagram is one JSON object with the numbers `time`, `x`, `y`
-and `yaw`, as poses.py tells. Where a key is shared, the HMAC-SHA256 of these bytes stands before
-them, 32 bytes long:
+It needs Python 3.6 and the standard library. A datagram is one JSON object with the numbers `time`,
+`x`, `y` and `yaw`, which poses.py describes. With a shared key, the 32 bytes of their HMAC-SHA256
+come before them:
 
     hmac.new(key, body, "sha256").digest() + body
 
-That keeps out whoever does not know the key. A datagram that was recorded and sent again is kept
-out by its `time`, which must grow: during a drive and, because the newest is kept in a file beside
-the key, from drive to drive. So the sender takes it from a clock that is never set back, such as
-`time.time()`.
+Without the key nobody can make a valid datagram. A recorded datagram that is sent again is rejected
+by its `time`, which must increase: during a drive and, because the newest time is saved in a file
+beside the key, from drive to drive. The sender must therefore use a clock that is never set back,
+such as `time.time()`.
 """
 
 import argparse
@@ -24,26 +24,26 @@ from typing import Any, NamedTuple, Optional
 
 from motors import DriveError
 
-LONGEST = 1024
-"""[bytes] More is no pose: a longer one is not parsed."""
+MAX_DATAGRAM_SIZE = 1024
+"""[bytes] A longer datagram is not parsed."""
 
-_SHORTEST_KEY = 16
-_LONGEST_KEY = 4096
+_MIN_KEY_SIZE = 16
+_MAX_KEY_SIZE = 4096
 _SIGNATURE = hashlib.sha256().digest_size
 
 # [s], [m], [m] and [rad]; an int of any length compares with these without becoming a float.
 _BOUNDS = (("time", 1e12), ("x", 1000.0), ("y", 1000.0), ("yaw", 1e6))
 
 
-class Refused(Exception):
-    """A datagram that is not believed; the message says why."""
+class RejectedDatagram(Exception):
+    """Raised when a datagram is rejected; the message says why."""
 
 
-class Sighting(NamedTuple):
-    """What one datagram says."""
+class TrackedPose(NamedTuple):
+    """The pose in one datagram."""
 
     time: float
-    """Of the sender's clock [s]."""
+    """Time of the sender's clock [s]."""
     x: float
     """[m]"""
     y: float
@@ -53,53 +53,53 @@ class Sighting(NamedTuple):
 
 
 class Key:
-    """A key that a tracker shares with this robot, and the newest time that it signed."""
+    """A key that a tracker shares with this robot, and the newest signed time."""
 
     def __init__(self, path: str) -> None:
-        """Read both.
+        """Read the key and the newest time.
 
         Args:
-          path: of the key; the newest time is kept beside it, in `PATH.newest`.
+          path: Path of the key; the newest time is saved beside it, in `PATH.newest`.
 
         Raises:
-          DriveError: the key cannot be read, is short, or can be read by others; or the newest
-            time cannot be kept.
+          DriveError: The key cannot be read, is short, or can be read by others; or the newest
+            time cannot be saved.
         """
         self._path, self._newest_path = path, path + ".newest"
         self._secret = self._read_secret()
         self._newest = self._read_newest()
-        # What cannot be written is told now and not after a drive.
+        # Save it once now, so that an error comes before the drive and not after it.
         self.close()
 
-    def check(self, datagram: bytes) -> Sighting:
-        """Return what a signed datagram says.
+    def check(self, datagram: bytes) -> TrackedPose:
+        """Return the pose in a signed datagram.
 
         Args:
-          datagram: signature and JSON.
+          datagram: Signature and JSON.
 
         Returns:
-          What it says, which is newer than all before.
+          The pose, which is newer than all before.
 
         Raises:
-          Refused: it is not signed with this key, no pose, or no news.
+          RejectedDatagram: It is not signed with this key, is not a pose, or is not newer.
         """
         signature, body = datagram[:_SIGNATURE], datagram[_SIGNATURE:]
         if not hmac.compare_digest(hmac.new(self._secret, body, "sha256").digest(), signature):
-            raise Refused("it is not signed with " + self._path)
-        sighting = parse(body)
-        if not sighting.time > self._newest:
-            raise Refused(
-                f"its time {sighting.time!r} is not later than {self._newest!r}, the newest so far:"
+            raise RejectedDatagram("it is not signed with " + self._path)
+        tracked = parse(body)
+        if not tracked.time > self._newest:
+            raise RejectedDatagram(
+                f"its time {tracked.time!r} is not later than {self._newest!r}, the newest so far:"
                 f" a replay, or the tracker's clock was set back (then remove {self._newest_path})"
             )
-        self._newest = sighting.time
-        return sighting
+        self._newest = tracked.time
+        return tracked
 
     def close(self) -> None:
-        """Keep the newest time for the next drive.
+        """Save the newest time for the next drive.
 
         Raises:
-          DriveError: it cannot be written.
+          DriveError: It cannot be written.
         """
         unfinished = self._newest_path + ".unfinished"
         try:
@@ -113,17 +113,16 @@ class Key:
         try:
             with open(self._path, "rb") as file:
                 mode = os.fstat(file.fileno()).st_mode
-                secret = file.read(_LONGEST_KEY).strip()
+                secret = file.read(_MAX_KEY_SIZE).strip()
         except (OSError, ValueError) as error:
             raise DriveError(f"--tracker-key {self._path}: {getattr(error, 'strerror', error)}")
         if os.name == "posix" and stat.S_IMODE(mode) & 0o077:
             raise DriveError(
                 f"--tracker-key {self._path} can be read by others: chmod 600 {self._path}"
             )
-        if len(secret) < _SHORTEST_KEY:
+        if len(secret) < _MIN_KEY_SIZE:
             raise DriveError(
-                f"--tracker-key {self._path} holds {len(secret)} bytes: make it at least"
-                f" {_SHORTEST_KEY}"
+                f"--tracker-key {self._path} has {len(secret)} bytes: use at least {_MIN_KEY_SIZE}"
             )
         return secret
 
@@ -138,49 +137,49 @@ class Key:
             raise DriveError(f"--tracker-key: {self._newest_path}: {reason}")
 
 
-def parse(body: bytes) -> Sighting:
-    """Return what the JSON of a datagram says.
+def parse(body: bytes) -> TrackedPose:
+    """Return the pose in the JSON of a datagram.
 
     Args:
-      body: any bytes.
+      body: Any bytes.
 
     Returns:
-      What it says; finite numbers within bounds.
+      The pose, of finite numbers within bounds.
 
     Raises:
-      Refused: it is no pose.
+      RejectedDatagram: The bytes are not a pose.
     """
-    if len(body) > LONGEST:
-        raise Refused(f"it is longer than {LONGEST} bytes")
+    if len(body) > MAX_DATAGRAM_SIZE:
+        raise RejectedDatagram(f"it is longer than {MAX_DATAGRAM_SIZE} bytes")
     try:
         values: Any = json.loads(body.decode("utf-8"))
     except (ValueError, RecursionError):
-        raise Refused("it is no JSON")
+        raise RejectedDatagram("it is not JSON")
     if not isinstance(values, dict):
-        raise Refused("it is no JSON object")
+        raise RejectedDatagram("it is not a JSON object")
     numbers = []
     for name, bound in _BOUNDS:
         value: Any = values.get(name)
-        # Not bool, which is an int too.
+        # This excludes bool, which is a subclass of int.
         if type(value) not in (int, float) or not -bound <= value <= bound:
-            raise Refused(f"its {name} is no number between -{bound:g} and {bound:g}")
+            raise RejectedDatagram(f"its {name} is not a number between -{bound:g} and {bound:g}")
         numbers.append(float(value))
-    return Sighting(*numbers)
+    return TrackedPose(*numbers)
 
 
 def main(arguments: Optional[list] = None) -> int:
-    """Write a new key, which nobody else can read.
+    """Write a new key that only this user can read.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: Arguments without the program's name; None: those of the process.
 
     Returns:
-      The exit code: 0, or 2 where the file is there already or cannot be written.
+      The exit code: 0, or 2 where the file exists already or cannot be written.
     """
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("file", help="to be written; copy it to the tracker's machine")
+    parser.add_argument("file", help="file to write the key to; copy it to the tracker's machine")
     path = parser.parse_args(arguments).file
     try:
         handle = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)

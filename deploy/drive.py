@@ -1,14 +1,14 @@
-"""Drives a JetBot to a goal: `python3 drive.py POLICY --goal X Y`.
+"""Drive a JetBot to a goal: `python3 drive.py POLICY --goal X Y`.
 
-Runs on the robot with Python 3.6 or newer and NumPy, and there with NVIDIA's `jetbot`. POLICY is
-the folder that `python -m jetbot_mjx.export` wrote. X and Y are metres: ahead and to the left of
-the robot as it stands, or in the frame of a tracker (`--tracker PORT`, see poses.py). A tracker on
-another machine needs `--tracker-host 0.0.0.0`, and a key that it shares with the robot.
+It runs on the robot with Python 3.6 or newer, NumPy and NVIDIA's `jetbot`. POLICY is the folder
+that `python -m jetbot_mjx.export` wrote. X and Y are metres: ahead and to the left of the robot at
+the start, or in the frame of a tracker (`--tracker PORT`, see poses.py). A tracker on another
+machine needs `--tracker-host 0.0.0.0`, and a key that it shares with the robot.
 
 The motors are set to zero before the first command; while the newest pose is older than
 `--stale-after`; at the goal, at `--timeout`, after any error, on Ctrl-C, SIGTERM and SIGHUP.
-`--dry-run` drives nothing but the dead reckoning. Exit codes: 0 at the goal, 1 not, 2 a mistake
-in one line, 128 + n by signal n.
+`--dry-run` needs no robot and takes poses from dead reckoning. Exit codes: 0 goal reached, 1 goal
+not reached, 2 wrong usage, 128 + n after signal n.
 """
 
 import argparse
@@ -39,13 +39,13 @@ from poses import Odometry, Pose, Tracker, udp_tracker
 LOG_FORMAT = "jetbot_mjx-drive/1"
 
 STALE_AFTER = 0.08
-"""[s] With the 17 ms of a control period the motors are at zero within 100 ms."""
+"""[s] Together with a control period of 17 ms, the motors are at zero within 100 ms."""
 
 _NEEDED = (
     *("files", "observation", "rest_quaternion", "rest_height", "goal_height", "success_radius"),
     *("control_period", "wheel_speeds", "run", "env_steps", "task", "robot"),
 )
-"""What a drive takes from `policy.json`."""
+"""Keys of `policy.json` that a drive needs."""
 
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
@@ -53,101 +53,102 @@ Log = Callable[[dict], Any]
 
 
 class Policy(NamedTuple):
-    """What `jetbot_mjx.export` wrote."""
+    """An exported policy."""
 
     act: Callable
-    """Of an observation; returns the action and wheel speeds (left, right) [rad/s]."""
-    contract: dict
-    """`policy.json`."""
+    """From an observation to the action and the wheel speeds (left, right) [rad/s]."""
+    spec: dict
+    """The policy spec, `policy.json`."""
 
 
 class Settings(NamedTuple):
-    """What a drive is to do."""
+    """The settings of one drive."""
 
     goal: tuple
-    """Where to, (x, y) in the frame of the poses [m]."""
+    """Position (x, y) of the goal in the frame of the poses [m]."""
     timeout: float
-    """Until when [s]."""
+    """Time limit [s]."""
     stale_after: float
-    """Age of a pose beyond which the motors are stopped [s]."""
+    """Age of a pose above which the motors are stopped [s]."""
     arrive_within: float
-    """Distance at which the goal is reached [m]."""
+    """Distance below which the goal is reached [m]."""
 
 
 class Outcome(NamedTuple):
-    """How a drive ended."""
+    """The result of one drive."""
 
     reached: bool
-    """Whether at the goal."""
+    """Whether the goal was reached."""
     seconds: float
-    """Since the start."""
+    """Duration of the drive [s]."""
     distance: Optional[float]
-    """From the goal, by the last pose [m]; None where none ever came."""
+    """Distance of the last pose from the goal [m]; None without any pose."""
     ticks: int
-    """Control periods."""
+    """Number of control periods."""
     late_ticks: int
-    """Those that ended after the next should have begun."""
+    """Number of periods that ended after the next should have begun."""
     stale_ticks: int
-    """Those without a fresh pose."""
+    """Number of periods without a fresh pose."""
 
 
 class WallClock:
-    """The time that passes for us all."""
+    """The clock of real time."""
 
     def now(self) -> float:
-        """Seconds since some moment."""
+        """Return the time since a fixed moment [s]."""
         return time.monotonic()
 
     def sleep(self, seconds: float) -> None:
-        """Waits."""
+        """Wait for a time [s]."""
         time.sleep(seconds)
 
 
 class NoRobot:
-    """Takes motor values and does nothing with them."""
+    """A robot for dry runs, which ignores motor values."""
 
     def set_motors(self, left_speed: float, right_speed: float) -> None:
-        """Does nothing."""
+        """Ignore the motor values."""
 
 
 def load_policy(folder: str) -> Policy:
-    """Loads what `jetbot_mjx.export` wrote.
+    """Load an exported policy.
 
     Args:
-      folder: with `policy.py` and `policy.json`.
-
-    Returns:
-      The policy.
+      folder: The folder that `jetbot_mjx.export` wrote, with `policy.py` and `policy.json`.
 
     Raises:
-      DriveError: it is not such a folder.
+      DriveError: The folder holds no such policy, or it cannot be run on this machine.
     """
     try:
         with open(os.path.join(folder, "policy.json"), encoding="utf-8") as file:
-            contract = json.load(file)
+            spec = json.load(file)
         path = os.path.join(folder, "policy.py")
-        missing = [name for name in _NEEDED if name not in contract]
+        missing = [name for name in _NEEDED if name not in spec]
         if missing:
-            raise DriveError(f"{folder} is no exported policy: policy.json lacks {missing[0]}")
-        if "numpy" not in contract["files"] or not os.path.isfile(path):
-            raise DriveError(f"{folder} holds no policy.py: export it with --format numpy")
+            raise DriveError(f"{folder} is not an exported policy: policy.json lacks {missing[0]}")
+        if "numpy" not in spec["files"] or not os.path.isfile(path):
+            raise DriveError(f"{folder} has no policy.py: export it with --format numpy")
         with open(path, encoding="utf-8") as file:
             source = file.read()
         module = types.ModuleType("policy")
         exec(compile(source, path, "exec"), module.__dict__)
-        return Policy(module.__dict__["act"], contract)
+        return Policy(module.__dict__["act"], spec)
     except OSError as error:
-        raise DriveError(f"{folder} is no exported policy: {error.strerror}")
+        raise DriveError(f"{folder} is not an exported policy: {error.strerror}")
     except (ValueError, LookupError, TypeError, SyntaxError, RecursionError) as error:
-        raise DriveError(f"{folder} is no exported policy: {error}")
+        raise DriveError(f"{folder} is not an exported policy: {error}")
     except ImportError as error:
         raise DriveError(f"{path} cannot be run here: {error}")
 
 
-def arrival_radius(contract: dict) -> float:
-    """The success radius of training, which is one in space, as one on the floor [m]."""
-    above = contract["goal_height"] - contract["rest_height"]
-    return math.sqrt(max(contract["success_radius"] ** 2 - above**2, 0.0))
+def arrival_radius(spec: dict) -> float:
+    """Return the success radius on the floor [m]: that of training is measured in space.
+
+    Args:
+      spec: The policy spec.
+    """
+    above = spec["goal_height"] - spec["rest_height"]
+    return math.sqrt(max(spec["success_radius"] ** 2 - above**2, 0.0))
 
 
 def drive(
@@ -159,22 +160,23 @@ def drive(
     settings: Settings,
     log: Optional[Log] = None,
 ) -> Outcome:
-    """Drives until the goal or the time is reached, at the rate of training.
+    """Drive to the goal, at the control rate of training, and set the motors to zero at the end.
 
     Args:
-      robot: has `set_motors(left, right)`, values in [-1, 1].
-      clock: has `now()` and `sleep(seconds)`.
-      poses: a source of `poses.py`.
-      policy: of `load_policy`.
-      calibration: of the motors.
-      settings: where to, and how long.
-      log: is given each period as a dict; None: nobody is.
+      robot: A robot with `set_motors(left, right)`, which takes values in [-1, 1].
+      clock: A clock with `now()` and `sleep(seconds)`.
+      poses: A pose source of `poses.py`.
+      policy: The policy.
+      calibration: The calibration of the motors.
+      settings: The goal and the limits of the drive.
+      log: A function that is called with a dict for each control period, or None.
 
     Returns:
-      How it ended. Whatever way it ends, the motors have been set to zero.
+      The result: the goal is reached, or the time is over. The motors are set to zero after an
+      exception too.
 
     Raises:
-      DriveError: the policy wants an observation that cannot be made.
+      DriveError: The policy needs an observation that this driver cannot provide.
     """
     try:
         stop(robot)
@@ -194,14 +196,14 @@ def _drive(
     settings: Settings,
     log: Log,
 ) -> Outcome:
-    observe = Observer(policy.contract)
-    period = policy.contract["control_period"]
-    radius = policy.contract["wheel_speeds"]["wheel_radius"]
-    # The first call of a policy takes far longer than a period.
+    observe = Observer(policy.spec)
+    period = policy.spec["control_period"]
+    # The first call of a policy takes far longer than a period, so make it before the start.
     policy.act(observe(Pose(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), settings.goal))
     start = due = clock.now()
     distance, ticks, late, stale = None, 0, 0, 0
     while True:
+        # Read the pose, and let the policy set the motor values where the pose is fresh.
         began = clock.now()
         pose = poses.read(began)
         line = {"t": began - start, "fresh": False}
@@ -214,23 +216,25 @@ def _drive(
             del line["time"]
             if fresh and not reached:
                 action, wheels = policy.act(observe(pose, settings.goal))
-                line["action"] = [float(one) for one in action]
-                line["wheel_speeds"] = [float(one) for one in wheels]
-                # A policy that has lost its mind stands still.
-                if all(math.isfinite(wheel) for wheel in wheels):
-                    values = (
-                        motor_value(float(wheels[0]) * radius, calibration.left),
-                        motor_value(float(wheels[1]) * radius, calibration.right),
-                    )
+                line["action"] = [float(value) for value in action]
+                line["wheel_speeds"] = [float(value) for value in wheels]
+                values = _motor_values(line["wheel_speeds"], policy, calibration)
+
+        # Finish at the goal or the time limit, before the motors are set again.
         if reached or began - start >= settings.timeout:
             stop(robot)
             log(dict(line, motors=[0.0, 0.0], outcome="reached" if reached else "timed out"))
             return Outcome(reached, began - start, distance, ticks, late, stale)
+
+        # Set the motors, and tell the pose source for its dead reckoning.
         robot.set_motors(*values)
         done = clock.now()
         left = wheel_speed(values[0], calibration.left)
         right = wheel_speed(values[1], calibration.right)
         poses.commanded(done, left, right)
+
+        # Wait for the next period. After a late one the schedule starts anew, so that lost time
+        # is not made up by shorter periods.
         due += period
         behind = done > due
         log(dict(line, motors=list(values), latency=done - began, late=behind))
@@ -241,15 +245,34 @@ def _drive(
             clock.sleep(max(due - clock.now(), 0.0))
 
 
+def _motor_values(wheel_speeds: list, policy: Policy, calibration: Calibration) -> tuple:
+    # If the policy returns non-finite numbers, the robot stands still.
+    if not all(math.isfinite(speed) for speed in wheel_speeds):
+        return 0.0, 0.0
+    radius = policy.spec["wheel_speeds"]["wheel_radius"]
+    left, right = wheel_speeds
+    return (
+        motor_value(left * radius, calibration.left),
+        motor_value(right * radius, calibration.right),
+    )
+
+
 def log_header(policy: Policy, calibration: Calibration, settings: Settings, source: str) -> dict:
-    """The first line of a log: all that is needed to replay what follows."""
-    contract = policy.contract
+    """Return the first line of a log, with all that is needed to replay the drive.
+
+    Args:
+      policy: The policy.
+      calibration: The calibration of the motors.
+      settings: The settings of the drive.
+      source: The name of the pose source.
+    """
+    spec = policy.spec
     return {
         "format": LOG_FORMAT,
-        "policy": {name: contract[name] for name in ("run", "env_steps", "task", "robot")},
+        "policy": {name: spec[name] for name in ("run", "env_steps", "task", "robot")},
         "goal": list(settings.goal),
         "arrive_within": settings.arrive_within,
-        "control_period": contract["control_period"],
+        "control_period": spec["control_period"],
         "pose_source": source,
         "calibration": as_json(calibration),
     }
@@ -261,7 +284,7 @@ def _log_file(path: Optional[str]) -> Iterator[Optional[Log]]:
         yield None
         return
     try:
-        # A line at a time: what was driven before a battery ran out is there.
+        # Each line is written at once, so that the log survives an empty battery.
         file = open(path, "w", buffering=1, encoding="utf-8")  # noqa: SIM115
     except OSError as error:
         raise DriveError(f"--log {path}: {error.strerror}")
@@ -269,16 +292,16 @@ def _log_file(path: Optional[str]) -> Iterator[Optional[Log]]:
         yield lambda line: file.write(json.dumps(line) + "\n")
 
 
-def _leave(number: int, frame: Any) -> None:
-    # A second signal must not interrupt the stopping.
+def _exit_on_signal(number: int, frame: Any) -> None:
+    # A second signal must not interrupt the stopping of the motors.
     for one in _SIGNALS:
         signal.signal(one, signal.SIG_IGN)
     sys.exit(128 + number)
 
 
 @contextlib.contextmanager
-def _leaving_by_signals() -> Iterator[None]:
-    before = {one: signal.signal(one, _leave) for one in _SIGNALS}
+def _exiting_on_signals() -> Iterator[None]:
+    before = {one: signal.signal(one, _exit_on_signal) for one in _SIGNALS}
     try:
         yield
     finally:
@@ -287,13 +310,13 @@ def _leaving_by_signals() -> Iterator[None]:
 
 
 def at_least(least: float, most: float = 1e9) -> Callable[[str], float]:
-    """An argument that is a number between two bounds."""
+    """Return a parser of numbers between two bounds, for an argument of the command line."""
 
     def parse(text: str) -> float:
         try:
             value = float(text)
         except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number")
+            raise argparse.ArgumentTypeError(f"{text!r} is not a number")
         if not value >= least:
             raise argparse.ArgumentTypeError(f"{text} is not at least {least:g}")
         if value > most:
@@ -304,15 +327,17 @@ def at_least(least: float, most: float = 1e9) -> Callable[[str], float]:
 
 
 def make_robot() -> Any:
-    """NVIDIA's robot.
+    """Return the robot of NVIDIA's package `jetbot`.
 
     Raises:
-      DriveError: its package is not installed.
+      DriveError: The package is not installed.
     """
     try:
         from jetbot import Robot  # pyright: ignore[reportMissingImports]
     except ImportError as error:
-        raise DriveError(f"no robot here ({error}): run this on the JetBot, or with --dry-run")
+        raise DriveError(
+            f"there is no robot here ({error}): run this on the JetBot, or use --dry-run"
+        )
     return Robot()
 
 
@@ -320,27 +345,46 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("policy", help="the folder that jetbot_mjx.export wrote")
+    parser.add_argument("policy", help="folder that jetbot_mjx.export wrote")
     parser.add_argument(
         "--goal",
         nargs=2,
         type=at_least(-1000.0, 1000.0),
         metavar=("X", "Y"),
         required=True,
-        help="[m]",
+        help="position of the goal [m]",
     )
-    parser.add_argument("--calibration", metavar="FILE", help="of calibrate.py")
-    parser.add_argument("--tracker", type=int, metavar="PORT", help="UDP; default: dead reckoning")
+    parser.add_argument("--calibration", metavar="FILE", help="file that calibrate.py wrote")
     parser.add_argument(
-        "--tracker-host", metavar="HOST", help="address to listen at (default: this machine alone)"
+        "--tracker",
+        type=int,
+        metavar="PORT",
+        help="UDP port of a tracker (default: dead reckoning)",
     )
     parser.add_argument(
-        "--tracker-key", metavar="FILE", help="what the tracker signs with, see datagrams.py"
+        "--tracker-host", metavar="HOST", help="address to listen on (default: this machine only)"
     )
-    parser.add_argument("--timeout", type=at_least(0.0), default=30.0, metavar="S")
-    parser.add_argument("--stale-after", type=at_least(0.0), default=STALE_AFTER, metavar="S")
-    parser.add_argument("--log", metavar="FILE", help="one JSON object for each control period")
-    parser.add_argument("--dry-run", action="store_true", help="no robot: dead reckoning alone")
+    parser.add_argument(
+        "--tracker-key", metavar="FILE", help="key that the tracker signs with, see datagrams.py"
+    )
+    parser.add_argument(
+        "--timeout",
+        type=at_least(0.0),
+        default=30.0,
+        metavar="S",
+        help="time limit [s] (default: 30)",
+    )
+    parser.add_argument(
+        "--stale-after",
+        type=at_least(0.0),
+        default=STALE_AFTER,
+        metavar="S",
+        help="age of a pose above which the motors stop [s] (default: 0.08)",
+    )
+    parser.add_argument("--log", metavar="FILE", help="file for one JSON object per control period")
+    parser.add_argument(
+        "--dry-run", action="store_true", help="run without a robot, by dead reckoning"
+    )
     return parser
 
 
@@ -349,17 +393,17 @@ def _pose_source(options: argparse.Namespace, calibration: Calibration) -> Any:
     if options.tracker is None:
         for name, value in (("host", host), ("key", key)):
             if value is not None:
-                raise DriveError(f"--tracker-{name} says how to listen: give --tracker PORT too")
+                raise DriveError(f"--tracker-{name} needs a tracker: give --tracker PORT too")
         return Odometry(calibration)
     return udp_tracker(options.tracker, host or "127.0.0.1", None if key is None else Key(key))
 
 
 def main(arguments: Optional[list] = None, clock: Any = None) -> int:
-    """Parses the command line and drives.
+    """Parse the command line and drive.
 
     Args:
-      arguments: without the program's name; None: those of the process.
-      clock: has `now()` and `sleep(seconds)`; None: the wall's.
+      arguments: Arguments without the program's name; None: those of the process.
+      clock: A clock with `now()` and `sleep(seconds)`; None: real time.
 
     Returns:
       The exit code.
@@ -374,11 +418,11 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
             tuple(options.goal),
             options.timeout,
             options.stale_after,
-            arrival_radius(policy.contract),
+            arrival_radius(policy.spec),
         )
         robot = NoRobot() if options.dry_run else make_robot()
         poses = _pose_source(options, calibration)
-        with contextlib.closing(poses), _log_file(options.log) as log, _leaving_by_signals():
+        with contextlib.closing(poses), _log_file(options.log) as log, _exiting_on_signals():
             if log is not None:
                 log(log_header(policy, calibration, settings, poses.name))
             outcome = drive(robot, clock or WallClock(), poses, policy, calibration, settings, log)
@@ -386,11 +430,13 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         return 2
     if isinstance(poses, Tracker) and poses.rejected:
-        print(f"{poses.rejected} datagrams were not believed, the last because {poses.reason}")
-    nearest = "no pose came" if outcome.distance is None else f"{outcome.distance:.3f} m from it"
+        print(f"{poses.rejected} datagrams were rejected, the last because {poses.reason}")
+    distance = "without any pose"
+    if outcome.distance is not None:
+        distance = f"{outcome.distance:.3f} m from the goal"
     print(
         f"{'reached' if outcome.reached else 'not reached'} after {outcome.seconds:.2f} s,"
-        f" {nearest}; {outcome.ticks} periods, {outcome.late_ticks} late,"
+        f" {distance}; {outcome.ticks} periods, {outcome.late_ticks} late,"
         f" {outcome.stale_ticks} without a fresh pose"
     )
     return 0 if outcome.reached else 1

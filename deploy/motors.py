@@ -1,7 +1,7 @@
-"""From wheel speeds to motor values: dead-band, full speed and the file that holds them.
+"""Convert wheel speeds to motor values, by a calibration of dead-band and full speed.
 
-Python 3.6 and the standard library. Speeds are those of a wheel's rim over the floor [m/s], so
-that no wheel radius has to be known. Of two wheels the left comes first.
+It needs Python 3.6 and the standard library. Speeds are those of a wheel's rim over the floor
+[m/s], so that no wheel radius has to be known. The left wheel comes first.
 """
 
 import json
@@ -11,54 +11,48 @@ from typing import Any, NamedTuple
 DEFAULT_LAG = 0.1
 DEFAULT_SEPARATION = 0.114
 
-# Slower than this [m/s] a wheel is left alone: it would jump back and forth over its dead-band.
-_STILL = 0.005
+# Below this speed [m/s] a wheel stands: it would jump back and forth over its dead-band.
+_STANDSTILL = 0.005
 
-# A remote write error of the motor driver's bus is seldom followed by a second.
+# The bus of the motor driver sometimes fails to write, but rarely several times in a row.
 _STOP_TRIES = 5
 
 
 class DriveError(Exception):
-    """A mistake that the user can mend; its message is one line."""
+    """Raised when the user can correct what is wrong; its message is one line."""
 
 
 class Wheel(NamedTuple):
-    """One motor."""
+    """The calibration of one wheel and its motor."""
 
     dead_band: float
-    """Motor value up to which it stands."""
+    """Motor value up to which the wheel does not turn."""
     full_speed: float
-    """At a motor value of 1 [m/s]."""
+    """Speed at a motor value of 1 [m/s]."""
 
 
 class Calibration(NamedTuple):
-    """Both motors of a robot."""
+    """The calibration of a robot."""
 
     left: Wheel
     right: Wheel
     lag: float
     """Time constant of the motors [s]."""
     separation: float
-    """Of the two wheels [m]."""
+    """Distance between the two wheels [m]."""
 
 
 def default_calibration() -> Calibration:
-    """That of the simulated robot `real`, for who has measured nothing yet."""
+    """Return the calibration of the simulated robot `real`, for a robot without measurements."""
     wheel = Wheel(dead_band=0.12, full_speed=0.408)
     return Calibration(wheel, wheel, DEFAULT_LAG, DEFAULT_SEPARATION)
 
 
 def check_calibration(calibration: Calibration) -> Calibration:
-    """Refuses numbers that no robot has.
-
-    Args:
-      calibration: to be looked at.
-
-    Returns:
-      The same.
+    """Check that all numbers of a calibration are within bounds, and return it.
 
     Raises:
-      DriveError: a number is out of bounds.
+      DriveError: A number is out of bounds.
     """
     bounds = []
     for side in ("left", "right"):
@@ -69,14 +63,14 @@ def check_calibration(calibration: Calibration) -> Calibration:
     bounds.append(("separation", calibration.separation, 0.05, 0.5))
     for name, value, low, high in bounds:
         if isinstance(value, bool) or not isinstance(value, (int, float)):
-            raise DriveError(f"{name} = {value!r} is no number")
+            raise DriveError(f"{name} = {value!r} is not a number")
         if not low <= value <= high:
             raise DriveError(f"{name} = {value:g} is not between {low:g} and {high:g}")
     return calibration
 
 
 def as_json(calibration: Calibration) -> dict:
-    """A calibration as it stands in its file."""
+    """Return a calibration as JSON, as its file holds it."""
     return {
         "left": dict(calibration.left._asdict()),
         "right": dict(calibration.right._asdict()),
@@ -86,16 +80,13 @@ def as_json(calibration: Calibration) -> dict:
 
 
 def read_calibration(path: str) -> Calibration:
-    """Reads a calibration file.
+    """Read a calibration file.
 
     Args:
-      path: as `calibrate.py` wrote it.
-
-    Returns:
-      The calibration.
+      path: The file that `calibrate.py` wrote.
 
     Raises:
-      DriveError: there is none, or it is not one.
+      DriveError: The file is missing, or is not a calibration.
     """
     try:
         with open(path) as file:
@@ -113,40 +104,40 @@ def read_calibration(path: str) -> Calibration:
     except KeyError as error:
         raise DriveError(f"--calibration {path} lacks {error}")
     except (ValueError, TypeError, RecursionError) as error:
-        raise DriveError(f"--calibration {path} is no calibration: {error}")
+        raise DriveError(f"--calibration {path} is not a calibration: {error}")
     except DriveError as error:
         raise DriveError(f"--calibration {path}: {error}")
 
 
 def motor_value(speed: float, wheel: Wheel) -> float:
-    """The motor value that lets a wheel turn at a speed.
+    """Return the motor value that turns a wheel at a speed.
 
         m = sign(v) (dead + (1 - dead) |v| / full)
 
     Args:
-      speed: v [m/s], negative backwards; what the motor cannot reach is cut off.
-      wheel: its calibration.
+      speed: Speed v [m/s], negative backwards; it is clipped to what the motor reaches.
+      wheel: The calibration of the wheel.
 
     Returns:
-      m in [-1, 1]; zero where the wheel is to stand.
+      The motor value m in [-1, 1]; zero where the wheel should stand.
     """
-    if abs(speed) < _STILL:
+    if abs(speed) < _STANDSTILL:
         return 0.0
     share = min(abs(speed) / wheel.full_speed, 1.0)
     return math.copysign(wheel.dead_band + (1.0 - wheel.dead_band) * share, speed)
 
 
 def wheel_speed(value: float, wheel: Wheel) -> float:
-    """The speed [m/s] that a motor value leads to; the inverse of `motor_value`."""
+    """Return the speed [m/s] at a motor value; the inverse of `motor_value`."""
     beyond = max(abs(value) - wheel.dead_band, 0.0) / (1.0 - wheel.dead_band)
     return math.copysign(wheel.full_speed * beyond, value)
 
 
 def stop(robot: Any) -> None:
-    """Sets both motors to zero, and tries again where the bus refuses.
+    """Set both motors to zero, and try again where the bus fails.
 
     Raises:
-      OSError: it refused every time, and the robot may still drive.
+      OSError: It failed every time, and the robot may still drive.
     """
     for attempt in range(_STOP_TRIES):
         try:

@@ -1,17 +1,18 @@
-"""Where the robot is: by dead reckoning, or from a tracker that sends datagrams.
+"""Pose sources: dead reckoning, or a tracker that sends datagrams.
 
-Python 3.6 and the standard library. A source has three methods: `read(now)` gives the newest pose,
-or None, `commanded(now, left, right)` is told what the motors were set to, and `close()` ends it.
+It needs Python 3.6 and the standard library. A source has three methods: `read(now)` returns the
+newest pose or None, `commanded(now, left, right)` receives the wheel speeds that were set, and
+`close()` ends it.
 
-`Odometry` needs nothing and sees nothing: a JetBot has no encoders, so it adds up the speeds that
-were commanded. It drifts, by centimetres for every metre on a calibrated robot, and never grows
-stale. Its frame is the robot's at the start.
+`Odometry` needs no hardware: a JetBot has no encoders, so it integrates the commanded speeds. It
+drifts, by centimetres per metre on a calibrated robot, and is never stale. Its frame is that of
+the robot at the start.
 
-`Tracker` listens to whoever sees the robot from outside, such as a camera above the floor. One
-datagram is one JSON object, `{"time": 12.25, "x": 0.31, "y": -0.02, "yaw": 1.57}`: seconds of the
-sender's own clock, metres, and radians counter-clockwise from x. `time` must grow; what repeats
-is no news, so a tracker that hangs counts as one that is silent. From another machine datagrams
-are signed, see datagrams.py.
+`Tracker` receives poses from a program that observes the robot, for example with a camera above
+the floor. One datagram is one JSON object, `{"time": 12.25, "x": 0.31, "y": -0.02, "yaw": 1.57}`:
+seconds of the sender's clock, metres, and radians counter-clockwise from x. `time` must increase; a
+repeated datagram is ignored, so that a tracker that hangs is treated as silent. Datagrams from
+another machine are signed, see datagrams.py.
 """
 
 import ipaddress
@@ -19,49 +20,50 @@ import math
 import socket
 from typing import Callable, NamedTuple, Optional
 
-from datagrams import LONGEST, Key, Refused, Sighting, parse
+from datagrams import MAX_DATAGRAM_SIZE, Key, RejectedDatagram, TrackedPose, parse
 from motors import Calibration, DriveError
 
-# [s] of a low-pass over the speeds: millimetres of noise are 0.1 m/s from picture to picture.
+# [s] time constant of a low-pass filter of the speeds: a millimetre of noise between two poses is
+# 0.1 m/s.
 SMOOTHING = 0.03
 
-# [s] without news after which a tracker may begin a new count of time.
-_FORGET_AFTER = 0.5
+# [s] without a new pose after which a tracker may restart its clock.
+_RESTART_AFTER = 0.5
 
-_LONGEST_DATAGRAM = 2 * LONGEST
-"""[bytes] Longer ones are cut off here, and are too long all the same."""
+_RECEIVE_SIZE = 2 * MAX_DATAGRAM_SIZE
+"""[bytes] Longer datagrams are truncated here, and are still rejected as too long."""
 
-_MOST_AT_ONCE = 256
-"""Datagrams; a flood of them must not keep the driver from its motors."""
+_MAX_DATAGRAMS = 256
+"""Number of datagrams read in one period, so that a flood of them cannot block the driver."""
 
 
 class Pose(NamedTuple):
-    """Where the axle midpoint is, and how it moves; counter-clockwise is positive."""
+    """Position and velocity of the axle midpoint; counter-clockwise is positive."""
 
     time: float
-    """When it was had, on our clock [s]."""
+    """Time of the pose on the driver's clock [s]."""
     x: float
     """[m]"""
     y: float
     """[m]"""
     yaw: float
-    """Heading from x [rad], without jumps."""
+    """Heading from x, without jumps [rad]."""
     speed: float
-    """Along the heading [m/s]."""
+    """Speed along the heading [m/s]."""
     yaw_rate: float
     """[rad/s]"""
 
 
 class Odometry:
-    """Dead reckoning of what was commanded, through the motors' lag."""
+    """Dead reckoning from the commanded speeds and the lag of the motors."""
 
     name = "odometry"
 
     def __init__(self, calibration: Calibration) -> None:
-        """Begins at the origin, heading along x.
+        """Start at the origin, heading along x.
 
         Args:
-          calibration: its lag and separation.
+          calibration: The calibration, for its lag and its separation.
         """
         self._calibration = calibration
         self._pose = None  # type: Optional[Pose]
@@ -69,18 +71,18 @@ class Odometry:
         self._targets = (0.0, 0.0)
 
     def read(self, now: float) -> Pose:
-        """The pose reckoned for now."""
+        """Return the estimated pose at a time [s]."""
         pose = self._pose or Pose(now, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._pose = self._advance(pose, now)
         return self._pose
 
     def commanded(self, now: float, left: float, right: float) -> None:
-        """Notes the speeds [m/s] that the wheels are asked for from now on."""
+        """Store the speeds [m/s] that the wheels are commanded from now on."""
         self.read(now)
         self._targets = (left, right)
 
     def close(self) -> None:
-        """Does nothing."""
+        """Close nothing; a tracker has a port to close."""
 
     def _advance(self, pose: Pose, now: float) -> Pose:
         lag, dt = self._calibration.lag, now - pose.time
@@ -92,7 +94,7 @@ class Odometry:
             decay * wheel + (1.0 - decay) * target for wheel, target in zip(before, self._targets)
         )
         self._wheels = (left, right)
-        # Exact mean of each speed over the interval.
+        # The exact mean of each speed over the interval.
         left, right = (
             target + (old - new) * lag / dt
             for target, old, new in zip(self._targets, before, self._wheels)
@@ -110,7 +112,7 @@ class Odometry:
 
 
 class Tracker:
-    """Poses that come from outside; speeds are their smoothed differences."""
+    """Poses from a tracker; the speeds are their filtered differences."""
 
     name = "tracker"
 
@@ -120,59 +122,59 @@ class Tracker:
         close: Callable[[], None] = lambda: None,
         key: Optional[Key] = None,
     ) -> None:
-        """Begins without a pose.
+        """Start without a pose.
 
         Args:
-          receive: returns the datagrams that have come since it was last called.
-          close: is called at the end.
-          key: that datagrams are signed with; None: they are not signed.
+          receive: Returns the datagrams received since its last call.
+          close: Called at the end.
+          key: The key that signs the datagrams; None: they are not signed.
         """
         self._receive, self._close, self._key = receive, close, key
         self._pose = None  # type: Optional[Pose]
         self._sent = 0.0
         self.rejected = 0
-        """Datagrams that were not believed."""
+        """Number of rejected datagrams."""
         self.reason = ""
-        """Why the last of them was not."""
+        """Why the last of them was rejected."""
 
     def read(self, now: float) -> Optional[Pose]:
-        """Return the newest pose; None before the first. No datagram makes it raise."""
+        """Return the newest pose; None before the first. No datagram raises an exception."""
         for datagram in self._receive():
             try:
-                sighting = parse(datagram) if self._key is None else self._key.check(datagram)
-            except Refused as error:
+                tracked = parse(datagram) if self._key is None else self._key.check(datagram)
+            except RejectedDatagram as error:
                 self.rejected += 1
                 self.reason = str(error)
             else:
-                self._update(now, sighting)
+                self._update(now, tracked)
         return self._pose
 
     def commanded(self, now: float, left: float, right: float) -> None:
-        """Of no use here."""
+        """Ignore the commanded speeds: the tracker measures the poses."""
 
     def close(self) -> None:
-        """Stops listening, and keeps the newest time that was signed.
+        """Stop listening, and save the newest signed time.
 
         Raises:
-          DriveError: it cannot be kept.
+          DriveError: It cannot be saved.
         """
         self._close()
         if self._key is not None:
             self._key.close()
 
-    def _update(self, now: float, seen: Sighting) -> None:
+    def _update(self, now: float, seen: TrackedPose) -> None:
         last = self._pose
-        # A key has seen to it already that time grows.
-        if last is None or now - last.time > _FORGET_AFTER:
+        # With a key, `Key.check` has already verified that time increases.
+        if last is None or now - last.time > _RESTART_AFTER:
             self._pose, self._sent = Pose(now, seen.x, seen.y, seen.yaw, 0.0, 0.0), seen.time
             return
         dt = seen.time - self._sent
         if dt <= 0.0:
             return
-        turned = _nearest(seen.yaw - last.yaw)
+        turned = _wrap_angle(seen.yaw - last.yaw)
         heading = last.yaw + 0.5 * turned
         moved = (seen.x - last.x) * math.cos(heading) + (seen.y - last.y) * math.sin(heading)
-        # The share by its rate: finite however close two pictures were.
+        # Multiplied in this order, the rate stays finite however close the two poses are in time.
         share = -math.expm1(-dt / SMOOTHING)
         rate = share / dt
         self._pose = Pose(
@@ -186,35 +188,36 @@ class Tracker:
         self._sent = seen.time
 
 
-def _nearest(angle: float) -> float:
-    """The same angle in [-π, π)."""
+def _wrap_angle(angle: float) -> float:
+    """Return the same angle in [-π, π)."""
     return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 def udp_tracker(port: int, host: str = "127.0.0.1", key: Optional[Key] = None) -> Tracker:
-    """Opens a UDP port for a tracker.
+    """Open a UDP port for a tracker.
 
     Args:
-      port: of this machine.
-      host: the address to listen at; by default only programs of this machine reach it.
-      key: that the tracker signs with; None: it does not sign.
+      port: The port on this machine.
+      host: The address to listen on; by default only programs of this machine can reach it.
+      key: The key that the tracker signs with; None: it does not sign.
 
     Returns:
       The tracker.
 
     Raises:
-      DriveError: the port cannot be had, or others reach the address and there is no key.
+      DriveError: The port cannot be opened, or other machines reach the address and there is no
+        key.
     """
     if not 0 < port < 65536:
-        raise DriveError(f"--tracker {port} is no port: give 1 to 65535")
+        raise DriveError(f"--tracker {port} is not a port: give 1 to 65535")
     try:
         address = socket.gethostbyname(host)
     except (OSError, ValueError) as error:
         raise DriveError(f"--tracker-host {host}: {error}")
     if key is None and not ipaddress.ip_address(address).is_loopback:
         raise DriveError(
-            f"--tracker-host {host}: whoever reaches this address could steer the robot: share a"
-            " key with the tracker by --tracker-key FILE"
+            f"--tracker-host {host}: anyone who reaches this address could steer the robot:"
+            " share a key with the tracker by --tracker-key FILE"
         )
     listener = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     try:
@@ -226,9 +229,9 @@ def udp_tracker(port: int, host: str = "127.0.0.1", key: Optional[Key] = None) -
 
     def receive() -> list:
         found = []
-        while len(found) < _MOST_AT_ONCE:
+        while len(found) < _MAX_DATAGRAMS:
             try:
-                found.append(listener.recv(_LONGEST_DATAGRAM))
+                found.append(listener.recv(_RECEIVE_SIZE))
             except BlockingIOError:
                 break
         return found

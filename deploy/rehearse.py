@@ -1,9 +1,8 @@
-"""Drives a simulated JetBot as drive.py drives a real one: `python deploy/rehearse.py POLICY`.
+"""Drive a simulated JetBot as drive.py drives a real one: `python deploy/rehearse.py POLICY`.
 
-Runs where jetbot_mjx is installed. The robot is `jetbot_mjx.deployment.simulated_jetbot`: delay,
-dead-band and lag between motor value and wheel. A tracker sees it `--rate` times a second,
-`--noise` metres beside the truth. Goals are drawn as the tutorial draws them, each from a fresh
-start.
+It runs where jetbot_mjx is installed. The robot is a `SimulatedJetBot`, with delay, dead-band and
+lag between motor value and wheel. A simulated tracker sends its pose `--rate` times a second, with
+noise of `--noise` metres. Goals are drawn as in the tutorial, and each drive starts at the origin.
 """
 
 import argparse
@@ -22,26 +21,26 @@ from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, P
 
 
 class Camera:
-    """Sees a stand-in and sends what a tracker receives."""
+    """A simulated camera that sends the datagrams of a tracker."""
 
     def __init__(
         self, robot: SimulatedJetBot, rate: float, noise: float, rng: np.random.Generator
     ) -> None:
-        """Looks for the first time now.
+        """Start with a first pose now.
 
         Args:
-          robot: to be looked at.
-          rate: pictures a second.
-          noise: deviation of each coordinate [m], and a tenth of it in radians per centimetre.
-          rng: of the noise.
+          robot: The robot that the camera sees.
+          rate: Poses per second.
+          noise: Standard deviation of each coordinate [m]; ten times the number for the yaw [rad].
+          rng: The generator of the noise.
         """
         self._robot, self._period, self._noise, self._rng = robot, 1.0 / rate, noise, rng
         self._next = robot.now()
         self.blind = False
-        """Whether it has stopped sending."""
+        """Whether the camera has stopped sending."""
 
     def receive(self) -> list[bytes]:
-        """The datagrams since the last call: the newest picture, where there is one."""
+        """Return the datagrams since the last call: one with the newest pose, or none."""
         now = self._robot.now()
         if self.blind or now < self._next - 1e-9:
             return []
@@ -53,7 +52,7 @@ class Camera:
 
 
 def draw_goals(count: int, seed: int = 0) -> list[tuple[float, float]]:
-    """Goals (x, y) [m] as the tutorial draws them: r = √u₁ + 0.2, in any direction."""
+    """Return goals (x, y) [m] as the tutorial draws them: r = √u₁ + 0.2, in any direction."""
     rng = np.random.default_rng(seed)
     found = []
     for u1, u2 in rng.random((count, 2)):
@@ -73,23 +72,23 @@ def rehearse(
     timeout: float = 10.0,
     calibration: Calibration | None = None,
 ) -> list[Outcome]:
-    """Drives to each goal from the origin.
+    """Drive to each goal from the origin.
 
     Args:
-      policy: as `load_policy` gives it.
-      goals: (x, y) [m].
-      motors: of the simulated robot.
-      rate: poses a second.
-      noise: deviation of a pose [m]; ten times the number in radians.
-      timeout: for each goal [s].
-      calibration: None: the true one.
+      policy: The policy.
+      goals: Positions (x, y) of the goals [m].
+      motors: The motors of the simulated robot.
+      rate: Poses per second.
+      noise: Standard deviation of a pose [m]; ten times the number for the yaw [rad].
+      timeout: Time limit for each goal [s].
+      calibration: The driver's calibration; None: the true one.
 
     Returns:
-      How each ended. Whether it arrived is told by the true pose.
+      The outcome of each drive. Whether a goal is reached is checked by the true pose.
     """
     robot = SimulatedJetBot(motors)
     calibration = calibration or true_calibration(motors)
-    within = arrival_radius(policy.contract)
+    within = arrival_radius(policy.spec)
     rng = np.random.default_rng(0)
     outcomes = []
     for goal in goals:
@@ -105,7 +104,7 @@ def rehearse(
 
 
 def true_calibration(motors: MotorModel) -> Calibration:
-    """What a perfect measurement of a stand-in would give."""
+    """Return the calibration that a perfect measurement of a `SimulatedJetBot` would give."""
     wheel = default_calibration().left
     left, right = (
         wheel._replace(dead_band=dead_band, full_speed=ROLLING_RADIUS * full_speed)
@@ -114,43 +113,64 @@ def true_calibration(motors: MotorModel) -> Calibration:
     return default_calibration()._replace(left=left, right=right, lag=motors.lag)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Parses the command line and rehearses.
-
-    Args:
-      arguments: without the program's name; None: those of the process.
-
-    Returns:
-      0 where `--min-success` of the goals were reached, 1 below, 2 after a mistake.
-    """
+def _parser() -> argparse.ArgumentParser:
     nominal = MotorModel()
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("policy", help="the folder that jetbot_mjx.export wrote")
-    parser.add_argument("--goals", type=int, default=100, help="how many (default: 100)")
+    parser.add_argument("policy", help="folder that jetbot_mjx.export wrote")
+    parser.add_argument("--goals", type=int, default=100, help="number of goals (default: 100)")
     parser.add_argument(
-        "--delay", type=at_least(0.0), default=nominal.delay, help="[s] (default: 0.05)"
+        "--delay",
+        type=at_least(0.0),
+        default=nominal.delay,
+        help="of the motors [s] (default: 0.05)",
     )
-    parser.add_argument("--lag", type=at_least(0.0), default=nominal.lag, help="[s] (default: 0.1)")
+    parser.add_argument(
+        "--lag", type=at_least(0.0), default=nominal.lag, help="of the motors [s] (default: 0.1)"
+    )
     parser.add_argument(
         "--dead-band", type=float, default=nominal.dead_band[0], help="motor value (default: 0.12)"
     )
     parser.add_argument(
-        "--rate", type=at_least(1.0), default=60.0, help="poses a second (default: 60)"
+        "--rate", type=at_least(1.0), default=60.0, help="poses per second (default: 60)"
     )
     parser.add_argument(
-        "--noise", type=at_least(0.0), default=0.0, help="of a pose [m] (default: 0)"
+        "--noise",
+        type=at_least(0.0),
+        default=0.0,
+        help="standard deviation of a pose [m] (default: 0)",
     )
     parser.add_argument(
-        "--timeout", type=at_least(0.0), default=10.0, help="for a goal [s] (default: 10)"
+        "--timeout",
+        type=at_least(0.0),
+        default=10.0,
+        help="time limit for a goal [s] (default: 10)",
     )
-    parser.add_argument("--min-success", type=at_least(0.0), default=0.95, help="(default: 0.95)")
-    options = parser.parse_args(arguments)
+    parser.add_argument(
+        "--min-success",
+        type=at_least(0.0),
+        default=0.95,
+        help="share of the goals to reach for exit code 0 (default: 0.95)",
+    )
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Parse the command line, drive to all goals and print the success rate.
+
+    Args:
+      arguments: Arguments without the program's name; None: those of the process.
+
+    Returns:
+      The exit code: 0 if at least `--min-success` of the goals were reached, 1 if fewer, 2 after
+      wrong usage.
+    """
+    options = _parser().parse_args(arguments)
     try:
         if options.goals < 1:
             raise DriveError(f"--goals {options.goals}: give at least 1")
         policy = load_policy(options.policy)
         began = time.monotonic()
-        motors = nominal._replace(
+        motors = MotorModel()._replace(
             delay=options.delay, lag=options.lag, dead_band=(options.dead_band,) * 2
         )
         check_calibration(true_calibration(motors))
@@ -165,12 +185,12 @@ def main(arguments: list[str] | None = None) -> int:
     except DriveError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    reached = [one.seconds for one in outcomes if one.reached]
-    median = f", after {statistics.median(reached):.2f} s in the median" if reached else ""
+    reached = [outcome.seconds for outcome in outcomes if outcome.reached]
+    median = f", median time {statistics.median(reached):.2f} s" if reached else ""
     print(
         f"{len(reached)} of {len(outcomes)} goals reached{median}; delay {options.delay:g} s,"
         f" lag {options.lag:g} s, dead-band {options.dead_band:g};"
-        f" {time.monotonic() - began:.0f} s of work"
+        f" computed in {time.monotonic() - began:.0f} s"
     )
     return int(len(reached) < options.min_success * len(outcomes))
 

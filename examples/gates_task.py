@@ -1,10 +1,10 @@
-"""A task with a memory: gates to be driven through one after the other.
+"""A task with a memory: drive through gates, one after the other.
 
     PYTHONPATH=examples python -m jetbot_mjx.train --config examples/gates.yaml
 
-How many gates are passed is part of the goal, and `advance` counts them. A gate counts when the
-robot's axle midpoint crosses the line between its posts from the front; whoever misses one has to
-turn round and come again.
+The number of gates passed is part of the goal, and `advance` counts it. A gate counts when the
+robot's axle midpoint crosses the line between its posts from the front; a robot that misses one
+has to turn around and try again.
 """
 
 from collections.abc import Mapping
@@ -27,25 +27,25 @@ POST_HEIGHT = 0.2  # [m]
 LEG = (0.35, 0.55)  # [m] from one gate to the next
 FIRST_TURN = 1.5  # [rad] largest bearing of the first gate from the start, to either side
 TURN = 1.1  # [rad] largest turn from one leg to the next, to either side
-BONUS = 0.2  # [m] what passing a gate is worth, in the unit of progress
+BONUS = 0.2  # [m] reward for passing a gate, in the unit of progress
 
 
 class GatesGoal(NamedTuple):
-    """What is drawn for one episode, and how far the robot has come in it."""
+    """The course of one episode, and the robot's progress on it."""
 
     gates_w: Float[Array, "gates 3"]
     """Middles of the gates [m], at half the posts' height."""
     headings: Float[Array, " gates"]
-    """Direction in which each is to be passed [rad], counter-clockwise from the world's x axis."""
+    """Direction in which to pass each gate [rad], counter-clockwise from the world's x axis."""
     passed: Int32[Array, ""]
-    """How many are behind the robot."""
+    """Number of gates that the robot has passed."""
 
 
 class GatesTask(GoalTask):
-    """Drive through all gates, in their order and in their direction."""
+    """A task to drive through all gates, in their order and direction."""
 
     def __init__(self, config: TaskConfig) -> None:
-        """Builds the task; of `task.observation` and the goal's settings nothing is used."""
+        """Build the task; it ignores `task.observation` and the settings of the goal."""
         super().__init__(config)
         self.layout = (
             Field("gate_position", 2, "m", "body"),
@@ -59,7 +59,7 @@ class GatesTask(GoalTask):
         )
 
     def sample(self, key: UInt32[Array, "2"]) -> GatesGoal:
-        """Draws a course: each leg turns from the one before, and a gate stands square at its end.
+        """Draw a course: each leg turns from the one before, and a gate stands at its end.
 
         headingₖ = headingₖ₋₁ + turnₖ,  gateₖ = gateₖ₋₁ + legₖ · (cos headingₖ, sin headingₖ)
         """
@@ -72,7 +72,7 @@ class GatesTask(GoalTask):
         return GatesGoal(gates_w, headings, jnp.int32(0))
 
     def advance(self, before: RobotState, after: RobotState, goal: GatesGoal) -> GatesGoal:
-        """Counts the gate that the robot has driven through in this step."""
+        """Return the goal with the gate counted that the robot passed in this step."""
         ahead_before, _ = self._seen_from_gate(before, goal)
         ahead_after, aside = self._seen_from_gate(after, goal)
         through = (ahead_before < 0) & (ahead_after >= 0) & (jnp.abs(aside) < OPENING / 2)
@@ -80,7 +80,7 @@ class GatesTask(GoalTask):
         return goal._replace(passed=goal.passed + (through & still).astype(jnp.int32))
 
     def observe(self, robot: RobotState, goal: GatesGoal) -> Float[Array, " obs"]:
-        """The gate to be passed and the one after it, in the body frame; the last one twice."""
+        """Return the next two gates in the body frame; at the end the last gate twice."""
         heading = kinematics.yaw(robot.quat)
 
         def seen(index: Int32[Array, ""]) -> tuple[Float[Array, "2"], Float[Array, "2"]]:
@@ -93,7 +93,7 @@ class GatesTask(GoalTask):
 
         gate_b, gate_heading_b = seen(goal.passed)
         next_b, next_heading_b = seen(goal.passed + 1)
-        # The floor under the distance only guards the division.
+        # The lower bound only guards the division.
         direction = gate_b / jnp.maximum(jnp.hypot(*gate_b), 1e-3)
         forward_speed = kinematics.to_body(heading, robot.linear_velocity_w[:2])[0]
         left = jnp.float32(GATES) - goal.passed
@@ -107,7 +107,7 @@ class GatesTask(GoalTask):
         goal: GatesGoal,
         action: Float[Array, "2"],
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """Progress towards the gate to be passed [m], and a bonus for passing it."""
+        """Return the progress towards the next gate [m], and a bonus for passing it."""
         del action
         progress = self._to_gate(before, goal) - self._to_gate(after, goal)
         passed = self.advance(before, after, goal).passed - goal.passed
@@ -115,21 +115,21 @@ class GatesTask(GoalTask):
         return progress + bonus, {"progress": progress, "gate": bonus}
 
     def success(self, robot: RobotState, goal: GatesGoal) -> Bool[Array, ""]:
-        """Whether all gates are passed; that also ends the episode."""
+        """Return whether all gates are passed; that also ends the episode."""
         del robot
         return goal.passed >= GATES
 
     def goal_position(self, goal: GatesGoal) -> Float[Array, "3"]:
-        """The last gate."""
+        """Return the position of the last gate."""
         return goal.gates_w[-1]
 
     def move_goal(self, goal: GatesGoal, position_w: Float[Array, "3"]) -> GatesGoal:
-        """The whole course moves along, so that its last gate stands there."""
+        """Return the whole course, shifted so that its last gate stands at the position."""
         shift = (position_w - goal.gates_w[-1]).at[2].set(0.0)
         return goal._replace(gates_w=goal.gates_w + shift)
 
     def markers(self, goal: GatesGoal) -> Mapping[str, Float[Array, "3"]]:
-        """The posts, at either side of each gate; the tutorial's cube is out of sight."""
+        """Return the positions of the posts; the tutorial's cube is below the floor."""
         left = _direction(goal.headings + jnp.pi / 2) * OPENING / 2
         left = jnp.concatenate([left, jnp.zeros((GATES, 1))], axis=1)
         posts = {f"gate_{i}_left": goal.gates_w[i] + left[i] for i in range(GATES)}
@@ -137,10 +137,10 @@ class GatesTask(GoalTask):
         return {"goal": jnp.array([0.0, 0.0, -1.0]), **posts}
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
-        """Adds the posts: mocap bodies, placed by `markers`, that take no part in physics."""
+        """Add the posts: mocap bodies, placed by `markers`, that take no part in physics."""
         super().build_scene(spec)
         for i in range(GATES):
-            # From light to dark, in the order in which they are to be passed.
+            # The colour goes from light to dark, in the order of the gates.
             shade = 1.0 - i / GATES
             for side in ("left", "right"):
                 post = spec.worldbody.add_body(name=f"gate_{i}_{side}", mocap=True)
@@ -153,17 +153,17 @@ class GatesTask(GoalTask):
                 )
 
     def _to_gate(self, robot: RobotState, goal: GatesGoal) -> Float[Array, ""]:
-        """Distance on the floor to the middle of the gate to be passed [m]."""
+        """Return the distance on the floor to the middle of the next gate [m]."""
         gate_w = goal.gates_w[jnp.minimum(goal.passed, GATES - 1), :2]
         return jnp.linalg.norm(gate_w - robot.position_w[:2])
 
     def _seen_from_gate(self, robot: RobotState, goal: GatesGoal) -> Float[Array, "2"]:
-        """The robot's place past the gate to be passed, and left of its middle [m]."""
+        """Return how far the robot is behind the next gate, and left of its middle [m]."""
         index = jnp.minimum(goal.passed, GATES - 1)
         offset_w = robot.position_w[:2] - goal.gates_w[index, :2]
         return kinematics.to_body(goal.headings[index], offset_w)
 
 
 def _direction(angle: Float[Array, "*n"]) -> Float[Array, "*n 2"]:
-    """The unit vector that an angle points to."""
+    """Return the unit vector at an angle."""
     return jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=-1)

@@ -1,11 +1,13 @@
-"""A task of your own, without touching the package: drive to the goal and round a pillar.
+"""A task outside the package: drive to the goal and around a pillar.
 
-Put this folder on `PYTHONPATH` and name the class in YAML, as `examples/obstacle.yaml` does:
+Put the folder of this file on `PYTHONPATH` and name the class in a YAML file:
 
     PYTHONPATH=examples python -m jetbot_mjx.train --config examples/obstacle.yaml
 
-A subclass of `GoalTask` says only what differs: what is drawn for an episode, what is seen,
-what is rewarded, and when it ends. Environment, trainer, evaluation and pictures follow.
+A subclass of `GoalTask` overrides only what differs: what is drawn for an episode, the
+observation, the reward, and when the episode ends. Environment, trainer, evaluation and rendering
+use the subclass as they use `GoalTask`. Every method takes one robot and is pure: no `if` on an
+array, no state in `self`, random numbers from `key` alone.
 """
 
 from collections.abc import Mapping
@@ -22,7 +24,7 @@ from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.task import Field, GoalTask, Layout, RobotState
 from jetbot_mjx.errors import UserError
 
-# What the policy sees beside the goal, in the same form: where the pillar's axis stands.
+# The pillar in the observation, in the form of the goal: position of its axis.
 PILLAR: Layout = (
     Field("pillar_position", 2, "m", "body"),
     Field("pillar_direction", 2, "1", "body"),
@@ -36,45 +38,44 @@ class Options(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     pillar_radius: Positive = 0.08
-    """[m]"""
+    """Radius of the pillar [m]."""
     pillar_height: Positive = 0.25
-    """[m]; only shows."""
+    """Height of the pillar [m]; it only matters for rendering."""
     pillar_offset: NonNegative = 0.1
-    """[m] largest distance of the pillar's axis from the straight line to the goal."""
+    """Largest distance of the pillar's axis from the straight line to the goal [m]."""
     robot_radius: Positive = 0.11
-    """[m] circle about the axle midpoint that holds the whole robot, its rear corners too."""
+    """Radius of the circle around the axle midpoint that encloses the whole robot [m]."""
     margin: Positive = 0.2
-    """[m] free room between pillar and robot at the start, and were it to stand on the goal."""
+    """Free distance between the pillar and a robot at the start or on the goal [m]."""
     collision_penalty: NonNegative = 1.0
-    """[m] what hitting the pillar costs, in the unit of progress."""
+    """Penalty for hitting the pillar [m], in the unit of progress."""
 
 
 class ObstacleGoal(NamedTuple):
-    """What is drawn for one episode."""
+    """The goal and the pillar that are drawn for one episode."""
 
     goal_w: Float[Array, "3"]
-    """Where to go [m]."""
+    """Position of the goal [m]."""
     pillar_w: Float[Array, "3"]
     """Centre of the pillar [m]."""
 
 
 class ObstacleTask(GoalTask):
-    """Drive to the goal without hitting a round pillar that stands in the way.
+    """A task to drive to the goal without hitting a round pillar in the way.
 
-    The pillar is virtual: it shows, but nothing touches it. A robot hits it where its axle
-    midpoint comes nearer to the pillar's axis than the two radii together; that ends the
+    The pillar is virtual: it is rendered, but takes no part in physics. A robot hits it when the
+    axle midpoint comes nearer to the pillar's axis than the sum of the two radii; that ends the
     episode as a failure and costs `collision_penalty`. Success is reaching the goal.
     """
 
     def __init__(self, config: TaskConfig) -> None:
-        """Builds the task.
+        """Build the task.
 
         Args:
-          config: as for `GoalTask`; its `options` are those of `Options`.
+          config: The task's configuration; its `options` are the fields of `Options`.
 
         Raises:
-          UserError: an option is wrong, or goals can be too near for a pillar to stand before
-            them.
+          UserError: An option is wrong, or goals can be too near to place a pillar before them.
         """
         super().__init__(config)
         try:
@@ -95,16 +96,16 @@ class ObstacleTask(GoalTask):
 
     @property
     def hit_distance(self) -> float:
-        """Distance of axle midpoint and pillar's axis below which they touch [m]."""
+        """Return the distance of axle midpoint and pillar's axis at which they touch [m]."""
         return self.options.pillar_radius + self.options.robot_radius
 
     @property
     def clearance(self) -> float:
-        """Distance that the pillar's axis keeps from start and goal [m]."""
+        """Return the least distance of the pillar's axis from start and goal [m]."""
         return self.hit_distance + self.options.margin
 
     def sample(self, key: UInt32[Array, "2"]) -> ObstacleGoal:
-        """Draws a goal, and a pillar between it and the start.
+        """Draw a goal, and a pillar between it and the start.
 
             pillar = s · e + o · e⊥,  s ∈ [clearance, r - clearance],  o ∈ [-offset, offset]
 
@@ -122,11 +123,11 @@ class ObstacleTask(GoalTask):
         return ObstacleGoal(goal_w, jnp.concatenate([way * ahead + offset * left, height]))
 
     def observe(self, robot: RobotState, goal: ObstacleGoal) -> Float[Array, " obs"]:
-        """The base class's observation, and the pillar as the robot sees it."""
+        """Return the base class's observation, then the pillar in the body frame."""
         heading = kinematics.yaw(robot.quat)
         pillar_b = kinematics.to_body(heading, goal.pillar_w[:2] - robot.position_w[:2])
         distance = self.pillar_distance(robot, goal)
-        # The floor under the distance only guards the division: a hit ends the episode before.
+        # The lower bound only guards the division: a hit ends the episode before.
         direction = pillar_b / jnp.maximum(distance, 1e-3)
         return jnp.concatenate([super().observe(robot, goal), pillar_b, direction, distance[None]])
 
@@ -137,33 +138,33 @@ class ObstacleTask(GoalTask):
         goal: ObstacleGoal,
         action: Float[Array, "2"],
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """Progress towards the goal [m], less the penalty where the pillar is hit."""
+        """Return the progress towards the goal [m], less the penalty for hitting the pillar."""
         progress, terms = super().reward(before, after, goal, action)
         collision = -self.options.collision_penalty * self.hit(after, goal).astype(jnp.float32)
         return progress + collision, {**terms, "collision": collision}
 
     def terminated(self, robot: RobotState, goal: ObstacleGoal) -> Bool[Array, ""]:
-        """The episode ends at the goal and at the pillar."""
+        """Return whether the robot reaches the goal or hits the pillar."""
         return self.success(robot, goal) | self.hit(robot, goal)
 
     def success(self, robot: RobotState, goal: ObstacleGoal) -> Bool[Array, ""]:
-        """Whether the goal is reached; a robot that hits the pillar in that step has failed."""
+        """Return whether the goal is reached without a hit in the same step."""
         return super().success(robot, goal) & ~self.hit(robot, goal)
 
     def goal_position(self, goal: ObstacleGoal) -> Float[Array, "3"]:
-        """Where to go; all of `GoalTask` that needs the goal asks here."""
+        """Return the position of the goal; `GoalTask` reads it from here alone."""
         return goal.goal_w
 
     def move_goal(self, goal: ObstacleGoal, position_w: Float[Array, "3"]) -> ObstacleGoal:
-        """The cube moves, the pillar stays where it was drawn."""
+        """Return the goal at another position, with the pillar unchanged."""
         return goal._replace(goal_w=position_w)
 
     def markers(self, goal: ObstacleGoal) -> Mapping[str, Float[Array, "3"]]:
-        """The red cube stands on the goal, the pillar on its place."""
+        """Return the positions of the red cube and of the pillar."""
         return {**super().markers(goal), "pillar": goal.pillar_w}
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
-        """Adds the pillar: a mocap body, placed by `markers`, that takes no part in physics."""
+        """Add the pillar: a mocap body, placed by `markers`, that takes no part in physics."""
         super().build_scene(spec)
         pillar = spec.worldbody.add_body(name="pillar", mocap=True)
         pillar.add_geom(
@@ -176,9 +177,9 @@ class ObstacleTask(GoalTask):
         )
 
     def pillar_distance(self, robot: RobotState, goal: ObstacleGoal) -> Float[Array, ""]:
-        """Distance on the floor from the axle midpoint to the pillar's axis [m]."""
+        """Return the distance on the floor from the axle midpoint to the pillar's axis [m]."""
         return jnp.linalg.norm(goal.pillar_w[:2] - robot.position_w[:2])
 
     def hit(self, robot: RobotState, goal: ObstacleGoal) -> Bool[Array, ""]:
-        """Whether the robot touches the pillar."""
+        """Return whether the robot touches the pillar."""
         return self.pillar_distance(robot, goal) < self.hit_distance

@@ -2,9 +2,10 @@
 
     PYTHONPATH=examples python -m jetbot_mjx.train --config examples/pillars.yaml
 
-Unlike the pillar of `obstacle_task.py`, which ends the episode, these stand: physics holds the
-robot off them. A robot may brush past one, and it may push against one until the time is out: that
-costs a little in every step, for without it pushing looks no worse than a detour.
+Unlike the pillar of `obstacle_task.py`, which ends the episode, these are solid: contact forces
+keep the robot out of them. A robot may brush past a pillar, or push against it until the time
+limit. Touching costs a little in every step: without that cost, pushing looks no worse than a
+detour.
 """
 
 from collections.abc import Mapping
@@ -23,32 +24,32 @@ PILLARS = 3
 PILLAR_RADIUS = 0.06  # [m]
 PILLAR_HEIGHT = 0.25  # [m]
 
-# A ball that holds chassis and wheels, in the body frame. One contact a pillar, and the force
-# acts at the height of the axle: it does not tip the robot.
+# A sphere that encloses chassis and wheels, in the body frame. It makes one contact with each
+# pillar, and the force acts at the height of the axle, so that it does not tip the robot.
 BUMPER_RADIUS = 0.085  # [m]
 BUMPER_POS = (-0.031, 0.0, 0.0)  # [m] middle of the chassis
 
-CONTACT_COST = 0.01  # [m] of touching a pillar for one step; full speed covers 0.017 m in one
-ARRIVAL = 0.5  # [m] what reaching the goal is worth beside the way there
-TOUCH = 0.003  # [m] gap below which it counts as touching
+CONTACT_COST = 0.01  # [m] cost of touching a pillar for one step; full speed covers 0.017 m
+ARRIVAL = 0.5  # [m] reward for reaching the goal, besides the progress
+TOUCH = 0.003  # [m] gap below which the robot counts as touching
 
 CLEARANCE = PILLAR_RADIUS + 0.18  # [m] of a pillar's axis from start and goal
 
 
 class PillarsGoal(NamedTuple):
-    """What is drawn for one episode."""
+    """The goal and the pillars that are drawn for one episode."""
 
     goal_w: Float[Array, "3"]
-    """Where to go [m]."""
+    """Position of the goal [m]."""
     pillars_w: Float[Array, "pillars 3"]
-    """Centres of the pillars [m]; the first is the one in the way."""
+    """Centres of the pillars [m]; the first stands in the way."""
 
 
 class PillarsTask(GoalTask):
-    """Drive to the goal between solid pillars, of which one stands in the way."""
+    """A task to drive to the goal between solid pillars, one of which stands in the way."""
 
     def __init__(self, config: TaskConfig) -> None:
-        """Builds the task; `task.observation: egocentric` suits it."""
+        """Build the task; use it with `task.observation: egocentric`."""
         super().__init__(config)
         self.layout = (
             *self.layout,
@@ -58,7 +59,7 @@ class PillarsTask(GoalTask):
         )
 
     def sample(self, key: UInt32[Array, "2"]) -> PillarsGoal:
-        """Draws a goal, a pillar on the way to it, and others at either side of that one."""
+        """Draw a goal, a pillar on the way to it, and one more at either side of that pillar."""
         goal_key, pillar_key = jax.random.split(key)
         goal_w = super().sample(goal_key)
         distance = jnp.hypot(goal_w[0], goal_w[1])
@@ -73,14 +74,14 @@ class PillarsTask(GoalTask):
         return PillarsGoal(goal_w, jnp.concatenate([places, height], axis=1))
 
     def observe(self, robot: RobotState, goal: PillarsGoal) -> Float[Array, " obs"]:
-        """The base class's observation, and the pillars as the robot sees them, nearest first."""
+        """Return the base class's observation, then the pillars in the body frame by distance."""
         offset_w = goal.pillars_w[:, :2] - robot.position_w[:2]
         heading = kinematics.yaw(robot.quat)
         pillars_b = jax.vmap(kinematics.to_body, in_axes=(None, 0))(heading, offset_w)
         distance = jnp.linalg.norm(pillars_b, axis=1)
         nearest = jnp.argsort(distance)
         pillars_b, distance = pillars_b[nearest], distance[nearest]
-        # The floor under the distance only guards the division: pillars keep the robot off.
+        # The lower bound only guards the division: the bumper keeps the robot at a distance.
         direction = pillars_b / jnp.maximum(distance, 1e-3)[:, None]
         return jnp.concatenate(
             [super().observe(robot, goal), pillars_b.ravel(), direction.ravel(), distance]
@@ -93,29 +94,29 @@ class PillarsTask(GoalTask):
         goal: PillarsGoal,
         action: Float[Array, "2"],
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """Progress towards the goal [m], less what touching costs, and a bonus for arriving."""
+        """Return the progress [m], less the cost of touching, plus a bonus at the goal."""
         progress, terms = super().reward(before, after, goal, action)
         contact = -CONTACT_COST * self.touches(after, goal).astype(jnp.float32)
         arrival = ARRIVAL * self.success(after, goal).astype(jnp.float32)
         return progress + contact + arrival, {**terms, "contact": contact, "arrival": arrival}
 
     def goal_position(self, goal: PillarsGoal) -> Float[Array, "3"]:
-        """Where to go."""
+        """Return the position of the goal."""
         return goal.goal_w
 
     def move_goal(self, goal: PillarsGoal, position_w: Float[Array, "3"]) -> PillarsGoal:
-        """The cube moves, the pillars stay where they were drawn."""
+        """Return the goal at another position, with the pillars unchanged."""
         return goal._replace(goal_w=position_w)
 
     def markers(self, goal: PillarsGoal) -> Mapping[str, Float[Array, "3"]]:
-        """The red cube on the goal, the pillars on their places: what shows and what is solid."""
+        """Return the positions of the red cube and of the solid pillars."""
         pillars = {f"pillar_{i}": goal.pillars_w[i] for i in range(PILLARS)}
         return {**super().markers(goal), **pillars}
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
-        """Adds a bumper to the robot, pillars to the scene, and a contact pair for each of them.
+        """Add a bumper to the robot, pillars to the scene, and a contact pair for each pillar.
 
-        Geoms collide where a pair says so, and nowhere else: `contype` and `conaffinity` stay 0.
+        Geoms collide only where a pair exists: `contype` and `conaffinity` stay 0.
         """
         super().build_scene(spec)
         spec.body("jetbot").add_geom(
@@ -129,7 +130,7 @@ class PillarsTask(GoalTask):
             conaffinity=0,
         )
         for i in range(PILLARS):
-            # Where they are built is away from the robot, which is put down to rest first.
+            # Build the pillars away from the robot, which is first simulated until it rests.
             pillar = spec.worldbody.add_body(
                 name=f"pillar_{i}", mocap=True, pos=(1.0, i - 1.0, PILLAR_HEIGHT / 2)
             )
@@ -140,8 +141,8 @@ class PillarsTask(GoalTask):
                 contype=0,
                 conaffinity=0,
             )
-            # Of a ball and a capsule MJX computes the contact in closed form; a cylinder takes
-            # it an iteration. At the height of the axle both have the same surface.
+            # MJX computes a contact of sphere and capsule in closed form, but iterates for a
+            # cylinder. At the height of the axle both have the same surface.
             pillar.add_geom(
                 name=f"pillar_{i}",
                 type=mujoco.mjtGeom.mjGEOM_CAPSULE,
@@ -153,7 +154,7 @@ class PillarsTask(GoalTask):
             spec.add_pair(name=f"pillar_{i}", geomname1="bumper", geomname2=f"pillar_{i}", condim=1)
 
     def touches(self, robot: RobotState, goal: PillarsGoal) -> Bool[Array, ""]:
-        """Whether the bumper rests against a pillar."""
+        """Return whether the bumper touches a pillar."""
         bumper_w = robot.position_w + kinematics.rotate(robot.quat, jnp.array(BUMPER_POS))
         gap = jnp.linalg.norm(goal.pillars_w[:, :2] - bumper_w[:2], axis=1)
         return (gap < PILLAR_RADIUS + BUMPER_RADIUS + TOUCH).any()

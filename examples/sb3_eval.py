@@ -1,7 +1,8 @@
-"""Watches a policy of `sb3_train.py` drive, and counts the goals that it reaches.
+"""Show a policy of `sb3_train.py`, and count the goals that it reaches.
 
-python examples/sb3_eval.py                        # twenty goals, in a window
-python examples/sb3_eval.py --headless             # without one
+It drives to twenty goals in a window; `--headless` opens no window:
+
+    python examples/sb3_eval.py --headless
 """
 
 import argparse
@@ -18,21 +19,21 @@ from jetbot_mjx.errors import UserError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Drives to goals and prints how many were reached.
+    """Drive to goals, and print how many were reached.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: Arguments without the program's name; None: those of the process.
 
     Returns:
       The exit code.
 
     Raises:
-      UserError: there is no policy, or no display.
+      UserError: There is no policy, or no display.
     """
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--policy", type=Path, default=Path("sb3_policy/jetbot.zip"))
     parser.add_argument("--episodes", type=cli.positive_int, default=20, help="default: 20")
-    parser.add_argument("--headless", action="store_true", help="no window")
+    parser.add_argument("--headless", action="store_true", help="do not open a window")
     options = parser.parse_args(arguments)
     if not options.policy.is_file():
         raise UserError(

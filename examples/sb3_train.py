@@ -1,10 +1,10 @@
 """Stable-Baselines3's PPO on the JetBot, with the tutorial's hyperparameters.
 
     pip install '.[sb3,tensorboard]'
-    python examples/sb3_train.py                          # one robot, as the tutorial has it
-    python examples/sb3_train.py --num-envs 32            # many, in one program
+    python examples/sb3_train.py                          # one robot, as in the tutorial
+    python examples/sb3_train.py --num-envs 32            # 32 robots in one program
 
-Whoever has a script of the tutorial's shape changes one line, the import of the environment:
+To run a script that follows the tutorial, change its import of the environment:
 
     from jetbot_mjx.adapters import JetBotGymEnv as JetBotEnv
 """
@@ -24,14 +24,14 @@ from jetbot_mjx.adapters import JetBotGymEnv
 from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
 
 _STEPS = 2560
-"""Of all robots together, between two updates."""
+"""Environment steps between two updates, over all robots."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Trains and saves the policy.
+    """Train and save the policy.
 
     Args:
-      arguments: without the program's name; None: those of the process.
+      arguments: Arguments without the program's name; None: those of the process.
 
     Returns:
       The exit code.
@@ -48,7 +48,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         env = JetBotGymEnv()
     else:
         env = VecMonitor(JetBotVecEnv(options.num_envs), info_keywords=("is_success",))
-    # Networks of this size gain nothing from more, and lose much where other programs run.
+    # More threads do not speed up networks of this size, and slow down on a busy machine.
     torch.set_num_threads(1)
     layers = {"pi": [16, 128, 128, 128], "vf": [16, 128, 128, 128]}
     ppo = PPO(
@@ -66,11 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         max_grad_norm=0.9,
         policy_kwargs={"activation_fn": torch.nn.Tanh, "net_arch": layers},
         tensorboard_log=str(options.folder) if importlib.util.find_spec("tensorboard") else None,
-        device="cpu",  # a policy of this size is slower on a GPU
+        device="cpu",  # a network of this size is slower on a GPU
         seed=0,
         verbose=1,
     )
-    # It counts calls of all robots at once.
+    # `CheckpointCallback` counts calls of `step`, each of which steps all robots.
     every = CheckpointCallback(max(1, 10_000 // options.num_envs), str(options.folder), "jetbot")
     ppo.learn(options.steps, callback=every)
     ppo.save(options.folder / "jetbot")

@@ -1,7 +1,7 @@
 """Write a task to start from: `python -m jetbot_mjx.new_task my_task.py`.
 
-The task is small and complete, and its settings are written as YAML to the same folder. Both pass
-`check_env` and can be trained unchanged. Nothing is overwritten.
+It is the example `examples/obstacle_task.py` under your name, with its settings as YAML in the same
+folder. Both pass `check_env` and can be trained unchanged. No file is overwritten.
 """
 
 from collections.abc import Sequence

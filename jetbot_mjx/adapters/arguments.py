@@ -1,36 +1,33 @@
-"""Arguments, seeds and optional packages, checked before anything is built."""
+"""Check the adapters' arguments, seeds, actions and optional packages before anything is built."""
 
 import contextlib
 import math
 import numbers
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt32
 
-from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, shown_here
+from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.config import Config, load_config, parse_config
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import UserError
 
 Seed = int | Sequence[int | None] | None
 Source = Config | Mapping[str, Any] | str | Path | None
-"""A configuration, nested settings, a YAML file, or None for the tutorial's."""
-
-_MOST_ENVS = 2**24
+"""A configuration, nested settings, a YAML file, or None for the tutorial's configuration."""
 
 
 @contextlib.contextmanager
-def an_extra(extra: str) -> Iterator[None]:
-    """Say in one line how to install what is imported inside.
+def requires_extra(extra: str) -> Iterator[None]:
+    """Replace a failing import by one line that says how to install the package.
 
     Args:
-      extra: of this project, which brings it.
+      extra: The extra of this project that installs what the block imports.
 
     Raises:
-      UserError: it is not there.
+      UserError: A package is not installed.
     """
     try:
         yield
@@ -41,76 +38,47 @@ def an_extra(extra: str) -> Iterator[None]:
         ) from None
 
 
-class Arguments(NamedTuple):
-    """The tutorial's arguments, which the adapters' constructors take by the same names."""
+def resolve(
+    config: Source,
+    skip_frame: int,
+    physics_dt: float | None,
+    rendering_dt: float | None,
+    max_episode_length: int | None,
+    headless: bool,
+    render_mode: str | None,
+) -> tuple[Config, str | None, float]:
+    """Apply the tutorial's arguments to a configuration.
 
-    skip_frame: int = 1
-    physics_dt: float | None = None
-    rendering_dt: float | None = None
-    max_episode_length: int | None = None
-    headless: bool = True
-    render_mode: str | None = None
-
-
-class Settings(NamedTuple):
-    """The configuration and the view that the arguments resolve to."""
-
-    config: Config
-    render_mode: str | None
-    rendering_dt: float
-    """[s] between two pictures in a window."""
-
-    @property
-    def metadata(self) -> dict[str, Any]:
-        """Return what an environment declares: render modes available here, images per second."""
-        modes = [mode for mode in RENDER_MODES if mode == self.render_mode or shown_here(mode)]
-        return {
-            "render_modes": modes,
-            "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
-        }
-
-    def view(self, env: JetBotEnv) -> FrameRenderer | None:
-        """Return what shows an environment; None where nothing is to be shown.
-
-        Raises:
-          UserError: there is no display for a window.
-        """
-        return FrameRenderer(env, self.render_mode, self.rendering_dt) if self.render_mode else None
-
-
-def resolve(given: Arguments, config: Source) -> Settings:
-    """Work the tutorial's arguments into a configuration.
-
-    Args:
-      given: the arguments; None leaves a setting as the configuration has it.
-      config: a configuration, as nested settings, as a YAML file, or None for the tutorial's.
+    `JetBotGymEnv` documents the arguments; None leaves a setting as it is in the configuration.
 
     Returns:
-      The configuration that the environment is built from, and how it shows itself.
+      The configuration to build the environment from, the render mode, and the simulated time
+      between two frames in a window [s].
 
     Raises:
-      UserError: an argument is out of bounds, or the configuration cannot be read.
+      UserError: An argument is out of bounds, or the configuration cannot be read.
     """
+    # Check each argument, with the configuration's value where none is given.
     base = _read(config)
-    physics_dt = base.physics.ctrl_dt if given.physics_dt is None else given.physics_dt
-    length = given.max_episode_length
-    length = base.task.episode_length if length is None else length
-    _check_count("skip_frame", given.skip_frame)
-    _check_count("max_episode_length", length)
+    physics_dt = base.physics.ctrl_dt if physics_dt is None else physics_dt
+    length = base.task.episode_length if max_episode_length is None else max_episode_length
+    check_count("skip_frame", skip_frame)
+    check_count("max_episode_length", length)
     _check_seconds("physics_dt", physics_dt)
-    ctrl_dt = given.skip_frame * physics_dt
-    rendering_dt = ctrl_dt if given.rendering_dt is None else given.rendering_dt
+    ctrl_dt = skip_frame * physics_dt
+    rendering_dt = ctrl_dt if rendering_dt is None else rendering_dt
     _check_seconds("rendering_dt", rendering_dt)
-    mode = given.render_mode or (None if given.headless else "human")
+    mode = render_mode or (None if headless else "human")
     if mode not in (None, *RENDER_MODES):
         raise UserError(f"render_mode = {mode!r} is unknown: known are {', '.join(RENDER_MODES)}")
+
+    # Divide each frame into the fewest physics steps that are no longer than the configuration's;
+    # the tolerance is that of a configuration with rounded numbers.
+    substeps = skip_frame * math.ceil(physics_dt / base.physics.sim_dt * (1 - 1e-3))
     values = base.model_dump()
-    # As many physics steps in every frame as it takes to make none longer than the configuration's,
-    # give or take what a configuration may round.
-    substeps = given.skip_frame * math.ceil(physics_dt / base.physics.sim_dt * (1 - 1e-3))
     values["physics"] |= {"ctrl_dt": float(ctrl_dt), "sim_dt": ctrl_dt / substeps}
     values["task"]["episode_length"] = int(length)
-    return Settings(parse_config(values), mode, rendering_dt)
+    return parse_config(values), mode, rendering_dt
 
 
 def _read(config: Source) -> Config:
@@ -126,9 +94,16 @@ def _read(config: Source) -> Config:
     raise UserError(f"config = {config!r} is wrong: give a YAML file, a mapping or a Config")
 
 
-def _check_count(name: str, value: Any) -> None:
+def check_count(name: str, value: Any, most: float = math.inf) -> None:
+    """Check that an argument is a whole number from 1 to `most`.
+
+    Raises:
+      UserError: It is not; the message begins with `name`.
+    """
     if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
         raise UserError(f"{name} = {value!r} is wrong: it should be a whole number from 1 on")
+    if int(value) > most:
+        raise UserError(f"{name} = {value} is wrong: it should be at most {most}")
 
 
 def _check_seconds(name: str, value: Any) -> None:
@@ -136,36 +111,18 @@ def _check_seconds(name: str, value: Any) -> None:
         raise UserError(f"{name} = {value!r} is wrong: it should be seconds above 0")
 
 
-def check_num_envs(num_envs: Any) -> int:
-    """Refuse what is no number of environments.
-
-    Args:
-      num_envs: how many environments are asked for.
-
-    Returns:
-      The same.
-
-    Raises:
-      UserError: it is none.
-    """
-    _check_count("num_envs", num_envs)
-    if num_envs > _MOST_ENVS:
-        raise UserError(f"num_envs = {num_envs} is wrong: it should be at most {_MOST_ENVS}")
-    return int(num_envs)
-
-
 def as_actions(actions: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
-    """Return actions as an array, and refuse what has another shape.
+    """Return actions as a float32 array of the expected shape.
 
     Args:
-      actions: numbers in [-1, 1]; values outside are clipped where they are used.
+      actions: Numbers in [-1, 1]; values outside are clipped where they are used.
       shape: (2,) for one robot, (n, 2) for a batch.
 
     Raises:
-      UserError: they are no numbers, or not of that shape.
+      UserError: The actions are not numbers, or have another shape.
     """
     try:
-        # What is too large for float32 is clipped later, as infinity is.
+        # What is too large for float32 becomes infinite here, and is clipped later.
         with np.errstate(over="ignore"):
             found = np.asarray(actions, np.float32)
     except (TypeError, ValueError):
@@ -176,43 +133,58 @@ def as_actions(actions: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]
 
 
 def key_from_seed(seed: int | None) -> UInt32[np.ndarray, "2"]:
-    """Return the random key that a robot's episodes come from.
+    """Return the random key of a robot's first episode, as `JetBotEnv.reset` takes it.
 
     Args:
-      seed: a whole number from 0 on; None: something else every time.
-
-    Returns:
-      A legacy key, as `JetBotEnv.reset` takes it.
+      seed: A whole number from 0 on; None draws another key in every call.
     """
     return np.random.default_rng(seed).integers(2**32, size=2, dtype=np.uint32)
 
 
-def seeds_of(seed: Seed, num_envs: int) -> list[int | None]:
-    """One seed for each environment, by Gymnasium's rule: one number counts on from there.
+class ResetKeys:
+    """The rule for the key of each environment's next episode.
 
-    Args:
-      seed: one number, one for each environment, or None.
-      num_envs: how many environments there are.
-
-    Returns:
-      As many seeds, or Nones.
-
-    Raises:
-      UserError: there are more or fewer seeds than environments, or one is no seed.
+    A seed of this reset comes first. Without one an environment continues its own random stream,
+    and before its first episode it takes the constructor's seed.
     """
-    if seed is None:
-        return [None] * num_envs
-    if not isinstance(seed, Sequence):
-        _check_seed(seed)
-        return [int(seed) + index for index in range(num_envs)]
-    if len(seed) != num_envs:
-        raise UserError(f"seed has {len(seed)} numbers: give one, or one for each of {num_envs}")
-    for one in seed:
-        if one is not None:
-            _check_seed(one)
-    return list(seed)
+
+    def __init__(self, seed: Seed, num_envs: int) -> None:
+        """Store the constructor's seeds.
+
+        Raises:
+          UserError: There are more or fewer seeds than environments, or one is not a seed.
+        """
+        self._first = _seeds(seed, num_envs)
+
+    def __call__(
+        self, seed: Seed, current: UInt32[np.ndarray, "n 2"] | None
+    ) -> UInt32[np.ndarray, "n 2"]:
+        """Return the keys of the next episodes.
+
+        Args:
+          seed: One number, which counts on from environment to environment as in Gymnasium, one
+            for each environment, or None.
+          current: The keys with which the environments continue; None before their first episode.
+
+        Raises:
+          UserError: There are more or fewer seeds than environments, or one is not a seed.
+        """
+        seeds = _seeds(seed, len(self._first))
+        if current is None:
+            pairs = zip(seeds, self._first, strict=True)
+            return np.stack([key_from_seed(first if one is None else one) for one, first in pairs])
+        pairs = zip(seeds, current, strict=True)
+        return np.stack([key if one is None else key_from_seed(one) for one, key in pairs])
 
 
-def _check_seed(seed: Any) -> None:
-    if not isinstance(seed, numbers.Integral) or int(seed) < 0:
-        raise UserError(f"seed = {seed!r} is wrong: it should be a whole number from 0 on")
+def _seeds(seed: Seed, num_envs: int) -> list[int | None]:
+    """Return one seed, or None, for each environment."""
+    each = list(seed) if isinstance(seed, Sequence) else [seed] * num_envs
+    if len(each) != num_envs:
+        raise UserError(f"seed has {len(each)} numbers: give one, or one for each of {num_envs}")
+    for one in each:
+        if one is not None and (not isinstance(one, numbers.Integral) or int(one) < 0):
+            raise UserError(f"seed = {one!r} is wrong: it should be a whole number from 0 on")
+    if seed is None or isinstance(seed, Sequence):
+        return each
+    return [int(seed) + index for index in range(num_envs)]

@@ -1,19 +1,21 @@
-"""The batched MJX environment with NumPy on either side, as Python's trainers want it."""
+"""The batched MJX environment with NumPy arrays in and out, for trainers written in Python."""
 
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, PyTree
+from jaxtyping import Bool, Float
 
-from jetbot_mjx.adapters.arguments import Seed, as_actions, key_from_seed, seeds_of
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions, check_count
+from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.wrappers import wrap_for_training
+
+_MOST_ENVS = 2**24
 
 
 class Steps(NamedTuple):
@@ -25,23 +27,14 @@ class Steps(NamedTuple):
     truncated: Bool[np.ndarray, " n"]
     success: Bool[np.ndarray, " n"]
     nonfinite: Bool[np.ndarray, " n"]
-    """Where a world blew up, and was truncated."""
+    """Where the state was not finite, and the episode was truncated for it."""
     final_obs: Float[np.ndarray, "n obs"]
-    """What the step led to; where no episode ended, the same as `obs`."""
+    """The observation after the step, before any reset; without a reset it equals `obs`."""
 
     @property
     def done(self) -> Bool[np.ndarray, " n"]:
         """Return where an episode ended."""
         return self.terminated | self.truncated
-
-
-class Pose(NamedTuple):
-    """The state of one robot that is shown."""
-
-    qpos: Float[np.ndarray, " nq"]
-    goal: PyTree
-    time: Float[np.ndarray, ""]
-    """Since its episode began [s]."""
 
 
 class BatchedEnv:
@@ -51,17 +44,17 @@ class BatchedEnv:
         """Build the environment; the first reset and the first step compile.
 
         Args:
-          config: robot, task and physics.
-          num_envs: robots.
-          seed: of the first episodes, where `reset` is given none.
+          config: The configuration of robot, task and physics.
+          num_envs: Number of robots.
+          seed: Seed of the first episodes, where `reset` is given none.
 
         Raises:
-          UserError: the task cannot be built, or there are not as many seeds as robots.
+          UserError: The task cannot be built, `num_envs` is not a number of robots, or there are
+            not as many seeds as robots.
         """
-        self._first_seeds = seeds_of(seed, num_envs)
-        # Who comes from elsewhere has no reason to know that JAX would compile at every start.
-        use_compilation_cache()
-        self.num_envs = num_envs
+        check_count("num_envs", num_envs, _MOST_ENVS)
+        self.num_envs = int(num_envs)
+        self._reset_keys = ResetKeys(seed, self.num_envs)
         self.env = make_env(config)
         wrapped: Any = wrap_for_training(self.env, config.task.episode_length)
         options = compiler_options(config)
@@ -82,49 +75,35 @@ class BatchedEnv:
         """Begin an episode in every environment.
 
         Args:
-          seed: of the random streams that episodes come from, by Gymnasium's rule (`seeds_of`);
-            None goes on with the streams that there are.
+          seed: Seed of new random streams, by the rule of `ResetKeys`; None continues those that
+            the environments have.
 
         Returns:
           The first observations.
 
         Raises:
-          UserError: there are not as many seeds as environments.
+          UserError: There are not as many seeds as environments.
         """
-        seeds = seeds_of(seed, self.num_envs)
-        if self._state is None:
-            begun = zip(seeds, self._first_seeds, strict=True)
-            keys = [key_from_seed(first if one is None else one) for one, first in begun]
-        else:
-            going_on = zip(seeds, np.asarray(self._state.key), strict=True)
-            keys = [key if one is None else key_from_seed(one) for one, key in going_on]
+        current = None if self._state is None else np.asarray(self._state.key)
+        keys = self._reset_keys(seed, current)
         self._results = None
-        state = self._state = self._reset(np.stack(keys))
+        state = self._state = self._reset(keys)
         return np.array(state.obs)
 
-    @property
-    def is_begun(self) -> bool:
-        """Return whether there was a `reset`."""
-        return self._state is not None
-
     def start(self, actions: np.ndarray) -> None:
-        """Let the device begin a step, and does not wait for it.
+        """Start a step on the device, without waiting for it.
 
         Args:
-          actions: of shape (n, 2), in [-1, 1].
+          actions: Actions of shape (n, 2), in [-1, 1].
 
         Raises:
-          UserError: they have another shape.
+          UserError: The actions have another shape.
         """
         actions = as_actions(actions, (self.num_envs, 2))
         self._state, self._results = self._step(self._state, actions)
 
     def finish(self) -> Steps:
-        """Wait for the step that `start` began.
-
-        Returns:
-          What came of it, in arrays of the caller's own.
-        """
+        """Wait for the step that `start` began, and return its results as the caller's arrays."""
         assert self._results is not None, "start() comes before finish()"
         obs, reward, flags, final_obs = (np.array(x) for x in jax.device_get(self._results))
         self._results = None
@@ -132,10 +111,8 @@ class BatchedEnv:
         return Steps(obs, reward, terminated, truncated, success, nonfinite, final_obs)
 
     def poses(self) -> list[Pose]:
-        """Return where every robot is, its goal, and since when it drives there."""
-        assert self._state is not None, "reset() comes before all else"
+        """Return the pose of every robot."""
+        assert self._state is not None, "reset() comes before poses()"
         physics, goals = jax.device_get((self._state.pipeline_state, self._state.goal))
-        return [
-            Pose(physics.qpos[index], jax.tree.map(lambda x: x[index], goals), physics.time[index])  # noqa: B023
-            for index in range(self.num_envs)
-        ]
+        goal_of = [jax.tree.map(lambda x, i=i: x[i], goals) for i in range(self.num_envs)]
+        return list(map(Pose, physics.qpos, goal_of, physics.time.tolist()))

@@ -5,36 +5,26 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import (
-    Arguments,
-    Source,
-    an_extra,
-    as_actions,
-    key_from_seed,
-    resolve,
-    seeds_of,
-)
-from jetbot_mjx.adapters.renderer import RENDER_MODES
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions, requires_extra
+from jetbot_mjx.adapters.base import AdapterBase
+from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.errors import UserError
 
-with an_extra("gymnasium"):
+with requires_extra("gymnasium"):
     import gymnasium
-    from gymnasium import spaces
 
 ENV_ID = "JetBot-v0"
 
 
-class JetBotGymEnv(gymnasium.Env):
-    """One robot, with the tutorial's constructor; physics is C MuJoCo's (`mujoco_jetbot`).
+class JetBotGymEnv(AdapterBase, gymnasium.Env):
+    """One robot, with the tutorial's constructor; physics runs in C MuJoCo (`MujocoJetBot`).
 
-    Action, observation, reward and the end are those of `jetbot_mjx.JetBotEnv`. `terminated` is
-    the task's end, `truncated` the time limit, which the environment keeps itself; `info` has
-    `is_success`. A world that blows up is truncated without a reward, and `info` then has
-    `nonfinite_world`. Without a seed `reset` goes on with the random stream that the first one
-    began.
+    Action, observation, reward and termination are those of `jetbot_mjx.JetBotEnv`. `terminated`
+    is the task's end, `truncated` the time limit, which the environment counts itself; `info` has
+    `is_success`. A step to a non-finite state is truncated with reward 0, and `info` then has
+    `nonfinite_world`. Without a seed `reset` continues the random stream that the first one began.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 60}  # noqa: RUF012
@@ -51,45 +41,39 @@ class JetBotGymEnv(gymnasium.Env):
         render_mode: str | None = None,
         config: Source = None,
     ) -> None:
-        """Build the model, and compiles what is not physics.
+        """Build the MuJoCo model, and compile the task's functions.
 
         Args:
-          skip_frame: `physics_dt` in one environment step.
-          physics_dt: [s] default: `physics.ctrl_dt`, 1/60; made in equal physics steps, none of
-            them longer than `physics.sim_dt`.
-          rendering_dt: [s] of simulated time between two pictures in a window; default: one for
+          skip_frame: Number of `physics_dt` in one environment step.
+          physics_dt: Simulated time [s], divided into equal physics steps no longer than
+            `physics.sim_dt`; default: `physics.ctrl_dt`, 1/60.
+          rendering_dt: Simulated time between two frames in a window [s]; default: one frame for
             every step.
-          max_episode_length: environment steps after which an episode is truncated; default:
+          max_episode_length: Environment steps after which an episode is truncated; default:
             `task.episode_length`, 256.
-          seed: of the first episode, where `reset` is given none; None: something else every time.
-          headless: False: `render_mode` is `human`, where none is given.
-          render_mode: `human`: in a window, in real time; `rgb_array`: as `render` is called.
-          config: a YAML file, nested settings or a `Config` for all else; default: the tutorial's.
+          seed: Seed of the first episode, where `reset` is given none; None draws another seed
+            every time.
+          headless: False makes `human` the render mode, where none is given.
+          render_mode: `human` renders in a window, in real time; `rgb_array` when `render` is
+            called.
+          config: A YAML file, nested settings or a `Config` with all other settings; default: the
+            tutorial's.
 
         Raises:
-          UserError: an argument or setting is wrong, robots are to be drawn for every episode, or
+          UserError: An argument or setting is wrong, the configuration randomizes the robot, or
             there is no display for a window.
         """
-        given = Arguments(
-            skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
+        self.robot, self.observation_space, self.action_space = self._construct(
+            _single_robot,
+            config,
+            skip_frame,
+            physics_dt,
+            rendering_dt,
+            max_episode_length,
+            headless,
+            render_mode,
         )
-        settings = resolve(given, config)
-        self.config: Config = settings.config
-        """What the environment was built from."""
-        if drawn := ", ".join(self.config.randomization.drawn):
-            raise UserError(
-                f"randomization.{drawn}: the single robot is the preset's; take JetBotVectorEnv, of"
-                " one robot if need be"
-            )
-        # Who comes from elsewhere has no reason to know that JAX would compile at every start.
-        use_compilation_cache()
-        self.robot = MujocoJetBot(settings.config)
-        self.render_mode = settings.render_mode
-        self._view = settings.view(self.robot.env)
-        self.metadata = {**type(self).metadata, **settings.metadata}
-        self.observation_space = spaces.Box(-np.inf, np.inf, (self.robot.env.observation_size,))
-        self.action_space = spaces.Box(-1.0, 1.0, (self.robot.env.action_size,))
-        (self._first_seed,) = seeds_of(seed, 1)
+        self._reset_keys = ResetKeys(seed, 1)
         self._next_key = None
         self._steps = 0
 
@@ -99,37 +83,35 @@ class JetBotGymEnv(gymnasium.Env):
         """Begin an episode: the robot at rest at the origin, a new goal.
 
         Args:
-          seed: begins a new random stream.
-          options: none are known.
+          seed: Seed of a new random stream; None continues the one that there is.
+          options: Not used.
 
         Returns:
-          The first observation, and nothing else to tell.
+          The first observation, and an empty `info`.
         """
         super().reset(seed=seed)
-        key = self._next_key
-        if seed is not None or key is None:
-            key = key_from_seed(self._first_seed if seed is None else seed)
-        obs, self._next_key = self.robot.reset(key)
-        self._steps = 0
+        (key,) = self._reset_keys(seed, self._next_key)
+        obs, next_key = self.robot.reset(key)
+        self._next_key = next_key[None]
+        self._is_begun, self._steps = True, 0
         self._show()
         return obs, {}
 
     def step(
         self, action: Float[np.ndarray, "2"]
     ) -> tuple[Float[np.ndarray, " obs"], float, bool, bool, dict[str, Any]]:
-        """Hold an action for one environment step.
+        """Apply an action for one environment step.
 
         Args:
-          action: in [-1, 1]²; values outside are clipped.
+          action: Action in [-1, 1]²; values outside are clipped.
 
         Returns:
-          Observation, reward, terminated, truncated and `is_success`.
+          Observation, reward, terminated, truncated and `info` with `is_success`.
 
         Raises:
-          ResetNeeded: there was no `reset` yet.
+          ResetNeeded: There was no `reset` yet.
         """
-        if self._next_key is None:
-            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        self._require_reset("step")
         obs, reward, terminated, success, finite = self.robot.step(as_actions(action, (2,)))
         self._steps += 1
         out_of_time = self._steps >= self.config.task.episode_length
@@ -141,29 +123,30 @@ class JetBotGymEnv(gymnasium.Env):
         return obs, reward, terminated, truncated, info
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Return an image from the following camera; None unless asked for `rgb_array`.
+        """Return an image of the robot and its goal; None unless the mode is `rgb_array`.
 
         Raises:
-          ResetNeeded: there was no `reset` yet.
-          UserError: this machine has no OpenGL that works without a screen.
+          ResetNeeded: There was no `reset` yet.
+          UserError: This machine has no OpenGL that works without a screen.
         """
-        if self.render_mode != "rgb_array":
-            return None
-        if self._next_key is None:
-            raise gymnasium.error.ResetNeeded("call reset() before render()")
-        assert self._view is not None
-        return self._view.frame(self.robot.data.qpos, self.robot.goal)
+        return self._frames()[0] if self.render_mode == "rgb_array" else None
 
     def close(self) -> None:
-        """Close what was opened to show the robot."""
-        if self._view is not None:
-            self._view.close()
+        """Close the renderer."""
+        self._close()
 
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            assert self._view is not None
-            now = self._steps * self.config.physics.ctrl_dt
-            self._view.show(self.robot.data.qpos, self.robot.goal, now)
+    def _poses(self) -> list[Pose]:
+        now = self._steps * self.config.physics.ctrl_dt
+        return [Pose(self.robot.data.qpos, self.robot.goal, now)]
+
+
+def _single_robot(config: Config) -> MujocoJetBot:
+    if drawn := ", ".join(config.randomization.drawn):
+        raise UserError(
+            f"randomization.{drawn}: the single robot is the preset's; take JetBotVectorEnv, of"
+            " one robot if need be"
+        )
+    return MujocoJetBot(config)
 
 
 def _register() -> None:

@@ -6,26 +6,24 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Arguments, Source, an_extra, check_num_envs, resolve
+from jetbot_mjx.adapters.arguments import Source, requires_extra
+from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv
-from jetbot_mjx.config import Config
+from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.errors import UserError
 
-with an_extra("sb3"):
-    import gymnasium
-    from gymnasium import spaces
+with requires_extra("sb3"):
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 Indices = None | int | Iterable[int]
 
 
-class JetBotVecEnv(VecEnv):
-    """Robots in one compiled program, for `PPO("MlpPolicy", JetBotVecEnv(64))` and its like.
+class JetBotVecEnv(AdapterBase, VecEnv):
+    """Robots in one compiled program, for example in `PPO("MlpPolicy", JetBotVecEnv(64))`.
 
     Where an episode ends, its `info` has `terminal_observation`, `is_success` and
     `TimeLimit.truncated`, by which Stable-Baselines3 bootstraps, and the observation is already
-    the next episode's. Without a seed `reset` goes on with the random streams of the
-    environments.
+    the next episode's. Without a seed `reset` continues the random streams of the environments.
     """
 
     def __init__(
@@ -44,37 +42,35 @@ class JetBotVecEnv(VecEnv):
         """Build the environment; the first reset and the first step compile.
 
         Args:
-          num_envs: robots.
-          skip_frame: as `JetBotGymEnv` has it, like all that follow.
-          physics_dt: likewise.
-          rendering_dt: likewise.
-          max_episode_length: likewise.
-          seed: of the first episodes, where nobody calls `seed`; it counts on from environment to
-            environment.
-          headless: likewise; a window shows the first robot.
-          render_mode: `human`, or `rgb_array`: one picture of all robots, side by side.
-          config: likewise.
+          num_envs: Number of robots.
+          skip_frame: See `JetBotGymEnv`, as for all arguments that are not explained here.
+          physics_dt: See `JetBotGymEnv`.
+          rendering_dt: See `JetBotGymEnv`.
+          max_episode_length: See `JetBotGymEnv`.
+          seed: Seed of the first episodes, unless `seed` is called; it counts on from environment
+            to environment.
+          headless: See `JetBotGymEnv`; a window shows the first robot.
+          render_mode: `human`, or `rgb_array` for one image of all robots, side by side.
+          config: See `JetBotGymEnv`.
 
         Raises:
-          UserError: an argument or setting is wrong, or there is no display for a window.
+          UserError: An argument or setting is wrong, or there is no display for a window.
         """
-        given = Arguments(
-            skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        )
-        settings = resolve(given, config)
-        self.config: Config = settings.config
-        """What the environments were built from."""
-        self.render_mode = settings.render_mode
-        self.batch = BatchedEnv(settings.config, check_num_envs(num_envs), seed)
-        self._view = settings.view(self.batch.env)
         self._attributes: dict[str, list[Any]] = {}
-        env = self.batch.env
-        super().__init__(
-            self.batch.num_envs,
-            spaces.Box(-np.inf, np.inf, (env.observation_size,)),
-            spaces.Box(-1.0, 1.0, (env.action_size,)),
+        self.batch, *spaces = self._construct(
+            lambda config: BatchedEnv(config, num_envs, seed),
+            config,
+            skip_frame,
+            physics_dt,
+            rendering_dt,
+            max_episode_length,
+            headless,
+            render_mode,
         )
-        self.metadata: dict[str, Any] = {**self.metadata, **settings.metadata}
+        metadata = self.metadata
+        super().__init__(self.batch.num_envs, *spaces)
+        # `VecEnv` leaves nothing but the render mode in it.
+        self.metadata = metadata
 
     def reset(self) -> Float[np.ndarray, "n obs"]:
         """Begin an episode in every environment, with the seeds that `seed` was called with.
@@ -83,6 +79,7 @@ class JetBotVecEnv(VecEnv):
           The first observations.
         """
         obs = self.batch.reset(self._seeds)
+        self._is_begun = True
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
@@ -90,13 +87,13 @@ class JetBotVecEnv(VecEnv):
         return obs
 
     def step_async(self, actions: Float[np.ndarray, "n 2"]) -> None:
-        """Let the device begin a step, and does not wait for it.
+        """Start a step on the device, without waiting for it.
 
         Args:
-          actions: in [-1, 1]²; values outside are clipped.
+          actions: Actions in [-1, 1]²; values outside are clipped.
 
         Raises:
-          ResetNeeded: there was no `reset` yet.
+          ResetNeeded: There was no `reset` yet.
         """
         self._require_reset("step")
         self.batch.start(actions)
@@ -112,7 +109,7 @@ class JetBotVecEnv(VecEnv):
         """Wait for the step that `step_async` began.
 
         Returns:
-          Observations, rewards, where an episode ended, and what there is to tell of each.
+          Observations, rewards, dones, and an `info` for each environment.
         """
         steps = self.batch.finish()
         done = steps.done
@@ -129,37 +126,34 @@ class JetBotVecEnv(VecEnv):
         return steps.obs, steps.reward, done, infos
 
     def close(self) -> None:
-        """Close what was opened to show the robots."""
-        if self._view is not None:
-            self._view.close()
+        """Close the renderer."""
+        self._close()
 
     def get_images(self) -> Sequence[UInt8[np.ndarray, "height width 3"]]:
-        """Return a picture of every robot.
+        """Return an image of every robot.
 
         Raises:
-          ResetNeeded: there was no `reset` yet.
-          UserError: this machine has no OpenGL that works without a screen.
+          ResetNeeded: There was no `reset` yet.
+          UserError: This machine has no OpenGL that works without a screen.
         """
-        self._require_reset("render")
-        assert self._view is not None, "asked for pictures without a render_mode"
-        return [self._view.frame(pose.qpos, pose.goal) for pose in self.batch.poses()]
+        return self._frames()
 
     def render(self, mode: str | None = None) -> UInt8[np.ndarray, "height width 3"] | None:
-        """Return all robots in one image; None where a window shows the first, in every step."""
+        """Return all robots in one image; None in mode `human`, whose window every step updates."""
         return None if self.render_mode == "human" else super().render(mode)
 
     def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
-        """Return an attribute of the environments: set by `set_attr`, or what they share.
+        """Return an attribute that `set_attr` set, or that the environments share.
 
         Args:
-          attr_name: its name, such as `config` or `dt`.
-          indices: of which environments; None: all.
+          attr_name: Name of the attribute, such as `config` or `dt`.
+          indices: Indices of the environments to ask; None: all.
 
         Returns:
-          Its value in each of them.
+          The value in each of these environments.
 
         Raises:
-          AttributeError: there is no such attribute.
+          AttributeError: There is no such attribute.
         """
         chosen = self._get_indices(indices)
         if attr_name in self._attributes:
@@ -168,24 +162,24 @@ class JetBotVecEnv(VecEnv):
         return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
-        """Keep a value for `get_attr`. The program is compiled: nothing in it changes.
+        """Store a value for `get_attr`. The compiled program does not see it.
 
         Args:
-          attr_name: its name.
-          value: for each of the environments.
-          indices: of which environments; None: all, and others have None.
+          attr_name: Name of the attribute.
+          value: The value, the same for each of these environments.
+          indices: Indices of the environments to set; None: all. Unset ones have None.
 
         Raises:
-          UserError: it is something that the environments are made of.
+          UserError: The environments have an attribute of this name themselves.
         """
         if self.has_attr(attr_name) and attr_name not in self._attributes:
             raise UserError(
                 f"{attr_name} cannot be set: the environments are one compiled program;"
                 " build others with config="
             )
-        kept = self._attributes.setdefault(attr_name, [None] * self.num_envs)
+        values = self._attributes.setdefault(attr_name, [None] * self.num_envs)
         for index in self._get_indices(indices):
-            kept[index] = value
+            values[index] = value
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
@@ -193,36 +187,29 @@ class JetBotVecEnv(VecEnv):
         """Call a method that the environments share, such as `wheel_targets`.
 
         Args:
-          method_name: of `JetBotEnv` or of this class.
-          method_args: handed on.
-          indices: for which environments; None: all.
-          method_kwargs: handed on.
+          method_name: Name of a method of `JetBotEnv`.
+          method_args: Positional arguments of the call.
+          indices: Indices of the environments; None: all.
+          method_kwargs: Keyword arguments of the call.
 
         Returns:
-          What it returned, once for each of them.
+          The result of the call, once for each of these environments.
 
         Raises:
-          AttributeError: there is no such method.
+          AttributeError: There is no such method.
         """
         method = self._shared(method_name)
         return [method(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
-        """No environment is wrapped; `VecMonitor` goes around all of them."""
+        """Return False for every environment: wrappers such as `VecMonitor` hold the batch."""
         del wrapper_class
         return [False for _ in self._get_indices(indices)]
-
-    def _require_reset(self, method: str) -> None:
-        if not self.batch.is_begun:
-            raise gymnasium.error.ResetNeeded(f"call reset() before {method}()")
 
     def _shared(self, name: str) -> Any:
         if name in ("render_mode", "config"):
             return getattr(self, name)
         return getattr(self.batch.env, name)
 
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            assert self._view is not None
-            pose = self.batch.poses()[0]
-            self._view.show(pose.qpos, pose.goal, float(pose.time))
+    def _poses(self) -> list[Pose]:
+        return self.batch.poses()

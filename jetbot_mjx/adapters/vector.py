@@ -5,31 +5,22 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.arguments import (
-    Arguments,
-    Seed,
-    Source,
-    an_extra,
-    check_num_envs,
-    resolve,
-)
+from jetbot_mjx.adapters.arguments import Seed, Source, requires_extra
+from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv
-from jetbot_mjx.adapters.renderer import RENDER_MODES
-from jetbot_mjx.config import Config
+from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
 
-with an_extra("gymnasium"):
-    import gymnasium
-    from gymnasium import spaces
+with requires_extra("gymnasium"):
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
 
-class JetBotVectorEnv(VectorEnv):
+class JetBotVectorEnv(AdapterBase, VectorEnv):
     """Robots in one compiled program; where an episode ends, the next begins in the same step.
 
     With `AutoresetMode.SAME_STEP`, `infos` has `final_obs` and `final_info` of the episodes that
-    ended, and `obs` is already the next episode's. Every environment draws goal after goal from a
-    random stream of its own, and the same ones as `JetBotGymEnv` draws from the same seed.
+    ended, and `obs` is already the next episode's. Every environment draws its goals from a random
+    stream of its own, and the same goals as `JetBotGymEnv` draws from the same seed.
     """
 
     metadata: dict[str, Any] = {  # noqa: RUF012
@@ -54,33 +45,30 @@ class JetBotVectorEnv(VectorEnv):
         """Build the environment; the first reset and the first step compile.
 
         Args:
-          num_envs: robots.
-          skip_frame: as `JetBotGymEnv` has it, like all that follow.
-          physics_dt: likewise.
-          rendering_dt: likewise.
-          max_episode_length: likewise.
-          seed: of the first episodes; one number counts on from environment to environment.
-          headless: likewise; a window shows the first robot.
-          render_mode: `human`, or `rgb_array`: a picture of every robot.
-          config: likewise.
+          num_envs: Number of robots.
+          skip_frame: See `JetBotGymEnv`, as for all arguments that are not explained here.
+          physics_dt: See `JetBotGymEnv`.
+          rendering_dt: See `JetBotGymEnv`.
+          max_episode_length: See `JetBotGymEnv`.
+          seed: Seed of the first episodes; one number counts on from environment to environment.
+          headless: See `JetBotGymEnv`; a window shows the first robot.
+          render_mode: `human`, or `rgb_array` for an image of every robot.
+          config: See `JetBotGymEnv`.
 
         Raises:
-          UserError: an argument or setting is wrong, or there is no display for a window.
+          UserError: An argument or setting is wrong, or there is no display for a window.
         """
-        given = Arguments(
-            skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
+        self.batch, self.single_observation_space, self.single_action_space = self._construct(
+            lambda config: BatchedEnv(config, num_envs, seed),
+            config,
+            skip_frame,
+            physics_dt,
+            rendering_dt,
+            max_episode_length,
+            headless,
+            render_mode,
         )
-        settings = resolve(given, config)
-        self.config: Config = settings.config
-        """What the environments were built from."""
-        self.num_envs = check_num_envs(num_envs)
-        self.batch = BatchedEnv(settings.config, self.num_envs, seed)
-        self.render_mode = settings.render_mode
-        self._view = settings.view(self.batch.env)
-        self.metadata = {**type(self).metadata, **settings.metadata}
-        env = self.batch.env
-        self.single_observation_space = spaces.Box(-np.inf, np.inf, (env.observation_size,))
-        self.single_action_space = spaces.Box(-1.0, 1.0, (env.action_size,))
+        self.num_envs = self.batch.num_envs
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
@@ -90,16 +78,17 @@ class JetBotVectorEnv(VectorEnv):
         """Begin an episode in every environment.
 
         Args:
-          seed: begins new random streams; one number counts on from environment to environment.
-          options: none are known.
+          seed: Seed of new random streams; one number counts on from environment to environment.
+          options: Not used.
 
         Returns:
-          The first observations, and nothing else to tell.
+          The first observations, and empty `infos`.
 
         Raises:
-          UserError: there are not as many seeds as environments.
+          UserError: There are not as many seeds as environments.
         """
         obs = self.batch.reset(seed)
+        self._is_begun = True
         self._show()
         return obs, {}
 
@@ -115,20 +104,19 @@ class JetBotVectorEnv(VectorEnv):
         """Step every environment.
 
         Args:
-          actions: in [-1, 1]²; values outside are clipped.
+          actions: Actions in [-1, 1]²; values outside are clipped.
 
         Returns:
-          Observations, rewards, terminated, truncated, and what there is to tell.
+          Observations, rewards, terminated, truncated and `infos`.
 
         Raises:
-          ResetNeeded: there was no `reset` yet.
+          ResetNeeded: There was no `reset` yet.
         """
-        if not self.batch.is_begun:
-            raise gymnasium.error.ResetNeeded("call reset() before step()")
+        self._require_reset("step")
         self.batch.start(actions)
         steps = self.batch.finish()
         done = steps.done
-        # Laid out as Gymnasium's own SyncVectorEnv has it.
+        # The layout is that of Gymnasium's own SyncVectorEnv.
         infos: dict[str, Any] = {}
         if done.any():
             final_obs = np.full(self.num_envs, None, object)
@@ -147,27 +135,18 @@ class JetBotVectorEnv(VectorEnv):
         return steps.obs, rewards, steps.terminated, steps.truncated, infos
 
     def render(self) -> tuple[UInt8[np.ndarray, "height width 3"], ...] | None:
-        """Return a picture of every robot; None unless asked for `rgb_array`.
+        """Return an image of every robot; None unless the render mode is `rgb_array`.
 
         Raises:
-          ResetNeeded: there was no `reset` yet.
-          UserError: this machine has no OpenGL that works without a screen.
+          ResetNeeded: There was no `reset` yet.
+          UserError: This machine has no OpenGL that works without a screen.
         """
-        if self.render_mode != "rgb_array":
-            return None
-        if not self.batch.is_begun:
-            raise gymnasium.error.ResetNeeded("call reset() before render()")
-        assert self._view is not None
-        return tuple(self._view.frame(pose.qpos, pose.goal) for pose in self.batch.poses())
+        return tuple(self._frames()) if self.render_mode == "rgb_array" else None
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Close what was opened to show the robots."""
+        """Close the renderer."""
         del kwargs
-        if self._view is not None:
-            self._view.close()
+        self._close()
 
-    def _show(self) -> None:
-        if self.render_mode == "human":
-            assert self._view is not None
-            pose = self.batch.poses()[0]
-            self._view.show(pose.qpos, pose.goal, float(pose.time))
+    def _poses(self) -> list[Pose]:
+        return self.batch.poses()

@@ -1,11 +1,12 @@
-"""A policy of jetbot_mjx with nothing but NumPy: Python 3.6 or newer, NumPy 1.13 or newer.
+"""A policy of jetbot_mjx in NumPy alone, for Python 3.6 or newer and NumPy 1.13 or newer.
 
     from policy import act
     action, wheel_speeds = act(obs)
 
-`policy.json` tells what each number is. Normaliser, network, clip to [-1, 1] and the controller
-that makes wheel speeds of an action are inside; motor values are not, they differ by robot.
-`python3 policy.py` compares it with the recording beside it, and says how long a call takes.
+`policy.json` describes each number. `act` applies the normaliser, the network, the clip to [-1, 1]
+and the controller that converts an action to wheel speeds. It does not compute motor values, which
+depend on the robot. `python3 policy.py` checks the policy against the recording beside it, and
+measures the time of a call.
 """
 
 import base64
@@ -41,7 +42,7 @@ def _activate(x: np.ndarray) -> np.ndarray:
         return np.maximum(x, np.float32(0))
     if kind == "elu":
         return np.where(x > 0, x, np.expm1(np.minimum(x, np.float32(0))))
-    # swish; tanh cannot overflow
+    # Swish, written with tanh because exp could overflow.
     half = np.float32(0.5)
     return x * half * (np.float32(1) + np.tanh(half * x))
 
@@ -51,21 +52,21 @@ _KERNELS, _BIASES = _REST[0::2], _REST[1::2]
 
 
 def act(obs: np.ndarray) -> tuple:
-    """Acts on one observation or a batch of them.
+    """Return the action and the wheel speeds for one observation or a batch.
 
     Args:
-      obs: [obs] or [n, obs], in the order and the units of `policy.json`.
+      obs: Observation of shape [obs] or [n, obs], in the order and the units of `policy.json`.
 
     Returns:
-      The action in [-1, 1], and the wheel speeds (left, right) [rad/s] that it commands, without
-      any motor's limit; of a batch, one row each.
+      The action in [-1, 1], and the wheel speeds (left, right) [rad/s] that it commands, before the
+      limits of any motor; for a batch, one row each.
 
     Raises:
-      ValueError: the observation has another length.
+      ValueError: The observation has another length.
     """
     x = np.asarray(obs, np.float32)
     if x.ndim == 0 or x.shape[-1] != _MEAN.size:
-        raise ValueError(f"the observation has the shape {x.shape}, and not {_MEAN.size} numbers")
+        raise ValueError(f"the observation has the shape {x.shape}, not {_MEAN.size} numbers")
     x = (x - _MEAN) / _STD
     for kernel, bias in zip(_KERNELS[:-1], _BIASES[:-1]):
         x = _activate(np.dot(x, kernel) + bias)
@@ -77,13 +78,13 @@ def act(obs: np.ndarray) -> tuple:
 
 
 def wheel_speeds(action: np.ndarray) -> np.ndarray:
-    """Wheel speeds of an action, by the controller that the policy was trained with.
+    """Return the wheel speeds of an action, by the controller of training.
 
         v = (a0 + 1)/2 max_speed          w = a1 max_yaw_rate
         left = (v - w b/2) / r            right = (v + w b/2) / r
 
     Args:
-      action: [2] or [n, 2], in [-1, 1].
+      action: Action of shape [2] or [n, 2], in [-1, 1].
 
     Returns:
       (left, right) [rad/s], in the same shape.
@@ -96,10 +97,10 @@ def wheel_speeds(action: np.ndarray) -> np.ndarray:
 
 
 def check(path: str) -> float:
-    """How far this file is from JAX, on the recording that was exported with it.
+    """Return the largest difference from JAX, on the recording that was exported with the policy.
 
     Args:
-      path: of `recording.npz`.
+      path: Path of `recording.npz`.
 
     Returns:
       The largest difference of any number, wheel speeds as a share of the fastest.
@@ -119,7 +120,7 @@ def check(path: str) -> float:
 def _main() -> int:
     path = os.path.join(os.path.dirname(os.path.abspath(__file__)), "recording.npz")
     if not os.path.isfile(path):
-        print(f"{path} is not there: copy the whole folder")
+        print(f"{path} is missing: copy the whole folder")
         return 2
     worst = check(path)
     with np.load(path) as recording:

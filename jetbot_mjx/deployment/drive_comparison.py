@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from jetbot_mjx.deployment.drive_log import figures, plot, read_log, replay
+from jetbot_mjx.deployment.drive_log import metrics, plot, read_log, replay
 from jetbot_mjx.evaluation.plots import theme, to_png
 from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, writing_to
 
@@ -46,7 +46,7 @@ def compare_drive(
     files = DriveComparison(
         image=folder / f"{path.stem}.sim2real.png",
         json=folder / f"{path.stem}.sim2real.json",
-        metrics=figures(compared),
+        metrics=metrics(compared),
     )
     with theme("light"):
         image = to_png(plot(compared))

@@ -1,4 +1,4 @@
-"""Read the log of a drive by `deploy/drive.py`, and replay its motor values in the simulator."""
+"""Read a log of `deploy/drive.py`, and replay its motor values on a simulated JetBot."""
 
 import json
 from collections.abc import Mapping
@@ -13,7 +13,7 @@ from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, P
 from jetbot_mjx.errors import UserError
 
 FORMAT = "jetbot_mjx-drive/1"
-"""Of a log's first line."""
+"""The format that a log's first line names."""
 
 _LEAST_POSES = 2
 
@@ -22,11 +22,11 @@ class Calibration(NamedTuple):
     """The motor calibration that the driver assumed, as pairs (left, right)."""
 
     dead_band: tuple[float, float]
-    """Motor value up to which a wheel stands."""
+    """Motor value up to which a wheel does not turn."""
     full_speed: tuple[float, float]
     """Speed of the wheel's rim at a motor value of 1 [m/s]."""
     lag: float
-    """[s]"""
+    """Time constant of the motors [s]."""
 
 
 class DriveLog(NamedTuple):
@@ -37,7 +37,7 @@ class DriveLog(NamedTuple):
     """Policy, goal and pose source."""
     calibration: Calibration
     goal_w: tuple[float, float]
-    """[m], in the frame of the poses."""
+    """Position of the goal in the frame of the poses [m]."""
     outcome: str
     """`reached`, `timed out`, or `interrupted` where the log has no end."""
     times: Float[np.ndarray, " n"]
@@ -59,13 +59,13 @@ class Replay(NamedTuple):
 
     log: DriveLog
     motors: MotorModel
-    """Of the simulated robot."""
+    """The motors of the simulated robot."""
     simulated: Float[np.ndarray, "m 3"]
     """(x, y, yaw) [m, m, rad]."""
 
     @property
     def distances(self) -> Float[np.ndarray, " m"]:
-        """Return the distance from the logged to the simulated position [m]."""
+        """Return the distance from the logged to the simulated position, at each pose [m]."""
         return np.linalg.norm(self.simulated[:, :2] - self.log.poses[:, :2], axis=-1)
 
     @property
@@ -78,81 +78,114 @@ def read_log(path: Path) -> DriveLog:
     """Read a log.
 
     Args:
-      path: the file that `drive.py --log` wrote.
+      path: The file that `drive.py --log` wrote.
 
     Returns:
       The drive.
 
     Raises:
-      UserError: the file is missing, is not a log, or has no pose.
+      UserError: The file is missing, is not a log, or has fewer than two poses.
     """
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from None
-    except UnicodeDecodeError:
-        raise UserError(f"{path} is no log of deploy/drive.py: it is no text") from None
+    lines = _read_lines(path)
+
+    # Parse the header and one line per control period; the number tells where a log is wrong.
+    periods: list[_Period] = []
     number = 1
     try:
         header = json.loads(lines[0])
-        if header["format"] != FORMAT:
-            raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
+        calibration = _parse_calibration(header)
         x, y = map(float, header["goal"])
-        sides = [header["calibration"][side] for side in ("left", "right")]
-        calibration = Calibration(
-            dead_band=(float(sides[0]["dead_band"]), float(sides[1]["dead_band"])),
-            full_speed=(float(sides[0]["full_speed"]), float(sides[1]["full_speed"])),
-            lag=float(header["calibration"]["lag"]),
-        )
-        if not max(calibration.dead_band) < 1:
-            raise ValueError(f"a dead-band of {max(calibration.dead_band):g} leaves no speed")
-        ticks: list[tuple[float, float, float]] = []
-        poses: dict[float, tuple[float, float, float]] = {}
-        latencies, stale, outcome = [], 0, "interrupted"
         for number, text in enumerate(lines[1:], start=2):
             if number == len(lines) and not text.endswith("}"):
-                break  # cut off while it was written
-            line = json.loads(text)
-            left, right = map(float, line["motors"])
-            ticks.append((float(line["t"]), left, right))
-            if "x" in line:
-                seen = float(line["t"]) - float(line["pose_age"])
-                pose = (float(line["x"]), float(line["y"]), float(line["yaw"]))
-                poses.setdefault(round(seen, 6), pose)
-            if "latency" in line:
-                latencies.append(float(line["latency"]))
-            stale += not line["fresh"]
-            outcome = line.get("outcome", outcome)
+                break  # The drive ended while this line was written.
+            periods.append(_parse_period(json.loads(text)))
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
-        raise UserError(f"{path} is no log of deploy/drive.py: line {number}: {reason}") from None
+        raise UserError(
+            f"{path} is not a log of deploy/drive.py: line {number}: {reason}"
+        ) from None
+
+    # Collect the poses; a period that saw no new one repeats the last.
+    poses: dict[float, tuple[float, float, float]] = {}
+    for period in periods:
+        if period.pose is not None:
+            poses.setdefault(period.pose_time, period.pose)
     if len(poses) < _LEAST_POSES:
         raise UserError(f"{path} has {len(poses)} poses: there is nothing to compare")
-    table = np.array(ticks)
-    if not np.all(np.isfinite(table)) or np.any(np.diff(table[:, 0]) < 0):
-        raise UserError(f"{path} is no log of deploy/drive.py: its times do not ascend")
+    times = np.array([period.time for period in periods])
+    motors = np.array([period.motors for period in periods])
+    if not np.isfinite(motors).all() or not np.isfinite(times).all() or np.any(np.diff(times) < 0):
+        raise UserError(f"{path} is not a log of deploy/drive.py: its times do not ascend")
     return DriveLog(
         path=path,
         header=header,
         calibration=calibration,
         goal_w=(x, y),
-        outcome=outcome,
-        times=table[:, 0],
-        motors=table[:, 1:],
+        outcome=next((one.outcome for one in reversed(periods) if one.outcome), "interrupted"),
+        times=times,
+        motors=motors,
         pose_times=np.array(list(poses)),
         poses=np.array(list(poses.values())),
-        latencies=np.array(latencies),
-        stale_ticks=stale,
+        latencies=np.array([one.latency for one in periods if one.latency is not None]),
+        stale_ticks=sum(not one.fresh for one in periods),
     )
+
+
+def _read_lines(path: Path) -> list[str]:
+    try:
+        return path.read_text(encoding="utf-8").splitlines()
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError:
+        raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
+
+
+class _Period(NamedTuple):
+    """One line of a log: one control period."""
+
+    time: float
+    motors: tuple[float, float]
+    fresh: bool
+    pose_time: float = 0.0
+    pose: tuple[float, float, float] | None = None
+    latency: float | None = None
+    outcome: str | None = None
+
+
+def _parse_calibration(header: Any) -> Calibration:
+    if header["format"] != FORMAT:
+        raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
+    left, right = (header["calibration"][side] for side in ("left", "right"))
+    calibration = Calibration(
+        dead_band=(float(left["dead_band"]), float(right["dead_band"])),
+        full_speed=(float(left["full_speed"]), float(right["full_speed"])),
+        lag=float(header["calibration"]["lag"]),
+    )
+    if not max(calibration.dead_band) < 1:
+        raise ValueError(f"a dead-band of {max(calibration.dead_band):g} leaves no speed")
+    return calibration
+
+
+def _parse_period(line: Any) -> _Period:
+    left, right = map(float, line["motors"])
+    period = _Period(float(line["t"]), (left, right), line["fresh"], outcome=line.get("outcome"))
+    if "x" in line:
+        period = period._replace(
+            pose_time=round(period.time - float(line["pose_age"]), 6),
+            pose=(float(line["x"]), float(line["y"]), float(line["yaw"])),
+        )
+    if "latency" in line:
+        period = period._replace(latency=float(line["latency"]))
+    return period
 
 
 def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Replay:
     """Replay the motor values of a log on a simulated robot, at the same times.
 
     Args:
-      log: the drive.
-      delay: delay of the simulated motors [s].
-      lag: their time constant [s]; None: the calibration's.
+      log: The drive.
+      delay: Delay of the simulated motors [s].
+      lag: Time constant of the simulated motors [s]; None: the calibration's.
 
     Returns:
       The logged and the simulated drive.
@@ -172,8 +205,8 @@ def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Re
     return Replay(log, motors, np.stack(columns, axis=-1))
 
 
-def figures(replay: Replay) -> dict[str, Any]:
-    """Return the metrics of the comparison, as JSON."""
+def metrics(replay: Replay) -> dict[str, Any]:
+    """Return the metrics that compare the logged drive with the simulated one, as JSON."""
     log, distances = replay.log, replay.distances
     periods = np.diff(log.times)
 
@@ -211,7 +244,7 @@ def plot(replay: Replay) -> Figure:
     """Plot both drives from above, and their differences over time.
 
     Args:
-      replay: the two drives.
+      replay: The logged and the simulated drive.
 
     Returns:
       The figure.
@@ -231,9 +264,9 @@ def plot(replay: Replay) -> Figure:
     figure.legend(*plan.get_legend_handles_labels(), loc="outside lower left", ncols=3)
     place, turn = axes["place"], axes["turn"]
     place.plot(log.pose_times, 1e3 * replay.distances, color="C0")
-    place.set(ylabel="apart [mm]", title="Simulated from logged")
+    place.set(ylabel="position error [mm]", title="Simulated minus logged")
     turn.plot(log.pose_times, np.degrees(replay.turns), color="C0")
-    turn.set(xlabel="time [s]", ylabel="turned [°]")
-    for one in (place, turn):
-        one.grid(visible=True)
+    turn.set(xlabel="time [s]", ylabel="heading error [°]")
+    for panel in (place, turn):
+        panel.grid(visible=True)
     return figure

@@ -1,8 +1,8 @@
 """Export a policy to files, and read each file back with the library that will run it.
 
-`numpy` is one file of Python, `stablehlo` what `jax.export` serialises. `onnx` is built here node
-by node: the exporter that is kept, jax2onnx 0.17, asks for an Orbax older than ours and pulls a
-model viewer and a hub client along, for what is nine kinds of node.
+`numpy` is one file of Python, and `stablehlo` is serialised by `jax.export`. `onnx` is built here
+node by node, from nine kinds of node: the maintained exporter, jax2onnx 0.17, requires an older
+Orbax than this package, and installs a model viewer and a hub client.
 """
 
 import base64
@@ -24,14 +24,14 @@ from jetbot_mjx.errors import UserError
 
 _TEXT_WIDTH = 96
 
-# What onnxruntime for a Jetson Nano's JetPack reads: later ones add nothing that is needed here.
+# The versions that onnxruntime for a Jetson Nano's JetPack reads; later ones are not needed here.
 _ONNX_OPSET = 13
 _ONNX_IR_VERSION = 7
 
 _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
 Act = Callable[[Float[np.ndarray, "n obs"]], Outputs]
-"""A batch of observations to actions and wheel speeds."""
+"""A function from a batch of observations to actions and wheel speeds."""
 
 
 class Source(NamedTuple):
@@ -47,19 +47,19 @@ class Format(NamedTuple):
     file: str
     write: Callable[[Source, Path], None]
     read: Callable[[Path], Act]
-    """Loads the file as its user would, with nothing of this package."""
+    """Load the file as its user would, without this package."""
     needs: tuple[str, ...] = ()
-    """Packages of the extra `export`."""
+    """Packages of the extra `export` that the format needs."""
 
 
 def require(name: str) -> None:
     """Check that a format can be written and verified on this machine.
 
     Args:
-      name: a key of `FORMATS`.
+      name: A key of `FORMATS`.
 
     Raises:
-      UserError: a package is missing.
+      UserError: A package is missing.
     """
     for package in FORMATS[name].needs:
         try:
@@ -89,7 +89,7 @@ def _write_numpy(source: Source, path: Path) -> None:
 
 
 def _read_numpy(path: Path) -> Act:
-    # Without leaving bytecode in a folder that is to be copied to a robot.
+    # An import would leave bytecode in a folder that is copied to a robot.
     module = types.ModuleType(path.stem)
     exec(compile(path.read_text("utf-8"), path, "exec"), module.__dict__)
     return module.act
@@ -126,6 +126,7 @@ def _write_onnx(source: Source, path: Path) -> None:
         nodes.append(helper.make_node(kind, inputs, [to], name=to, **attributes))
         return to
 
+    # Normalise the observation, and apply the layers with their activations.
     x = node("Sub", "obs", constant("mean", policy.mean), to="centred")
     x = node("Div", x, constant("std", policy.std), to="normalised")
     last = len(policy.layers) - 1
@@ -140,7 +141,7 @@ def _write_onnx(source: Source, path: Path) -> None:
     if policy.squash:
         x = node("Tanh", x, to="squashed")
     node("Clip", x, constant("low", -1.0), constant("high", 1.0), to="action")
-    # The controller is linear in the action.
+    # Append the controller, which is linear in the action.
     drive = 0.5 * policy.controller.max_speed / policy.controller.wheel_radius
     turn = policy.controller.fastest - 2.0 * drive
     mixing = constant("mixing", [[drive, drive], [-turn, turn]])
@@ -149,6 +150,7 @@ def _write_onnx(source: Source, path: Path) -> None:
     def tensor(name: str, size: int) -> Any:
         return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
 
+    # Check and write the graph.
     graph = helper.make_graph(
         nodes,
         "policy",

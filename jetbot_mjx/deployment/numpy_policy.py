@@ -1,8 +1,8 @@
 """Convert a policy to NumPy arrays and to a pure JAX function, and compare implementations.
 
-What leaves this package is one function of a batch of observations, with all inside that lies
-between them and the motors: normaliser, network, the distribution's mode, the environment's clip
-to [-1, 1], and the controller that makes wheel speeds of an action. Its two results are both.
+An exported policy is one function of a batch of observations. It applies the normaliser, the
+network, the distribution's mode, the environment's clip to [-1, 1] and the controller that converts
+an action to wheel speeds; it returns both the actions and the wheel speeds.
 """
 
 from collections.abc import Callable, Mapping
@@ -21,10 +21,10 @@ from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import Checkpoint
 
 RECORDED = 10_000
-"""How many observations an export is checked on."""
+"""Number of observations on which an export is checked."""
 
 TOLERANCE = 1e-5
-"""Largest difference to JAX that an export may have, of an action's unit."""
+"""Largest difference from JAX that an export may have, in the unit of an action."""
 
 Outputs = tuple[Float[Array | np.ndarray, "n 2"], Float[Array | np.ndarray, "n 2"]]
 """Actions in [-1, 1], and the wheel speeds (left, right) [rad/s] that they command."""
@@ -38,9 +38,9 @@ class Controller(NamedTuple):
     max_yaw_rate: float
     """Yaw rate of a₁ = 1 [rad/s]."""
     wheel_radius: float
-    """Of the controller, not of a robot [m]."""
+    """Wheel radius that the controller assumes, not that of a robot [m]."""
     wheel_separation: float
-    """Likewise [m]."""
+    """Wheel separation that the controller assumes [m]."""
 
     @property
     def fastest(self) -> float:
@@ -64,7 +64,7 @@ class PortablePolicy(NamedTuple):
     std: Float[np.ndarray, " obs"]
     """Standard deviation of the normaliser; ones without one."""
     layers: tuple[Layer, ...]
-    """The last gives the distribution's location alone."""
+    """The last layer gives only the location of the distribution."""
     activation: Literal["tanh", "relu", "elu", "swish"]
     """Activation between the layers."""
     squash: bool
@@ -85,10 +85,10 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
     """Extract a policy from a checkpoint.
 
     Args:
-      checkpoint: a checkpoint of a network as `make_networks` builds it.
+      checkpoint: A checkpoint of a network that `make_networks` built.
 
     Returns:
-      Its numbers. Nothing here knows whether they are used as Brax does: compare with `as_jax`.
+      The policy as arrays. Compare its outputs with `as_jax`, which uses Brax's own code.
     """
     config = checkpoint.config
     network = config.ppo.network
@@ -99,7 +99,7 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
         mean, std = np.asarray(params.normalizer.mean), np.asarray(params.normalizer.std)
     dense: Mapping[str, Any] = params.policy["params"]
     if network.distribution_type == "normal":
-        # Brax keeps the last layer of this one apart, and a deviation beside it.
+        # Brax stores the last layer of this distribution apart, with a standard deviation.
         dense = {**dense["MLP_0"], f"hidden_{len(dense['MLP_0'])}": dense["Dense_0"]}
     layers = [
         Layer(np.asarray(one["kernel"]), np.asarray(one["bias"]))
@@ -128,8 +128,8 @@ def as_jax(
     """Return the policy as used in training and evaluation, the reference for every export.
 
     Args:
-      checkpoint: the policy's.
-      env: its environment.
+      checkpoint: The checkpoint of the policy.
+      env: The environment that the policy was trained in.
 
     Returns:
       A pure function of a batch of observations, in full float32 on every device.
@@ -150,9 +150,9 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Rec
     The drive runs in C MuJoCo, which needs no compilation and simulates the same robot.
 
     Args:
-      checkpoint: the policy's.
-      env: its environment.
-      count: number of observations.
+      checkpoint: The checkpoint of the policy.
+      env: The environment that the policy was trained in.
+      count: Number of observations.
 
     Returns:
       The recording, the same for the same checkpoint on the same machine.
@@ -179,13 +179,13 @@ def difference(recording: Recording, outputs: Outputs, controller: Controller) -
     """Return the largest difference of another implementation's results from JAX's.
 
     Args:
-      recording: observations, and what JAX makes of them.
-      outputs: the other implementation's outputs.
-      controller: tells the range of wheel speeds.
+      recording: Observations, and JAX's outputs for them.
+      outputs: The other implementation's outputs.
+      controller: The controller, which limits the wheel speeds.
 
     Returns:
       The largest difference of any number, wheel speeds as a share of the fastest; infinite
-      where a result has another shape or is no number.
+      where an output has another shape or is not finite.
     """
     worst = 0.0
     pairs = ((recording.action, 1.0), (recording.wheel_speeds, controller.fastest))

@@ -17,7 +17,7 @@ from jetbot_mjx.deployment.numpy_policy import (
     portable_policy,
     record,
 )
-from jetbot_mjx.deployment.policy_spec import FILE, contract
+from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
 from jetbot_mjx.runs.run_dir import write_json, writing_to
@@ -87,7 +87,7 @@ def export_policy(
                 )
             differences[name] = found
         # Write the observations and the description of all files.
-        _write_spec(unfinished, contract(checkpoint, env, policy), differences, recording)
+        _write_spec(unfinished, policy_spec(checkpoint, env, policy), differences, recording)
     return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.obs))
 
 

@@ -1,4 +1,4 @@
-"""Describe an exported policy in `policy.json`, for users who have only its file."""
+"""The policy spec `policy.json`: all that a program needs to use an exported policy."""
 
 import json
 from collections.abc import Mapping
@@ -14,7 +14,7 @@ from jetbot_mjx.runs.run_dir import versions
 FILE = "policy.json"
 
 FORMAT = "jetbot_mjx-policy/1"
-"""Of `policy.json`."""
+"""The format that `policy.json` names."""
 
 FRAMES = {
     "world": "fixed to the floor, z up; training starts at its origin, heading along x",
@@ -32,16 +32,16 @@ _COMPONENTS = {
 }
 
 
-def contract(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> dict[str, Any]:
-    """Return the description of a policy, which is the same for every export format.
+def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> dict[str, Any]:
+    """Return the spec of a policy, which is the same for every export format.
 
     Args:
-      checkpoint: the policy's.
-      env: its environment.
-      policy: as numbers.
+      checkpoint: The checkpoint of the policy.
+      env: The environment that the policy was trained in.
+      policy: The policy as arrays.
 
     Returns:
-      JSON; `export` adds the files and how far each is from JAX.
+      The spec as JSON; `export` adds the files and the difference of each to JAX.
     """
     config = checkpoint.config
     rest = env.mj_model.qpos0

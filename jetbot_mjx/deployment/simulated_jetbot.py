@@ -1,10 +1,11 @@
 """Simulate a JetBot for a driver: motor values in, a pose out, in simulation time.
 
-It has the two methods of NVIDIA's `jetbot.Robot` that a driver calls, and a clock that a driver
-can wait on: waiting is what moves it. Physics is the preset `real` in C MuJoCo. Between motor
-value and wheel stand a delay, a dead-band, the motor's full speed and a lag:
+A `SimulatedJetBot` has the two methods of NVIDIA's `jetbot.Robot` that a driver calls, and a clock
+on which a driver waits; waiting advances the simulation. Physics is the preset `real` in C MuJoCo.
+The motor model turns a motor value m into a wheel speed ω by a delay, a dead-band, the full speed
+and a lag:
 
-    s = m of `delay` ago        target = sign(s) full (|s| - dead) / (1 - dead), 0 below `dead`
+    s(t) = m(t - delay)          target = sign(s) full (|s| - dead) / (1 - dead), 0 below `dead`
     ω' = d ω + (1 - d) target    d = exp(-dt / lag)
 """
 
@@ -22,20 +23,20 @@ from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
 
 ROLLING_RADIUS = 0.0321
-"""Way over the floor for each radian that a wheel turns [m]: loaded, it sinks in by 0.4 mm."""
+"""Distance over the floor per radian of a wheel [m]: under load it sinks 0.4 mm into the floor."""
 
 
 class MotorModel(NamedTuple):
     """The actuator model between a motor value and a wheel. Pairs are (left, right)."""
 
     dead_band: tuple[float, float] = (0.12, 0.12)
-    """Motor value up to which the wheel stands. PICOBOT: 0.11; others up to 0.25."""
+    """Motor value up to which a wheel does not turn. PICOBOT: 0.11; others up to 0.25."""
     full_speed: tuple[float, float] = (12.56, 12.56)
-    """Wheel speed at a motor value of 1 [rad/s]; the preset's."""
+    """Wheel speed at a motor value of 1 [rad/s]; the default is the preset's."""
     lag: float = 0.1
     """Time constant [s]. PICOBOT: 0.085."""
     delay: float = 0.05
-    """Delay from a motor value to the motor [s]."""
+    """Delay from setting a motor value to its effect on the motor [s]."""
 
 
 class Pose(NamedTuple):
@@ -50,16 +51,16 @@ class Pose(NamedTuple):
 
 
 class SimulatedJetBot:
-    """One simulated JetBot with its motors and its clock."""
+    """A simulated JetBot with its motors and its clock."""
 
     def __init__(self, motors: MotorModel | None = None) -> None:
         """Build the robot, at rest at the origin.
 
         Args:
-          motors: None: a dead-band of 0.12, a lag of 0.1 s and a delay of 0.05 s.
+          motors: The motor model; None: the defaults of `MotorModel`.
         """
         self.motor_model = MotorModel() if motors is None else motors
-        # The motor model says how fast a wheel turns, in place of the preset's limit.
+        # The motor model limits the wheel speed instead of the preset.
         robot = dataclasses.replace(REAL, max_wheel_speed=None)
         self._model = make_mj_model(robot, PhysicsConfig(), visual=False)
         self._data = mujoco.MjData(self._model)
@@ -67,28 +68,28 @@ class SimulatedJetBot:
         self.place(Pose(0.0, 0.0, 0.0))
 
     def place(self, pose: Pose) -> None:
-        """Place the robot at rest and drop all pending commands. The clock goes on."""
+        """Place the robot at rest and drop all pending motor values; the clock is not reset."""
         mujoco.mj_resetData(self._model, self._data)
         qpos = self._data.qpos
         qpos[QPOS_XYZ][:2] = pose.x, pose.y
         turned = np.array([math.cos(pose.yaw / 2), 0.0, 0.0, math.sin(pose.yaw / 2)])
         mujoco.mju_mulQuat(qpos[QPOS_QUAT], turned, self._model.qpos0[QPOS_QUAT])
-        self._arrived = np.zeros(2)
+        self._active = np.zeros(2)
         self._wheels = np.zeros(2)
-        self._under_way: collections.deque[tuple[float, np.ndarray]] = collections.deque()
+        self._pending: collections.deque[tuple[float, np.ndarray]] = collections.deque()
         self.motors = (0.0, 0.0)
-        """The motor values that were set last (left, right)."""
+        """The last motor values (left, right)."""
 
     def set_motors(self, left_speed: float, right_speed: float) -> None:
         """Set both motor values, as `jetbot.Robot` does.
 
         Args:
-          left_speed: motor value in [-1, 1]; values beyond are clipped.
-          right_speed: the same for the right motor.
+          left_speed: Motor value of the left motor in [-1, 1]; values outside are clipped.
+          right_speed: Motor value of the right motor.
         """
         self.motors = (float(left_speed), float(right_speed))
         values = np.clip(self.motors, -1.0, 1.0)
-        self._under_way.append((self._time + self.motor_model.delay, values))
+        self._pending.append((self._time + self.motor_model.delay, values))
 
     def stop(self) -> None:
         """Set both motor values to zero."""
@@ -102,11 +103,11 @@ class SimulatedJetBot:
         """Advance the simulation in whole physics steps.
 
         Args:
-          seconds: how long; the remainder of a step is added to the next call.
+          seconds: Simulated time [s]; the remainder of a step is added to the next call.
         """
         dt = self._model.opt.timestep
         end = self._time + seconds
-        # Half a step early or late: times are sums of rounded numbers.
+        # The tolerance is half a step, because times are sums of rounded numbers.
         while self._time < end - 0.5 * dt:
             self._tick(dt)
 
@@ -122,10 +123,10 @@ class SimulatedJetBot:
         return float(np.hypot(*self._data.qvel[:2]))
 
     def _tick(self, dt: float) -> None:
-        while self._under_way and self._under_way[0][0] <= self._time + 1e-9:
-            self._arrived = self._under_way.popleft()[1]
+        while self._pending and self._pending[0][0] <= self._time + 1e-9:
+            self._active = self._pending.popleft()[1]
         model = self.motor_model
-        target = np.array([*map(_wheel_speed, self._arrived, model.dead_band, model.full_speed)])
+        target = np.array([*map(_wheel_speed, self._active, model.dead_band, model.full_speed)])
         decay = math.exp(-dt / model.lag) if model.lag > 0 else 0.0
         self._wheels = decay * self._wheels + (1.0 - decay) * target
         self._data.ctrl[:] = self._wheels
@@ -144,10 +145,10 @@ def replayed(
     """Drive a simulated JetBot by logged motor values, and return its path.
 
     Args:
-      motors: its motors.
-      start: where it begins, at rest.
-      times: when each value was set [s], ascending.
-      values: motor values (left, right).
+      motors: The motor model.
+      start: The pose at the start, where the robot is at rest.
+      times: Times at which each value was set [s], ascending.
+      values: Motor values (left, right).
 
     Returns:
       (x, y, yaw) [m, m, rad] at each of the times, before its value is set; yaw without jumps.

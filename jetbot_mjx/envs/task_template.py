@@ -1,13 +1,15 @@
-"""Write the module and the settings of a small, complete task to start from."""
+"""Write a copy of the obstacle example, as a task to start from."""
 
 import importlib.util
 import keyword
-import string
 from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
 from jetbot_mjx.errors import UserError
+
+_EXAMPLE = ("obstacle_task.py", "obstacle.yaml")
+"""The files that are copied; in a checkout they are links to the examples."""
 
 
 class TaskFiles(NamedTuple):
@@ -37,22 +39,25 @@ def write_task_template(path: Path) -> TaskFiles:
     files = TaskFiles(path, path.with_suffix(".yaml"))
     for file in files:
         if file.exists():
-            raise UserError(f"{file} is there already: choose another name")
+            raise UserError(f"{file} exists already: choose another name")
     if importlib.util.find_spec(name) is not None:
-        raise UserError(f"{path}: there is a module {name} already: choose another name")
-    # Fill in the templates.
-    words = {
-        "stem": name,
-        "Class": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
-        "title": name.replace("_", " ").strip().capitalize(),
+        raise UserError(f"{path}: a module {name} exists already: choose another name")
+    # Copy the example under the new names.
+    renamed = {
+        "examples/obstacle.yaml": files.config.name,
+        "PYTHONPATH=examples": "PYTHONPATH=.",
+        "obstacle_task": name,
+        "ObstacleTask": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
     }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        for file, kind in zip(files, ("task.py", "task.yaml"), strict=True):
-            template = resources.files("jetbot_mjx").joinpath(f"assets/{kind}.template")
+        for file, example in zip(files, _EXAMPLE, strict=True):
+            text = resources.files("jetbot_mjx").joinpath(f"assets/{example}").read_text("utf-8")
+            for old, new in renamed.items():
+                text = text.replace(old, new)
             # Mode "x" does not overwrite a file that was created in the meantime.
             with file.open("x", encoding="utf-8") as out:
-                out.write(string.Template(template.read_text("utf-8")).substitute(words))
+                out.write(text)
     except OSError as error:
         raise UserError(f"{error.filename}: {error.strerror}") from None
     return files

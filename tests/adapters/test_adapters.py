@@ -37,7 +37,7 @@ ENDS = {"task": {"success_radius": 0.6}}  # near goals are reached within some s
 
 
 class Window:
-    """In place of MuJoCo's, for no test machine has a display."""
+    """A substitute for MuJoCo's window: no test machine has a display."""
 
     def __init__(self):
         self.shown = []
@@ -90,7 +90,7 @@ def gliding():
 
 
 def drive(env, actions):
-    """Observations, rewards, ends and infos of an environment under given actions."""
+    """Return observations, rewards, ends and infos of an environment under given actions."""
     return list(zip(*(env.step(action) for action in actions), strict=True))
 
 
@@ -419,7 +419,7 @@ seconds, and 1 mrad. A full-speed step covers 17 mm; a pillar elsewhere would te
 
 @pytest.mark.parametrize("config", TASKS)
 def test_every_task_is_the_same_in_c_in_the_batch_and_in_training(config, monkeypatch):
-    """Episodes to their end and on, with what Gymnasium prescribes to be told of them."""
+    """Compare episodes to their end and on, with the infos that Gymnasium prescribes."""
     monkeypatch.syspath_prepend(str(ROOT / "examples"))
     if isinstance(config, Path):
         config = load_config(config)
@@ -461,7 +461,7 @@ def test_every_task_is_the_same_in_c_in_the_batch_and_in_training(config, monkey
 
 
 def _towards(obs, held, layout):
-    """Actions that turn towards what a task shows a direction of, the rest as it is held."""
+    """Return actions that turn towards the first direction that a task observes."""
     starts = dict(zip((field.name for field in layout), _starts(layout), strict=True))
     start = next((start for name, start in starts.items() if name.endswith("direction")), None)
     if start is None:

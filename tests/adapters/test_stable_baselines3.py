@@ -118,8 +118,8 @@ def test_a_batch_is_that_of_gymnasium(task, root, monkeypatch):
             assert infos[index]["TimeLimit.truncated"] == truncated[index]
 
 
-class TrainerCallback(VecEnvWrapper):
-    """Keeps what the environments said, before a trainer adds to it."""
+class StepRecorder(VecEnvWrapper):
+    """A wrapper that stores what the environments return, before a trainer adds to it."""
 
     def __init__(self, venv):
         super().__init__(venv)
@@ -137,7 +137,7 @@ class TrainerCallback(VecEnvWrapper):
 
 
 class Rewards(BaseCallback):
-    """What PPO is about to learn from, and its values of final observations."""
+    """A callback that stores the rewards of PPO's buffer, and the values of final observations."""
 
     def __init__(self):
         super().__init__()
@@ -165,7 +165,7 @@ def test_a_truncated_episode_is_bootstrapped_and_one_that_arrived_is_not(adapter
         env = DummyVecEnv([lambda: JetBotGymEnv(max_episode_length=8, config=ENDS)] * 2)
     else:
         env = vec_env
-    recorder, callback = TrainerCallback(env), Rewards()
+    recorder, callback = StepRecorder(env), Rewards()
     ppo = sb3.PPO("MlpPolicy", recorder, gamma=GAMMA, n_steps=32, batch_size=32, n_epochs=1, seed=0)
     ppo.learn(3 * 32 * env.num_envs, callback=callback)
     seen, told = np.array(callback.seen), np.array(recorder.rewards)
@@ -265,7 +265,7 @@ def test_robots_are_drawn_side_by_side(needs_opengl):
 
 
 @pytest.mark.parametrize("num_envs", [1, 4])
-def test_the_examples_train_and_judge(num_envs, root, tmp_path, monkeypatch, capsys):
+def test_the_examples_train_and_evaluate(num_envs, root, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(root / "examples"))
     for name in ("sb3_train", "sb3_eval"):
         monkeypatch.delitem(sys.modules, name, raising=False)

@@ -29,7 +29,7 @@ from jetbot_mjx.deployment.numpy_policy import (
     portable_policy,
     record,
 )
-from jetbot_mjx.deployment.policy_spec import contract
+from jetbot_mjx.deployment.policy_spec import policy_spec
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
@@ -184,9 +184,9 @@ def test_the_contract_holds_the_summary_of_a_report(run_dir, tmp_path):
     policy, env = portable_policy(checkpoint), checkpoint.make_env()
     for text in ("", "{}", "[]"):
         (folder / "report.json").write_text(text)
-        assert contract(checkpoint, env, policy)["evaluation"] is None
+        assert policy_spec(checkpoint, env, policy)["evaluation"] is None
     write_json(folder / "report.json", {"goal_set_version": 7, "policy": {"success_rate": 0.5}})
-    told = contract(checkpoint, env, policy)["evaluation"]
+    told = policy_spec(checkpoint, env, policy)["evaluation"]
     assert told == {"goal_set_version": 7, "success_rate": 0.5}
 
 

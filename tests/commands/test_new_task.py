@@ -1,4 +1,4 @@
-"""What the template writes: it passes the checks and trains, and nothing is ever overwritten."""
+"""The task that `new_task` writes passes the checks and trains, and no file is overwritten."""
 
 import sys
 
@@ -42,14 +42,17 @@ def test_what_is_written_passes_the_checks_and_trains(folder, capsys):
         assert check_env.main(["--config", str(config)]) == 0
         result = session.run(load_config(config, TINY), folder / "run")
     assert result.finished
-    assert "class ParkHere(GoalTask)" in (folder / "park_here.py").read_text("utf-8")
-    assert "$" not in (folder / "park_here.py").read_text("utf-8") + config.read_text("utf-8")
+    written = (folder / "park_here.py").read_text("utf-8") + config.read_text("utf-8")
+    assert "class ParkHere(GoalTask)" in written
+    assert "PYTHONPATH=. python -m jetbot_mjx.train --config park_here.yaml" in written
+    for name in ("examples", "obstacle_task", "ObstacleTask", "obstacle.yaml"):
+        assert name not in written
 
 
 @pytest.mark.parametrize("there", ["mine.py", "mine.yaml"])
 def test_nothing_is_overwritten(folder, there):
     (folder / there).write_text("mine")
-    with pytest.raises(UserError, match=f"{there} is there already"):
+    with pytest.raises(UserError, match=f"{there} exists already"):
         write_task_template(folder / "mine.py")
     assert [file.name for file in folder.iterdir()] == [there]
     assert (folder / there).read_text() == "mine"
@@ -61,7 +64,7 @@ def test_nothing_is_overwritten(folder, there):
         ("my-task.py", "name a Python module"),
         ("class.py", "name a Python module"),
         ("my_task.txt", "name a Python module"),
-        ("json.py", "there is a module json already"),
+        ("json.py", "a module json exists already"),
     ],
 )
 def test_names_that_cannot_be_imported_are_refused(folder, name, told):

@@ -225,8 +225,7 @@ def test_the_source_is_all_python_and_all_models():
     # Finished runs, and what reports tell beside them, decide nothing.
     suffixes = {path.suffix for path in files if PRETRAINED not in path.parents}
     assert (
-        suffixes - {".html", ".json", ".md", ".pyc", ".template", ".typed", ""}
-        <= program_key.SOURCES
+        suffixes - {".html", ".json", ".md", ".pyc", ".typed", ".yaml", ""} <= program_key.SOURCES
     )
 
 

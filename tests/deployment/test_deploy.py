@@ -1,4 +1,4 @@
-"""The driver: at its goal in the stand-in, and with its motors at zero whenever it must be."""
+"""The driver: a SimulatedJetBot reaches its goals, and its motors are at zero when they must."""
 
 import contextlib
 import functools
@@ -44,7 +44,7 @@ IDEAL = MotorModel(dead_band=(0.0, 0.0), lag=0.0, delay=0.0)
 
 @pytest.fixture(scope="module")
 def exported(smoke_run, tmp_path_factory):
-    """An export of a policy that has learnt next to nothing."""
+    """Export a policy with almost no training."""
     folder = tmp_path_factory.mktemp("deploy") / "policy"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(policy_export, "record", functools.partial(record, count=50))
@@ -54,9 +54,9 @@ def exported(smoke_run, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def policy(exported):
-    """What `scripted` decides, as if it had been exported."""
-    contract = drive.load_policy(str(exported)).contract
-    return drive.Policy(scripted, {**contract, "observation": layout("egocentric")})
+    """Return the policy `scripted`, with the spec of an exported one."""
+    spec = drive.load_policy(str(exported)).spec
+    return drive.Policy(scripted, {**spec, "observation": layout("egocentric")})
 
 
 def layout(name):
@@ -69,7 +69,7 @@ def layout(name):
 
 
 def scripted(obs):
-    """Turns towards the goal, and drives the faster the better it is aligned."""
+    """Turn towards the goal, and drive faster the better the robot is aligned."""
     error = math.atan2(obs[3], obs[2])
     speed = 0.35 * max((math.cos(error) - 0.8) / 0.2, 0.0)
     yaw_rate = max(-math.pi, min(math.pi, 2.5 * error))
@@ -85,7 +85,7 @@ def camera(robot, rate=60.0):
     return rehearse.Camera(robot, rate, 0.0, np.random.default_rng(0))
 
 
-# In the stand-in.
+# In the SimulatedJetBot.
 
 
 def test_the_driver_reaches_goals_through_delay_dead_band_and_lag(policy):
@@ -158,8 +158,8 @@ def test_the_robot_stands_still_without_a_pose(policy):
     assert robot.pose() == pytest.approx((0.0, 0.0, 0.0), abs=1e-6)
 
 
-class TrainerCallback:
-    """A robot and a clock that keep what they are told."""
+class RecordingRobot:
+    """A robot and a clock that record the motor values."""
 
     def __init__(self, at=0.5, happens=None):
         self.values, self.time, self._at, self._happens = [], 0.0, at, happens
@@ -187,7 +187,7 @@ def failing(error):
 @pytest.mark.parametrize("where", ["clock", "poses", "policy", "log", "start"])
 @pytest.mark.parametrize("error", [ValueError("!"), KeyboardInterrupt(), SystemExit(143)])
 def test_whatever_goes_wrong_stops_the_motors(where, error, policy):
-    robot = TrainerCallback(happens=failing(error) if where == "clock" else None)
+    robot = RecordingRobot(happens=failing(error) if where == "clock" else None)
     source = poses.Odometry(motors.default_calibration())
     count = iter(range(1000))
 
@@ -215,7 +215,7 @@ def test_whatever_goes_wrong_stops_the_motors(where, error, policy):
 
 
 def test_a_bus_that_refuses_once_is_asked_again(policy):
-    robot = TrainerCallback()
+    robot = RecordingRobot()
     refusals = [OSError(121, "Remote I/O error")] * 4
 
     def set_motors(left, right):
@@ -232,7 +232,7 @@ def test_a_bus_that_refuses_once_is_asked_again(policy):
 
 
 def test_a_policy_that_gives_no_numbers_stands_still(policy):
-    robot = TrainerCallback()
+    robot = RecordingRobot()
     lost = policy._replace(act=lambda obs: ((0.0, 0.0), (math.nan, 5.0)))
     source = poses.Odometry(motors.default_calibration())
     drive.drive(robot, robot, source, lost, motors.default_calibration(), settings(timeout=0.5))
@@ -241,7 +241,7 @@ def test_a_policy_that_gives_no_numbers_stands_still(policy):
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
 def test_a_signal_stops_the_motors_and_tells_its_number(number, exported, monkeypatch):
-    robot = TrainerCallback(happens=lambda: os.kill(os.getpid(), number))
+    robot = RecordingRobot(happens=lambda: os.kill(os.getpid(), number))
     monkeypatch.setattr(drive, "NoRobot", lambda: robot)
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as left:
@@ -253,7 +253,7 @@ def test_a_signal_stops_the_motors_and_tells_its_number(number, exported, monkey
 
 
 def test_late_periods_are_counted_and_do_not_pile_up(policy):
-    robot = TrainerCallback()
+    robot = RecordingRobot()
     naps = iter([0.03] * 10)
     slow = policy._replace(act=lambda obs: robot.sleep(next(naps, 0.0)) or scripted(obs))
     source = poses.Odometry(motors.default_calibration())
@@ -287,7 +287,7 @@ def test_motor_values_undo_dead_band_and_full_speed():
     assert motors.motor_value(0.004, wheel) == 0.0
     assert motors.motor_value(9.0, wheel) == 1.0
     assert motors.motor_value(-9.0, wheel) == -1.0
-    # As the stand-in's motors do.
+    # The motors of SimulatedJetBot do the same.
     robot = SimulatedJetBot(IDEAL._replace(dead_band=(0.2, 0.2)))
     robot.set_motors(*[motors.motor_value(0.3, motors.Wheel(0.2, 12.56 * ROLLING_RADIUS))] * 2)
     robot.sleep(1.0)
@@ -296,34 +296,34 @@ def test_motor_values_undo_dead_band_and_full_speed():
 
 @pytest.mark.parametrize("name", ["world", "egocentric"])
 def test_observations_are_those_of_training(name, exported):
-    contract = drive.load_policy(str(exported)).contract
-    observe = observations.Observer({**contract, "observation": layout(name)})
+    spec = drive.load_policy(str(exported)).spec
+    observe = observations.Observer({**spec, "observation": layout(name)})
     task = GoalTask(parse_config({"task": {"observation": name}}).task)
     rng = np.random.default_rng(0)
     for x, y, yaw, speed, rate, goal_x, goal_y in rng.uniform(-3, 3, (20, 7)):
         seen = observe(poses.Pose(0.0, x, y, yaw, speed, rate), (goal_x, goal_y))
-        pitch = 2 * math.asin(contract["rest_quaternion"][2])
+        pitch = 2 * math.asin(spec["rest_quaternion"][2])
         half = [math.cos(yaw / 2), math.sin(yaw / 2)]
         ahead, tilt = math.cos(pitch / 2), math.sin(pitch / 2)
         robot = RobotState(
-            jnp.array([x, y, contract["rest_height"]]),
+            jnp.array([x, y, spec["rest_height"]]),
             jnp.array([half[0] * ahead, -half[1] * tilt, half[0] * tilt, half[1] * ahead]),
             jnp.array([speed * math.cos(yaw), speed * math.sin(yaw), 0.0]),
             jnp.array([0.0, 0.0, rate]),
         )
         wanted = task.observe(robot, jnp.array([goal_x, goal_y, GOAL_HEIGHT]))
         np.testing.assert_allclose(seen, wanted, atol=2e-5)
-    assert contract["goal_height"] == GOAL_HEIGHT
+    assert spec["goal_height"] == GOAL_HEIGHT
 
 
 def test_an_observation_that_cannot_be_made_is_told(policy):
     part = {"name": "pillar_position", "frame": "body", "index": [7, 8]}
-    other = {**policy.contract, "observation": [*policy.contract["observation"], part]}
-    with pytest.raises(motors.DriveError, match=r"wants pillar_position \(2 numbers, body frame\)"):
+    other = {**policy.spec, "observation": [*policy.spec["observation"], part]}
+    with pytest.raises(motors.DriveError, match=r"needs pillar_position \(2 numbers, body frame\)"):
         observations.Observer(other)
 
 
-def test_dead_reckoning_follows_the_stand_in(policy):
+def test_dead_reckoning_follows_the_simulated_jetbot(policy):
     model = MotorModel(delay=0.0)
     robot = SimulatedJetBot(model)
     calibration = rehearse.true_calibration(model)
@@ -396,7 +396,7 @@ NASTY = [
 
 @pytest.mark.parametrize("content", NASTY, ids=range(len(NASTY)))
 def test_no_datagram_ends_a_drive(content, policy):
-    """The robot stops while nothing else comes, and goes on when the tracker is back."""
+    """Check that the robot stops while nothing else comes, and continues afterwards."""
     robot = SimulatedJetBot()
     eye = camera(robot)
 
@@ -415,7 +415,7 @@ def test_no_datagram_ends_a_drive(content, policy):
 
 
 def mutated(rng, time):
-    """Bytes that are nearly a pose, or nothing of the kind."""
+    """Return bytes that are nearly a pose, or random bytes."""
     if rng.random() < 0.2:
         return rng.bytes(rng.integers(0, 1500))
     numbers = [0, -1, 1.5, 1e-320, 1e17, 1e300, 10**30, 10**400, math.nan, -math.inf, True, None]
@@ -433,7 +433,7 @@ def mutated(rng, time):
 
 @pytest.mark.parametrize("signs", [False, True])
 def test_whatever_comes_a_pose_stays_finite(signs, key):
-    """20,000 datagrams, of which some are poses."""
+    """Send 20,000 datagrams, some of which are poses."""
     rng = np.random.default_rng(0)
     inbox = []
     tracker = poses.Tracker(lambda: [inbox.pop()], key=datagrams.Key(str(key)) if signs else None)
@@ -595,7 +595,7 @@ def test_a_key_is_made_that_nobody_else_reads(tmp_path, capsys):
     ("damage", "message"),
     [
         (lambda key: key.chmod(0o644), "can be read by others: chmod 600 "),
-        (lambda key: key.write_text("secret"), "holds 6 bytes: make it at least 16"),
+        (lambda key: key.write_text("secret"), "has 6 bytes: use at least 16"),
         (lambda key: key.unlink(), "tracker.key: No such file"),
         (lambda key: key.with_suffix(".key.newest").write_text("x"), "could not convert"),
         (lambda key: key.with_suffix(".key.newest").mkdir(), "newest: Is a directory"),
@@ -645,8 +645,11 @@ def test_calibration_finds_dead_bands_and_full_speeds(tmp_path, monkeypatch, cap
             lambda c: c["left"].update(dead_band=0.9),
             "left.dead_band = 0.9 is not between 0 and 0.6",
         ),
-        (lambda c: c["right"].update(full_speed="fast"), "right.full_speed = 'fast' is no number"),
-        (lambda c: c["right"].update(speed=1), "is no calibration"),
+        (
+            lambda c: c["right"].update(full_speed="fast"),
+            "right.full_speed = 'fast' is not a number",
+        ),
+        (lambda c: c["right"].update(speed=1), "is not a calibration"),
     ],
 )
 def test_a_wrong_calibration_is_told(change, message, tmp_path):
@@ -667,8 +670,8 @@ DRY = ("{policy}", "--goal", "1", "0", "--dry-run")
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["{policy}", "--goal", "1", "0"], "no robot here"),
-        (["nowhere", "--goal", "1", "0"], "nowhere is no exported policy: No such file"),
+        (["{policy}", "--goal", "1", "0"], "there is no robot here"),
+        (["nowhere", "--goal", "1", "0"], "nowhere is not an exported policy: No such file"),
         (
             ["{policy}", "--goal", "1", "0", "--calibration", "c.json"],
             "--calibration c.json: No such",
@@ -723,30 +726,30 @@ def test_a_dry_run_needs_numpy_alone(exported, tmp_path):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda contract: contract.pop("rest_height"), "policy.json lacks rest_height"),
-        (lambda contract: contract.pop("run"), "policy.json lacks run"),
-        (lambda contract: contract.update(files={}), "holds no policy.py"),
+        (lambda spec: spec.pop("rest_height"), "policy.json lacks rest_height"),
+        (lambda spec: spec.pop("run"), "policy.json lacks run"),
+        (lambda spec: spec.update(files={}), "has no policy.py"),
     ],
 )
 def test_a_policy_that_lacks_something_is_told(change, message, exported, tmp_path, capsys):
-    contract = json.loads((exported / "policy.json").read_text())
-    change(contract)
-    (tmp_path / "policy.json").write_text(json.dumps(contract))
+    spec = json.loads((exported / "policy.json").read_text())
+    change(spec)
+    (tmp_path / "policy.json").write_text(json.dumps(spec))
     (tmp_path / "policy.py").write_text("")
     assert drive.main([str(tmp_path), "--goal", "1", "0", "--dry-run"]) == 2
     assert message in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
-    ("contract", "source", "message"),
+    ("spec", "source", "message"),
     [
-        ("[" * 100_000, "", "is no exported policy: "),
+        ("[" * 100_000, "", "is not an exported policy: "),
         (None, "import no_such_package", "cannot be run here: No module named 'no_such_package'"),
     ],
 )
-def test_a_policy_that_cannot_be_read_is_told(contract, source, message, exported, tmp_path):
-    contract = contract or (exported / "policy.json").read_text()
-    (tmp_path / "policy.json").write_text(contract)
+def test_a_policy_that_cannot_be_read_is_told(spec, source, message, exported, tmp_path):
+    spec = spec or (exported / "policy.json").read_text()
+    (tmp_path / "policy.json").write_text(spec)
     (tmp_path / "policy.py").write_text(source)
     with pytest.raises(motors.DriveError, match=message):
         drive.load_policy(str(tmp_path))
@@ -782,7 +785,7 @@ def test_a_rehearsal_of_nonsense_is_refused(arguments, message, exported, capsys
     ],
 )
 def test_a_calibration_that_does_not_end_is_told(arguments, error, code, message, tmp_path, capsys):
-    robot, path = TrainerCallback(), tmp_path / "calibration.json"
+    robot, path = RecordingRobot(), tmp_path / "calibration.json"
     arguments = ["--output", str(path), *arguments]
     assert calibrate.main(arguments, robot, robot, failing(error)) == code
     assert message in capsys.readouterr().err
@@ -802,7 +805,7 @@ def test_a_rehearsal_tells_how_many_goals_were_reached(exported, capsys):
 
 @pytest.fixture(scope="module")
 def driven(policy, tmp_path_factory):
-    """The log of a drive in a stand-in whose calibration is known, but for its delay."""
+    """Log a drive of a SimulatedJetBot with a known calibration, except for its delay."""
     model = MotorModel(full_speed=(12.0, 11.5), dead_band=(0.1, 0.15))
     robot, calibration = SimulatedJetBot(model), rehearse.true_calibration(model)
     robot.place(Pose(0.2, -0.1, 3.0))
@@ -828,7 +831,7 @@ def test_a_replay_with_the_same_motors_ends_where_the_drive_did(driven):
     assert late.distances.max() > 5 * same.distances.max()
 
 
-def test_a_log_is_told_in_figures_and_a_picture(driven, tmp_path, capsys):
+def test_a_log_is_told_in_metrics_and_a_plot(driven, tmp_path, capsys):
     assert sim2real.main([str(driven), "--delay", "0.05", "--output", str(tmp_path)]) == 0
     out = capsys.readouterr().out
     assert "reached after" in out
@@ -867,7 +870,7 @@ def test_a_log_that_was_cut_off_is_read_to_its_end(driven, tmp_path):
     cut = read_log(path)
     assert (cut.outcome, len(cut.times) > 20) == ("interrupted", True)
     (tmp_path / "no.jsonl").write_bytes(b"\xff\xfe")
-    with pytest.raises(UserError, match="it is no text"):
+    with pytest.raises(UserError, match="it is not text"):
         read_log(tmp_path / "no.jsonl")
     with pytest.raises(UserError, match="cannot be read: No such file"):
         read_log(tmp_path / "nothing.jsonl")

@@ -1,4 +1,4 @@
-"""The example of an own task: it loads by name, behaves as it says, and trains."""
+"""The example of a task of your own: it loads by name, behaves as described, and trains."""
 
 import json
 
@@ -37,7 +37,7 @@ TINY = (
 
 @pytest.fixture(scope="module")
 def load(root):
-    """Loads the example's configuration, with its folder on the path as PYTHONPATH puts it."""
+    """Return a loader of the example's configuration, with its folder on the path."""
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(root / "examples"))
         yield lambda *overrides: load_config(root / "examples" / "obstacle.yaml", overrides)
@@ -50,7 +50,7 @@ def env(load):
 
 @pytest.fixture(scope="module")
 def drives(env):
-    """One second straight ahead at full speed, twice: into the pillar, and past it."""
+    """Drive straight ahead at full speed for one second, twice: into the pillar, and past it."""
     goals = jnp.array([[1.0, 0.0, 0.05], [0.6, 0.0, 0.05]])
     pillars = jnp.array([[0.5, 0.1, 0.125], [0.3, 0.25, 0.125]])
     first = env.reset(jax.random.PRNGKey(0))
@@ -77,7 +77,7 @@ def drives(env):
 
 @pytest.fixture(scope="module")
 def episodes(env):
-    """Five episodes of two steps in each of eight environments: observations and what was drawn."""
+    """Run five episodes of two steps in each of eight environments; return obs and goals."""
     batch = wrap_for_training(env, episode_length=2)
 
     def step(state, _):
@@ -193,7 +193,7 @@ def test_wrong_settings_are_refused(load, override, message):
         make_env(load(override))
 
 
-def test_training_and_judging_run_end_to_end(load, env, tmp_path):
+def test_training_and_evaluation_run_end_to_end(load, env, tmp_path):
     with gliding.everywhere():
         result = session.run(load(*TINY), tmp_path / "run")
         report = evaluate_run(result.run_dir, episodes=4)
@@ -201,7 +201,7 @@ def test_training_and_judging_run_end_to_end(load, env, tmp_path):
     assert [json.loads(line)["env_steps"] for line in lines] == [0, 1024, 2048]
     policy = jetbot_mjx.load_policy(result.run_dir, "last")
     assert policy(jnp.zeros((3, 12))).shape == (3, 2)
-    # A goal that is more than a position is judged and told all the same.
+    # A goal that is more than a position is evaluated and reported like any other.
     goals = jax.vmap(env.reset)(report_keys(4)).goal.goal_w
     distances = np.linalg.norm(goals[:, :2], axis=-1)
     told = {failure.goal: failure.distance for failure in report.failures}

@@ -52,7 +52,7 @@ OUTSIDERS = {
 """All that these import from outside the standard library and the package."""
 
 OPTIONAL = {
-    "gymnasium": ("adapters.gymnasium", "adapters.vector", "adapters.stable_baselines3"),
+    "gymnasium": ("adapters.base", "adapters.gymnasium", "adapters.vector"),
     "stable_baselines3": ("adapters.stable_baselines3",),
     "torch": (),
 }

@@ -1,0 +1,97 @@
+"""The construction and the rendering that all adapters share."""
+
+from collections.abc import Callable
+from typing import Any, Protocol, TypeVar
+
+import numpy as np
+from jaxtyping import UInt8
+
+from jetbot_mjx.adapters.arguments import Source, requires_extra, resolve
+from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
+from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+
+with requires_extra("gymnasium"):
+    import gymnasium
+    from gymnasium import spaces
+
+
+class _HasEnv(Protocol):
+    env: JetBotEnv
+
+
+Simulation = TypeVar("Simulation", bound=_HasEnv)
+
+
+class AdapterBase:
+    """The base of the adapters. A subclass builds its simulation by `_construct`."""
+
+    metadata: dict[str, Any]
+    config: Config
+    """The configuration that the environment is built from."""
+    render_mode: str | None
+    _renderer: FrameRenderer | None
+    _is_begun = False
+    """Whether there was a `reset`; the subclass sets it."""
+
+    def _construct(
+        self, simulate: Callable[[Config], Simulation], config: Source, *given: Any
+    ) -> tuple[Simulation, spaces.Box, spaces.Box]:
+        """Build the simulation and the renderer, and set `config`, `render_mode` and `metadata`.
+
+        Args:
+          simulate: Builds the simulation from a configuration.
+          config: The constructor's `config`.
+          given: The constructor's other arguments, in the order of `arguments.resolve`.
+
+        Returns:
+          The simulation, and the observation and action space of one robot.
+
+        Raises:
+          UserError: An argument or setting is wrong, or there is no display for a window.
+        """
+        self.config, mode, rendering_dt = resolve(config, *given)
+        self.render_mode = mode
+        # A script that imports an adapter has no other reason to set up JAX's cache.
+        use_compilation_cache()
+        simulation = simulate(self.config)
+        env = simulation.env
+        self._renderer = FrameRenderer(env, mode, rendering_dt) if mode else None
+        self.metadata = {
+            **getattr(type(self), "metadata", {}),
+            "render_modes": [one for one in RENDER_MODES if one == mode or is_available(one)],
+            "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
+        }
+        observations = spaces.Box(-np.inf, np.inf, (env.observation_size,))
+        return simulation, observations, spaces.Box(-1.0, 1.0, (env.action_size,))
+
+    def _poses(self) -> list[Pose]:
+        """Return the pose of every robot."""
+        raise NotImplementedError
+
+    def _require_reset(self, method: str) -> None:
+        if not self._is_begun:
+            raise gymnasium.error.ResetNeeded(f"call reset() before {method}()")
+
+    def _frames(self) -> list[UInt8[np.ndarray, "height width 3"]]:
+        """Return an image of every robot.
+
+        Raises:
+          ResetNeeded: There was no `reset` yet.
+          UserError: This machine has no OpenGL that works without a screen.
+        """
+        self._require_reset("render")
+        assert self._renderer is not None, "images need a render_mode"
+        return [self._renderer.frame(pose) for pose in self._poses()]
+
+    def _show(self) -> None:
+        """Show the first robot where the render mode is `human`."""
+        if self.render_mode == "human":
+            assert self._renderer is not None
+            self._renderer.show(self._poses()[0])
+
+    def _close(self) -> None:
+        """Close the renderer."""
+        if self._renderer is not None:
+            self._renderer.close()
