@@ -19,9 +19,7 @@ use, so that a mistyped command fails at once and a GPU initialises while the re
 
 from typing import TYPE_CHECKING
 
-from jetbot_mjx.imports import install_lazy_imports as _install_lazy_imports
 from jetbot_mjx.imports import load_lazily as _load_lazily
-from jetbot_mjx.interrupts import leave_at_once as _leave_at_once
 
 if TYPE_CHECKING:
     from jetbot_mjx.config import load_config as load_config
@@ -35,9 +33,6 @@ if TYPE_CHECKING:
     from jetbot_mjx.runs.checkpoint import load_policy as load_policy
 
 __version__ = "0.1.0"
-
-_leave_at_once()
-_install_lazy_imports()
 
 # Configurations and runs refer to tasks by these names, independently of the module they are in.
 __getattr__, __dir__ = _load_lazily(

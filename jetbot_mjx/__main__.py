@@ -1,47 +1,50 @@
-"""List the commands, or run one: `python -m jetbot_mjx`, `jetbot-mjx train --config FILE`."""
+"""List the commands, or run one: `jetbot-mjx train --config FILE`.
 
-import ast
+`jetbot-mjx COMMAND`, `python -m jetbot_mjx COMMAND` and `python -m jetbot_mjx.COMMAND` do the same.
+A command is imported only if it is chosen, so that the list is printed at once.
+"""
+
 import difflib
-import re
 import runpy
 import sys
-from collections.abc import Sequence
-from importlib import resources
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
 
-from jetbot_mjx import __version__
-
-COMMANDS = (
-    "pretrained",
-    "train",
-    "plan",
-    "evaluate",
-    "render",
-    "play",
-    "export",
-    "sim2real",
-    "replay",
-    "new_task",
-    "check_env",
-)
-"""Names of the commands, in the order in which a user needs them."""
-
-_ALONE = "python -m jetbot_mjx"
-_WHAT_AND_HOW = re.compile(r"(?P<what>.+?): `(?P<how>python -m jetbot_mjx\.[^`]+)`")
+from jetbot_mjx import __version__, cli
 
 
-def run() -> dict[str, str]:
-    """Return the description of each command from its module's first line, without importing it.
+class Command(NamedTuple):
+    """A `Command` says where a subcommand is implemented and what it does."""
 
-    Returns:
-      The descriptions by command line, in the order of `COMMANDS`.
-    """
-    found = {}
-    for name in COMMANDS:
-        source = resources.files("jetbot_mjx").joinpath(f"{name}.py").read_text("utf-8")
-        told = _WHAT_AND_HOW.match(ast.get_docstring(ast.parse(source)) or "")
-        assert told is not None, name
-        found[told["how"]] = told["what"]
-    return found
+    module: str
+    """Name of the module in this package; it may be in a subpackage, such as `viewers.window`."""
+    help: str
+    """Description for the list of commands, in one line."""
+
+
+COMMANDS: Mapping[str, Command] = {
+    "pretrained": Command("pretrained", "copy the policies that come with the package"),
+    "train": Command("train", "train a policy into a run folder"),
+    "plan": Command("plan", "predict the memory that a training needs"),
+    "evaluate": Command("evaluate", "evaluate policies on fixed goals, and compare them"),
+    "render": Command("render", "write videos and plots of a policy that drives"),
+    "play": Command("play", "watch a policy live in the browser, and interact with it"),
+    "export": Command("export", "write a policy to files that run without this package"),
+    "sim2real": Command("sim2real", "compare the log of a real drive with the simulator"),
+    "replay": Command("replay", "replay the steps that led to a non-finite state"),
+    "new_task": Command("new_task", "write a task to start from"),
+    "check_env": Command("check_env", "check a task before it is trained"),
+}
+"""The commands by name, in the order in which a user needs them."""
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(prog=cli.PROGRAM, description="Train a JetBot to drive to goals.")
+    parser.add_argument("--version", action="version", version=f"jetbot_mjx {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND [--help]")
+    for name, command in COMMANDS.items():
+        commands.add_parser(name, help=command.help, add_help=False)
+    return parser
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,26 +54,20 @@ def main(arguments: Sequence[str] | None = None) -> int:
       arguments: arguments without the program's name; None: those of the process.
 
     Returns:
-      0, or 2 if there is no such command. A command that runs ends the process with its own code.
+      0. A command that runs, or that does not exist, ends the process with its exit code.
     """
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words and words[0] in COMMANDS:
-        # Behave like `python -m jetbot_mjx.COMMAND`, including the exit code.
         sys.argv[1:] = words[1:]
-        runpy.run_module(f"jetbot_mjx.{words[0]}", run_name="__main__", alter_sys=True)
-    if words == ["--version"]:
-        print(f"jetbot_mjx {__version__}")
-        return 0
-    if words and words not in (["-h"], ["--help"]):
+        module = f"jetbot_mjx.{COMMANDS[words[0]].module}"
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    parser = _parser()
+    if words and not words[0].startswith("-"):
         close = difflib.get_close_matches(words[0], COMMANDS, n=1)
-        remedy = f"did you mean {close[0]}?" if close else f"say {_ALONE} for a list"
-        print(f"error: {_ALONE} {words[0]}: there is no such command: {remedy}", file=sys.stderr)
-        return 2
-    listed = run()
-    width = max(map(len, listed))
-    print("Each tells of its arguments with --help:")
-    for how, what in listed.items():
-        print(f"  {how:{width}}  {what[0].lower()}{what[1:]}")
+        remedy = f": did you mean {close[0]}?" if close else ""
+        parser.error(f"there is no command {words[0]!r}{remedy}")
+    parser.parse_args(words)
+    parser.print_help()
     return 0
 
 

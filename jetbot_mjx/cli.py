@@ -1,8 +1,11 @@
-"""Provide what all commands share: argument types, one-line error messages and exit codes.
+"""Provide what all commands share: arguments and their types, one-line errors, exit codes.
 
 The exit codes are: 0 success · 1 finished, but below the requested `--min-success`, or a plan that
 does not fit · 2 an error that the user can correct · 75 a training that was asked to stop, is
 saved, and continues with the same command · 130 interrupted.
+
+A command module imports only this module at its top and the rest in `main`, after `run_command` has
+installed the lazy imports. For the same reason this module imports JAX only where it uses it.
 """
 
 import argparse
@@ -12,12 +15,18 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
-from typing import Literal, NoReturn
-
-import jax
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal, NoReturn
 
 from jetbot_mjx.errors import UserError, ran_out
-from jetbot_mjx.interrupts import raise_again
+from jetbot_mjx.imports import install_lazy_imports
+from jetbot_mjx.interrupts import repeat_lost_interrupts
+
+if TYPE_CHECKING:
+    from jetbot_mjx.config import Config
+
+PROGRAM = "jetbot-mjx"
+"""Name of the console script, with which every command's usage begins."""
 
 USER_ERROR = 2
 INTERRUPTED = 130
@@ -43,19 +52,21 @@ def run_command(
         it opened: JAX takes a second to release a GPU, and a compiler's thread, which cannot be
         interrupted, may abort the process.
     """
-    # Prepare output and signals.
+    # Prepare the process: its output, its imports and its signals.
     for stream in (sys.stdout, sys.stderr):
         # A character that the terminal cannot show must not fail a command that has finished.
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")
-    raise_again()
+    install_lazy_imports()
+    repeat_lost_interrupts()
     # Run the command and convert known errors to an exit code.
     try:
         code = command(None)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         code = USER_ERROR
-    except jax.errors.JaxRuntimeError as error:
+    # JAX raises a subclass, which is not named here because that would import JAX.
+    except RuntimeError as error:
         if not ran_out(error):
             raise
         print(
@@ -70,6 +81,7 @@ def run_command(
         # The reader of the output has closed the pipe, so nothing more can be printed.
         sys.stderr.close()
         code = USER_ERROR
+    # Exit.
     if at_once:
         with contextlib.suppress(BrokenPipeError, ValueError):
             sys.stdout.flush()
@@ -78,12 +90,26 @@ def run_command(
     sys.exit(code)
 
 
+def prepare_device() -> None:
+    """Check that JAX has a usable device, and turn its compilation cache on.
+
+    Raises:
+      UserError: as for `require_device`.
+    """
+    from jetbot_mjx.compiler.program_cache import use_compilation_cache
+
+    require_device()
+    use_compilation_cache()
+
+
 def require_device() -> None:
     """Raise an error if JAX has no usable device.
 
     Raises:
       UserError: `JAX_PLATFORMS` names a missing platform, or JAX is set to 64 bits.
     """
+    import jax
+
     if jax.config.values["jax_enable_x64"]:
         raise UserError("all is computed in float32, and JAX_ENABLE_X64 is set: unset it")
     try:
@@ -104,6 +130,7 @@ def wake_device() -> None:
     for other processes.
     """
     os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    import jax
 
     def touch() -> None:
         # The first code that needs the device will report the error.
@@ -203,3 +230,55 @@ def add_checkpoint_arguments(
         metavar="best|last|STEPS",
         help="which checkpoint of a run folder (default: best)",
     )
+
+
+def add_config_arguments(
+    parser: argparse.ArgumentParser,
+    group: "argparse._ActionsContainer | None" = None,
+    *,
+    required: bool = False,
+    default: Path | None = None,
+) -> None:
+    """Add the arguments `--config` and `--set`, which select a configuration.
+
+    Args:
+      parser: The parser of the command.
+      group: The group of arguments that `--config` belongs to, or None for none.
+      required: Whether `--config` must be given.
+      default: The file that is used without `--config`, or None for the defaults of `Config`.
+    """
+    suffix = f" (default: {default.parent.name}/{default.name})" if default else ""
+    (group or parser).add_argument(
+        "--config",
+        type=Path,
+        default=default,
+        metavar="FILE",
+        help=f"YAML file, see configs/{suffix}",
+        required=required,
+    )
+    parser.add_argument(
+        "--set",
+        dest="overrides",
+        action="append",
+        default=[],
+        metavar="SECTION.KEY=VALUE",
+        help="override one setting; may be given again",
+    )
+
+
+def config_of(options: argparse.Namespace, *overrides: str) -> "Config":
+    """Return the configuration that `--config` and `--set` select.
+
+    Args:
+      options: The parsed arguments.
+      overrides: Further overrides, which take precedence over `--set`.
+
+    Returns:
+      The checked configuration.
+
+    Raises:
+      UserError: the file cannot be read, or a setting is invalid.
+    """
+    from jetbot_mjx.config import load_config
+
+    return load_config(options.config, [*options.overrides, *overrides])

@@ -3,8 +3,9 @@
 MuJoCo loads GLFW before a window is requested. MJX loads trimesh and SciPy's geometry for meshes,
 which no robot here has, and prints two lines if its optional Warp part is absent. Brax loads JAXopt
 for an engine that is not used here, and tensorboardX loads a logging service that is not used. On a
-slow machine these imports take almost two seconds at every start. A training also needs no OpenGL,
-so that MuJoCo must be importable even if the backend that `MUJOCO_GL` names is unavailable.
+slow machine these imports take almost two seconds at every start of a command. A training also
+needs no OpenGL, so that a command must be able to import MuJoCo even if the backend that
+`MUJOCO_GL` names is unavailable.
 """
 
 import contextlib
@@ -150,5 +151,10 @@ _AROUND: Mapping[str, _Around] = {
 
 
 def install_lazy_imports() -> None:
-    """Install the lazy imports for the whole process from now on."""
-    sys.meta_path.insert(0, _Finder(_AROUND))
+    """Install the lazy imports for the whole process, from now on.
+
+    Only a command does this. A program that imports the package as a library loads the other
+    libraries in its own way.
+    """
+    if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _Finder(_AROUND))

@@ -1,4 +1,4 @@
-"""Handle Ctrl-C from the first import of a command to its end, without tracebacks or lost signals.
+"""Handle Ctrl-C while a command imports and while it runs, without tracebacks or lost signals.
 
 Python raises an exception for Ctrl-C wherever the interpreter happens to be. During imports this
 prints a traceback, or a library catches the exception and continues. In a callback, for example of
@@ -6,39 +6,41 @@ garbage collection, it is printed and then ignored. A training handles it in `pr
 """
 
 import _thread
+import contextlib
 import signal
 import sys
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 _SOON = 0.05
 """[s] Time after which a lost interrupt is raised again."""
 
 
-def leave_at_once() -> None:
-    """Let the signal of Ctrl-C end a command of this package while it is still importing.
+@contextlib.contextmanager
+def exit_on_interrupt() -> Iterator[None]:
+    """Let Ctrl-C end the process at once inside the context, in which a command imports modules.
 
-    At that time nothing needs an orderly shutdown. If another program imports the package, the
-    function does nothing.
+    At that time nothing needs an orderly shutdown. A handler that others have set is left alone: a
+    shell's background jobs ignore Ctrl-C.
     """
-    # `sys.argv` starts with `-m` while `python -m` looks for the module, and later with its path.
-    modules = [word.removeprefix("-m").partition(".")[0] for word in sys.orig_argv]
-    if sys.argv[:1] == ["-m"] and __package__ in modules:
-        _replace(signal.default_int_handler, signal.SIG_DFL)
+    in_main_thread = threading.current_thread() is threading.main_thread()
+    if not in_main_thread or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    try:
+        yield
+    finally:
+        # An imported module may have set a handler of its own.
+        if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
-def raise_again() -> None:
-    """Let Ctrl-C raise an exception again, and repeat it where it was lost."""
-    _replace(signal.SIG_DFL, signal.default_int_handler)
+def repeat_lost_interrupts() -> None:
+    """Raise a KeyboardInterrupt again if Python has printed and ignored it."""
     if sys.unraisablehook is sys.__unraisablehook__:
         sys.unraisablehook = _look_for_interrupts
-
-
-def _replace(former: Any, handler: Any) -> None:
-    # Keep a handler that was set by others: a shell's background jobs ignore Ctrl-C.
-    in_main_thread = threading.current_thread() is threading.main_thread()
-    if in_main_thread and signal.getsignal(signal.SIGINT) is former:
-        signal.signal(signal.SIGINT, handler)
 
 
 def _look_for_interrupts(lost: Any) -> None:

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from jetbot_mjx.envs.task import GoalTask as GoalTask
     from jetbot_mjx.envs.task import RobotState as RobotState
     from jetbot_mjx.envs.task import Task as Task
+    from jetbot_mjx.envs.task_template import write_task_template as write_task_template
     from jetbot_mjx.envs.wrappers import wrap_for_training as wrap_for_training
 
 __getattr__, __dir__ = load_lazily(
@@ -30,5 +31,6 @@ __getattr__, __dir__ = load_lazily(
         "DomainRandomizationWrapper": "domain_randomization",
         "make_env": "jetbot_env",
         "wrap_for_training": "wrappers",
+        "write_task_template": "task_template",
     },
 )

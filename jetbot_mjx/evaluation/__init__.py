@@ -5,6 +5,9 @@ from typing import TYPE_CHECKING
 from jetbot_mjx.imports import load_lazily
 
 if TYPE_CHECKING:
+    from jetbot_mjx.evaluation.evaluate_runs import compare_runs as compare_runs
+    from jetbot_mjx.evaluation.evaluate_runs import evaluate_in_mujoco as evaluate_in_mujoco
+    from jetbot_mjx.evaluation.evaluate_runs import evaluate_run as evaluate_run
     from jetbot_mjx.evaluation.evaluator import Evaluator as Evaluator
     from jetbot_mjx.evaluation.evaluator import report_keys as report_keys
     from jetbot_mjx.evaluation.html_report import write_comparison as write_comparison
@@ -17,5 +20,8 @@ __getattr__, __dir__ = load_lazily(
         "report_keys": "evaluator",
         "write_comparison": "html_report",
         "write_report": "html_report",
+        "compare_runs": "evaluate_runs",
+        "evaluate_in_mujoco": "evaluate_runs",
+        "evaluate_run": "evaluate_runs",
     },
 )

@@ -8,6 +8,8 @@ if TYPE_CHECKING:
     from jetbot_mjx.runs.checkpoint import PRETRAINED as PRETRAINED
     from jetbot_mjx.runs.checkpoint import load_checkpoint as load_checkpoint
     from jetbot_mjx.runs.checkpoint import load_policy as load_policy
+    from jetbot_mjx.runs.nan_replay import replay_nan_dump as replay_nan_dump
+    from jetbot_mjx.runs.pretrained_runs import copy_pretrained as copy_pretrained
 
 __getattr__, __dir__ = load_lazily(
     __name__,
@@ -15,5 +17,7 @@ __getattr__, __dir__ = load_lazily(
         "PRETRAINED": "checkpoint",
         "load_checkpoint": "checkpoint",
         "load_policy": "checkpoint",
+        "copy_pretrained": "pretrained_runs",
+        "replay_nan_dump": "nan_replay",
     },
 )

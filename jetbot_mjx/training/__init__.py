@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from jetbot_mjx.imports import load_lazily
 
 if TYPE_CHECKING:
+    from jetbot_mjx.training.memory_plan import plan_memory as plan_memory
     from jetbot_mjx.training.session import Result as Result
     from jetbot_mjx.training.session import run as run
 
@@ -13,5 +14,6 @@ __getattr__, __dir__ = load_lazily(
     {
         "Result": "session",
         "run": "session",
+        "plan_memory": "memory_plan",
     },
 )

@@ -5,11 +5,17 @@ from typing import TYPE_CHECKING
 from jetbot_mjx.imports import load_lazily
 
 if TYPE_CHECKING:
+    from jetbot_mjx.viewers.gallery import render_gallery as render_gallery
+    from jetbot_mjx.viewers.gallery import render_run as render_run
+    from jetbot_mjx.viewers.live import play_live as play_live
     from jetbot_mjx.viewers.player import Player as Player
 
 __getattr__, __dir__ = load_lazily(
     __name__,
     {
         "Player": "player",
+        "play_live": "live",
+        "render_gallery": "gallery",
+        "render_run": "gallery",
     },
 )

@@ -15,6 +15,7 @@ from test_config import refusal, write
 from test_metrics import read_events
 
 from jetbot_mjx import cli, evaluate, render, train
+from jetbot_mjx.compiler import program_cache
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
@@ -202,7 +203,7 @@ def test_a_forbidden_path_costs_one_line(monkeypatch, method, use):
 
     monkeypatch.setattr(Path, method, deny)
     # Denied its folder, JAX would do without one in all later tests.
-    monkeypatch.setattr(evaluate, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(program_cache, "use_compilation_cache", lambda: None)
     with pytest.raises(UserError, match="Permission denied"):
         use()
 

@@ -4,6 +4,7 @@ import gliding
 import pytest
 
 from jetbot_mjx import check_env
+from jetbot_mjx.envs.checks import runner
 from jetbot_mjx.errors import UserError
 
 
@@ -12,7 +13,7 @@ def test_a_sound_task_is_clean(capsys):
         assert check_env.main(["broken_tasks:Sound"]) == 0
     printed = capsys.readouterr().out
     assert printed.count("ok ") == 11
-    assert printed.splitlines()[-1] == "broken_tasks:Sound: nothing wrong"
+    assert printed.splitlines()[-1] == "broken_tasks:Sound: no errors"
 
 
 def test_a_fault_is_told_in_one_line_and_in_the_exit_code(capsys):
@@ -20,20 +21,20 @@ def test_a_fault_is_told_in_one_line_and_in_the_exit_code(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].startswith("wrong  purity")
     assert lines[2].startswith("       - observe raises KeyError: 'lidar' (broken_tasks.py:")
-    assert lines[3].startswith("not checked until that is mended: types, draws")
-    assert lines[4] == "broken_tasks:Raises: 1 fault"
+    assert lines[3].startswith("not checked until that is corrected: types, draws")
+    assert lines[4] == "broken_tasks:Raises: 1 error"
 
 
 def test_a_built_in_task_goes_by_its_class(capsys, monkeypatch):
     asked = []
-    monkeypatch.setattr(check_env, "run", lambda config: asked.append(config.task) or iter(()))
+    monkeypatch.setattr(runner, "check_task", lambda config: asked.append(config.task) or iter(()))
     check_env.main(["GoalTask", "--set", "task.observation=egocentric"])
     assert (asked[0].name, asked[0].observation) == ("jetbot_mjx:GoalTask", "egocentric")
 
 
 def test_a_configuration_names_its_task(root, monkeypatch):
     asked = []
-    monkeypatch.setattr(check_env, "run", lambda config: asked.append(config.task) or iter(()))
+    monkeypatch.setattr(runner, "check_task", lambda config: asked.append(config.task) or iter(()))
     check_env.main(["--config", str(root / "examples" / "gates.yaml")])
     assert (asked[0].name, asked[0].episode_length) == ("gates_task:GatesTask", 360)
 

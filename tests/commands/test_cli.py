@@ -20,6 +20,7 @@ from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.task import WORLD, layout_data
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import evaluate_runs
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint import FORMAT
 from jetbot_mjx.training import session
@@ -79,7 +80,7 @@ def refused(here, capfd):
 )
 def test_train_refuses_a_mistaken_command_line(refused, arguments, said):
     line = refused(train, *arguments)
-    assert line.startswith("python -m jetbot_mjx.train: error: ")
+    assert line.startswith("jetbot-mjx train: error: ")
     assert said in line
     assert "(--help lists the arguments)" in line
 
@@ -260,7 +261,7 @@ both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "
 )
 def test_a_mistaken_command_line_is_refused(refused, command, arguments, said):
     line = refused(command, *arguments)
-    assert line.startswith(f"python -m {command.__name__}: error: ")
+    assert line.startswith(f"jetbot-mjx {command.__name__.partition('.')[2]}: error: ")
     assert said in line
 
 
@@ -408,7 +409,7 @@ def test_help_is_no_mistake(capfd, name):
         cli.run_command(lambda _: COMMANDS[name].main(["--help"]))
     out, err = capfd.readouterr()
     assert (caught.value.code, err) == (0, "")
-    assert out.startswith(f"usage: python -m jetbot_mjx.{name}")
+    assert out.startswith(f"usage: jetbot-mjx {name} ")
 
 
 @pytest.mark.parametrize(
@@ -417,7 +418,7 @@ def test_help_is_no_mistake(capfd, name):
 )
 def test_only_a_success_rate_below_the_target_gives_1(monkeypatch, capfd, arguments, code):
     report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]))
-    monkeypatch.setattr(evaluate, "run", lambda *args, **kwargs: report)
+    monkeypatch.setattr(evaluate_runs, "evaluate_run", lambda *args, **kwargs: report)
     assert evaluate.main(["run", *arguments]) == code
     assert ("is below the 51.00% asked for" in capfd.readouterr().out) == (code == 1)
 

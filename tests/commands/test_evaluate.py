@@ -14,7 +14,13 @@ from PIL import Image
 
 from jetbot_mjx import cli, evaluate
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import html_report
+from jetbot_mjx.evaluation import (
+    compare_runs,
+    evaluate_in_mujoco,
+    evaluate_run,
+    evaluate_runs,
+    html_report,
+)
 from jetbot_mjx.evaluation.evaluator import BASELINES, Summary
 from jetbot_mjx.evaluation.robustness import SWEEPS, SweepResult
 from jetbot_mjx.evaluation.tables import policies_table
@@ -184,7 +190,7 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
             for one in SWEEPS
         )
 
-    monkeypatch.setattr(evaluate, "sweep", sweep)
+    monkeypatch.setattr(evaluate_runs, "sweep", sweep)
     code, said = judge(run_dir, "--robustness", "--output", tmp_path)
     assert code == 0
     assert "wheel-floor friction        1 to 1 × preset" in said
@@ -224,7 +230,7 @@ def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_pa
     assert "implicitfast with 8 steps per control step, elliptic friction cone" in page
     assert f"--episodes {EPISODES} --simulator mujoco\n" in page
     # And without a report, the same again.
-    again = evaluate.evaluate_in_mujoco(run_dir, episodes=EPISODES)
+    again = evaluate_in_mujoco(run_dir, episodes=EPISODES)
     assert json.loads(json.dumps(again.to_json())) == values["mujoco"]
 
 
@@ -262,8 +268,10 @@ def test_ranges_of_a_file_are_judged_beside_the_preset(judged, tmp_path):
 
 def test_a_file_without_ranges_is_refused(judged, root):
     run_dir, _, _, _ = judged
-    with pytest.raises(UserError, match=r"smoke\.yaml: it draws nothing; give a configuration"):
-        evaluate.run(run_dir, ranges=root / "configs" / "smoke.yaml")
+    with pytest.raises(
+        UserError, match=r"smoke\.yaml: it randomizes nothing; give a configuration"
+    ):
+        evaluate_run(run_dir, ranges=root / "configs" / "smoke.yaml")
 
 
 def test_figures_are_drawn_for_light_and_dark_surroundings(judged):
@@ -301,7 +309,7 @@ def still(smoke_run, tmp_path_factory):
 def hopeless(still, tmp_path_factory):
     """That policy's report, written elsewhere than into the run folder."""
     folder = tmp_path_factory.mktemp("hopeless") / "out"
-    return evaluate.run(still, episodes=EPISODES, output=folder)
+    return evaluate_run(still, episodes=EPISODES, output=folder)
 
 
 def test_a_policy_that_reaches_nothing_gets_its_report(hopeless, still):
@@ -398,14 +406,14 @@ def test_the_comparison_tells_the_numbers_of_its_json_file(several):
 
 def test_seeds_of_one_run_are_a_comparison_without_a_pair(several, tmp_path, monkeypatch):
     run = several[0] / "five"
-    comparison = evaluate.run_comparison([run], episodes=EPISODES, output=tmp_path)
+    comparison = compare_runs([run], episodes=EPISODES, output=tmp_path)
     values = json.loads((tmp_path / "comparison.json").read_text())
     assert values["pairs"] == []
     check_numbers(tmp_path / "comparison.html", values)
     before = files(tmp_path)
     html_report.write_comparison(comparison)
     assert files(tmp_path) == before
-    monkeypatch.setattr(evaluate, "run_comparison", lambda *args, **kwargs: comparison)
+    monkeypatch.setattr(evaluate_runs, "compare_runs", lambda *args, **kwargs: comparison)
     mean = values["runs"][0]["success_rate"]["mean"]["value"]
     code, said = judge(run, "--min-success", mean)
     assert code == 0
@@ -417,7 +425,9 @@ def test_seeds_of_one_run_are_a_comparison_without_a_pair(several, tmp_path, mon
 def test_checkpoints_of_one_run_are_told_apart_by_their_steps(several, tmp_path, monkeypatch):
     folder, _, _ = several
     run = folder / "five" / "seed-0"
-    monkeypatch.setattr(evaluate, "_judge", lambda *args: pytest.fail("they are the same"))
+    monkeypatch.setattr(
+        evaluate_runs, "_write_reports", lambda *args: pytest.fail("they are the same")
+    )
     with pytest.raises(UserError, match=r"are the same policy, .*000000065536: name each once"):
         judge(run, run / "checkpoints" / "000000065536")
     with pytest.raises(UserError, match="are the same policy"):
@@ -428,9 +438,9 @@ def test_names_take_as_much_of_the_path_as_they_need(several, smoke_run, tmp_pat
     for name in ("x/run", "y/run"):
         shutil.copytree(smoke_run, tmp_path / name)
     paths = [tmp_path / "x" / "run", tmp_path / "y" / "run"]
-    assert list(evaluate._load(paths, "best")) == ["x/run", "y/run"]
+    assert list(evaluate_runs._load_runs(paths, "best")) == ["x/run", "y/run"]
     paths = [paths[0] / "checkpoints" / f"{steps:012d}" for steps in (0, 65_536)]
-    assert list(evaluate._load(paths, "best")) == ["run @ 0", "run @ 65,536"]
+    assert list(evaluate_runs._load_runs(paths, "best")) == ["run @ 0", "run @ 65,536"]
 
 
 def test_runs_with_different_things_to_do_are_refused_before_anything_is_written(

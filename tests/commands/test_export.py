@@ -19,7 +19,7 @@ from brax.training.acme import running_statistics, specs
 from jetbot_mjx import export
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import load_config, parse_config
-from jetbot_mjx.deployment import exporters, numpy_policy
+from jetbot_mjx.deployment import export_policy, exporters, numpy_policy, policy_export
 from jetbot_mjx.deployment.exporters import FORMATS, Source
 from jetbot_mjx.deployment.numpy_policy import (
     TOLERANCE,
@@ -58,7 +58,7 @@ def exported(run_dir):
 @pytest.fixture
 def shortly(monkeypatch):
     """Exports are checked on few observations."""
-    monkeypatch.setattr(export, "record", functools.partial(record, count=20))
+    monkeypatch.setattr(policy_export, "record", functools.partial(record, count=20))
 
 
 def checkpoint_of(settings, tmp_path):
@@ -346,7 +346,7 @@ def test_what_differs_from_jax_is_not_written(run_dir, exported, shortly, monkey
         with pytest.raises(
             UserError, match=r"nothing was written to .*policy\.py differs from JAX"
         ):
-            export.run(run_dir, formats=("onnx", "numpy"), output=folder)
+            export_policy(run_dir, formats=("onnx", "numpy"), output=folder)
     assert os.listdir(tmp_path) == []
     assert {path.name: path.read_bytes() for path in exported.iterdir()} == before
     assert not [path for path in run_dir.iterdir() if path.name.startswith(".policy")]
@@ -356,9 +356,9 @@ def test_an_export_that_is_stopped_leaves_the_earlier_one(run_dir, exported, sho
     def stop(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(export, "write_json", stop)
+    monkeypatch.setattr(policy_export, "write_json", stop)
     with pytest.raises(KeyboardInterrupt):
-        export.run(run_dir)
+        export_policy(run_dir)
     assert (exported / "policy.onnx").is_file()
     assert not [path for path in run_dir.iterdir() if path.name.startswith(".policy")]
 
@@ -390,13 +390,13 @@ def test_a_missing_package_is_told_with_its_remedy(run_dir, monkeypatch, tmp_pat
 def test_a_folder_with_something_else_is_left_alone(run_dir, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
     with pytest.raises(UserError, match="is there and no export"):
-        export.run(run_dir, output=tmp_path)
+        export_policy(run_dir, output=tmp_path)
     assert os.listdir(tmp_path) == ["thesis.txt"]
 
 
 def test_a_folder_that_cannot_be_is_told(run_dir, tmp_path):
     with pytest.raises(UserError, match="cannot be written: File name too long"):
-        export.run(run_dir, output=tmp_path / ("x" * 300))
+        export_policy(run_dir, output=tmp_path / ("x" * 300))
     assert os.listdir(tmp_path) == []
 
 

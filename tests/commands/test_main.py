@@ -1,4 +1,5 @@
 import importlib
+import re
 import subprocess
 import sys
 
@@ -9,33 +10,43 @@ import jetbot_mjx
 from jetbot_mjx import __main__ as overview
 
 
-def test_every_command_is_listed_with_what_it_does():
-    listed = overview.run()
+def test_every_command_is_listed_with_what_it_does(capsys):
+    listed = {}
+    assert overview.main([]) == 0
+    for line in capsys.readouterr().out.splitlines():
+        if found := re.fullmatch(r"    (\w+) {2,}(.+)", line):
+            listed[found[1]] = found[2]
+    assert listed == {name: command.help for name, command in overview.COMMANDS.items()}
     at_root = {path.stem for path in (ROOT / PACKAGE).glob("*.py")}
-    assert sorted(overview.COMMANDS) == sorted(at_root - {"__init__", "__main__", "cli", *COMMON})
-    for name, (how, what) in zip(overview.COMMANDS, listed.items(), strict=True):
-        assert how.startswith(f"python -m jetbot_mjx.{name}")
-        assert importlib.import_module(f"jetbot_mjx.{name}").__doc__.startswith(what)
+    modules = {
+        command.module for command in overview.COMMANDS.values() if "." not in command.module
+    }
+    assert modules == at_root - {"__init__", "__main__", "cli", *COMMON}
+    for command in overview.COMMANDS.values():
+        assert callable(importlib.import_module(f"jetbot_mjx.{command.module}").main)
 
 
 def test_it_is_printed_at_once():
     command = [sys.executable, "-X", "importtime", "-m", "jetbot_mjx"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     lines = done.stdout.splitlines()
-    assert len(lines) == 1 + len(overview.COMMANDS)
     assert max(map(len, lines)) <= 120
-    assert " trains a policy into a run folder" in done.stdout
+    assert " train a policy into a run folder" in done.stdout
     assert " jetbot_mjx" in done.stderr
     assert " jax" not in done.stderr
 
 
 @pytest.mark.parametrize(
     ("asked", "remedy"),
-    [("evalute", "did you mean evaluate?"), ("dance", "say python -m jetbot_mjx for a list")],
+    [("evalute", ": did you mean evaluate?"), ("dance", "")],
 )
 def test_what_is_no_command_is_one_line(asked, remedy, capsys):
-    assert overview.main([asked, "--config", "x"]) == 2
-    line = f"error: python -m jetbot_mjx {asked}: there is no such command: {remedy}\n"
+    with pytest.raises(SystemExit) as left:
+        overview.main([asked, "--config", "x"])
+    assert left.value.code == 2
+    line = (
+        f"jetbot-mjx: error: there is no command {asked!r}{remedy} (--help lists the arguments)\n"
+    )
     assert capsys.readouterr().err == line
 
 
@@ -50,10 +61,53 @@ def test_a_command_runs_with_a_dot_or_without(words):
 
 
 def test_the_version_is_told(capsys):
-    assert overview.main(["--version"]) == 0
+    with pytest.raises(SystemExit) as left:
+        overview.main(["--version"])
+    assert left.value.code == 0
     assert capsys.readouterr().out == f"jetbot_mjx {jetbot_mjx.__version__}\n"
 
 
 def test_help_is_the_list(capsys):
-    assert overview.main(["--help"]) == 0
-    assert capsys.readouterr().out.startswith("Each tells of its arguments with --help:\n  python")
+    assert overview.main([]) == 0
+    listed = capsys.readouterr().out
+    with pytest.raises(SystemExit) as left:
+        overview.main(["--help"])
+    assert left.value.code == 0
+    assert capsys.readouterr().out == listed
+    assert listed.startswith("usage: jetbot-mjx ")
+
+
+@pytest.mark.parametrize(
+    "words", [["jetbot_mjx.sim2real"], ["jetbot_mjx", "sim2real"]], ids=["dot", "space"]
+)
+def test_the_usage_is_the_same_however_a_command_is_started(words):
+    command = [sys.executable, "-m", *words, "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert done.stdout.startswith("usage: jetbot-mjx sim2real [-h] ")
+
+
+UNTOUCHED = """
+import signal, sys
+before = [*sys.meta_path], signal.getsignal(signal.SIGINT), sys.unraisablehook
+import jetbot_mjx, jetbot_mjx.cli, jetbot_mjx.train, jetbot_mjx.training.session
+added = [type(one).__module__ for one in sys.meta_path if one not in before[0]]
+print(added, (signal.getsignal(signal.SIGINT), sys.unraisablehook) == before[1:])
+
+def command(_):
+    print([type(one).__module__ for one in sys.meta_path if one not in before[0]])
+    return 0
+
+jetbot_mjx.cli.run_command(command)
+"""
+
+
+def test_a_command_changes_imports_and_signals_and_the_package_does_not():
+    done = subprocess.run(
+        [sys.executable, "-W", "ignore", "-c", UNTOUCHED], capture_output=True, text=True
+    )
+    assert done.stderr == ""
+    # MJX prints where its optional Warp is missing.
+    imported, command = done.stdout.splitlines()[-2:]
+    assert "jetbot_mjx" not in imported
+    assert imported.endswith(" True")
+    assert "jetbot_mjx.imports" in command

@@ -7,6 +7,7 @@ import pytest
 
 from jetbot_mjx import check_env, new_task
 from jetbot_mjx.config import load_config
+from jetbot_mjx.envs import write_task_template
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import session
 
@@ -52,7 +53,7 @@ def test_what_is_written_passes_the_checks_and_trains(folder, capsys):
 def test_nothing_is_overwritten(folder, there):
     (folder / there).write_text("mine")
     with pytest.raises(UserError, match=f"{there} exists already"):
-        new_task.run(folder / "mine.py")
+        write_task_template(folder / "mine.py")
     assert [file.name for file in folder.iterdir()] == [there]
     assert (folder / there).read_text() == "mine"
 
@@ -68,5 +69,5 @@ def test_nothing_is_overwritten(folder, there):
 )
 def test_names_that_cannot_be_imported_are_refused(folder, name, told):
     with pytest.raises(UserError, match=told):
-        new_task.run(folder / name)
+        write_task_template(folder / name)
     assert list(folder.iterdir()) == []

@@ -11,7 +11,7 @@ import pytest
 
 from jetbot_mjx import play, viewers
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.viewers import mujoco_window
+from jetbot_mjx.viewers import live, mujoco_window
 
 
 @pytest.fixture
@@ -21,7 +21,7 @@ def nothing_loads(monkeypatch):
     def load(*_, **__):
         raise AssertionError("loaded")
 
-    monkeypatch.setattr(play, "Player", load)
+    monkeypatch.setattr(live, "Player", load)
 
 
 def test_the_page_is_served_until_ctrl_c(smoke_run, capfd, unused_port):
@@ -66,7 +66,7 @@ def test_the_page_is_served_until_ctrl_c(smoke_run, capfd, unused_port):
     ],
 )
 def test_the_address_is_one_to_open_and_a_warning_where_all_may(host, here, lines):
-    told = play.addresses(host, 8080)
+    told = live.addresses(host, 8080)
     assert f"http://{here}:8080 " in told[0]
     assert f"-L 8080:{here}:8080 " in told[1]
     assert len(told) == lines
@@ -77,10 +77,10 @@ def test_a_user_without_a_name_is_left_out(monkeypatch):
     def fail():
         raise KeyError("getpwuid(): uid not found: 1234")
 
-    monkeypatch.setattr(play.getpass, "getuser", fail)
+    monkeypatch.setattr(live.getpass, "getuser", fail)
     assert (
         f"-L 8080:127.0.0.1:8080 {socket.gethostname()}, and open"
-        in (play.addresses("127.0.0.1", 8080)[1])
+        in (live.addresses("127.0.0.1", 8080)[1])
     )
 
 
@@ -114,7 +114,7 @@ def test_the_window_is_driven_until_it_is_closed(smoke_run, monkeypatch, capsys)
     seen = []
     monkeypatch.setattr(mujoco_window, "require_window", lambda: None)
     monkeypatch.setattr(mujoco_window, "run", seen.append)
-    monkeypatch.setattr(play, "Player", FakePlayer)
+    monkeypatch.setattr(live, "Player", FakePlayer)
     assert play.main([str(smoke_run), "--viewer", "native", "--seed", "3"]) == 0
     (player,) = seen
     assert player.given == {"which": "best", "agent": "policy", "seed": 3}

@@ -8,7 +8,9 @@ import pytest
 from jetbot_mjx import PRETRAINED, evaluate, load_policy, play, pretrained, train
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import copy_pretrained
 from jetbot_mjx.runs.checkpoint import load_checkpoint
+from jetbot_mjx.viewers import live
 
 NAMES = ("jetbot_egocentric", "real_jetbot")
 LONGER = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
@@ -18,7 +20,7 @@ LONGER = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
 @pytest.fixture
 def runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    return pretrained.run()
+    return copy_pretrained(pretrained.FOLDER)
 
 
 def test_there_is_a_run_for_each_of_two_configurations(runs):
@@ -76,7 +78,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     with pytest.raises(
         UserError, match=r"file/runs/jetbot_egocentric cannot be written: Not a dir"
     ):
-        pretrained.run(tmp_path / "file" / "runs")
+        copy_pretrained(tmp_path / "file" / "runs")
 
 
 def test_it_tells_where_the_runs_are(tmp_path, capsys):
@@ -90,7 +92,9 @@ def test_it_tells_where_the_runs_are(tmp_path, capsys):
 def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):
     given = []
     monkeypatch.setattr(
-        play, "run", lambda run, **more: given.append((run, more["which"])) or play.Played(0, 0)
+        live,
+        "play_live",
+        lambda run, **more: given.append((run, more["which"])) or live.Played(0, 0),
     )
     assert play.main([]) == 0
     assert given == [(PRETRAINED / "jetbot_egocentric", "best")]

@@ -10,12 +10,13 @@ import jax
 import numpy as np
 import pytest
 
-from jetbot_mjx import evaluate, render
+from jetbot_mjx import render
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
 from jetbot_mjx.runs.checkpoint import load_checkpoint
-from jetbot_mjx.viewers import offscreen
+from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run
 from jetbot_mjx.viewers.video import Studio
 
 
@@ -57,14 +58,14 @@ def evaluator(smoke_run):
     checkpoint = load_checkpoint(smoke_run)
     evaluator = Evaluator(checkpoint.make_env(), checkpoint.networks, ProgramCache({}), record=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(render, "Evaluator", lambda env, networks, programs, record: evaluator)
+        patch.setattr(gallery, "Evaluator", lambda env, networks, programs, record: evaluator)
         yield evaluator
 
 
 @pytest.fixture
 def coarse(monkeypatch):
     """Films in few and small pictures."""
-    monkeypatch.setattr(render, "Studio", functools.partial(Studio, side=80, fps=5))
+    monkeypatch.setattr(gallery, "Studio", functools.partial(Studio, side=80, fps=5))
 
 
 @pytest.fixture
@@ -90,7 +91,7 @@ def filmed(monkeypatch):
             shots.append(shown)
             yield np.zeros((2, 2, 3), np.uint8)
 
-    monkeypatch.setattr(render, "Studio", Listener)
+    monkeypatch.setattr(gallery, "Studio", Listener)
     return shots
 
 
@@ -118,7 +119,7 @@ def test_rendering_writes_a_film_a_gif_and_a_plot(run_copy, needs_opengl, coarse
 
 
 def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
-    pictures = render.run(run_copy, goals=[3, 1])
+    pictures = render_run(run_copy, goals=[3, 1])
     env = load_checkpoint(run_copy).make_env()
     goals_w = {drive.goal_number: drive.goal_w for ((_, drive),) in filmed}
     assert list(goals_w) == [3, 1]
@@ -140,8 +141,8 @@ def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
     ],
 )
 def test_goals_are_written_as_indices_and_ranges(text, goals, name):
-    assert render._goals(text) == goals
-    assert render._spans(goals) == name
+    assert gallery.parse_goals(text) == goals
+    assert gallery._ranges(goals) == name
 
 
 @pytest.mark.parametrize(
@@ -172,11 +173,11 @@ def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, said, capsys):
 @pytest.mark.parametrize("goals", [[], [-1], [1024], [2, 2]])
 def test_goals_that_are_none_are_refused_from_python_too(goals):
     with pytest.raises(UserError, match="goal"):
-        render.run("run", goals=goals)
+        render_run("run", goals=goals)
 
 
 def test_a_report_takes_the_goals_that_can_be_filmed():
-    assert inspect.signature(evaluate.run).parameters["episodes"].default == REPORT_GOALS
+    assert inspect.signature(evaluate_run).parameters["episodes"].default == REPORT_GOALS
 
 
 @pytest.mark.parametrize(
@@ -190,7 +191,7 @@ def test_a_report_takes_the_goals_that_can_be_filmed():
     ],
 )
 def test_a_gallery_shows_the_first_the_middle_and_the_last(steps, chosen):
-    assert render.early_middle_final(steps) == chosen
+    assert gallery.early_middle_final(steps) == chosen
 
 
 def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys):
@@ -212,21 +213,21 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys):
 
 
 def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
-    gallery = render.run_gallery(run_copy, episodes=2)
-    film = iio.imread(gallery.mp4, plugin="pyav")
+    rendered = render_gallery(run_copy, episodes=2)
+    film = iio.imread(rendered.mp4, plugin="pyav")
     assert film.shape[1:] == (80, 240, 3)
     assert names(run_copy / "videos") == ["gallery.gif", "gallery.mp4", "gallery.png"]
-    assert iio.imread(gallery.gif).shape[1:] == (60, 180, 3)
-    height, width, _ = iio.imread(gallery.plans).shape
+    assert iio.imread(rendered.gif).shape[1:] == (60, 180, 3)
+    height, width, _ = iio.imread(rendered.plots).shape
     assert width == 3 * height
-    assert list(gallery.successes) == [0, 32_768, 65_536]
+    assert list(rendered.successes) == [0, 32_768, 65_536]
 
 
 def test_one_checkpoint_makes_no_gallery(run_copy):
     with pytest.raises(UserError, match="is one checkpoint: give the run folder it lies in"):
-        render.run_gallery(run_copy / "checkpoints" / f"{65_536:012}")
+        render_gallery(run_copy / "checkpoints" / f"{65_536:012}")
     with pytest.raises(UserError, match="no such folder"):
-        render.run_gallery(run_copy / "nothing")
+        render_gallery(run_copy / "nothing")
 
 
 def test_without_opengl_one_line_names_the_remedy(monkeypatch, run_copy):
@@ -235,7 +236,7 @@ def test_without_opengl_one_line_names_the_remedy(monkeypatch, run_copy):
     offscreen.find_backend.cache_clear()
     try:
         with pytest.raises(UserError, match="apt-get install") as caught:
-            render.run(run_copy, episodes=2)
+            render_run(run_copy, episodes=2)
     finally:
         offscreen.find_backend.cache_clear()
     assert "\n" not in str(caught.value)
@@ -265,9 +266,10 @@ def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
     monkeypatch.setenv("MUJOCO_GL", wanted)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     program = """
+from jetbot_mjx import errors, imports
+imports.install_lazy_imports()
 import jetbot_mjx.envs.physics
-from jetbot_mjx import errors
-from jetbot_mjx.viewers import offscreen
+from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run
 try:
     offscreen.find_backend()
 except errors.UserError as error:

@@ -10,8 +10,9 @@ import pytest
 from gliding import Gliding
 from test_metrics import read_events
 
-from jetbot_mjx import evaluate, load_config, train, wrap_for_training
+from jetbot_mjx import load_config, train, wrap_for_training
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.sb3_tags import aliases
 from jetbot_mjx.training import brax_trainer, session
@@ -159,4 +160,4 @@ def test_stock_brax_takes_wrap_for_training_as_its_wrap_env_fn(root):
 )
 def test_the_shipped_configurations_reach_their_success(name, least, root, tmp_path):
     session.run(load_config(root / "configs" / name), tmp_path / "run")
-    assert evaluate.run(tmp_path / "run").policy.success_rate >= least
+    assert evaluate_run(tmp_path / "run").policy.success_rate >= least

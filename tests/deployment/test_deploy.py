@@ -19,6 +19,7 @@ from test_export import NUMPY, alone, site_with
 
 from jetbot_mjx import export, sim2real
 from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.deployment import compare_drive, export_policy, policy_export
 from jetbot_mjx.deployment.drive_log import read_log, replay
 from jetbot_mjx.deployment.numpy_policy import record
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, SimulatedJetBot
@@ -46,8 +47,8 @@ def exported(smoke_run, tmp_path_factory):
     """Export a policy with almost no training."""
     folder = tmp_path_factory.mktemp("deploy") / "policy"
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(export, "record", functools.partial(record, count=50))
-        export.run(smoke_run, output=folder)
+        patch.setattr(policy_export, "record", functools.partial(record, count=50))
+        export_policy(smoke_run, output=folder)
     return folder
 
 
@@ -859,7 +860,7 @@ def test_a_bad_log_is_told(change, message, driven, tmp_path):
     path = tmp_path / "bad.jsonl"
     path.write_text("\n".join(change(driven.read_text().splitlines())))
     with pytest.raises(UserError, match=message):
-        sim2real.run(path)
+        compare_drive(path)
     assert os.listdir(tmp_path) == ["bad.jsonl"]
 
 

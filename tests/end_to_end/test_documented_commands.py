@@ -19,14 +19,14 @@ import pytest
 from ruamel.yaml import YAML
 from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, own_files
 
-from jetbot_mjx import plan, render
+from jetbot_mjx import plan
 from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import load_config
 from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs.nan_dump import save_nan_dump
-from jetbot_mjx.viewers import mujoco_window
+from jetbot_mjx.viewers import gallery, mujoco_window
 from jetbot_mjx.viewers.video import Studio
 
 TEXTS = {**PAGES, "README.md": (ROOT / "README.md").read_text("utf-8")}
@@ -111,7 +111,7 @@ def reader(checkout, monkeypatch):
     def sit(page):
         monkeypatch.chdir(checkout)
         # Pictures are looked at elsewhere.
-        monkeypatch.setattr(render, "Studio", functools.partial(Studio, side=64, fps=2))
+        monkeypatch.setattr(gallery, "Studio", functools.partial(Studio, side=64, fps=2))
         for name, text in own_files(page).items() if page in PAGES else ():
             if name.endswith(".yaml"):
                 with Path(name).open("w") as file:

@@ -5,7 +5,8 @@ import sys
 
 MESH = """
 import sys
-import jetbot_mjx
+from jetbot_mjx.imports import install_lazy_imports
+install_lazy_imports()
 assert not [name for name in sys.modules if name.startswith("trimesh")]
 import mujoco
 from jetbot_mjx.envs import mjx

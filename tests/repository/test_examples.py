@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 
 import jetbot_mjx
-from jetbot_mjx import evaluate
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.task import layout_size
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.training import session
 
@@ -196,7 +196,7 @@ def test_wrong_settings_are_refused(load, override, message):
 def test_training_and_evaluation_run_end_to_end(load, env, tmp_path):
     with gliding.everywhere():
         result = session.run(load(*TINY), tmp_path / "run")
-        report = evaluate.run(result.run_dir, episodes=4)
+        report = evaluate_run(result.run_dir, episodes=4)
     lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(line)["env_steps"] for line in lines] == [0, 1024, 2048]
     policy = jetbot_mjx.load_policy(result.run_dir, "last")
@@ -215,4 +215,4 @@ def test_training_and_evaluation_run_end_to_end(load, env, tmp_path):
 def test_the_larger_examples_reach_nine_tenths(name, root, tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "examples"))
     session.run(load_config(root / "examples" / f"{name}.yaml"), tmp_path / "run")
-    assert evaluate.run(tmp_path / "run").policy.success_rate >= 0.9
+    assert evaluate_run(tmp_path / "run").policy.success_rate >= 0.9

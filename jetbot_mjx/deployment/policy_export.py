@@ -1,0 +1,138 @@
+"""Export one policy: write its files, and check each of them against JAX."""
+
+import contextlib
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jetbot_mjx.deployment.exporters import FORMATS, Source, require
+from jetbot_mjx.deployment.numpy_policy import (
+    TOLERANCE,
+    Recording,
+    as_jax,
+    difference,
+    portable_policy,
+    record,
+)
+from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
+from jetbot_mjx.runs.run_dir import write_json, writing_to
+
+FOLDER = "policy"
+"""Name of the folder of an export in the run folder."""
+
+RECORDING = "recording.npz"
+
+
+class ExportedPolicy(NamedTuple):
+    """An `ExportedPolicy` holds the result of exporting one policy."""
+
+    folder: Path
+    env_steps: int
+    differences: Mapping[str, float]
+    """The largest difference to JAX, by format."""
+    observations: int
+    """Number of observations on which the formats were compared."""
+
+
+def export_policy(
+    run_or_checkpoint: str | Path,
+    *,
+    formats: Sequence[str] = ("numpy",),
+    which: Which = "best",
+    output: str | Path | None = None,
+) -> ExportedPolicy:
+    """Export one policy.
+
+    Args:
+      run_or_checkpoint: A run folder, or one of its checkpoint folders.
+      formats: Names of formats from `FORMATS`.
+      which: The checkpoint of a run folder.
+      output: The folder to write, which replaces an earlier export there, or None for `policy/` in
+        the run folder.
+
+    Returns:
+      The result. The files are complete, or absent if an error is raised.
+
+    Raises:
+      UserError: there is no usable checkpoint, a package is missing, the folder holds something
+        else or cannot be written, or the output of a file differs from JAX by too much.
+    """
+    for name in formats:
+        require(name)
+    # Load the policy.
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
+    env = checkpoint.make_env()
+    policy = portable_policy(checkpoint)
+    source = Source(policy, as_jax(checkpoint, env))
+    with _atomic_folder(folder) as unfinished:
+        recording = record(checkpoint, env)
+        # Write each format and check its output against JAX.
+        differences = {}
+        for name in formats:
+            path = unfinished / FORMATS[name].file
+            FORMATS[name].write(source, path)
+            found = difference(
+                recording, FORMATS[name].read(path)(recording.obs), policy.controller
+            )
+            if not found < TOLERANCE:
+                raise UserError(
+                    f"nothing was written to {folder}: {path.name} differs from JAX by {found:.1e}"
+                    f" on {len(recording.obs):,} observations, and {TOLERANCE:.0e} is allowed"
+                )
+            differences[name] = found
+        # Write the observations and the description of all files.
+        _write_spec(unfinished, policy_spec(checkpoint, env, policy), differences, recording)
+    return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.obs))
+
+
+def _write_spec(
+    folder: Path, spec: dict[str, Any], differences: Mapping[str, float], recording: Recording
+) -> None:
+    np.savez_compressed(folder / RECORDING, **recording._asdict())
+    spec["files"] = {
+        name: {"file": FORMATS[name].file, "largest_difference": found}
+        for name, found in differences.items()
+    }
+    spec["recording"] = {"file": RECORDING, "observations": len(recording.obs)}
+    write_json(folder / FILE, spec)
+
+
+@contextlib.contextmanager
+def _atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder, and rename it to `folder` when it is complete."""
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    earlier = folder.with_name(f".{folder.name}.earlier")
+    with writing_to(folder):
+        if folder.exists() and not (folder / FILE).is_file():
+            raise UserError(f"{folder} is there and no export: give --out a folder that is not")
+        for leftover in (unfinished, earlier):
+            shutil.rmtree(leftover, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        try:
+            yield unfinished
+            if folder.exists():
+                folder.rename(earlier)
+            unfinished.rename(folder)
+        finally:
+            for leftover in (unfinished, earlier):
+                shutil.rmtree(leftover, ignore_errors=True)
+
+
+def summarize_export(exported: ExportedPolicy) -> str:
+    """Return the result of an export as lines for the terminal."""
+    lines = [
+        f"policy after {exported.env_steps:,} steps, the largest difference to JAX on"
+        f" {exported.observations:,} observations:"
+    ]
+    lines += [
+        f"  {exported.folder / FORMATS[name].file}  {found:.1e}"
+        for name, found in exported.differences.items()
+    ]
+    lines.append(f"description of inputs and outputs: {exported.folder / FILE}")
+    return "\n".join(lines)

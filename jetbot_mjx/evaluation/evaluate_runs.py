@@ -1,0 +1,364 @@
+"""Evaluate the policies of runs on fixed goals, write their reports, and compare the runs."""
+
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, get_args
+
+import jax
+
+from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
+from jetbot_mjx.config import Config, RandomizationConfig, load_config
+from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
+from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, Summary, report_keys, summarize
+from jetbot_mjx.evaluation.html_report import write_comparison, write_report
+from jetbot_mjx.evaluation.report import (
+    CurvePoint,
+    Report,
+    by_goal,
+    compare_with_best_known,
+    find_failures,
+    learning_curve,
+)
+from jetbot_mjx.evaluation.robustness import (
+    SWEEP_GOALS,
+    MujocoEvaluator,
+    MujocoResult,
+    sweep,
+)
+from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
+from jetbot_mjx.runs.metrics import read_history
+from jetbot_mjx.runs.run_dir import seed_folders, versions
+
+Simulator = Literal["mujoco"]
+"""A simulator other than the one that policies are trained in."""
+
+SIMULATORS: tuple[Simulator, ...] = get_args(Simulator)
+
+
+def evaluate_run(
+    run_or_checkpoint: str | Path,
+    *,
+    episodes: int = REPORT_GOALS,
+    which: Which = "best",
+    output: str | Path | None = None,
+    robustness: bool = False,
+    ranges: str | Path | None = None,
+    simulator: Simulator | None = None,
+) -> Report:
+    """Evaluate one policy and write its report.
+
+    Args:
+      run_or_checkpoint: A run folder, or one of its checkpoint folders.
+      episodes: The number of fixed goals, from the first on.
+      which: The checkpoint of a run folder.
+      output: The folder to write, or None for `evaluations/<env_steps>/` of the run folder.
+      robustness: Whether to evaluate the policy also on robots that differ from the preset, and in
+        C MuJoCo.
+      ranges: A configuration file with ranges below `randomization`. The policy is evaluated also
+        on one robot sampled from them for each goal. None means the ranges of the run, if any.
+      simulator: A second simulator in which the policy is evaluated too, or None.
+
+    Returns:
+      The report, which names its folder.
+
+    Raises:
+      UserError: there is no usable checkpoint, or the folder cannot be written.
+    """
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    folder = _report_folder(checkpoint) if output is None else Path(output)
+    reports = _write_reports(
+        [(checkpoint, folder)],
+        episodes,
+        robustness=robustness,
+        in_mujoco=robustness or simulator is not None,
+        ranges_file=_RangesFile.read(ranges),
+    )
+    return next(reports)
+
+
+def evaluate_in_mujoco(
+    run_or_checkpoint: str | Path,
+    *,
+    episodes: int = REPORT_GOALS,
+    which: Which = "best",
+    ranges: str | Path | None = None,
+    numerics: Numerics = OTHER_NUMERICS,
+) -> MujocoResult:
+    """Evaluate one policy in C MuJoCo, without writing anything.
+
+    Args:
+      run_or_checkpoint: A run folder, or one of its checkpoint folders.
+      episodes: The number of fixed goals, from the first on.
+      which: The checkpoint of a run folder.
+      ranges: As for `evaluate_run`.
+      numerics: The numerical settings of C MuJoCo.
+
+    Returns:
+      The metrics.
+
+    Raises:
+      UserError: there is no usable checkpoint, or JAX was told to do without a CPU.
+    """
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    ranges_file = _RangesFile.read(ranges)
+    evaluator = MujocoEvaluator(
+        checkpoint.make_env(),
+        checkpoint.networks,
+        ranges_file.ranges if ranges_file else checkpoint.config.randomization,
+        numerics,
+    )
+    return evaluator.run(checkpoint.params, report_keys(episodes))
+
+
+def compare_runs(
+    runs: Sequence[str | Path],
+    *,
+    episodes: int = REPORT_GOALS,
+    which: Which = "best",
+    output: str | Path | None = None,
+    robustness: bool = False,
+    ranges: str | Path | None = None,
+    simulator: Simulator | None = None,
+) -> Comparison:
+    """Evaluate the policies of several runs or seeds, write a report on each, and compare them.
+
+    Args:
+      runs: Run folders, of one seed or several, or checkpoint folders.
+      episodes: The number of fixed goals, from the first on.
+      which: The checkpoint of a run folder, of each seed.
+      output: The folder for the comparison, or None for `evaluations/comparison/` of the first run.
+      robustness: Whether each policy is also evaluated on other robots and in C MuJoCo.
+      ranges: As for `evaluate_run`.
+      simulator: As for `evaluate_run`.
+
+    Returns:
+      The comparison, which names its folder. Each of its reports names its own.
+
+    Raises:
+      UserError: a checkpoint cannot be used or is named twice, the runs have different tasks, or a
+        folder cannot be written.
+    """
+    # Load all policies and check that they can be compared.
+    entries = _load_runs([Path(path) for path in runs], which)
+    check_comparable({name: entry.config for name, entry in entries.items()})
+    # Evaluate each policy and write its report.
+    checkpoints = [one for entry in entries.values() for one in entry.seeds.values()]
+    reports = _write_reports(
+        [(one, _report_folder(one)) for one in checkpoints],
+        episodes,
+        robustness=robustness,
+        in_mujoco=robustness or simulator is not None,
+        ranges_file=_RangesFile.read(ranges),
+    )
+    by_run = {
+        name: {seed: _without_trajectories(next(reports)) for seed in entry.seeds}
+        for name, entry in entries.items()
+    }
+    # Compare the reports and write the comparison.
+    first = next(iter(entries.values())).folder
+    folder = first / "evaluations" / "comparison" if output is None else Path(output)
+    comparison = compare(folder.absolute(), by_run)
+    write_comparison(comparison)
+    return comparison
+
+
+class _RangesFile(NamedTuple):
+    """A `_RangesFile` holds the ranges of `--ranges`, which replace those of every run."""
+
+    path: Path
+    ranges: RandomizationConfig
+
+    @classmethod
+    def read(cls, path: str | Path | None) -> "_RangesFile | None":
+        if path is None:
+            return None
+        ranges = load_config(path).randomization
+        if not ranges.drawn:
+            raise UserError(
+                f"--ranges {path}: it randomizes nothing; give a configuration with ranges below"
+                " `randomization`, such as configs/real_jetbot.yaml"
+            )
+        return cls(Path(path), ranges)
+
+
+class RunEntry(NamedTuple):
+    """A `RunEntry` is a run that takes part in a comparison."""
+
+    folder: Path
+    seeds: Mapping[str, Checkpoint]
+
+    @property
+    def config(self) -> Config:
+        """Return the configuration of the first seed."""
+        return next(iter(self.seeds.values())).config
+
+
+def _load_runs(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
+    """Load the runs and return them by a unique name."""
+    entries: list[RunEntry] = []
+    owners: dict[Path, Path] = {}
+    for path in paths:
+        folders = seed_folders(path)
+        seeds = {one.name: load_checkpoint(one, which) for one in folders or [path]}
+        for checkpoint in seeds.values():
+            place = checkpoint.path.resolve()
+            if place in owners:
+                raise UserError(
+                    f"{path} and {owners[place]} are the same policy, {_relative(checkpoint.path)}:"
+                    " name each once"
+                )
+            owners[place] = path
+        first = next(iter(seeds.values()))
+        entries.append(RunEntry(first.run_dir.parent if folders else first.run_dir, seeds))
+    return dict(zip(_names(entries), entries, strict=True))
+
+
+def _names(entries: Sequence[RunEntry]) -> list[str]:
+    """Return the shortest unique end of each folder's path, with the steps if needed."""
+    folders = [entry.folder for entry in entries]
+    different = set(folders)
+    length = 1
+    while len({folder.parts[-length:] for folder in different}) < len(different):
+        length += 1
+    names = []
+    for entry in entries:
+        name = "/".join(entry.folder.parts[-length:])
+        if folders.count(entry.folder) > 1:
+            name += f" @ {next(iter(entry.seeds.values())).env_steps:,}"
+        names.append(name)
+    return names
+
+
+class _Evaluators(NamedTuple):
+    """An `_Evaluators` tuple holds compiled evaluators, and the baselines of their task."""
+
+    key: tuple[Any, ...]
+    """The parts of configuration and ranges that the compiled programs depend on."""
+    nominal: Evaluator
+    randomized: Evaluator | None
+    """For robots sampled from the ranges; None if there are no ranges."""
+    mujoco: MujocoEvaluator | None
+    baselines: Mapping[str, Summary]
+
+    @classmethod
+    def build(
+        cls,
+        checkpoint: Checkpoint,
+        env: JetBotEnv,
+        keys: Any,
+        ranges: RandomizationConfig,
+        *,
+        in_mujoco: bool,
+    ) -> "_Evaluators":
+        networks = checkpoint.networks
+        programs = ProgramCache(compiler_options(checkpoint.config))
+        nominal = Evaluator(env, networks, programs, baselines=True, record=True)
+        baselines = nominal.run_baselines(checkpoint.params, keys)
+        randomized = None
+        if ranges.drawn:
+            varied = DomainRandomizationWrapper(env, ranges=ranges)
+            randomized = Evaluator(varied, networks, programs)
+        return cls(
+            key=_program_key(checkpoint.config, ranges),
+            nominal=nominal,
+            randomized=randomized,
+            mujoco=MujocoEvaluator(env, networks, ranges) if in_mujoco else None,
+            baselines={name: summarize(each, env.dt) for name, each in baselines.items()},
+        )
+
+
+def _program_key(config: Config, ranges: RandomizationConfig) -> tuple[Any, ...]:
+    """Return the parts of a configuration that the compiled episodes depend on."""
+    return (
+        config.task,
+        config.robot,
+        config.physics,
+        config.deterministic,
+        config.ppo.network,
+        config.ppo.normalize_observations,
+        ranges,
+    )
+
+
+def _write_reports(
+    checkpoints: Sequence[tuple[Checkpoint, Path]],
+    episodes: int,
+    *,
+    robustness: bool,
+    in_mujoco: bool,
+    ranges_file: _RangesFile | None,
+) -> Iterator[Report]:
+    """Evaluate policies and write their reports, reusing compiled programs where they fit."""
+    keys, used_versions = report_keys(episodes), versions()
+    # Build all environments first, so that an unsuitable policy is rejected before any writing.
+    envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
+    evaluators = None
+    for (checkpoint, folder), env in zip(checkpoints, envs, strict=True):
+        config, params = checkpoint.config, checkpoint.params
+        ranges = ranges_file.ranges if ranges_file else config.randomization
+        if evaluators is None or evaluators.key != _program_key(config, ranges):
+            evaluators = _Evaluators.build(checkpoint, env, keys, ranges, in_mujoco=in_mujoco)
+        # Run the fixed goals, which most parts of the report are computed from.
+        finished = jax.device_get(evaluators.nominal.run(params, keys))
+        best_known, missing = compare_with_best_known(config, finished)
+        run_dir = _relative(checkpoint.run_dir)
+        report = Report(
+            folder=folder,
+            run=run_dir,
+            checkpoint=checkpoint.path,
+            env_steps=checkpoint.env_steps,
+            config=config,
+            policy=summarize(finished, env.dt),
+            baselines=evaluators.baselines,
+            cells=by_goal(finished, env.dt),
+            failures=find_failures(finished, run_dir, checkpoint.env_steps),
+            learning_curve=_learning_curve(checkpoint.run_dir),
+            episodes=finished,
+            versions=used_versions,
+            ranges=ranges if ranges.drawn else None,
+            ranges_file=ranges_file.path if ranges_file else None,
+            best_known=best_known,
+            best_known_missing=missing,
+        )
+        # Add the optional evaluations on other robots and in the other simulator.
+        if robustness:
+            sweep_keys = report_keys(min(episodes, SWEEP_GOALS))
+            swept = sweep(env, checkpoint.networks, params, sweep_keys)
+            report = report._replace(robustness=swept)
+        if evaluators.randomized:
+            on_others = summarize(evaluators.randomized.run(params, keys), env.dt)
+            report = report._replace(randomized=on_others)
+        if evaluators.mujoco:
+            report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
+        write_report(report)
+        yield report
+
+
+def _report_folder(checkpoint: Checkpoint) -> Path:
+    return checkpoint.run_dir / "evaluations" / checkpoint.path.name
+
+
+def _without_trajectories(report: Report) -> Report:
+    """Return a report without trajectories, which are large and already plotted."""
+    return report._replace(episodes=report.episodes._replace(qpos=None))
+
+
+def _relative(path: Path) -> Path:
+    """Return the path relative to the current folder if it is inside of it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
+def _learning_curve(run_dir: Path) -> tuple[CurvePoint, ...]:
+    path = run_dir / "metrics.jsonl"
+    try:
+        history = read_history(path, sys.maxsize)
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+    return learning_curve((line.env_steps, line.metrics) for line in history)

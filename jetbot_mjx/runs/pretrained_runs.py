@@ -1,0 +1,36 @@
+"""Copy the trained runs that come with the package."""
+
+import shutil
+from pathlib import Path
+
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.checkpoint import PRETRAINED
+from jetbot_mjx.runs.run_dir import writing_to
+
+
+def copy_pretrained(folder: Path) -> tuple[Path, ...]:
+    """Copy the runs that come with the package, without overwriting anything.
+
+    Args:
+      folder: The folder in which each run gets a folder of its own.
+
+    Returns:
+      The run folders, named after their configurations. Each is complete or absent.
+
+    Raises:
+      UserError: one of them exists already, or cannot be written.
+    """
+    runs = {path: folder / path.name for path in sorted(PRETRAINED.iterdir())}
+    for target in runs.values():
+        if target.exists():
+            raise UserError(f"{target} is there already: give --out another folder")
+    for source, target in runs.items():
+        unfinished = target.with_name(f".{target.name}.unfinished")
+        with writing_to(target):
+            shutil.rmtree(unfinished, ignore_errors=True)
+            try:
+                shutil.copytree(source, unfinished)
+                unfinished.rename(target)
+            finally:
+                shutil.rmtree(unfinished, ignore_errors=True)
+    return tuple(runs.values())

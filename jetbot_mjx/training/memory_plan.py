@@ -1,0 +1,82 @@
+"""Predict the memory of a training, for the configuration and for other numbers of environments."""
+
+from typing import NamedTuple
+
+import jax
+
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.training.memory import GIB, Footprint, device_memory, ladder, sizes
+from jetbot_mjx.training.ppo_trainer import build_ppo
+
+
+class MemoryPlan(NamedTuple):
+    """A `MemoryPlan` holds the memory that a training needs and the memory of each device."""
+
+    config: Config
+    device_count: int
+    limit: int
+    """Memory of each device [bytes]."""
+    footprints: list[Footprint]
+    """Memory footprints in ascending order of the number of environments."""
+
+    @property
+    def largest(self) -> Footprint | None:
+        """Return the largest footprint that fits, or None."""
+        return max((one for one in self.footprints if one.total <= self.limit), default=None)
+
+    @property
+    def fits(self) -> bool:
+        """Return whether the configuration fits as it is."""
+        asked = self.config.ppo.num_envs
+        return next(one for one in self.footprints if one.num_envs == asked).total <= self.limit
+
+
+def plan_memory(config: Config, memory: float | None = None) -> MemoryPlan:
+    """Predict the memory of a training from shapes alone, without compiling anything.
+
+    Args:
+      config: The configuration of the run.
+      memory: The memory of each device [GiB], or None for what the first device reports.
+
+    Returns:
+      The needed memory by the number of environments.
+
+    Raises:
+      UserError: the devices cannot share the environments, or do not report their memory.
+    """
+    device_count = jax.device_count()
+    config.check_devices(device_count)
+    limit = device_memory() if memory is None else int(memory * GIB)
+    if limit is None:
+        raise UserError("this device does not report its memory: give --memory GIB")
+    env = make_env(config)
+    each = sizes(build_ppo(config, env), env)
+    return MemoryPlan(config, device_count, limit, ladder(config, each, device_count, limit))
+
+
+def memory_table(plan: MemoryPlan) -> str:
+    """Return a plan as a table for the terminal."""
+    parts = ("parameters", "environments", "collecting", "learning", "evaluation")
+    lines = [
+        f"GiB on each of {plan.device_count} x {jax.devices()[0].device_kind},"
+        f" which has {plan.limit / GIB:.1f}; > marks the configuration",
+        f"  {'num_envs':>10}  {'batch_size':>10}  "
+        + "  ".join(f"{one:>12}" for one in parts)
+        + f"  {'needed':>8}",
+    ]
+    for one in plan.footprints:
+        mark = ">" if one.num_envs == plan.config.ppo.num_envs else " "
+        values = "  ".join(f"{getattr(one, part) / GIB:12.3f}" for part in parts)
+        fits = "" if one.total <= plan.limit else "  does not fit"
+        lines.append(
+            f"{mark} {one.num_envs:10,}  {one.batch_size:10,}  {values}"
+            f"  {one.total / GIB:8.3f}{fits}"
+        )
+    if (best := plan.largest) is None:
+        return "\n".join(
+            [*lines, "none of them fits: try a smaller network or evaluation.episodes"]
+        )
+    settings = f"--set ppo.num_envs={best.num_envs} --set ppo.batch_size={best.batch_size}"
+    return "\n".join([*lines, f"the largest of these that fits: {settings}"])

@@ -1,0 +1,265 @@
+"""Render a policy that drives to the report's fixed goals: videos, and trajectories from above."""
+
+import io
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from itertools import groupby
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from PIL import Image
+
+from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.xla_options import compiler_options
+from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
+from jetbot_mjx.evaluation.plots import plot_trajectories
+from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
+from jetbot_mjx.runs.run_dir import make_folder, writing_to
+from jetbot_mjx.viewers.video import GIF_STRIDE, Frame, Studio, drives, shrunk, write_gif, write_mp4
+
+_GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
+_GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # relative to the video
+
+
+class RenderedRun(NamedTuple):
+    """A `RenderedRun` holds the files rendered for one policy."""
+
+    mp4: Path
+    gif: Path
+    trajectories: Path
+    successes: int
+    episodes: int
+
+
+class Gallery(NamedTuple):
+    """A `Gallery` holds the files rendered for several policies of one run."""
+
+    mp4: Path
+    gif: Path
+    plots: Path
+    """Trajectories of the policies from above, side by side."""
+    successes: dict[int, int]
+    """Number of goals reached, by the checkpoint's environment steps."""
+    episodes: int
+    """Number of goals that each policy drove to."""
+
+
+def render_run(
+    run_or_checkpoint: str | Path,
+    *,
+    episodes: int = 20,
+    goals: Sequence[int] | None = None,
+    which: Which = "best",
+) -> RenderedRun:
+    """Render deterministic episodes of one policy on some of the report's fixed goals.
+
+    Args:
+      run_or_checkpoint: A run folder, or one of its checkpoint folders.
+      episodes: The number of goals, from the first on.
+      goals: Indices of the goals in the order of the video, which replace `episodes`, or None.
+      which: The checkpoint of a run folder.
+
+    Returns:
+      The files, in `videos/<env_steps>/` of the run folder. With `goals`, their names contain the
+      indices.
+
+    Raises:
+      UserError: there is no usable checkpoint, no such goal, no OpenGL, or no space on the disk.
+    """
+    # Choose the goals and the names of the files.
+    names = ("episodes", "trajectories")
+    if goals is None:
+        goals = range(episodes)
+    else:
+        check_goals(goals)
+        names = (f"goals-{_ranges(goals)}",) * 2
+    # Run the episodes.
+    checkpoint = load_checkpoint(run_or_checkpoint, which)
+    env = checkpoint.make_env()
+    rolled_out = _run_episodes([checkpoint], env, goals)[0]
+    folder = checkpoint.run_dir / "videos" / checkpoint.path.name
+    make_folder(folder)
+    rendered = RenderedRun(
+        mp4=folder / f"{names[0]}.mp4",
+        gif=folder / f"{names[0]}.gif",
+        trajectories=folder / f"{names[1]}.png",
+        successes=int(rolled_out.success.sum()),
+        episodes=len(goals),
+    )
+    # Plot the trajectories and render the videos.
+    with writing_to(rendered.trajectories):
+        _trajectory_plot(checkpoint, env, rolled_out, goals).save(rendered.trajectories)
+    with Studio(env) as studio:
+        videos = [studio.film_episode(drive) for drive in drives(env, rolled_out, goals)]
+        _write_videos(rendered.mp4, rendered.gif, videos, _GIF_SIZE)
+    return rendered
+
+
+def render_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
+    """Render the first, the middle and the last checkpoint of a run driving to the same goals.
+
+    The goals are the report's, from the first on, so that none is chosen by its outcome.
+
+    Args:
+      run_dir: A run folder.
+      episodes: The number of goals.
+
+    Returns:
+      The files, in `videos/` of the run folder.
+
+    Raises:
+      UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
+    """
+    path = Path(run_dir).absolute()
+    if find_checkpoint(path, "last") == path:
+        raise UserError(f"--gallery {run_dir} is one checkpoint: give the run folder it lies in")
+    # Run all chosen checkpoints on the same goals.
+    chosen = early_middle_final(checkpoint_steps(path))
+    checkpoints = [load_checkpoint(path, one) for one in chosen]
+    env = checkpoints[0].make_env()
+    goals = range(episodes)
+    rolled_out = _run_episodes(checkpoints, env, goals)
+    folder = path / "videos"
+    make_folder(folder)
+    successes = [int(each.success.sum()) for each in rolled_out]
+    gallery = Gallery(
+        mp4=folder / "gallery.mp4",
+        gif=folder / "gallery.gif",
+        plots=folder / "gallery.png",
+        successes=dict(zip(chosen, successes, strict=True)),
+        episodes=episodes,
+    )
+    # Plot the trajectories side by side.
+    plots = [
+        np.asarray(_trajectory_plot(checkpoint, env, each, goals))
+        for checkpoint, each in zip(checkpoints, rolled_out, strict=True)
+    ]
+    with writing_to(gallery.plots):
+        Image.fromarray(np.hstack(plots)).save(gallery.plots)
+    # Render the videos side by side, one goal after the other.
+    headings = [f"{step:,} steps" for step in chosen]
+    by_goal = zip(*(drives(env, each, goals) for each in rolled_out), strict=True)
+    with Studio(env) as studio:
+        videos = [
+            studio.film_together(list(zip(headings, same_goal, strict=True)))
+            for same_goal in by_goal
+        ]
+        _write_videos(gallery.mp4, gallery.gif, videos, _GALLERY_GIF_SIZE)
+    return gallery
+
+
+def early_middle_final(steps: Sequence[int]) -> list[int]:
+    """Return the first, the middle and the last step, or all of them if there are at most two.
+
+    Of two middle steps, the earlier one is returned.
+
+    Args:
+      steps: Environment steps of the checkpoints, in ascending order, at least one.
+    """
+    return sorted({steps[0], steps[(len(steps) - 1) // 2], steps[-1]})
+
+
+def _run_episodes(
+    checkpoints: Sequence[Checkpoint], env: JetBotEnv, goals: Sequence[int]
+) -> list[Episodes]:
+    """Run recorded episodes of several policies of one run with one compiled program."""
+    programs = ProgramCache(compiler_options(env.config))
+    evaluator = Evaluator(env, checkpoints[0].networks, programs, record=True)
+    keys = report_keys(max(goals) + 1)[np.asarray(goals)]
+    return [jax.device_get(evaluator.run(each.params, keys)) for each in checkpoints]
+
+
+def _trajectory_plot(
+    checkpoint: Checkpoint, env: JetBotEnv, episodes: Episodes, goals: Sequence[int]
+) -> Image.Image:
+    """Plot the trajectories from above, with the index of each goal."""
+    markers = jax.vmap(env.task.markers)(episodes.goal)
+    others = [np.asarray(place) for name, place in markers.items() if name != "goal"]
+    title = (
+        f"{int(episodes.success.sum())} of {len(goals)} goals reached,"
+        f" policy after {checkpoint.env_steps:,} steps"
+    )
+    figure = plot_trajectories(episodes, title, others)
+    for number, goal_w in zip(goals, episodes.goal_w, strict=True):
+        figure.axes[0].annotate(str(number), goal_w[:2], ha="center", va="center", fontsize="small")
+    file = io.BytesIO()
+    figure.savefig(file, dpi=120)
+    return Image.open(file).convert("RGB")
+
+
+def _write_videos(mp4: Path, gif: Path, videos: Sequence[Iterable[Frame]], size: float) -> None:
+    """Write all videos to one mp4 file, and the first ones to a gif of relative size `size`."""
+    gif_frames: list[Frame] = []
+
+    def frames() -> Iterator[Frame]:
+        for place, video in enumerate(videos):
+            for index, frame in enumerate(video):
+                if place < _GIF_EPISODES and index % GIF_STRIDE == 0:
+                    gif_frames.append(shrunk(frame, size))
+                yield frame
+
+    with writing_to(mp4):
+        write_mp4(mp4, frames())
+    with writing_to(gif):
+        write_gif(gif, gif_frames)
+
+
+def check_goals(goals: Sequence[int]) -> None:
+    """Raise an error if an index is outside of the fixed goal set or occurs twice.
+
+    Args:
+      goals: The indices.
+
+    Raises:
+      UserError: an index is invalid or occurs twice, or there is none.
+    """
+    if not goals:
+        raise UserError("goals = [] names none: give at least one index")
+    for place, goal in enumerate(goals):
+        if not 0 <= goal < REPORT_GOALS:
+            raise UserError(
+                f"goal {goal} is none of the {REPORT_GOALS:,} fixed goals: they are 0 to"
+                f" {REPORT_GOALS - 1}"
+            )
+        if goal in goals[:place]:
+            raise UserError(f"goal {goal} is named twice: once will do")
+
+
+def _ranges(goals: Sequence[int]) -> str:
+    """Format indices as `3,17`, or `0-7` for consecutive ones."""
+    runs = [
+        [goal for _, goal in run] for _, run in groupby(enumerate(goals), lambda p: p[1] - p[0])
+    ]
+    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
+
+
+def parse_goals(text: str) -> list[int]:
+    """Return the goals that a text lists as indices and ranges, such as `3,17` or `0-7`.
+
+    Args:
+      text: Indices and ranges, separated by commas.
+
+    Returns:
+      The indices, in the order of the text.
+
+    Raises:
+      UserError: the text is no such list, or `check_goals` rejects an index.
+    """
+    goals: list[int] = []
+    for part in text.split(","):
+        found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", part.strip(), re.ASCII)
+        if found is None:
+            raise UserError(f"{part!r} is no goal: write indices and ranges, as in 3,17 or 0-7")
+        first, last = int(found[1]), int(found[2] or found[1])
+        if last < first:
+            raise UserError(f"{part} runs backwards: write {last}-{first}")
+        # Limit the length: an index beyond the last goal is rejected below anyway.
+        goals += range(first, min(last, first + REPORT_GOALS) + 1)
+    check_goals(goals)
+    return goals
