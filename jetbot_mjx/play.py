@@ -73,7 +73,7 @@ def run(
     player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed)
     try:
         if viewer == "browser":
-            with server.Browser(player, host=host, port=free, allow=allow, tell=tell) as page:
+            with server.ViserViewer(player, host=host, port=free, allow=allow, tell=tell) as page:
                 for line in addresses(host, free):
                     tell(line)
                 page.run()

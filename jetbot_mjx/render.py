@@ -27,7 +27,15 @@ from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
-from jetbot_mjx.viewers.video import GIF_STRIDE, Frame, Studio, drives, shrunk, write_gif, write_mp4
+from jetbot_mjx.viewers.video import (
+    GIF_STRIDE,
+    Frame,
+    VideoRenderer,
+    resize_frame,
+    split_trajectories,
+    write_gif,
+    write_mp4,
+)
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # of the film's
@@ -100,8 +108,8 @@ def run(
     # Plot the trajectories and render the videos.
     with writing_to(pictures.trajectories):
         _plan(checkpoint, env, driven, goals).save(pictures.trajectories)
-    with Studio(env) as studio:
-        films = [studio.film_episode(drive) for drive in drives(env, driven, goals)]
+    with VideoRenderer(env) as renderer:
+        films = [renderer.render_episode(drive) for drive in split_trajectories(env, driven, goals)]
         _write(pictures.mp4, pictures.gif, films, _GIF_SIZE)
     return pictures
 
@@ -150,10 +158,10 @@ def run_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
         Image.fromarray(np.hstack(plans)).save(gallery.plans)
     # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
-    by_goal = zip(*(drives(env, each, goals) for each in driven), strict=True)
-    with Studio(env) as studio:
+    by_goal = zip(*(split_trajectories(env, each, goals) for each in driven), strict=True)
+    with VideoRenderer(env) as renderer:
         films = [
-            studio.film_together(list(zip(headings, same_goal, strict=True)))
+            renderer.render_side_by_side(list(zip(headings, same_goal, strict=True)))
             for same_goal in by_goal
         ]
         _write(gallery.mp4, gallery.gif, films, _GALLERY_GIF_SIZE)
@@ -206,7 +214,7 @@ def _write(mp4: Path, gif: Path, films: Sequence[Iterable[Frame]], size: float) 
         for place, film in enumerate(films):
             for index, frame in enumerate(film):
                 if place < _GIF_EPISODES and index % GIF_STRIDE == 0:
-                    kept.append(shrunk(frame, size))
+                    kept.append(resize_frame(frame, size))
                 yield frame
 
     with writing_to(mp4):
