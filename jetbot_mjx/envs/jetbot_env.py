@@ -105,7 +105,7 @@ class JetBotEnv(brax.envs.Env):
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """The MJX model that is stepped."""
+        """Return the MJX model that is stepped."""
         return self.physics.model
 
     def with_model(self, mjx_model: mjx.Model) -> "JetBotEnv":

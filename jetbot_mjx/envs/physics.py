@@ -62,7 +62,7 @@ class Physics:
 
     @functools.cached_property
     def model(self) -> mjx.Model:
-        """The MJX model that is stepped."""
+        """Return the MJX model that is stepped."""
         return mjx.put_model(self._mj_model)
 
     @functools.cached_property
@@ -95,7 +95,7 @@ class Physics:
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
-        """Names of the solid mocap bodies, which a task places, in MuJoCo's order."""
+        """Return the names of the solid mocap bodies, which a task places, in MuJoCo's order."""
         model = self._mj_model
         bodies = [model.body(i) for i in range(model.nbody)]
         mocap = sorted((body for body in bodies if body.mocapid[0] >= 0), key=lambda b: b.mocapid)

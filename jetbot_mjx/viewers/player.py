@@ -174,7 +174,7 @@ class Player:
 
     @property
     def agent(self) -> str:
-        """The agent that drives, one of `AGENTS`."""
+        """Return the agent that drives, one of `AGENTS`."""
         return AGENTS[self._agent]
 
     @agent.setter
@@ -221,7 +221,7 @@ class Player:
 
     @property
     def frames_per_second(self) -> float:
-        """Frames that the viewer showed within the last second [1/s]."""
+        """Return how many frames the viewer showed within the last second [1/s]."""
         return self.frames.per_second(time.monotonic())
 
     def _use(self, checkpoint: Checkpoint) -> None:

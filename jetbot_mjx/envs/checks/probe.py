@@ -119,19 +119,19 @@ class TaskProbe:
 
     @functools.cached_property
     def goals(self) -> Any:
-        """Goals of `DRAWS` episodes, as a batch."""
+        """Return the goals of `DRAWS` episodes, as a batch."""
         return jax.jit(jax.vmap(self.task.sample))(jax.random.split(first_key(), DRAWS))
 
     @functools.cached_property
     def example(self) -> Transition:
-        """One transition in which the robot stands still."""
+        """Return one transition in which the robot stands still."""
         quat = jnp.array([1.0, 0.0, 0.0, 0.0])
         robot = RobotState(jnp.array([0.1, 0.2, _AXLE_HEIGHT]), quat, *jnp.zeros((2, 3)))
         return Transition(robot, robot, self.task.sample(first_key()), jnp.zeros(2))
 
     @functools.cached_property
     def transitions(self) -> dict[str, Transition]:
-        """Batches of `DRAWS` transitions, by a description of the robot."""
+        """Return batches of `DRAWS` transitions, by a description of the robot."""
         random = np.random.default_rng(0)
 
         def normal(scale: float, size: int = 3) -> jax.Array:
@@ -169,7 +169,7 @@ class TaskProbe:
 
     @functools.cached_property
     def results(self) -> dict[str, dict[str, Any]]:
-        """Results of all methods on the host, by description of the robot and by method."""
+        """Return the results of all methods, on the host, by kind of robot and by method."""
         call = jax.jit(jax.vmap(call_methods(self.task)))
         return {where: jax.device_get(call(batch)) for where, batch in self.transitions.items()}
 
