@@ -1,6 +1,7 @@
-"""An actuator model: delay, voltage, dead-band, lag, unequal motors and wheels.
+"""Model the actuators: delay, supply voltage, dead-band, motor lag, unequal motors and wheels.
 
-A pure pipeline of one robot, outside physics, on wheel speeds (left, right) [rad/s].
+The model is a pure function of one robot. It runs before physics, on wheel speeds (left, right)
+[rad/s]; its result is the control of MuJoCo's velocity actuators.
 """
 
 from typing import NamedTuple
@@ -12,23 +13,20 @@ from jetbot_mjx.envs.robot_params import RobotParams
 
 
 class ActuatorState(NamedTuple):
-    """The memory of the actuator model."""
+    """An `ActuatorState` holds what the actuator model carries from step to step."""
 
     commands: Float[Array, "delay 2"] | None
-    """The last commands, the newest first; None: there is no delay."""
+    """The last commands [rad/s], the newest first; None: the model has no delay."""
     targets: Float[Array, "2"] | None
-    """What the motors were asked for in the last step; None: there is no lag."""
+    """Output of the motor lag in the last step [rad/s]; None: the model has no lag."""
 
 
-def motors_at_rest(robot_params: RobotParams, longest_delay: int) -> ActuatorState:
-    """Return the state of actuators that no command has reached yet.
+def initial_actuator_state(robot_params: RobotParams, longest_delay: int) -> ActuatorState:
+    """Return the actuator state before the first command: the motors stand still.
 
     Args:
-      robot_params: the robot's.
-      longest_delay: of any robot that the program serves [control steps].
-
-    Returns:
-      What they remember.
+      robot_params: the parameters of the robot.
+      longest_delay: the longest `action_delay` that the compiled program supports [control steps].
     """
     return ActuatorState(
         jnp.zeros((longest_delay, 2)) if longest_delay else None,
@@ -36,60 +34,63 @@ def motors_at_rest(robot_params: RobotParams, longest_delay: int) -> ActuatorSta
     )
 
 
-def drive_motors(
-    motors: ActuatorState,
+def step_actuators(
+    actuators: ActuatorState,
     command: Float[Array, "2"],
     robot_params: RobotParams,
     *,
     full_speed: float,
     ctrl_dt: float,
 ) -> tuple[ActuatorState, Float[Array, "2"]]:
-    """Pass one command on to the wheels.
+    """Return the wheel speed targets of this step for one command.
 
         u = voltage · command of `action_delay` steps ago
         w = sign(u) max(|u| - band · full, 0) / (1 - band)
         target' = d target + (1 - d) w          d = exp(-ctrl_dt / motor_lag)
         wheel speed = gain · radius · target'
 
-    A motor turns at what its voltage exceeds the share that friction takes, and at full voltage
-    at full speed. No-load speeds of a TT motor, 90 rpm at 3 V and 200 rpm at 6 V, lie on such a
-    line; it meets zero at 0.55 V.
+    Dead-band: the speed of a motor is linear in the voltage above the share that friction takes,
+    and reaches full speed at full voltage. The no-load speeds of a TT motor, 90 rpm at 3 V and
+    200 rpm at 6 V, lie on such a line, which meets zero at 0.55 V.
 
-    Wheels of another radius or separation are entered as wheel speeds: as long as they roll, a
-    wheel of radius f r at ω moves as one of radius r at f ω, and wheels f b apart turn the robot as
-    wheels b apart whose difference of speeds is divided by f, the mean being the same.
+    Wheel radius and separation enter as wheel speeds, which is exact while the wheels roll: a wheel
+    of radius f r at speed ω moves like one of radius r at f ω. Wheels that are f b apart turn the
+    robot like wheels that are b apart with the same mean speed and a difference of speeds divided
+    by f.
 
     Args:
-      motors: before.
-      command: within the motors' limits.
-      robot_params: the robot's.
-      full_speed: what a motor makes of full voltage [rad/s].
-      ctrl_dt: duration of one control step [s].
+      actuators: the state before the step.
+      command: wheel speeds (left, right) [rad/s], within the limits of the motors.
+      robot_params: the parameters of the robot.
+      full_speed: the speed of a motor at full voltage [rad/s].
+      ctrl_dt: the duration of a control step [s].
 
     Returns:
-      The motors after it, and the wheel speeds to aim at during this step.
+      The state after the step, and the wheel speed targets (left, right) of this step [rad/s].
     """
-    commands, targets = motors
+    commands, targets = actuators
+    # Delay: read the command of `action_delay` steps ago.
     if commands is not None:
-        line = jnp.concatenate([command[None], commands])
-        command = line[jnp.round(robot_params.action_delay).astype(jnp.int32)]
-        commands = line[:-1]
+        history = jnp.concatenate([command[None], commands])
+        command = history[jnp.round(robot_params.action_delay).astype(jnp.int32)]
+        commands = history[:-1]
+    # Voltage and dead-band.
     if robot_params.differs("supply_voltage"):
         command = command * robot_params.supply_voltage
     if robot_params.differs("dead_band"):
         band = jnp.asarray(robot_params.dead_band)
         excess = jnp.maximum(jnp.abs(command) - band * full_speed, 0.0)
         command = jnp.sign(command) * excess / (1.0 - band)
+    # Motor lag: with a time constant of 0, exp(-∞) is exactly 0, and the command stays as it is.
     if targets is not None:
-        # Without a lag exp(-∞) is exactly zero, and the command passes bit for bit.
         decay = jnp.exp(-ctrl_dt / jnp.asarray(robot_params.motor_lag))
         targets = decay * targets + (1.0 - decay) * command
         command = targets
-    return ActuatorState(commands, targets), _at_the_wheels(command, robot_params)
+    return ActuatorState(commands, targets), _at_preset_wheels(command, robot_params)
 
 
-def _at_the_wheels(target: Float[Array, "2"], robot_params: RobotParams) -> Float[Array, "2"]:
-    """Return the speeds at which the preset's wheels do what these wheels do at `target`."""
+def _at_preset_wheels(target: Float[Array, "2"], robot_params: RobotParams) -> Float[Array, "2"]:
+    """Return the speeds at which the preset's wheels move like this robot's wheels at `target`."""
     sides = jnp.array([0.5, -0.5])
     if robot_params.differs("motor_gain", "wheel_radius"):
         target = target * (robot_params.motor_gain * robot_params.wheel_radius)
@@ -97,7 +98,7 @@ def _at_the_wheels(target: Float[Array, "2"], robot_params: RobotParams) -> Floa
         if robot_params.differs(name):
             target = target * (1.0 + sides * getattr(robot_params, name))
     if robot_params.differs("wheel_separation"):
-        # As a difference, so that no rounding is left where there is none.
+        # Written as a difference, so that a factor of 1 leaves the speeds bit-identical.
         change = 0.5 * (1.0 / jnp.asarray(robot_params.wheel_separation) - 1.0)
         target = target + change * (target - target[::-1])
     return target

@@ -1,7 +1,8 @@
-"""The environment: one model and one task, wired into a `brax.envs.Env`.
+"""Combine a robot model and a task into a `brax.envs.Env`.
 
-Pure, unbatched and stateless: batch with `jax.vmap`, compile with `jax.jit`. The state holds
-only what physics integrates and what the task drew; `mjx.Data` is rebuilt inside `step`.
+The environment is pure, unbatched and stateless: batch it with `jax.vmap`, compile it with
+`jax.jit`. The state holds only what physics integrates and what the task drew; `mjx.Data` is
+rebuilt inside `step`.
 """
 
 import copy
@@ -39,7 +40,10 @@ from jetbot_mjx.errors import UserError
 
 
 class TaskStep(NamedTuple):
-    """A `TaskStep` holds the task's answer to one step of the robot, whoever moved it."""
+    """A `TaskStep` holds the task's results for one step of the robot.
+
+    It does not depend on which simulator moved the robot.
+    """
 
     obs: Float[Array, " obs"]
     """Observation after the step."""
@@ -50,29 +54,30 @@ class TaskStep(NamedTuple):
     terminated: Float[Array, ""]
     """1 where the step ended the episode."""
     success: Float[Array, ""]
-    """1 where the task is done."""
+    """1 where the robot has solved the task."""
     goal: Goal
     """Goal after the step."""
 
 
 class JetBotEnv(brax.envs.Env):
-    """A JetBot and its task.
+    """An environment of one JetBot and its task.
 
-    Action: two numbers in [-1, 1], clipped; v = (a₀ + 1)/2 · `max_speed` [m/s] and
-    ω = a₁ · `max_yaw_rate` [rad/s], turned into wheel speeds by the tutorial's differential
-    controller and held for one environment step. Observation: as the task's `layout` says.
-    `metrics` holds `reward/<term>` of every step and `success`; `info` holds `terminated`.
-    `done` is termination; the time limit belongs to the wrappers.
+    Action: two numbers, clipped to [-1, 1]. They command the speed v = (a₀ + 1)/2 · `max_speed`
+    [m/s] and the yaw rate ω = a₁ · `max_yaw_rate` [rad/s]. The tutorial's differential controller
+    turns both into wheel speed targets, which are held for one environment step.
+    Observation: described by the task's `layout`.
+    State: `metrics` holds `success` and `reward/<term>` of the step; `info` holds `terminated`.
+    `done` means termination only; `EpisodeWrapper` adds the time limit.
     """
 
     def __init__(self, config: Config) -> None:
-        """Build the models.
+        """Build the task and its models.
 
         Args:
-          config: robot, task and physics.
+          config: the configuration; the sections robot, task and physics are used.
 
         Raises:
-          UserError: the task cannot be built.
+          UserError: the task or its scene cannot be built.
         """
         self.config = config
         self.task: Task = make_task(config.task)
@@ -85,8 +90,8 @@ class JetBotEnv(brax.envs.Env):
                 self.robot, config.physics, build_scene=self.task.build_scene, visual=False
             )
             self.physics = Physics(physics_model, config.physics)
-            # A scene of its own may be more than MJX can simulate: better said before a run begins.
-            # The model of a task that comes with the package is built when something is compiled.
+            # MJX may not support a custom scene: build its model now, to fail before a run begins.
+            # The model of a built-in task is built later, when a program is compiled.
             if type(self.task).build_scene is not GoalTask.build_scene:
                 _ = self.physics.model
         except (RuntimeError, ValueError) as error:
@@ -100,38 +105,32 @@ class JetBotEnv(brax.envs.Env):
 
     @property
     def mjx_model(self) -> mjx.Model:
-        """Return the model that is stepped."""
+        """Return the MJX model that is stepped."""
         return self.physics.model
 
     def with_model(self, mjx_model: mjx.Model) -> "JetBotEnv":
-        """Return this environment on another physics model, as a new object.
+        """Return a copy of this environment with another physics model.
 
         Args:
-          mjx_model: a model of the same structure, such as one with other friction.
-
-        Returns:
-          A copy; `self` stays as it is.
+          mjx_model: a model of the same structure, for example with another friction.
         """
         return self.with_physics(self.physics.with_model(mjx_model))
 
     def with_physics(self, physics: Physics) -> "JetBotEnv":
-        """Return this environment with something else to step its physics, as a new object.
+        """Return a copy of this environment that steps its physics in another way.
 
         Args:
-          physics: of the same robot and scene.
-
-        Returns:
-          A copy; `self` stays as it is.
+          physics: the physics of the same robot and scene.
         """
         env = copy.copy(self)
         env.physics = physics
         return env
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begin an episode: the robot at rest at the origin, a new goal.
+        """Begin an episode: the robot is at rest at the origin, and the task draws a goal.
 
         Args:
-          rng: a legacy key, `jax.random.PRNGKey`; Brax's wrappers rely on its shape.
+          rng: a legacy random key of shape (2,), `jax.random.PRNGKey`, as Brax's wrappers need it.
 
         Returns:
           The first state.
@@ -145,7 +144,7 @@ class JetBotEnv(brax.envs.Env):
             time=jnp.zeros(()),
         )
         robot = robot_state(physics)
-        # The names of the terms, without computing them: a first state has none.
+        # Only the names of the reward terms are needed here: a first state has no reward.
         _, terms = jax.eval_shape(self.task.reward, robot, robot, goal, jnp.zeros(self.action_size))
         zero = jnp.zeros(())
         return State(
@@ -160,29 +159,29 @@ class JetBotEnv(brax.envs.Env):
         )
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Hold an action for one environment step.
+        """Make one environment step.
 
         Args:
-          state: of the same environment.
-          action: in [-1, 1]².
+          state: a state of this environment.
+          action: the action, in [-1, 1]².
 
         Returns:
-          The next state, with the same tree, shapes and dtypes.
+          The next state, with the same tree structure, shapes and dtypes.
         """
         return self.step_with_ctrl(state, action, self.wheel_targets(action))
 
     def step_with_ctrl(
         self, state: State, action: Float[Array, "2"], ctrl: Float[Array, "2"]
     ) -> State:
-        """Step the environment with wheel speeds other than those that the action commands.
+        """Make one environment step with given wheel speed targets.
 
         Args:
-          state: of the same environment.
-          action: in [-1, 1]², for the task's reward alone.
-          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
+          state: a state of this environment.
+          action: the action, in [-1, 1]²; only the task's reward uses it.
+          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
 
         Returns:
-          The next state.
+          The next state, with the same tree structure, shapes and dtypes.
         """
         mocap_pos = self.mocap_positions(state.goal)
         physics = self.step_physics(state.pipeline_state, ctrl, mocap_pos)
@@ -202,18 +201,15 @@ class JetBotEnv(brax.envs.Env):
     def task_step(
         self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, "2"]
     ) -> TaskStep:
-        """Apply the task to one step of the robot.
+        """Compute the task's results for one step of the robot.
 
-        `reward` is given the goal before the step, all else the goal after it.
+        `reward` gets the goal before the step; all other methods get the goal after the step.
 
         Args:
           before: the robot before the step.
-          after: the robot after it.
+          after: the robot after the step.
           goal: the goal before the step.
-          action: the action of the step, as it was given.
-
-        Returns:
-          Observation, reward, end and the next goal.
+          action: the action of the step, as the caller gave it.
         """
         reward, terms = self.task.reward(before, after, goal, action)
         if isinstance(self.task, AdvancesGoal):
@@ -224,16 +220,17 @@ class JetBotEnv(brax.envs.Env):
         return TaskStep(obs, reward, terms, terminated, success, goal)
 
     def mocap_positions(self, goal: Goal) -> Float[Array, "nmocap 3"] | None:
-        """Return where the task's solid mocap bodies stand.
+        """Return the positions of the task's solid mocap bodies during a step.
 
         Args:
-          goal: the goal of the episode, before the step in which they stand there.
+          goal: the goal before the step.
 
         Returns:
-          Positions [m], world frame, in the order of `physics.mocap_names`; None: there are none.
+          Positions [m], world frame, in the order of `physics.mocap_names`; None if the scene has
+          no such bodies.
 
         Raises:
-          UserError: `markers` leaves one out.
+          UserError: the task's `markers` lacks one of the bodies.
         """
         names = self.physics.mocap_names
         if not names:
@@ -247,7 +244,14 @@ class JetBotEnv(brax.envs.Env):
         return jnp.stack([markers[name] for name in names])
 
     def wheel_targets(self, action: Float[Array, "2"]) -> Float[Array, "2"]:
-        """Wheel speeds (left, right) [rad/s] that an action commands, before motor limits."""
+        """Return the wheel speeds that an action commands, before motor limits.
+
+        Args:
+          action: the action; values outside [-1, 1] are clipped.
+
+        Returns:
+          Wheel speed targets (left, right) [rad/s].
+        """
         twist_b = kinematics.twist_from_action(
             action,
             max_speed=self.config.task.max_speed,
@@ -265,13 +269,13 @@ class JetBotEnv(brax.envs.Env):
         ctrl: Float[Array, "2"],
         mocap_pos: Float[Array, "nmocap 3"] | None = None,
     ) -> PhysicsState:
-        """Integrate one environment step.
+        """Integrate the physics of one environment step.
 
         Args:
-          physics: where to start.
-          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
-          mocap_pos: where the task's solid bodies stand [m], world frame; None: where they were
-            built.
+          physics: the physics state before the step.
+          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
+          mocap_pos: positions of the task's solid mocap bodies [m], world frame; None: their
+            positions in the model.
 
         Returns:
           The physics state one `ctrl_dt` later.
@@ -280,28 +284,28 @@ class JetBotEnv(brax.envs.Env):
 
     @property
     def observation_size(self) -> int:
-        """Length of the observation, from the task's layout."""
+        """Length of the observation vector."""
         return layout_size(self.task.layout)
 
     @property
     def observation_min_std(self) -> Float[np.ndarray, " obs"]:
-        """Smallest deviation by which training normalises each number of the observation.
+        """Smallest standard deviation by which training normalises each entry of the observation.
 
         Raises:
-          UserError: the task's layout does not tell it.
+          UserError: the task's layout does not define it.
         """
         layout = self.task.layout
-        scales = [min_std(field) for field in layout]
-        return np.repeat(np.array(scales, np.float32), [field.size for field in layout])
+        by_field = [min_std(field) for field in layout]
+        return np.repeat(np.array(by_field, np.float32), [field.size for field in layout])
 
     @property
     def action_size(self) -> int:
-        """Two: drive and turn."""
+        """Length of the action: drive and turn."""
         return 2
 
     @property
     def backend(self) -> str:
-        """Return the physics back end, in Brax's terms."""
+        """Name of the physics back end, for Brax."""
         return "mjx"
 
     @property
@@ -314,12 +318,12 @@ def make_env(config: Config) -> JetBotEnv:
     """Build the environment that a configuration describes.
 
     Args:
-      config: robot, task and physics.
+      config: the configuration; the sections robot, task and physics are used.
 
     Returns:
       The environment, unbatched and unwrapped.
 
     Raises:
-      UserError: the task cannot be built.
+      UserError: the task or its scene cannot be built.
     """
     return JetBotEnv(config)

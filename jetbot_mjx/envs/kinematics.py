@@ -1,4 +1,4 @@
-"""Planar differential-drive kinematics and frames: pure functions of one robot.
+"""Compute planar differential-drive kinematics and frame changes, as pure functions of one robot.
 
 No batch axis: batch with `jax.vmap`. SI units. Frames: `_w` world, `_b` body
 (x forward, y left, z up). Angles are counter-clockwise positive. Quaternions are
@@ -12,11 +12,11 @@ from jaxtyping import Array, Float
 def twist_from_action(
     action: Float[Array, "2"], *, max_speed: float, max_yaw_rate: float
 ) -> Float[Array, "2"]:
-    """Body twist that the tutorial's action asks for.
+    """Return the body twist that the tutorial's action commands.
 
         v = (a₀ + 1)/2 · v_max        ω = a₁ · ω_max
 
-    The map has no reverse gear: a₀ = -1 stands still, a₀ = 0 is already half speed.
+    The robot cannot reverse: a₀ = -1 means standstill, and a₀ = 0 is half speed.
 
     Args:
       action: (a₀, a₁), each in [-1, 1]; values outside are clipped.
@@ -35,7 +35,7 @@ def twist_from_action(
 def action_from_twist(
     twist_b: Float[Array, "2"], *, max_speed: float, max_yaw_rate: float
 ) -> Float[Array, "2"]:
-    """Action that asks for a body twist; the inverse of `twist_from_action`, clipped.
+    """Return the action that commands a body twist: the inverse of `twist_from_action`, clipped.
 
     Args:
       twist_b: (v, ω), forward speed [m/s] and yaw rate [rad/s].
@@ -53,11 +53,11 @@ def action_from_twist(
 def wheel_speeds(
     twist_b: Float[Array, "2"], *, wheel_radius: float, wheel_separation: float
 ) -> Float[Array, "2"]:
-    """Wheel speeds that make a differential drive follow a body twist.
+    """Return the wheel speeds with which a differential drive follows a body twist.
 
         ω_L = (v - ω b/2) / r        ω_R = (v + ω b/2) / r
 
-    Assumes rolling without slip; no actuator limits are applied here.
+    The wheels roll without slip; actuator limits are not applied.
 
     Args:
       twist_b: (v, ω), forward speed [m/s] and yaw rate [rad/s].
@@ -77,7 +77,7 @@ def wheel_speeds(
 def body_twist(
     wheel_speeds: Float[Array, "2"], *, wheel_radius: float, wheel_separation: float
 ) -> Float[Array, "2"]:
-    """Body twist of a differential drive that rolls without slip.
+    """Return the body twist of a differential drive that rolls without slip.
 
         v = r (ω_L + ω_R) / 2        ω = r (ω_R - ω_L) / b
 
@@ -97,23 +97,23 @@ def rotate(quat: Float[Array, "4"], vector: Float[Array, "3"]) -> Float[Array, "
     """Rotate a vector by a unit quaternion: body frame to world frame.
 
     Args:
-      quat: (w, x, y, z) of the body in the world.
-      vector: in the body frame.
+      quat: the attitude (w, x, y, z) of the body in the world frame.
+      vector: the vector in the body frame.
 
     Returns:
       The same vector in the world frame.
     """
     w, axis = quat[0], quat[1:]
-    # Two cross products in place of a matrix: element-wise, hence never in TF32.
+    # Two cross products instead of a matrix: element-wise operations never use TF32.
     t = 2.0 * jnp.cross(axis, vector)
     return vector + w * t + jnp.cross(axis, t)
 
 
 def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
-    """Heading of a body, the angle of its x axis about the world's z axis.
+    """Return the heading of a body: the angle of its x axis about the world's z axis.
 
     Args:
-      quat: (w, x, y, z) of the body in the world.
+      quat: the attitude (w, x, y, z) of the body in the world frame.
 
     Returns:
       Yaw in (-π, π] [rad].
@@ -123,16 +123,16 @@ def yaw(quat: Float[Array, "4"]) -> Float[Array, ""]:
 
 
 def turned(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"]:
-    """Return a body turned about the world's z axis.
+    """Return the attitude of a body rotated about the world's z axis.
 
         q' = (cos α/2, 0, 0, sin α/2) ⊗ q
 
     Args:
-      quat: (w, x, y, z) of the body in the world.
+      quat: the attitude (w, x, y, z) of the body in the world frame.
       angle: α, counter-clockwise [rad].
 
     Returns:
-      Its attitude afterwards, (w, x, y, z).
+      The attitude after the rotation, (w, x, y, z).
     """
     c, s = jnp.cos(0.5 * angle), jnp.sin(0.5 * angle)
     w, x, y, z = quat
@@ -140,16 +140,16 @@ def turned(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"
 
 
 def pitched(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4"]:
-    """Return the attitude of a body turned about its own y axis.
+    """Return the attitude of a body rotated about its own y axis.
 
         q' = q ⊗ (cos α/2, 0, sin α/2, 0)
 
     Args:
-      quat: (w, x, y, z) of the body in the world.
+      quat: the attitude (w, x, y, z) of the body in the world frame.
       angle: α [rad]; positive lowers the nose.
 
     Returns:
-      Its attitude afterwards, (w, x, y, z).
+      The attitude after the rotation, (w, x, y, z).
     """
     c, s = jnp.cos(0.5 * angle), jnp.sin(0.5 * angle)
     w, x, y, z = quat
@@ -157,10 +157,10 @@ def pitched(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4
 
 
 def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
-    """Angle between a body's z axis and the world's.
+    """Return the angle between the z axes of a body and of the world.
 
     Args:
-      quat: (w, x, y, z) of the body in the world.
+      quat: the attitude (w, x, y, z) of the body in the world frame.
 
     Returns:
       Tilt in [0, π] [rad]; π is upside down.
@@ -170,11 +170,11 @@ def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
 
 
 def to_body(heading: Float[Array, ""], vector_w: Float[Array, "2"]) -> Float[Array, "2"]:
-    """Turn a horizontal world vector into the frame of a body that heads `heading`.
+    """Rotate a horizontal vector from the world frame into the body frame.
 
     Args:
-      heading: yaw of the body [rad].
-      vector_w: (x, y) in the world frame.
+      heading: the yaw of the body [rad].
+      vector_w: the vector (x, y) in the world frame.
 
     Returns:
       (forward, left) in the body frame.

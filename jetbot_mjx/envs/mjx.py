@@ -1,7 +1,7 @@
-"""MJX, with models that stay on the host until they are needed.
+"""Wrap MJX so that models stay on the host until a program needs them.
 
-MJX would put them on the first device of all, which of several processes only one has, and compile
-a small program there for many an array; a model's numbers are constants of programs.
+MJX puts models on the first of all devices, which only one of several processes has, and compiles
+small programs there for many arrays. Here a model's arrays are constants of programs instead.
 """
 
 from typing import Any
@@ -18,19 +18,19 @@ __all__ = ["Data", "Model", "make_data", "put_model", "step"]
 
 
 def put_model(model: mujoco.MjModel) -> Model:
-    """Return MuJoCo's model as arrays."""
-    # Whoever asks may be in the middle of tracing something.
+    """Return the MJX model of a C model, as uncommitted arrays."""
+    # The caller may be tracing a program.
     with jax.ensure_compile_time_eval(), default_device_cpu() as device:
-        return _anywhere(mjx.put_model(model, device=device))
+        return _uncommitted(mjx.put_model(model, device=device))
 
 
 def make_data(model: mujoco.MjModel) -> Data:
-    """Return the model's state before the first step, as arrays."""
+    """Return MJX's simulation data before the first step, as uncommitted arrays."""
     with jax.ensure_compile_time_eval(), default_device_cpu() as device:
-        return _anywhere(mjx.make_data(model, device=device))
+        return _uncommitted(mjx.make_data(model, device=device))
 
 
-def _anywhere(tree: Any) -> Any:
-    """Return the same arrays, free to go wherever they are needed."""
-    # `jnp.asarray` would compile a program for every shape among them.
+def _uncommitted(tree: Any) -> Any:
+    """Return arrays that JAX may move to any device."""
+    # `jnp.asarray` would compile a program for every shape.
     return jax.device_put(jax.tree.map(np.asarray, tree))

@@ -1,8 +1,7 @@
-"""One robot in C MuJoCo and its task, one step at a time: MJX takes several times as long for one.
+"""Simulate a single robot and its task with C MuJoCo, which for one robot is faster than MJX.
 
-The model is the one that MJX is given. All that is not physics, the draw of the goal, where solid
-bodies stand, observation, reward, the end and the next goal, is the environment's own code,
-compiled by JAX for the CPU.
+The model is the one that MJX gets. Everything but physics (goals, positions of solid bodies,
+observation, reward, termination) is the code of `JetBotEnv`, compiled by JAX for the CPU.
 """
 
 import functools
@@ -27,56 +26,61 @@ from jetbot_mjx.envs.robot_model import (
 from jetbot_mjx.envs.state import PhysicsState, robot_state
 from jetbot_mjx.envs.task import AdvancesGoal, Goal, RobotState
 
-# MuJoCo prints the first of each of these in an episode, and appends it to a file in the folder
-# that the program runs in. `Step.finite` tells them instead.
-_NONFINITE = [
+# MuJoCo prints each of these warnings once per episode and appends it to a file in the working
+# directory. They are suppressed, since `Step.finite` reports the same.
+_NONFINITE_WARNINGS = [
     int(getattr(mujoco.mjtWarning, f"mjWARN_BAD{name}"))
     for name in ("QPOS", "QVEL", "QACC", "CTRL")
 ]
 
 
 class Step(NamedTuple):
-    """The result of one step."""
+    """A `Step` holds the result of one step."""
 
     obs: Float[np.ndarray, " obs"]
+    """Observation after the step."""
     reward: float
+    """Reward of the step."""
     terminated: bool
+    """Whether the task ended the episode."""
     success: bool
+    """Whether the robot has solved the task."""
     finite: bool
-    """Whether state, observation and reward are finite; where not, no step was taken."""
+    """Whether state, observation and reward are finite; if not, the step was discarded."""
 
 
 class _Programs(NamedTuple):
-    """The programs and models that robots of one configuration share."""
+    """A `_Programs` holds the model and programs that robots of one configuration share."""
 
     env: JetBotEnv
     model: mujoco.MjModel
-    begin: Any
-    """From a key to the first pose, goal, solid bodies' places and observation, and a key."""
-    judge: Any
-    """From poses, action and goal to the step's numbers; goal and places, if they can change."""
+    reset: Any
+    """From a key to (first pose, goal, positions of solid bodies, observation, next key)."""
+    task_step: Any
+    """From (poses and action, goal) to (observation and scalars of the step, goal, positions of
+    solid bodies); the last two are None if goals cannot change."""
 
 
 class MujocoJetBot:
-    """A robot and its goal."""
+    """A `MujocoJetBot` simulates one robot and its goal."""
 
     def __init__(self, config: Config) -> None:
-        """Build the model, and compiles what is not physics.
+        """Build the model, and compile the programs of the task.
 
         Args:
-          config: robot, task and physics; of `randomization` nothing is drawn.
+          config: the configuration; `randomization` is ignored.
 
         Raises:
-          UserError: the task cannot be built.
+          UserError: the task or its scene cannot be built.
         """
-        self.env, self.model, self._begin, self._judge = _programs(config.model_dump_json())
+        self.env, self.model, self._reset, self._task_step = _programs(config.model_dump_json())
         self.data = mujoco.MjData(self.model)
         self.goal: Goal = None
-        """Goal of this episode, as it stands."""
+        """Goal of this episode, as it stands now."""
         self._task = config.task
         self._n_substeps = config.physics.n_substeps
         self._goal_advances = isinstance(self.env.task, AdvancesGoal)
-        # Views, which stay true while MuJoCo steps.
+        # Views of MuJoCo's arrays.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._mocap_pos: Float[np.ndarray, "nmocap 3"] = self.data.mocap_pos.copy()
         self._before = self._pose()
@@ -88,42 +92,42 @@ class MujocoJetBot:
         """Begin the episode that `JetBotEnv.reset` draws from a key.
 
         Args:
-          key: of this episode.
+          key: the random key of this episode.
 
         Returns:
           The first observation, and the key of the next episode.
         """
-        pose, self.goal, mocap_pos, obs, next_key = self._begin(key)
+        pose, self.goal, mocap_pos, obs, next_key = self._reset(key)
         self._before, self._obs = np.array(pose), np.array(obs)
         if mocap_pos is not None:
             self._mocap_pos = np.asarray(mocap_pos)
-        self._place(time=0.0)
+        self._restore(time=0.0)
         return self._obs.copy(), np.asarray(next_key)
 
     def step(self, action: Float[np.ndarray, "2"]) -> Step:
-        """Hold an action for one environment step.
+        """Make one environment step.
 
         Args:
-          action: in [-1, 1]²; values outside are clipped.
-
-        Returns:
-          What came of it.
+          action: the action; values outside [-1, 1] are clipped.
         """
+        # Step the physics.
         time = self.data.time
         ctrl = self.wheel_targets(action)
         if not all(map(math.isfinite, ctrl)):
-            # MuJoCo would stop the motors instead.
+            # MuJoCo would replace these controls by zeros.
             return self._discarded(time)
         self._ctrl[:] = ctrl
         mujoco.mj_step(self.model, self.data, self._n_substeps)
-        # One array in and one out: every array more costs a third as much as physics.
+        # Apply the task. Each array passed to or from JAX costs a third of the time of physics,
+        # so that all numbers are concatenated.
         given = np.concatenate((self._before, self._qpos, self._qvel, action), dtype=np.float32)
-        judged, goal, mocap_pos = self._judge(given, self.goal)
-        judged = np.array(judged)
-        reward, terminated, success, finite = judged[-4:].tolist()
+        result, goal, mocap_pos = self._task_step(given, self.goal)
+        result = np.array(result)
+        reward, terminated, success, finite = result[-4:].tolist()
         if not finite:
             return self._discarded(time)
-        self._before, self._obs = given[len(self._before) : -len(action)], judged[:-4]
+        self._before, self._obs = given[len(self._before) : -len(action)], result[:-4]
+        # Update the goal.
         if self._goal_advances:
             self.goal = goal
             if mocap_pos is not None:
@@ -132,28 +136,31 @@ class MujocoJetBot:
         return Step(self._obs.copy(), reward, terminated > 0, success > 0, True)
 
     def wheel_targets(self, action: Float[np.ndarray, "2"]) -> tuple[float, float]:
-        """Wheel speeds (left, right) [rad/s] that an action commands, before motor limits.
+        """Return the wheel speeds (left, right) [rad/s] of an action, before motor limits.
 
-        `JetBotEnv.wheel_targets` in plain numbers, for a call of JAX would take as long as physics.
+        This is `JetBotEnv.wheel_targets` in Python, since a call of JAX takes as long as physics.
+
+        Args:
+          action: the action; values outside [-1, 1] are clipped.
         """
-        # Comparisons let through what is not a number, as `jnp.clip` does.
+        # These comparisons keep NaN, as `jnp.clip` does.
         drive, turn = (-1.0 if x < -1.0 else 1.0 if x > 1.0 else x for x in action.tolist())
         speed = 0.5 * (drive + 1.0) * self._task.max_speed
         half = 0.5 * turn * self._task.max_yaw_rate * CONTROLLER_WHEEL_SEPARATION
         return (speed - half) / CONTROLLER_WHEEL_RADIUS, (speed + half) / CONTROLLER_WHEEL_RADIUS
 
     def _discarded(self, time: float) -> Step:
-        """Return the step that is not taken, because it would not be finite."""
-        self._place(time)
+        """Restore the state before a non-finite step, and return its result."""
+        self._restore(time)
         return Step(self._obs.copy(), 0.0, False, False, False)
 
-    def _place(self, time: float) -> None:
-        """Put robot and solid bodies where they were last known to be."""
+    def _restore(self, time: float) -> None:
+        """Set robot and solid bodies to their last finite state."""
         mujoco.mj_resetData(self.model, self.data)
         self._qpos[:], self._qvel[:] = np.split(self._before, [self.model.nq])
         self.data.mocap_pos[:] = self._mocap_pos
         self.data.time = time
-        self.data.warning.number[_NONFINITE] = 1
+        self.data.warning.number[_NONFINITE_WARNINGS] = 1
 
     def _pose(self) -> Float[np.ndarray, " nq+nv"]:
         return np.concatenate((self._qpos, self._qvel), dtype=np.float32)
@@ -161,7 +168,11 @@ class MujocoJetBot:
 
 @functools.lru_cache(maxsize=8)
 def _programs(settings: str) -> _Programs:
-    """Environment, model and programs of a configuration, given as JSON: it has no hash."""
+    """Build the environment, model and programs of a configuration.
+
+    Args:
+      settings: the configuration as JSON, since a `Config` is not hashable.
+    """
     config = Config.model_validate_json(settings)
     env = make_env(config)
     model = make_mj_model(
@@ -169,33 +180,32 @@ def _programs(settings: str) -> _Programs:
         config.physics,
         build_scene=env.task.build_scene,
         visual=False,
+        autoreset=False,
     )
-    # A state that is not finite is ours to tell; MuJoCo would put the robot back without a word.
-    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     nq, size = model.nq, model.nq + model.nv
 
-    def begin(key: UInt32[Array, "2"]) -> tuple[Any, ...]:
+    def reset(key: UInt32[Array, "2"]) -> tuple[Any, ...]:
         state = env.reset(key)
         pose = jnp.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel])
         return pose, state.goal, env.mocap_positions(state.goal), state.obs, state.key
 
     def robot_of(pose: Float[Array, " n"]) -> RobotState:
-        nothing = jnp.zeros(())
-        return robot_state(PhysicsState(pose[:nq], pose[nq:], jnp.zeros(model.nv), nothing))
+        time = jnp.zeros(())
+        return robot_state(PhysicsState(pose[:nq], pose[nq:], jnp.zeros(model.nv), time))
 
-    def judge(given: Float[Array, " n"], goal: Goal) -> tuple[Array, Goal, Array | None]:
+    def task_step(given: Float[Array, " n"], goal: Goal) -> tuple[Array, Goal, Array | None]:
         before, after, action = jnp.split(given, [size, 2 * size])
         task = env.task_step(robot_of(before), robot_of(after), goal, action)
         finite = jnp.isfinite(jnp.concatenate([after, task.obs, task.reward[None]])).all()
-        numbers = jnp.stack([task.reward, task.terminated, task.success, finite])
-        judged = jnp.concatenate([task.obs, numbers])
+        scalars = jnp.stack([task.reward, task.terminated, task.success, finite])
+        result = jnp.concatenate([task.obs, scalars])
         if not isinstance(env.task, AdvancesGoal):
-            return judged, None, None
-        return judged, task.goal, env.mocap_positions(task.goal)
+            return result, None, None
+        return result, task.goal, env.mocap_positions(task.goal)
 
-    # On a GPU every call would wait for the device.
+    # Compile for the CPU: on a GPU, every call would wait for the device.
     with default_device_cpu():
         key, given = np.zeros(2, np.uint32), np.zeros(2 * size + env.action_size, np.float32)
-        begin_program = jax.jit(begin).lower(key).compile()
-        judge_program = jax.jit(judge).lower(given, begin_program(key)[1]).compile()
-    return _Programs(env, model, begin_program, judge_program)
+        reset_program = jax.jit(reset).lower(key).compile()
+        task_program = jax.jit(task_step).lower(given, reset_program(key)[1]).compile()
+    return _Programs(env, model, reset_program, task_program)

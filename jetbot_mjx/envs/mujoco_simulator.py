@@ -1,12 +1,11 @@
-"""C MuJoCo in the place of MJX: the same environment in another simulator, many robots at once.
+"""Replace MJX by C MuJoCo: the same environment in another simulator, for many robots at once.
 
-Only physics changes hands. A compiled program calls back for every environment step, with the
-states of all its robots, and `mujoco.rollout` steps them over the CPU's threads. Goals, actuators,
-sensors, drawn robots, reward, `advance`, solid bodies, and how episodes end and are counted stay
-the environment's own code.
+Only physics is replaced. A compiled program calls back at every environment step with the states of
+all robots, and `mujoco.rollout` steps them on the CPU's threads. Goals, actuators, sensors, domain
+randomization, reward, termination and episode statistics remain the code of the environment.
 
-What a robot becomes depends on its own state alone, so no result depends on how many threads or
-robots there are. States are rounded to float32 once per environment step.
+The next state of a robot depends on its own state only, so results do not depend on the number of
+threads or robots. States are rounded to float32 once per environment step.
 """
 
 import copy
@@ -41,12 +40,12 @@ _INPUTS = mujoco.mjtState.mjSTATE_CTRL.value | mujoco.mjtState.mjSTATE_MOCAP_POS
 
 
 class Numerics(NamedTuple):
-    """Settings of C MuJoCo. The defaults share none of the choices that training makes."""
+    """A `Numerics` holds solver settings of C MuJoCo, by default all unlike those of training."""
 
     substeps: int = 8
     """Physics steps per environment step."""
     integrator: Literal["Euler", "implicitfast"] = "implicitfast"
-    """`Euler` is explicit: without implicit joint damping."""
+    """Integrator; `Euler` is explicit, without implicit joint damping."""
     cone: Literal["pyramidal", "elliptic"] = "elliptic"
     """Friction cone."""
     solref: tuple[float, float] | None = (0.02, 1.0)
@@ -59,18 +58,18 @@ class Numerics(NamedTuple):
     ls_iterations: int = 50
     """Upper limit of line-search steps per Newton iteration."""
     tolerance: float = 1e-12
-    """Where the solver stops before."""
+    """Tolerance at which the solver stops earlier."""
 
 
 OTHER_NUMERICS = Numerics()
-"""Those by which a policy is shown to drive elsewhere."""
+"""Numerics for evaluating a policy in a simulator that it was not trained in."""
 
 
 def training_numerics(physics: PhysicsConfig) -> Numerics:
-    """Return the numerics that a policy is trained with, but with a converged solver.
+    """Return the numerics of training, but with a converged solver.
 
     Args:
-      physics: of the run.
+      physics: the physics section of the run's configuration.
     """
     return Numerics(
         substeps=physics.n_substeps,
@@ -86,16 +85,16 @@ def in_mujoco(
 ) -> JetBotEnv:
     """Return the same environment with C MuJoCo as its physics.
 
-    Its programs run on the CPU: compile them within `xla_options.default_device_cpu`.
-    `DomainRandomizationWrapper` may wrap it; each robot then gets an `MjModel` of its own.
+    Its programs run on the CPU: compile them within `xla_options.default_device_cpu`. It may be
+    wrapped in `DomainRandomizationWrapper`; then each robot has its own `MjModel`.
 
     Args:
-      env: one environment, unwrapped, with its preset's model.
-      numerics: how C MuJoCo computes.
-      threads: for all robots together; None: one for each core that this process may use.
+      env: one environment, unwrapped, with the model of its preset.
+      numerics: the solver settings of C MuJoCo.
+      threads: the number of threads for all robots; None: one per core that the process may use.
 
     Raises:
-      UserError: JAX was told to do without a CPU.
+      UserError: `JAX_PLATFORMS` excludes the CPU.
     """
     try:
         jax.local_devices(backend="cpu")
@@ -112,29 +111,29 @@ def make_model(env: JetBotEnv, numerics: Numerics) -> mujoco.MjModel:
 
     Args:
       env: one environment, unwrapped.
-      numerics: how C MuJoCo is to compute.
+      numerics: the solver settings of C MuJoCo.
 
     Returns:
-      The model, without what only shows.
+      The model, without visual elements.
     """
 
     def build_scene(spec: mujoco.MjSpec) -> None:
         env.task.build_scene(spec)
-        # Textures are a hundred times as large as the rest, and every drawn robot is a copy.
+        # Textures are most of a model's memory, and every varied robot copies the model.
         for material in spec.materials:
             material.textures = [""] * len(material.textures)
         for texture in spec.textures:
             spec.delete(texture)
 
-    model = make_mj_model(env.robot, env.config.physics, build_scene=build_scene, visual=False)
+    model = make_mj_model(
+        env.robot, env.config.physics, build_scene=build_scene, visual=False, autoreset=False
+    )
     option = model.opt
     option.timestep = env.dt / numerics.substeps
     option.integrator = _INTEGRATORS[numerics.integrator]
     option.cone = _CONES[numerics.cone]
     option.iterations, option.ls_iterations = numerics.iterations, numerics.ls_iterations
     option.tolerance = numerics.tolerance
-    # A state that is not finite is for the wrappers to count; MuJoCo would put the robot back.
-    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     if numerics.solref is not None:
         model.geom_solref[:] = model.pair_solref[:] = numerics.solref
         model.pair_solreffriction[:] = 0.0
@@ -144,15 +143,15 @@ def make_model(env: JetBotEnv, numerics: Numerics) -> mujoco.MjModel:
 
 
 class MujocoPhysics(Physics):
-    """A model and how C MuJoCo steps it; pure and unbatched."""
+    """A model that C MuJoCo steps; pure and unbatched, like `Physics`."""
 
     def __init__(self, env: JetBotEnv, numerics: Numerics, threads: int) -> None:
-        """Build the model and starts the threads.
+        """Build the model and start the threads.
 
         Args:
-          env: whose physics this is to be.
-          numerics: how C MuJoCo computes.
-          threads: at least 1.
+          env: the environment whose physics is replaced.
+          numerics: the solver settings of C MuJoCo.
+          threads: the number of threads, at least 1.
         """
         self._c_model = make_model(env, numerics)
         super().__init__(self._c_model, env.config.physics)
@@ -160,20 +159,20 @@ class MujocoPhysics(Physics):
         self._env_dt = env.dt
         self._substeps = numerics.substeps
         self._changed: dict[str, Array] = {}
-        """Arrays of the model that a robot has its own of, by their names in `MjModel`."""
-        self._robots = _Robots(self._c_model)
+        """Model arrays that differ from robot to robot, by their names in `MjModel`."""
+        self._model_cache = _ModelCache(self._c_model)
         self._thread_data = [mujoco.MjData(self._c_model) for _ in range(threads)]
-        # MuJoCo takes 0 for the calling thread.
+        # 0 means that `rollout` uses the calling thread.
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
 
     def with_model(self, model: mjx.Model) -> "MujocoPhysics":
-        """Return the same on another model, as a new object.
+        """Return a copy of this object with another model.
 
         Args:
-          model: of the same structure, such as one with other friction.
+          model: a model of the same structure, for example with another friction.
 
         Raises:
-          UserError: something differs that C MuJoCo's model does not have.
+          UserError: a leaf differs that has no counterpart in C MuJoCo's model.
         """
         other = copy.copy(self)
         other.model, other._changed = model, {}
@@ -182,8 +181,8 @@ class MujocoPhysics(Physics):
             if new is old:
                 continue
             name = jax.tree_util.keystr(path).lstrip(".")
-            held = getattr(self._c_model, name, None)
-            if not isinstance(held, np.ndarray) or held.shape != new.shape:
+            array = getattr(self._c_model, name, None)
+            if not isinstance(array, np.ndarray) or array.shape != new.shape:
                 raise UserError(
                     f"the model's {name} differs from robot to robot: C MuJoCo's model has no such"
                     " array; drive this policy in MJX alone"
@@ -193,7 +192,7 @@ class MujocoPhysics(Physics):
 
     @property
     def impl(self) -> str:
-        """Return the name of the simulator; no value of `physics.impl`."""
+        """Name of the simulator, which is not a value of `physics.impl`."""
         return "mujoco"
 
     def step(
@@ -205,14 +204,14 @@ class MujocoPhysics(Physics):
         """Integrate one environment step.
 
         Args:
-          state: where to start.
-          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
-          mocap_pos: where the bodies of `mocap_names` stand [m], world frame; None: where the
-            model has them.
+          state: the state before the step.
+          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
+          mocap_pos: positions of the bodies of `mocap_names` [m], world frame; None: their
+            positions in the model.
 
         Returns:
-          The state one environment step later. The solver needs no warm start to converge: that
-          of `state` is passed on.
+          The state one environment step later. Its `qacc_warmstart` is that of `state`: this
+          solver converges without a warm start.
         """
         after = tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in (state.qpos, state.qvel))
         qpos, qvel = jax.pure_callback(
@@ -235,49 +234,52 @@ class MujocoPhysics(Physics):
         mocap_pos: Float[Array, "*n nmocap 3"] | None,
         changed: Mapping[str, Array],
     ) -> tuple[Float[np.ndarray, "*n nq"], Float[np.ndarray, "*n nv"]]:
-        """Step all robots; those that are not finite stay so, and are not shown to MuJoCo."""
+        """Step all robots; non-finite ones stay non-finite and are not passed to MuJoCo."""
+        # Flatten the batch axes.
         batch, model = np.shape(qpos)[:-1], self._c_model
         count = int(np.prod(batch))
-        places = model.body_pos[model.body_mocapid >= 0] if mocap_pos is None else mocap_pos
-        places = np.broadcast_to(places, (*batch, model.nmocap, 3)).reshape(count, -1)
-        moving = np.concatenate([np.asarray(x).reshape(count, -1) for x in (qpos, qvel)], axis=1)
-        inputs = np.concatenate([np.asarray(ctrl).reshape(count, -1), places], axis=1)
+        mocap = model.body_pos[model.body_mocapid >= 0] if mocap_pos is None else mocap_pos
+        mocap = np.broadcast_to(mocap, (*batch, model.nmocap, 3)).reshape(count, -1)
+        states = np.concatenate([np.asarray(x).reshape(count, -1) for x in (qpos, qvel)], axis=1)
+        inputs = np.concatenate([np.asarray(ctrl).reshape(count, -1), mocap], axis=1)
         own = {name: np.asarray(x).reshape(count, -1) for name, x in changed.items()}
-        good = _is_finite(moving, inputs, *own.values())
-        moved = np.full(moving.shape, np.nan, np.float32)
-        if good.any():
-            models = self._robots.models({name: x[good] for name, x in own.items()})
-            moved[good] = self._roll_out(models, moving[good], inputs[good])
+        # Step the finite robots.
+        finite = _is_finite(states, inputs, *own.values())
+        after = np.full(states.shape, np.nan, np.float32)
+        if finite.any():
+            models = self._model_cache.models({name: x[finite] for name, x in own.items()})
+            after[finite] = self._roll_out(models, states[finite], inputs[finite])
         nq = model.nq
-        return moved[:, :nq].reshape(*batch, nq), moved[:, nq:].reshape(*batch, model.nv)
+        return after[:, :nq].reshape(*batch, nq), after[:, nq:].reshape(*batch, model.nv)
 
     def _roll_out(
         self,
         models: list[mujoco.MjModel],
-        moving: Float[np.ndarray, "n nq+nv"],
+        qpos_qvel: Float[np.ndarray, "n nq+nv"],
         inputs: Float[np.ndarray, "n inputs"],
     ) -> Float[np.ndarray, "n nq+nv"]:
-        model, count = self._c_model, len(moving)
-        # The time comes first, then positions and velocities.
-        place = slice(1, 1 + model.nq + model.nv)
+        """Step finite robots with `mujoco.rollout`; a result that diverges becomes NaN."""
+        model, count = self._c_model, len(qpos_qvel)
+        # A full state begins with the time, followed by positions and velocities.
+        columns = slice(1, 1 + model.nq + model.nv)
         states = np.zeros((count, mujoco.mj_stateSize(model, _WHOLE_STATE)))
-        states[:, place] = moving
-        every = np.zeros((count, self._substeps, states.shape[1]))
+        states[:, columns] = qpos_qvel
+        substates = np.zeros((count, self._substeps, states.shape[1]))
         self._pool.rollout(
             models or model,
             self._thread_data,
             states,
             inputs[:, None].astype(float),
             control_spec=_INPUTS,
-            state=every,
+            state=substates,
         )
-        after = every[:, -1, place]
+        after = substates[:, -1, columns]
         after[(np.abs(after) > mujoco.mjMAXVAL).any(axis=1)] = np.nan
         return after
 
 
-class _Robots:
-    """The models of robots that differ from their preset, kept from one step to the next."""
+class _ModelCache:
+    """A `_ModelCache` holds the models of varied robots from one step to the next."""
 
     def __init__(self, model: mujoco.MjModel) -> None:
         self._preset = model
@@ -285,26 +287,31 @@ class _Robots:
         self._models: dict[bytes, mujoco.MjModel] = {}
 
     def models(self, changed: Mapping[str, Float[np.ndarray, "n _"]]) -> list[mujoco.MjModel]:
-        """Return a model for each robot, or none where all are the preset's."""
+        """Return a model for each robot, or an empty list if all are the preset.
+
+        Args:
+          changed: the arrays that differ, by name, one flattened row per robot.
+        """
         if not changed:
             return []
         rows = zip(*changed.values(), strict=True)
-        kept, self._models = self._models, {}
-        found = []
+        previous, self._models = self._models, {}
+        models = []
         for row in rows:
             own = dict(zip(changed, row, strict=True))
             key = b"".join(name.encode() + values.tobytes() for name, values in own.items())
             if key not in self._models:
-                self._models[key] = kept.get(key) or self._make(own)
-            found.append(self._models[key])
-        return found
+                self._models[key] = previous.get(key) or self._make(own)
+            models.append(self._models[key])
+        return models
 
     def _make(self, own: Mapping[str, Float[np.ndarray, " _"]]) -> mujoco.MjModel:
+        """Return a copy of the preset's model with other arrays."""
         model = copy.copy(self._preset)
         for name, values in own.items():
-            held = getattr(model, name)
-            held[:] = values.reshape(held.shape)
-        # What MuJoCo derives from masses and places when it compiles a model.
+            array = getattr(model, name)
+            array[:] = values.reshape(array.shape)
+        # Recompute the constants that MuJoCo derives from masses and positions.
         mujoco.mj_setConst(model, self._data)
         return model
 
@@ -314,6 +321,7 @@ def _is_finite(*columns: Float[np.ndarray, "n _"]) -> Bool[np.ndarray, " n"]:
 
 
 def _cores() -> int:
+    """Return the number of cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

@@ -1,4 +1,7 @@
-"""The physics of one environment step: MJX's arithmetic, as XLA compiles it or as one kernel."""
+"""Step the physics of one robot with MJX, compiled by XLA or lowered to one kernel.
+
+Both ways run the same arithmetic, that of `mjx.step`.
+"""
 
 import contextlib
 import copy
@@ -21,33 +24,33 @@ from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
 
 BACKENDS: tuple[kernel.Backend, ...] = (ptx_backend, llvm_backend)
-"""Who can make a step as one kernel."""
+"""Back ends that can compile a step as one kernel."""
 
 kernel.register(*BACKENDS)
 
 _PLATFORMS = {"gpu": "cuda"}
-"""What JAX's devices call a platform that its programs are compiled for under another name."""
+"""Names of lowering platforms, where they differ from those of JAX's devices."""
 
 
 class Physics:
-    """A model and how it is stepped; pure and unbatched."""
+    """A model and a way to step it; pure and unbatched."""
 
     def __init__(self, mj_model: mujoco.MjModel, config: PhysicsConfig) -> None:
-        """Hand the model over to MJX.
+        """Prepare the physics; the MJX model is built at its first use.
 
         Args:
-          mj_model: of what moves and touches.
-          config: the physics of the run.
+          mj_model: the C model, without visual elements.
+          config: the physics section of the configuration.
 
         Raises:
-          UserError: one kernel is asked for where there can be none, or JAX computes in 64 bits.
+          UserError: the requested kernel back end is not available, or JAX computes in 64 bits.
         """
         if jax.config.values["jax_enable_x64"]:
             raise UserError("physics is float32, and JAX_ENABLE_X64 is set: unset it")
         self._mj_model = mj_model
         self._config = config
-        self._varied: tuple[int, ...] = ()
-        """Leaves of the model that are known only when a program runs, robot by robot."""
+        self._traced_leaves: tuple[int, ...] = ()
+        """Indices of the model's leaves that are traced: they may differ from robot to robot."""
         self._lock = threading.Lock()
         self._kernel: kernel.Step | UnsupportedError | None = None
         for backend in BACKENDS:
@@ -59,47 +62,44 @@ class Physics:
 
     @functools.cached_property
     def model(self) -> mjx.Model:
-        """Return the model that is stepped."""
+        """Return the MJX model that is stepped."""
         return mjx.put_model(self._mj_model)
 
     @functools.cached_property
     def _data(self) -> mjx.Data:
-        """Return the data of which a step replaces what a `PhysicsState` holds."""
+        """Template of the simulation data; a step replaces the fields of `PhysicsState`."""
         return mjx.make_data(self._mj_model)
 
     def with_model(self, model: mjx.Model) -> "Physics":
-        """Return the same on another model, as a new object.
+        """Return a copy of this object with another model.
 
         Args:
-          model: of the same structure, such as one with other friction.
-
-        Returns:
-          A copy; `self` stays as it is.
+          model: a model of the same structure, for example with another friction. Leaves may be
+            traced.
         """
         other = copy.copy(self)
         other.model = model
         leaves = jax.tree.leaves(model)
-        other._varied = tuple(i for i, x in enumerate(leaves) if isinstance(x, Tracer))
+        other._traced_leaves = tuple(i for i, x in enumerate(leaves) if isinstance(x, Tracer))
         other._lock = threading.Lock()
         other._kernel = None
         return other
 
     @property
     def impl(self) -> str:
-        """Return what `physics.impl` is on JAX's default devices; never `auto`."""
-        platform = jax.local_devices()[0].platform
-        here = [
-            x.IMPL for x in self._backends() if _PLATFORMS.get(platform, platform) == x.PLATFORM
-        ]
-        return "xla" if not here or self._as_kernel() is None else here[0]
+        """Implementation that JAX's default device runs: `physics.impl`, with `auto` resolved."""
+        device = jax.local_devices()[0].platform
+        platform = _PLATFORMS.get(device, device)
+        impls = [x.IMPL for x in self._backends() if platform == x.PLATFORM]
+        return "xla" if not impls or self._kernel_step() is None else impls[0]
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
-        """Solid bodies that stand where a task puts them, in MuJoCo's order."""
+        """Return the names of the solid mocap bodies, which a task places, in MuJoCo's order."""
         model = self._mj_model
         bodies = [model.body(i) for i in range(model.nbody)]
-        placed = sorted((body for body in bodies if body.mocapid[0] >= 0), key=lambda b: b.mocapid)
-        return tuple(body.name for body in placed)
+        mocap = sorted((body for body in bodies if body.mocapid[0] >= 0), key=lambda b: b.mocapid)
+        return tuple(body.name for body in mocap)
 
     def step(
         self,
@@ -110,48 +110,51 @@ class Physics:
         """Integrate one environment step, `n_substeps` physics steps.
 
         Args:
-          state: where to start.
-          ctrl: wheel speed targets (left, right) [rad/s], held throughout.
-          mocap_pos: where the bodies of `mocap_names` stand [m], world frame; None: where the
-            model has them.
+          state: the state before the step.
+          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
+          mocap_pos: positions of the bodies of `mocap_names` [m], world frame; None: their
+            positions in the model.
 
         Returns:
           The state one `ctrl_dt` later.
         """
         leaves = jax.tree.leaves(self.model)
-        traced_leaves = [leaves[place] for place in self._varied]
+        arrays = [leaves[index] for index in self._traced_leaves]
         if self._mj_model.nmocap:
-            places = self._data.mocap_pos if mocap_pos is None else mocap_pos
-            traced_leaves.append(jnp.asarray(places, self._data.mocap_pos.dtype))
-        held = jnp.asarray(ctrl, state.qpos.dtype), traced_leaves
-        return (self._as_kernel() or self._steps)(state, held)
+            positions = self._data.mocap_pos if mocap_pos is None else mocap_pos
+            arrays.append(jnp.asarray(positions, self._data.mocap_pos.dtype))
+        consts = jnp.asarray(ctrl, state.qpos.dtype), arrays
+        return (self._kernel_step() or self._xla_step)(state, consts)
 
-    def _steps(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
-        """Make all physics steps of an environment step through XLA."""
+    def _xla_step(self, state: PhysicsState, consts: tuple[Array, list[Array]]) -> PhysicsState:
+        """Integrate one environment step with a loop that XLA compiles."""
         state, _ = jax.lax.scan(
-            lambda state, _: (self.substep(state, held), None),
+            lambda state, _: (self.substep(state, consts), None),
             state,
             length=self._config.n_substeps,
         )
         return state
 
-    def substep(self, state: PhysicsState, held: tuple[Array, list[Array]]) -> PhysicsState:
-        """Make one step of MJX.
+    def substep(self, state: PhysicsState, consts: tuple[Array, list[Array]]) -> PhysicsState:
+        """Make one physics step with MJX.
 
         Args:
-          state: where to start.
-          held: wheel speed targets (left, right) [rad/s], and what else is known only when a
-            program runs: leaves of the model, then, where there are any, the places of solid mocap
-            bodies [m].
+          state: the state before the step.
+          consts: what is constant during an environment step: the wheel speed targets (left, right)
+            [rad/s], and a list with the traced leaves of the model, followed by the positions of
+            the solid mocap bodies [m] if there are any.
 
         Returns:
           The state one `sim_dt` later.
         """
-        ctrl, traced_leaves = held
+        # Insert the traced leaves into the model.
+        ctrl, arrays = consts
         leaves, treedef = jax.tree.flatten(self.model)
-        varied, places = traced_leaves[: len(self._varied)], traced_leaves[len(self._varied) :]
-        for place, leaf in zip(self._varied, varied, strict=True):
-            leaves[place] = leaf
+        count = len(self._traced_leaves)
+        traced, mocap_pos = arrays[:count], arrays[count:]
+        for index, leaf in zip(self._traced_leaves, traced, strict=True):
+            leaves[index] = leaf
+        # Build the simulation data from the state.
         data = self._data.replace(
             qpos=state.qpos,
             qvel=state.qvel,
@@ -159,30 +162,30 @@ class Physics:
             time=state.time,
             ctrl=ctrl,
         )
-        if places:
-            data = data.replace(mocap_pos=places[0])
+        if mocap_pos:
+            data = data.replace(mocap_pos=mocap_pos[0])
         factorise = (
             contextlib.nullcontext if self._config.cholesky == "library" else cholesky.unrolled
         )
-        # GPUs multiply float32 matrices in TF32 unless told otherwise, and the contact solver
-        # then diverges. Only physics asks for full precision; networks choose their own.
+        # By default GPUs multiply float32 matrices in TF32, with which the contact solver diverges.
+        # Only physics requires full precision; networks choose their own.
         with jax.default_matmul_precision("highest"), factorise():
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
     def _backends(self) -> list[kernel.Backend]:
-        """Return the back ends that may compile the step as one kernel in this process."""
+        """Return the back ends that the configuration allows and this process has."""
         return [x for x in BACKENDS if self._config.impl in ("auto", x.IMPL) and x.is_available()]
 
-    def _as_kernel(self) -> kernel.Step | None:
-        """Return the step as one kernel; None where XLA makes it on all platforms."""
+    def _kernel_step(self) -> kernel.Step | None:
+        """Return an environment step as one kernel; None: XLA compiles it on all platforms."""
         if not self._backends():
             return None
-        # Programs are traced in several threads; one is enough to write the kernel.
+        # Programs are traced in several threads; only one of them lowers the kernel.
         with self._lock:
             if self._kernel is None:
                 try:
-                    self._kernel = kernel.as_step(self._written())
+                    self._kernel = kernel.as_step(self._lower())
                 except UnsupportedError as error:
                     self._kernel = error
         if not isinstance(self._kernel, UnsupportedError):
@@ -194,19 +197,21 @@ class Physics:
             )
         return None
 
-    def _written(self) -> kernel.Kernel:
-        # Shapes alone: arrays made here would become part of the program that is being traced.
-        def numbers(*shape: int) -> Any:
+    def _lower(self) -> kernel.Kernel:
+        """Lower one physics step to a kernel that repeats it `n_substeps` times."""
+
+        # Shapes only: arrays made here would become part of the program that is being traced.
+        def array(*shape: int) -> Any:
             return jax.ShapeDtypeStruct(shape, jnp.float32)
 
         model = self._mj_model
-        state = PhysicsState(numbers(model.nq), numbers(model.nv), numbers(model.nv), numbers())
+        state = PhysicsState(array(model.nq), array(model.nv), array(model.nv), array())
         leaves = jax.tree.leaves(self.model)
-        traced_leaves = [
-            jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._varied
+        traced = [
+            jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._traced_leaves
         ]
-        traced_leaves += [numbers(model.nmocap, 3)] if model.nmocap else []
-        arguments = state, (numbers(model.nu), traced_leaves)
+        traced += [array(model.nmocap, 3)] if model.nmocap else []
+        arguments = state, (array(model.nu), traced)
         program = scalarize(self.substep, *arguments)
         llvm_codegen.require(program)
         structure = jax.tree.structure(arguments)
@@ -215,7 +220,7 @@ class Physics:
             carried=len(jax.tree.leaves(state)),
             steps=self._config.n_substeps,
             fallback=lambda *leaves: jax.tree.leaves(
-                self._steps(*jax.tree.unflatten(structure, leaves))
+                self._xla_step(*jax.tree.unflatten(structure, leaves))
             ),
             impl=self._config.impl,
         )

@@ -1,15 +1,15 @@
-"""The robot: two presets, the MJCF they are poured into, and the models for C and for JAX.
+"""Define the robot: the numbers of two presets, and the MuJoCo model made from them.
 
-Every number carries its unit and its source; derived numbers are computed. Frame of all
-places: midpoint of the wheel axle, x forward, y left, z up. SI units.
+Every number has its unit and its source. All positions are in the body frame: the origin is the
+midpoint of the wheel axle, x is forward, y is left, z is up. Units are SI units.
 
 Sources, by tag:
   CAD    NVIDIA-AI-IOT/jetbot, assets/*.stl and *.step, measured.
   BOM    NVIDIA-AI-IOT/jetbot, docs/bill_of_materials.md.
   USD    a public copy of Isaac's jetbot.usd (snt-spacer/RobRAN-Code), read with usd-core.
   ISAAC  Isaac Sim 2022.x documentation, section 9.9, and its `DifferentialController`.
-  EST    an estimate; the comment says from what.
-  SIM    chosen in simulation; the tests of `test_model.py` hold it.
+  EST    an estimate; the comment names its basis.
+  SIM    chosen in simulation and checked by `tests/envs/test_robot_model.py`.
 """
 
 import dataclasses
@@ -22,8 +22,8 @@ import numpy as np
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.errors import UserError
 
-# The tutorial's controller. Kept apart from the robot's own geometry: the mismatch of 1.3 %
-# between its wheel base and the true separation is part of the task.
+# The tutorial's controller assumes a geometry of its own: the mismatch of 1.3 % between its wheel
+# base and the true wheel separation is part of the task.
 CONTROLLER_WHEEL_RADIUS = 0.0325  # [m] ISAAC, DifferentialController(wheel_radius=0.0325)
 CONTROLLER_WHEEL_SEPARATION = 0.1125  # [m] ISAAC, wheel_base=0.1125: left to right
 
@@ -36,51 +36,52 @@ QVEL_LINEAR_W, QVEL_ANGULAR_B = slice(0, 3), slice(3, 6)
 
 @dataclasses.dataclass(frozen=True)
 class Caster:
-    """A frictionless ball under the chassis."""
+    """A `Caster` describes a frictionless ball under the chassis."""
 
     name: str
     """Name of its collision geom."""
     radius: float
-    """[m]"""
+    """Radius of the ball [m]."""
     pos: tuple[float, float, float]
     """Centre of the ball [m]."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Robot:
-    """The physical numbers of one JetBot."""
+    """A `Robot` holds the physical parameters of a JetBot."""
 
     chassis_mass: float
-    """[kg] without the wheels."""
+    """Mass without the wheels [kg]."""
     chassis_com: tuple[float, float, float]
     """Centre of mass of the chassis [m]."""
     chassis_inertia: tuple[float, float, float]
     """Principal moments of the chassis about its centre of mass [kg m²]."""
     wheel_mass: float
-    """[kg] each."""
+    """Mass of one wheel [kg]."""
     wheel_inertia: tuple[float, float, float]
-    """About x, y (the axle) and z [kg m²]."""
+    """Moments of inertia of a wheel about x, y (the axle) and z [kg m²]."""
     casters: tuple[Caster, ...]
+    """Casters of the chassis."""
     motor_torque: float
-    """Largest torque of one motor at the wheel [N m]."""
+    """Largest torque of a motor at the wheel [N m]."""
     motor_gain: float
-    """Torque per error of wheel speed [N m s/rad]."""
+    """Gain of the speed controller: torque per error of the wheel speed [N m s/rad]."""
     armature: float
-    """Rotor inertia seen at the wheel [kg m²]."""
+    """Rotor inertia, reflected through the gear to the wheel [kg m²]."""
     max_wheel_speed: float | None
-    """Largest wheel speed a motor is asked for [rad/s]; None: not limited."""
+    """Limit of the commanded wheel speed [rad/s]; None: not limited."""
     friction: float = 1.0
-    """Coulomb coefficient of wheel on floor. USD: 1.0 wheel, combined by maximum."""
+    """Coulomb friction coefficient between wheel and floor. USD: 1.0, combined by maximum."""
 
 
 def _box_inertia(mass: float, size: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Principal moments of a homogeneous box [kg m²] from its mass [kg] and sides [m]."""
+    """Return the principal moments of a homogeneous box [kg m²] from mass [kg] and sides [m]."""
     x, y, z = (side * side for side in size)
     return mass / 12 * (y + z), mass / 12 * (x + z), mass / 12 * (x + y)
 
 
 def _wheel_inertia(mass: float, width: float) -> tuple[float, float, float]:
-    """Return moments of a homogeneous wheel [kg m²] from its mass [kg] and width [m]."""
+    """Return the moments of a homogeneous wheel [kg m²] from mass [kg] and width [m]."""
     spin = mass * WHEEL_RADIUS**2 / 2
     across = mass * (3 * WHEEL_RADIUS**2 + width**2) / 12
     return across, spin, across
@@ -90,8 +91,8 @@ _CHASSIS_SIZE = (0.136, 0.090, 0.054)  # [m] CAD, envelope of the printed chassi
 
 ISAAC = Robot(
     chassis_mass=2.0,  # USD
-    # EST: the USD gives none; between the two casters and at the height of the axle, which
-    # is what keeps Isaac's robot on its wheels at 1 m/s.
+    # EST: the USD has none. Midway between the casters at the height of the axle, which keeps
+    # Isaac's robot on its wheels at 1 m/s.
     chassis_com=(-0.022, 0.0, 0.0),
     chassis_inertia=_box_inertia(2.0, _CHASSIS_SIZE),  # EST: homogeneous box
     wheel_mass=0.25,  # USD
@@ -125,9 +126,9 @@ REAL = Robot(
 
 ROBOTS = {"isaac": ISAAC, "real": REAL}
 
-# Contact of every pair, softer than MuJoCo's default. In a pyramidal cone the friction of a
-# wheel that slides also pushes it off the floor, the harder the contact the more: at μ = 0.4
-# and (0.02, 1), (0.95, 0.99) the robot hops and tilts by 5° even with a converged solver.
+# Contact parameters of every pair, softer than MuJoCo's defaults. In a pyramidal cone the friction
+# of a sliding wheel also pushes it off the floor, more so in a stiffer contact: with μ = 0.4,
+# (0.02, 1) and (0.95, 0.99) the robot hops and tilts by 5°, even with a converged solver.
 _SOLREF = (0.04, 1.0)  # time constant [s], damping ratio; SIM
 _SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)  # SIM
 
@@ -138,18 +139,26 @@ def make_mj_model(
     *,
     build_scene: Callable[[mujoco.MjSpec], None] = lambda spec: None,
     visual: bool = True,
+    autoreset: bool = True,
 ) -> mujoco.MjModel:
     """Compile the robot and its scene.
 
     Args:
-      robot: the physical numbers.
-      physics: time step and solver effort.
-      build_scene: adds a task's own bodies to the scene.
-      visual: False leaves out all that only shows (it costs kernels and changes nothing).
+      robot: the physical parameters.
+      physics: the physics section of the configuration: time step and solver settings.
+      build_scene: a function that adds a task's bodies to the scene.
+      visual: whether to include visual elements. They do not change physics, but cost kernels.
+      autoreset: whether C MuJoCo resets non-finite states by itself. False leaves them to the
+        caller, who can then count them.
 
     Returns:
-      The C model. `qpos` is (x, y, z, w, x, y, z, left, right); the robot's initial pose,
-      `qpos0`, is at rest on the floor.
+      The C model. Its `qpos` is (x, y, z, w, x, y, z, left, right), and in its initial pose,
+      `qpos0`, the robot is at rest on the floor.
+
+    Raises:
+      UserError: the physics time step is too long for the robot's motors.
+      RuntimeError: the robot does not come to rest in this scene.
+      ValueError: MuJoCo rejects the scene.
     """
     text = resources.files("jetbot_mjx").joinpath("assets/jetbot.xml").read_text()
     spec = mujoco.MjSpec.from_string(text)
@@ -158,13 +167,16 @@ def make_mj_model(
     _set_robot(spec, robot)
     build_scene(spec)
     if not visual:
-        _strip(spec)
+        _remove_visuals(spec)
     _settle(spec)
-    return spec.compile()
+    model = spec.compile()
+    if not autoreset:
+        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    return model
 
 
 def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
-    """Explicit Euler's condition: timestep * motor_gain / wheel inertia < 2."""
+    """Check the stability of explicit Euler: timestep * motor_gain / wheel inertia < 2."""
     limit = 2.0 * (robot.wheel_inertia[1] + robot.armature) / robot.motor_gain
     if physics.sim_dt >= limit:
         raise UserError(
@@ -187,6 +199,8 @@ def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig, robot: Robot) -> N
 
 
 def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
+    """Set masses, geometry, motors and contacts of the robot."""
+    # Chassis and wheels.
     chassis = spec.body("jetbot")
     chassis.mass = robot.chassis_mass
     chassis.ipos = robot.chassis_com
@@ -196,8 +210,8 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
         wheel.pos = (0.0, sign * WHEEL_SEPARATION / 2, 0.0)
         wheel.mass = robot.wheel_mass
         wheel.inertia = robot.wheel_inertia
-        # A sphere touches a plane where a wheel does, in one contact; a cylinder gives
-        # several, and they jitter.
+        # A sphere touches a plane in the same single point as a wheel; a cylinder has several
+        # contacts, which jitter.
         spec.geom(f"{side}_wheel").size = (WHEEL_RADIUS, 0.0, 0.0)
         spec.joint(f"{side}_wheel_joint").armature = robot.armature
         motor = spec.actuator(side)
@@ -209,6 +223,7 @@ def _set_robot(spec: mujoco.MjSpec, robot: Robot) -> None:
             motor.ctrllimited = True
         slide = robot.friction
         _add_pair(spec, f"{side}_wheel", condim=3, friction=(slide, slide, 5e-3, 1e-4, 1e-4))
+    # Casters.
     casters = {caster.name: caster for caster in robot.casters}
     for name in ("caster_front", "caster_rear"):
         if name not in casters:
@@ -228,8 +243,11 @@ def _add_pair(
     condim: int,
     friction: tuple[float, ...] = (0.0, 0.0, 0.0, 0.0, 0.0),
 ) -> None:
-    # Explicit pairs, because MuJoCo combines two geoms' friction by the maximum: a caster
-    # without friction would still inherit the floor's.
+    """Add a contact pair of a geom with the floor.
+
+    Pairs are explicit, because MuJoCo otherwise takes the larger friction of the two geoms: a
+    frictionless caster would inherit the floor's.
+    """
     spec.add_pair(
         name=geom,
         geomname1="floor",
@@ -241,8 +259,8 @@ def _add_pair(
     )
 
 
-def _strip(spec: mujoco.MjSpec) -> None:
-    """Remove all that takes no part in physics."""
+def _remove_visuals(spec: mujoco.MjSpec) -> None:
+    """Remove all elements that do not take part in physics."""
     paired = {pair.geomname1 for pair in spec.pairs} | {pair.geomname2 for pair in spec.pairs}
     for geom in spec.geoms:
         if geom.name not in paired and not geom.contype and not geom.conaffinity:
@@ -255,9 +273,9 @@ def _strip(spec: mujoco.MjSpec) -> None:
 
 
 def _settle(spec: mujoco.MjSpec) -> None:
-    """Put the robot down as it stands at rest, so that no episode starts with a drop."""
+    """Set the initial pose to the robot at rest, so that no episode starts with a drop."""
     model = spec.compile()
-    # To the solver's full accuracy, and through implicit damping, which dies out sooner.
+    # Use a converged solver, and the implicit integrator, with which motion decays faster.
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)
@@ -265,7 +283,7 @@ def _settle(spec: mujoco.MjSpec) -> None:
         mujoco.mj_step(model, data)
     if not np.all(np.isfinite(data.qpos)) or np.max(np.abs(data.qvel)) > 1e-3:
         raise RuntimeError(f"the robot does not come to rest: qvel = {data.qvel}")
-    # It may have crept along the floor; its height and attitude are what counts.
+    # Keep only height and pitch: the robot may have crept along the floor.
     body = spec.body("jetbot")
     body.pos = (0.0, 0.0, data.qpos[2])
     pitch = 2.0 * np.arcsin(data.qpos[5])

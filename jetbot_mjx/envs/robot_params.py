@@ -1,8 +1,8 @@
-"""Robots that differ from their preset, and the physics model of each.
+"""Define robot parameters, and make the physics model of a robot that differs from its preset.
 
-A `RobotParams` is data, not structure: one compiled program serves every value, traced or not,
-and `jax.vmap` gives each robot its own. Floor and masses enter physics through the model; wheels,
-motors and what the robot sees of itself stand before and behind it, in `motors` and `sensors`.
+Parameters are data: one compiled program serves all values of a traced parameter, and `jax.vmap`
+gives each robot its own. Friction and masses enter the physics model here; wheels and motors enter
+in `actuators`, and measurement errors in `sensors`.
 """
 
 from typing import NamedTuple
@@ -16,11 +16,10 @@ from jaxtyping import Array, Bool, Float
 from jetbot_mjx.envs import mjx
 
 MAX_ACTION_DELAY = 9
-"""Longest `action_delay` [control steps] of a robot whose delay is not known when its program is
-compiled: 150 ms at the default `ctrl_dt`."""
+"""Longest `action_delay` [control steps] of a traced delay: 150 ms at the default `ctrl_dt`."""
 
 MAX_OBSERVATION_DELAY = 6
-"""Longest `observation_delay` likewise: 100 ms."""
+"""Longest `observation_delay` [control steps] if the delay is traced: 100 ms."""
 
 _CHASSIS = "jetbot"
 _SIDES = ("left", "right")
@@ -29,64 +28,67 @@ Quantity = Float[ArrayLike, ""]
 
 
 class RobotParams(NamedTuple):
-    """Differences of one robot from its preset. `RobotParams()` does not differ at all.
+    """A `RobotParams` holds the differences of one robot from its preset.
 
-    What is left at its default costs nothing: no program contains it.
+    The defaults are the preset. A parameter at its default costs nothing: programs omit its code.
     """
 
     friction: Quantity = 1.0
-    """Factor on the Coulomb coefficient of wheel on floor."""
+    """Factor on the Coulomb friction coefficient between wheels and floor."""
     mass: Quantity = 1.0
-    """Factor on mass and inertia of the chassis; the wheels keep theirs."""
+    """Factor on mass and inertia of the chassis; the wheels stay the same."""
     com_x: Quantity = 0.0
-    """Shift of the chassis's centre of mass [m], body frame: forward."""
+    """Shift of the chassis's centre of mass forward [m], body frame."""
     com_y: Quantity = 0.0
-    """To the left."""
+    """Shift of the chassis's centre of mass to the left [m], body frame."""
     com_z: Quantity = 0.0
-    """Up."""
+    """Shift of the chassis's centre of mass up [m], body frame."""
     wheel_radius: Quantity = 1.0
     """Factor on the radius of both wheels."""
     wheel_radius_mismatch: Quantity = 0.0
-    """(left - right) / mean radius."""
+    """Difference of the wheel radii, (left - right) / mean."""
     wheel_separation: Quantity = 1.0
     """Factor on the distance between the wheels."""
     motor_gain: Quantity = 1.0
-    """Factor on the wheel speeds that the motors make of a command, and on their limit."""
+    """Factor on the wheel speeds that the motors reach for a command, and on their limit."""
     motor_gain_mismatch: Quantity = 0.0
-    """(left - right) / mean gain."""
+    """Difference of the motor gains, (left - right) / mean."""
     supply_voltage: Quantity = 1.0
-    """Factor on the voltage at the motors, and so on their speed. A low one also widens the
-    dead-band."""
+    """Factor on motor voltage and thus on wheel speed; a low one also widens the dead-band."""
     dead_band: Quantity = 0.0
     """Fraction of full voltage below which a wheel stands still."""
     motor_lag: Quantity = 0.0
-    """Time constant of a first-order lag [s], ahead of the motors' own run-up."""
+    """Time constant of a first-order lag of the command [s], in addition to the motor dynamics."""
     action_delay: Quantity = 0.0
-    """From command to motor [control steps], rounded; until the first command arrives the motors
-    hold the robot still."""
+    """Delay from command to motor [control steps], rounded; until the first command arrives, the
+    motors hold the robot still."""
     position_noise: Quantity = 0.0
-    """Deviation of the position (x, y) that the robot takes itself to be at [m]."""
+    """Standard deviation of the measured position (x, y) [m]."""
     yaw_noise: Quantity = 0.0
-    """Of its heading [rad]."""
+    """Standard deviation of the measured heading [rad]."""
     speed_noise: Quantity = 0.0
-    """Of its velocity (x, y) [m/s]."""
+    """Standard deviation of the measured velocity (x, y) [m/s]."""
     yaw_rate_noise: Quantity = 0.0
-    """Of its yaw rate [rad/s]."""
+    """Standard deviation of the measured yaw rate [rad/s]."""
     observation_delay: Quantity = 0.0
-    """By how much the robot sees itself late [control steps], rounded; the goal it knows."""
+    """Delay of the measured robot state [control steps], rounded; the goal has no delay."""
     height_offset: Quantity = 0.0
-    """By how much higher than it is the robot takes itself to be [m], in the whole episode."""
+    """Offset of the measured height [m], constant over an episode."""
     pitch_offset: Quantity = 0.0
-    """Likewise by how much its nose is lower [rad]."""
+    """Offset of the measured pitch [rad], constant over an episode; positive lowers the nose."""
     start_x: Quantity = 0.0
-    """Where the episode starts [m], world frame: forward of the origin."""
+    """Start position along the world's x axis [m]."""
     start_y: Quantity = 0.0
-    """To the left."""
+    """Start position along the world's y axis [m]."""
     start_yaw: Quantity = 0.0
     """Heading at the start [rad], counter-clockwise."""
 
     def differs(self, *names: str) -> bool:
-        """Return whether any of some quantities may differ from the preset's; a traced one may."""
+        """Return whether any of some parameters may differ from the preset.
+
+        Args:
+          *names: the parameters; a traced one may always differ.
+        """
         presets = type(self)._field_defaults
         values = {name: getattr(self, name) for name in names}
         return any(
@@ -96,26 +98,27 @@ class RobotParams(NamedTuple):
 
 
 def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams) -> mjx.Model:
-    """Return the physics model of a varied robot, as MuJoCo would compile it.
+    """Return the physics model of a varied robot, equal to one that MuJoCo compiles.
 
     Args:
-      model: the preset's.
-      mj_model: the same robot for C, with or without what only shows.
-      robot_params: its friction, mass and centre of mass.
+      model: the MJX model of the preset.
+      mj_model: the C model of the preset, with or without visual elements.
+      robot_params: the robot parameters; friction, mass and centre of mass are used.
 
     Returns:
-      A model of the same structure. The constants that MuJoCo derives from the masses when it
-      compiles, and its contacts read, follow exactly; those that no part of this robot reads
-      stay as they were.
+      A model of the same structure. Constants that MuJoCo derives from the masses are updated if
+      the contacts of this robot use them; the others stay those of the preset.
     """
     changed = {}
+    # Friction of the wheels.
     if robot_params.differs("friction"):
         wheels = np.zeros(mj_model.npair, bool)
         wheels[[mj_model.pair(f"{side}_wheel").id for side in _SIDES]] = True
-        # Tangential only: torsion and rolling take no part in a contact of three dimensions.
+        # Tangential friction only: a contact with condim 3 has no torsional or rolling friction.
         tangential = wheels[:, None] & (np.arange(5) < 2)
         factor = jnp.where(tangential, robot_params.friction, 1.0)
         changed["pair_friction"] = model.pair_friction * factor
+    # Mass and centre of mass of the chassis.
     chassis = np.arange(model.nbody) == mj_model.body(_CHASSIS).id
     if robot_params.differs("mass"):
         mass = jnp.where(chassis, robot_params.mass, 1.0)
@@ -138,17 +141,22 @@ def _com_shift(robot_params: RobotParams) -> Float[Array, "3"]:
 def _invweights(
     model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams
 ) -> Float[Array, "bodies 2"]:
-    """`body_invweight0`, the softness of contacts, which follows chassis mass and centre of mass.
+    """Return `body_invweight0`, which sets the softness of contacts, for a varied chassis.
 
-    MuJoCo takes it from the diagonal of J M⁻¹ Jᵀ in the initial pose, averaged over the three
-    translations and the three rotations of each body. A wheel is as heavy however it is turned,
-    and of its spin s the rest of the robot feels only what the rotor's a lets through,
-    s a / (s + a). So all is one rigid body of mass m, centre c and inertia J about it, and with
-    A = J⁻¹, d = p - c, e = a / (s + a):
+    MuJoCo computes it from the diagonal of J M⁻¹ Jᵀ in the initial pose, averaged over the three
+    translations and over the three rotations of each body. The inertia of a wheel does not depend
+    on its angle. Of a wheel's spin inertia s the rest of the robot feels s a / (s + a), where a is
+    the rotor inertia. Hence the robot acts like one rigid body of mass m, centre of mass c and
+    inertia J about c. With A = J⁻¹, d = p - c and e = a / (s + a):
 
-        a point p     1/m + (|d|² tr A - dᵀ A d) / 3
-        the chassis   tr A / 3
-        a wheel       (A_xx + A_zz + 1/(s + a) + e² A_yy) / 3
+        translation of a body at p   1/m + (|d|² tr A - dᵀ A d) / 3
+        rotation of the chassis      tr A / 3
+        rotation of a wheel          (A_xx + A_zz + 1/(s + a) + e² A_yy) / 3
+
+    Args:
+      model: the MJX model of the preset.
+      mj_model: the C model of the preset.
+      robot_params: the robot parameters; mass and centre of mass are used.
     """
     bodies = [mj_model.body(name).id for name in (_CHASSIS, "left_wheel", "right_wheel")]
     chassis, *wheels = bodies
@@ -186,7 +194,7 @@ def _invweights(
 
     shift = _com_shift(robot_params)
     varied = model.body_invweight0.at[np.asarray(bodies)].set(weights(robot_params.mass, shift))
-    # Where it is the preset's robot, to the bit.
+    # Bit-identical to the preset where mass and centre of mass are those of the preset.
     return jnp.where(_is_preset(robot_params, shift), model.body_invweight0, varied)
 
 
@@ -195,6 +203,6 @@ def _is_preset(robot_params: RobotParams, shift: Float[Array, "3"]) -> Bool[Arra
 
 
 def _inverse(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Decompose a symmetric matrix without a call of LAPACK or cuSOLVER."""
+    """Invert a symmetric matrix by cross products, without a call of LAPACK or cuSOLVER."""
     rows = [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])]
     return jnp.stack(rows, axis=1) / (a[0] * rows[0]).sum()

@@ -1,9 +1,9 @@
-"""A sensor model: the robot's own state, late and inexact. A pure pipeline of one robot.
+"""Model the sensors: delay, noise and offsets of the robot state that the policy observes.
 
-It stands between physics and the task's `observe`, so any observation of any task has its share.
-The first one of an episode has no delay and no noise: a robot that stands can take its time to
-look. Offsets are in every one.
-Reward, success and the end of an episode follow the true state; the goal is known as it is.
+The model is a pure function of one robot. It runs between physics and the task's `observe`, so it
+acts on every observation of every task. Reward, success and termination use the true state, and the
+goal has no errors. The first observation of an episode has no delay and no noise, since a robot at
+rest has time to average; offsets are in every observation.
 """
 
 from typing import NamedTuple
@@ -21,27 +21,26 @@ _OFFSETS = ("height_offset", "pitch_offset")
 
 
 class SensorState(NamedTuple):
-    """The memory of the sensor model."""
+    """A `SensorState` holds what the sensor model carries from step to step."""
 
     seen: Float[Array, "delay robot"] | None
-    """The last states of the robot, the newest first; None: there is no delay."""
+    """The last robot states, the newest first, each as the concatenated fields of a `RobotState`;
+    None: the model has no delay."""
     key: UInt32[Array, "2"] | None
-    """Random key of this episode's noise; None: there is no noise."""
+    """Random key of this episode's noise; None: the model has no noise."""
 
 
-def sensors_at_start(
+def initial_sensor_state(
     robot: RobotState, key: UInt32[Array, "2"], robot_params: RobotParams, longest_delay: int
 ) -> SensorState:
-    """Return the state of sensors that have seen the robot stand where it starts.
+    """Return the sensor state at the start of an episode: the robot has been at rest there.
 
     Args:
-      robot: there.
-      key: of the noise.
-      robot_params: the robot's.
-      longest_delay: of any robot that the program serves [control steps].
-
-    Returns:
-      What they remember.
+      robot: the robot state at the start.
+      key: the random key of the noise.
+      robot_params: the parameters of the robot.
+      longest_delay: the longest `observation_delay` that the compiled program supports
+        [control steps].
     """
     return SensorState(
         jnp.repeat(jnp.concatenate(robot)[None], longest_delay, axis=0) if longest_delay else None,
@@ -49,42 +48,43 @@ def sensors_at_start(
     )
 
 
-def sense(
+def step_sensors(
     sensors: SensorState, robot: RobotState, robot_params: RobotParams, step: Int[Array, ""]
 ) -> tuple[SensorState, RobotState]:
-    """Return the state that the robot measures.
+    """Return the robot state that the sensors measure in this step.
 
     Args:
-      sensors: before.
-      robot: as it is.
-      robot_params: the robot's.
+      sensors: the sensor state before the step.
+      robot: the true robot state.
+      robot_params: the parameters of the robot.
       step: control steps since the episode began.
 
     Returns:
-      The sensors after it, and the state of `observation_delay` steps ago, with noise and offsets.
+      The sensor state after the step, and the robot state of `observation_delay` steps ago with
+      noise and offsets.
     """
     seen, key = sensors
     if seen is not None:
-        line = jnp.concatenate([jnp.concatenate(robot)[None], seen])
-        late = line[jnp.round(robot_params.observation_delay).astype(jnp.int32)]
+        history = jnp.concatenate([jnp.concatenate(robot)[None], seen])
+        delayed = history[jnp.round(robot_params.observation_delay).astype(jnp.int32)]
         ends = [3, 7, 10]  # position, quaternion, velocity, angular velocity
-        robot = RobotState(*jnp.split(late, ends))
-        seen = line[:-1]
+        robot = RobotState(*jnp.split(delayed, ends))
+        seen = history[:-1]
     if key is not None:
-        # Another key for every step, without drawing it: Threefry takes any.
-        own = key ^ jnp.stack([jnp.uint32(0), step.astype(jnp.uint32)])
-        robot = _noisy(robot, own, robot_params)
-    return SensorState(seen, key), with_offsets(robot, robot_params)
+        # A key per step without a draw: any two integers are a valid Threefry key.
+        step_key = key ^ jnp.stack([jnp.uint32(0), step.astype(jnp.uint32)])
+        robot = _add_noise(robot, step_key, robot_params)
+    return SensorState(seen, key), add_offsets(robot, robot_params)
 
 
-def with_offsets(robot: RobotState, robot_params: RobotParams) -> RobotState:
-    """Return a robot's state with the errors that last a whole episode.
+def add_offsets(robot: RobotState, robot_params: RobotParams) -> RobotState:
+    """Return a robot state with the offsets in height and pitch, constant over an episode.
 
-    The attitude alone is turned: velocities in the world frame do not depend on it.
+    Only the attitude is rotated: velocities in the world frame do not depend on it.
 
     Args:
-      robot: its state.
-      robot_params: its offsets.
+      robot: the robot state.
+      robot_params: the parameters of the robot.
     """
     if not robot_params.differs(*_OFFSETS):
         return robot
@@ -95,7 +95,8 @@ def with_offsets(robot: RobotState, robot_params: RobotParams) -> RobotState:
     )
 
 
-def _noisy(robot: RobotState, key: UInt32[Array, "2"], robot_params: RobotParams) -> RobotState:
+def _add_noise(robot: RobotState, key: UInt32[Array, "2"], robot_params: RobotParams) -> RobotState:
+    """Add Gaussian noise to the planar quantities: x, y, yaw and their rates."""
     x, y, turn, vx, vy, spin = jax.random.normal(key, (6,))
     zero = jnp.zeros(())
     return RobotState(

@@ -1,4 +1,4 @@
-"""The state of an episode: Brax's state, kept as small as physics allows."""
+"""Define the state of an environment: Brax's state, as small as physics allows."""
 
 from typing import Any
 
@@ -11,47 +11,58 @@ from jetbot_mjx.envs.task import Goal, RobotState
 
 
 class PhysicsState(struct.PyTreeNode):
-    """The quantities that physics integrates, and nothing that can be computed from them."""
+    """A `PhysicsState` holds what physics integrates, and nothing that follows from it.
+
+    `mjx.Data` is rebuilt from it at every step, so that a batch of states stays small in memory.
+    """
 
     qpos: Float[Array, " nq"]
-    """Position (x, y, z) [m], quaternion (w, x, y, z), wheel angles (left, right) [rad]."""
+    """Generalised position: axle midpoint (x, y, z) [m] in the world frame, attitude quaternion
+    (w, x, y, z), wheel angles (left, right) [rad]."""
     qvel: Float[Array, " nv"]
-    """Velocity, world frame [m/s]; angular velocity, body frame; wheel speeds [rad/s]."""
+    """Generalised velocity: linear velocity in the world frame [m/s], angular velocity in the body
+    frame [rad/s], wheel speeds (left, right) [rad/s]."""
     qacc_warmstart: Float[Array, " nv"]
-    """Last acceleration, where the solver starts from."""
+    """Acceleration of the last physics step, from which the constraint solver starts."""
     time: Float[Array, ""]
-    """Since the episode began [s]."""
+    """Simulated time since the episode began [s]."""
 
 
 class State(struct.PyTreeNode):
-    """An environment's state: Brax's fields, which its trainers use, and the task's own."""
+    """A `State` holds the state of an environment: Brax's fields and those of this package.
+
+    The names are stored in checkpoints.
+    """
 
     pipeline_state: PhysicsState
-    """What physics integrates, under Brax's name for it."""
+    """The physics state; the name is Brax's."""
     obs: Float[Array, " obs"]
-    """What the policy sees."""
+    """Observation of the policy."""
     reward: Float[Array, ""]
-    """Of the step that led here."""
+    """Reward of the last step."""
     done: Float[Array, ""]
-    """1 where that step ended the episode."""
+    """1 where the last step ended the episode, else 0."""
     metrics: dict[str, Float[Array, ""]]
-    """Metrics of that step; the same names at every step."""
+    """Metrics of the last step; the names are the same at every step."""
     info: dict[str, Any]
-    """What wrappers and trainers keep beside; the same names at every step."""
+    """Fields of wrappers and trainers; the names are the same at every step."""
     goal: Goal
-    """What the task drew for this episode."""
+    """The goal that the task drew for this episode, as it stands now."""
     key: UInt32[Array, "2"]
     """Random key from which the next episode is drawn."""
     episode_params: Any = None
-    """How this episode's robot differs from its preset, and what its motors and sensors remember;
-    None: it is its preset."""
+    """`EpisodeParams` of a `DomainRandomizationWrapper`: the robot parameters of this episode and
+    the states of actuators and sensors. None: the robot is its preset."""
 
 
 def robot_state(physics: PhysicsState) -> RobotState:
-    """Return the robot as a task sees it, from the generalised coordinates.
+    """Return the robot state that a task sees, from the generalised coordinates.
 
-    MuJoCo's free joint holds the velocity of the body's origin in the world frame, but the
-    angular velocity in the body frame: it is rotated here.
+    MuJoCo's free joint has the linear velocity in the world frame but the angular velocity in the
+    body frame; the latter is rotated into the world frame here.
+
+    Args:
+      physics: the physics state.
     """
     quat = physics.qpos[QPOS_QUAT]
     return RobotState(

@@ -1,8 +1,8 @@
-"""Tasks: goals, observations, rewards, termination. Pure functions of one robot.
+"""Define tasks: goals, observations, rewards and termination, as pure functions of one robot.
 
-`Task` is the contract; `GoalTask` is the tutorial's task and a base class for your own.
-A task is built as `Class(task_config)` and named in YAML as `package.module:Class`.
-Frames: `_w` world, `_b` body (x forward, y left, z up). No batch axis: `jax.vmap`.
+`Task` is the interface; `GoalTask` is the tutorial's task and a base class for your own. A task is
+built as `Class(task_config)` and named in YAML as `package.module:Class`. No method has a batch
+axis: batch with `jax.vmap`. Frames: `_w` world, `_b` body (x forward, y left, z up).
 """
 
 import importlib
@@ -20,41 +20,47 @@ from jetbot_mjx.envs import kinematics
 from jetbot_mjx.errors import UserError
 
 Goal = PyTree
-"""Whatever a task draws for an episode; the tutorial's is a position [m], world frame."""
+"""Arrays in any pytree that a task draws for an episode; `GoalTask` draws a position [m], world
+frame."""
 
-GOAL_HEIGHT = 0.05  # [m] centre of the tutorial's cube of 0.1 m, ISAAC `VisualCuboid`
+GOAL_HEIGHT = 0.05  # [m] centre of the tutorial's 0.1 m cube; source: ISAAC `VisualCuboid`
 
 
 class RobotState(NamedTuple):
-    """The robot as a task sees it: its axle midpoint and body frame, in the world frame."""
+    """A `RobotState` holds what a task sees of the robot, in the world frame."""
 
     position_w: Float[Array, "3"]
-    """Axle midpoint [m]."""
+    """Position of the axle midpoint [m]."""
     quat: Float[Array, "4"]
-    """Attitude (w, x, y, z)."""
+    """Attitude of the body as a unit quaternion (w, x, y, z)."""
     linear_velocity_w: Float[Array, "3"]
     """Velocity of the axle midpoint [m/s]."""
     angular_velocity_w: Float[Array, "3"]
-    """[rad/s]"""
+    """Angular velocity of the body [rad/s]."""
 
 
 class Field(NamedTuple):
-    """One named stretch of the observation vector."""
+    """A `Field` describes consecutive entries of the observation vector."""
 
     name: str
     size: int
+    """Number of entries."""
     unit: str
+    """Unit, such as `m`; `1` for quantities without a unit."""
     frame: str
+    """Frame, such as `world` or `body`."""
     min_std: float | None = None
-    """[unit] smallest deviation by which training normalises it; None: that of its unit."""
+    """Smallest standard deviation by which training normalises the entries, in their unit; None:
+    the value of `MIN_STD` for the unit."""
 
 
 MIN_STD = {"m": 0.01, "m/s": 0.05, "rad": 0.05, "rad/s": 0.1, "1": 0.05}
-"""Smallest deviation of an observation by its unit: changes below it may be the simulator's own."""
+"""Smallest standard deviation for observation normalisation, by unit: smaller changes may be
+artefacts of the simulator."""
 
 Layout = tuple[Field, ...]
 
-# The tutorial's 16 numbers, in its order.
+# The tutorial's 16-number observation, in its order.
 WORLD: Layout = (
     Field("position", 3, "m", "world"),
     Field("quaternion", 4, "1", "world"),
@@ -63,7 +69,7 @@ WORLD: Layout = (
     Field("goal_position", 3, "m", "world"),
 )
 
-# What a robot can know without a global pose.
+# An observation that a real robot can measure without its global pose.
 EGOCENTRIC: Layout = (
     Field("goal_position", 2, "m", "body"),
     Field("goal_direction", 2, "1", "body"),
@@ -76,12 +82,12 @@ LAYOUTS: dict[str, Layout] = {"world": WORLD, "egocentric": EGOCENTRIC}
 
 
 def layout_size(layout: Layout) -> int:
-    """Length of the observation vector that a layout describes."""
+    """Return the length of the observation vector that a layout describes."""
     return sum(field.size for field in layout)
 
 
 def layout_data(layout: Layout) -> list[dict[str, Any]]:
-    """Return what a policy has to know of its observation, as JSON: all but `min_std`."""
+    """Return a layout as JSON for the users of a trained policy: all fields but `min_std`."""
     return [
         {name: value for name, value in field._asdict().items() if name != "min_std"}
         for field in layout
@@ -89,10 +95,13 @@ def layout_data(layout: Layout) -> list[dict[str, Any]]:
 
 
 def min_std(field: Field) -> float:
-    """Return the smallest deviation by which training normalises a field [its unit].
+    """Return the smallest standard deviation by which training normalises a field [its unit].
+
+    Args:
+      field: a field of a layout.
 
     Raises:
-      UserError: it is no positive number, or not given and its unit has none in `MIN_STD`.
+      UserError: `min_std` is not a positive number, or it is None and `MIN_STD` lacks the unit.
     """
     if field.min_std is None:
         if field.unit not in MIN_STD:
@@ -124,16 +133,17 @@ def layout_table(layout: Layout) -> str:
 
 @runtime_checkable
 class Task(Protocol):
-    """The interface of a task. All methods are pure and see one robot.
+    """The interface of a task. All methods are pure functions of one robot.
 
-    Optional beside these: `move_goal`, of `MovesGoal`, and `advance`, of `AdvancesGoal`.
+    Two optional methods are declared in protocols of their own: `MovesGoal.move_goal` and
+    `AdvancesGoal.advance`.
     """
 
     layout: Layout
-    """The observation as data: name, size, unit and frame of each part."""
+    """Description of the observation: name, size, unit and frame of each part."""
 
     def sample(self, key: UInt32[Array, "2"]) -> Goal:
-        """Draw the goal of one episode: arrays in any pytree."""
+        """Draw the goal of one episode, arrays in any pytree."""
         ...
 
     def observe(self, robot: RobotState, goal: Goal) -> Float[Array, " obs"]:
@@ -147,15 +157,15 @@ class Task(Protocol):
         goal: Goal,
         action: Float[Array, "2"],
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """Return the reward of one step and its named terms, the same names at every step."""
+        """Return the reward of one step and its named terms; names are the same at every step."""
         ...
 
     def terminated(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Return whether the episode has ended for good, in success or failure."""
+        """Return whether the task ends the episode, in success or failure."""
         ...
 
     def success(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Return whether the task is done."""
+        """Return whether the robot has solved the task."""
         ...
 
     def goal_position(self, goal: Goal) -> Float[Array, "3"]:
@@ -163,28 +173,31 @@ class Task(Protocol):
         ...
 
     def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]:
-        """Return where the scene's mocap bodies stand [m], by name."""
+        """Return the positions [m] of the scene's mocap bodies, world frame, by name."""
         ...
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
         """Add the task's own bodies to the scene before it is compiled.
 
-        What only shows wants `contype=0, conaffinity=0`. What the robot can run into is given a
-        contact pair with a geom of the robot; as a mocap body it stands where `markers` says.
+        Visual geoms need `contype=0, conaffinity=0`. A geom that the robot can hit needs a contact
+        pair with a geom of the robot. A mocap body is placed at its position in `markers`.
+
+        Args:
+          spec: the scene with robot and floor; it is modified in place.
         """
         ...
 
 
 @runtime_checkable
 class MovesGoal(Protocol):
-    """An optional interface of a task whose goal a user can move while a robot drives."""
+    """An optional interface of tasks whose goal a user can move while a robot drives."""
 
     def move_goal(self, goal: Goal, position_w: Float[Array, "3"]) -> Goal:
-        """Return the same goal, elsewhere.
+        """Return the goal moved to another position.
 
         Args:
-          goal: what `sample` drew; all of it that is not the place to go stays.
-          position_w: where the robot is to go instead [m], world frame.
+          goal: the goal that `sample` drew; its other parts stay the same.
+          position_w: the new position [m], world frame.
 
         Returns:
           A tree of the same structure, shapes and dtypes.
@@ -194,20 +207,21 @@ class MovesGoal(Protocol):
 
 @runtime_checkable
 class AdvancesGoal(Protocol):
-    """An optional interface of a task whose goal changes as the robot drives.
+    """An optional interface of tasks whose goal changes while the robot drives.
 
-    What an episode has to remember, such as how many gates are passed, is part of the goal.
+    The memory of an episode, such as the number of gates passed, is part of the goal.
     """
 
     def advance(self, before: RobotState, after: RobotState, goal: Goal) -> Goal:
         """Return the goal after a step.
 
-        `reward` sees the goal before it; `terminated`, `success` and `observe` the one after.
+        `reward` gets the goal before the step; `terminated`, `success` and `observe` get the goal
+        after the step.
 
         Args:
           before: the robot before the step.
-          after: the robot after it.
-          goal: until then.
+          after: the robot after the step.
+          goal: the goal before the step.
 
         Returns:
           A tree of the same structure, shapes and dtypes.
@@ -216,13 +230,13 @@ class AdvancesGoal(Protocol):
 
 
 class GoalTask:
-    """The tutorial's task: drive to a cube that lies anywhere around the start.
+    """The tutorial's task: drive to a cube at a random position around the start.
 
-    Goals: distance r = span·√u + minimum and any direction. The added minimum makes nearby
-    goals rarer than a uniform draw over the ring would; that is the tutorial's sampler.
-    Reward: progress, d(t-1) - d(t), so an episode's return is what distance it covered.
-    Success, and the end: the 3-D distance of the axle midpoint to the cube's centre is below
-    `success_radius`. Since the cube's centre lies 18 mm higher, that is 98.4 mm on the floor.
+    Goals: the distance is r = span·√u + minimum, and the direction is uniform. Adding the minimum
+    makes near goals rarer than a uniform draw over the ring would; the tutorial samples so.
+    Reward: the progress d(t-1) - d(t), so that the return is the distance covered towards the goal.
+    Success and termination: the 3-D distance from the axle midpoint to the cube's centre is below
+    `success_radius`. Since the centre lies 18 mm higher, that is 98.4 mm on the floor.
 
     Source: Isaac Sim 2022.x documentation, section 9.9.
     """
@@ -231,7 +245,7 @@ class GoalTask:
         """Build the task.
 
         Args:
-          config: ranges, radius and the observation's layout.
+          config: the range of goals, the success radius and the observation layout.
         """
         self.config = config
         self.layout: Layout = LAYOUTS[config.observation]
@@ -239,7 +253,10 @@ class GoalTask:
     def sample(self, key: UInt32[Array, "2"]) -> Float[Array, "3"]:
         """Draw a goal position [m], world frame.
 
-        α = 2π u₁,  r = span √u₂ + minimum,  goal = (r sin α, r cos α, 0.05)
+            α = 2π u₁,  r = span √u₂ + minimum,  goal = (r sin α, r cos α, 0.05)
+
+        Args:
+          key: the random key of the episode.
         """
         u1, u2 = jax.random.uniform(key, (2,))
         angle = 2.0 * math.pi * u1
@@ -249,7 +266,7 @@ class GoalTask:
         )
 
     def observe(self, robot: RobotState, goal: Goal) -> Float[Array, " obs"]:
-        """Return the observation in the configured layout, see `WORLD` and `EGOCENTRIC`."""
+        """Return the observation in the configured layout: `WORLD` or `EGOCENTRIC`."""
         position_w = self.goal_position(goal)
         if self.config.observation == "world":
             return jnp.concatenate([*robot, position_w])
@@ -257,10 +274,10 @@ class GoalTask:
         goal_b = kinematics.to_body(heading, position_w[:2] - robot.position_w[:2])
         distance = jnp.hypot(*goal_b)
         forward_speed = kinematics.to_body(heading, robot.linear_velocity_w[:2])[0]
-        # The floor under the distance only guards the division; an episode ends at 98 mm.
+        # The minimum only guards the division: an episode ends at 98 mm.
         direction = goal_b / jnp.maximum(distance, 1e-3)
-        rest = jnp.stack([distance, forward_speed, robot.angular_velocity_w[2]])
-        return jnp.concatenate([goal_b, direction, rest])
+        scalars = jnp.stack([distance, forward_speed, robot.angular_velocity_w[2]])
+        return jnp.concatenate([goal_b, direction, scalars])
 
     def reward(
         self,
@@ -269,52 +286,52 @@ class GoalTask:
         goal: Goal,
         action: Float[Array, "2"],
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
-        """Progress towards the goal in this step [m]."""
+        """Return the progress towards the goal in this step [m], d(t-1) - d(t)."""
         del action
         progress = self.distance(before, goal) - self.distance(after, goal)
         return progress, {"progress": progress}
 
     def terminated(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Return whether the episode has succeeded, which ends it."""
+        """Return whether the robot has reached the goal; nothing else ends an episode."""
         return self.success(robot, goal)
 
     def success(self, robot: RobotState, goal: Goal) -> Bool[Array, ""]:
-        """Return whether the goal is nearer than the success radius."""
+        """Return whether the distance to the goal is below `success_radius`."""
         return self.distance(robot, goal) < self.config.success_radius
 
     def goal_position(self, goal: Goal) -> Float[Array, "3"]:
-        """Return the goal itself."""
+        """Return the goal, which is a position."""
         return goal
 
     def move_goal(self, goal: Goal, position_w: Float[Array, "3"]) -> Goal:
-        """Return the position itself; a task that draws more says where in its draw it goes."""
+        """Return the new position as the goal.
+
+        A task whose goal has other parts must override this method.
+        """
         del goal
         return position_w
 
     def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]:
-        """Return the place of the red cube, which stands on the goal."""
+        """Return the position of the red cube, which marks the goal."""
         return {"goal": self.goal_position(goal)}
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
-        """Nothing to add: the cube is part of the scene."""
+        """Add nothing: the cube is part of the base scene."""
         del spec
 
     def distance(self, robot: RobotState, goal: Goal) -> Float[Array, ""]:
-        """3-D distance from the axle midpoint to the goal [m]."""
+        """Return the 3-D distance from the axle midpoint to the goal [m]."""
         return jnp.linalg.norm(self.goal_position(goal) - robot.position_w)
 
 
 def make_task(config: TaskConfig) -> Task:
-    """Import and builds the task that a configuration names.
+    """Import and build the task that a configuration names.
 
     Args:
-      config: its `name` is `package.module:Class`.
-
-    Returns:
-      The task.
+      config: the task section; its `name` is `package.module:Class`.
 
     Raises:
-      UserError: the name is malformed, cannot be imported, or is no task.
+      UserError: the name is malformed, cannot be imported, or does not name a task.
     """
     module_name, separator, class_name = config.name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
@@ -337,8 +354,9 @@ def make_task(config: TaskConfig) -> Task:
     return task
 
 
-def _check_members(name: str, thing: object, members: Sequence[str]) -> None:
-    missing = [member for member in members if not hasattr(thing, member)]
+def _check_members(name: str, task: object, members: Sequence[str]) -> None:
+    """Raise an error if a task or its class lacks members of the interface."""
+    missing = [member for member in members if not hasattr(task, member)]
     if missing:
         raise UserError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
 
@@ -353,3 +371,4 @@ METHODS = (
     "markers",
     "build_scene",
 )
+"""Methods that every task must have."""

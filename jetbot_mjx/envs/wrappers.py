@@ -1,17 +1,10 @@
-"""Wrappers for training: termination and truncation apart, and a new goal in every episode.
+"""Wrap an environment for training: count, end and restart its episodes.
 
-Brax's `AutoResetWrapper` puts back the first state it ever saw, goal included. Here each
-episode is drawn afresh from the environment's own key. The wrappers see one robot;
-`jax.vmap` comes last, outermost.
+`wrap_for_training` is the entry point. The order, from the inside out:
 
-What `info` holds from `reset` on, all float32 (Brax's trainer reads the first four):
-  steps            environment steps of this episode so far, the last one's at its end
-  truncation       1 where the episode was cut off (time limit, non-finite world): bootstraps
-  episode_done     1 where an episode ended in this step
-  episode_metrics  sums over the episode: every metric, `sum_reward` and `length`; with
-                   `action_repeat` reward and metrics of a step are sums already
-  terminated       1 where the task ended it: success or failure, does not bootstrap
-  final_obs        what the policy would have seen next in the episode that ended
+    JetBotEnv > DomainRandomizationWrapper > EpisodeWrapper > NewEpisodeWrapper > jax.vmap
+
+All wrappers but the last one see a single robot without a batch axis.
 """
 
 from collections.abc import Callable
@@ -29,11 +22,11 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
-"""From one model to (a batch of models, the batch's axes as `jax.vmap` wants them)."""
+"""A function from one model to (batch of models, their `in_axes` for `jax.vmap`), as in Brax."""
 
 
 class _Env(Protocol):
-    """The interface that a wrapper needs of what it wraps."""
+    """The interface that a wrapper requires of the environment inside it."""
 
     def reset(self, rng: UInt32[Array, "2"]) -> State: ...
 
@@ -46,36 +39,73 @@ def wrap_for_training(
     action_repeat: int = 1,
     randomization_fn: RandomizationFn | None = None,
 ) -> Env:
-    """Wrap an environment as trainers need it, batched, with what its configuration draws.
+    """Wrap an environment for a trainer: batched, with automatic resets and domain randomization.
 
-    The signature is that of Brax's `wrap_env_fn`: pass this function to `ppo.train`.
+    The signature is that of Brax's `wrap_env_fn`, so this function can be passed to `ppo.train`.
+    The `randomization` section of the environment's configuration is applied in every episode;
+    `randomization_fn` is Brax's way to give each environment one fixed model.
 
     Args:
-      env: one environment.
+      env: one environment, unwrapped.
       episode_length: environment steps after which an episode is truncated.
-      action_repeat: environment steps for which each action is held.
-      randomization_fn: draws one physics model for each environment; the batch it returns
-        must be as large as the batch of keys given to `reset`.
+      action_repeat: environment steps for which each action is repeated.
+      randomization_fn: draws one physics model per environment. The batch of models must be as
+        large as the batch of keys given to `reset`. None: all environments share one model.
 
     Returns:
-      The batched environment: `reset` takes keys of shape (n, 2), `step` actions (n, 2).
+      The batched environment: `reset` takes keys of shape (n, 2), `step` takes actions of shape
+      (n, 2).
     """
 
-    def chain(env: JetBotEnv) -> NewEpisodeWrapper:
-        varied = maybe_randomize(env)
-        return NewEpisodeWrapper(EpisodeWrapper(varied, episode_length, action_repeat))
+    def wrap_one(env: JetBotEnv) -> NewEpisodeWrapper:
+        randomized = maybe_randomize(env)
+        return NewEpisodeWrapper(EpisodeWrapper(randomized, episode_length, action_repeat))
 
     if randomization_fn is None:
-        return VmapWrapper(chain(env))
-    return RandomizedVmapWrapper(env, chain, randomization_fn)
+        return VmapWrapper(wrap_one(env))
+    return RandomizedVmapWrapper(env, wrap_one, randomization_fn)
 
 
 class EpisodeWrapper(Wrapper):
-    """Keeps an episode's books: steps, sums, the time limit, and worlds that blew up.
+    """A wrapper that ends episodes and accumulates their statistics.
 
-    A world whose state, observation or reward is not finite ends here: the step counts for
-    nothing (reward 0, truncated, so the loss masks it), the learner sees the last finite
-    observation instead, and `nonfinite_envs` counts it.
+    Motivation: PPO must tell two ends of an episode apart. Where the task ended it (termination),
+    the value of the next state is zero. Where the time limit or a simulation error cut it off
+    (truncation), the episode could have gone on: the loss masks that step, and the return is
+    bootstrapped from the value function. A non-finite state must not reach the learner at all,
+    since a single NaN destroys the network. Brax's `EpisodeWrapper` does not check for non-finite
+    states, and with `action_repeat` it steps on after an episode has ended.
+
+    Protocol: the environment writes `obs`, `reward`, `metrics` and `info["terminated"]`; this
+    wrapper writes the fields below at every step, all float32; `NewEpisodeWrapper` reads `done` and
+    leaves `info` and `metrics` as they are. The same names are present from `reset` on.
+
+      field                    value                                            read by
+      done                     1 where the episode ended in this step, by       PPO, adapters,
+                               termination or truncation                        NewEpisodeWrapper
+      info["terminated"]       1 where the task ended it, in success or         adapters, evaluation
+                               failure; the return is not bootstrapped
+      info["truncation"]       1 where it was cut off by the time limit or a    PPO, adapters
+                               non-finite state; the return is bootstrapped
+      info["steps"]            environment steps of this episode so far         this wrapper
+      info["episode_done"]     the same as `done`, where Brax's trainer reads   PPO, this wrapper
+                               it
+      info["episode_metrics"]  sums over the episode so far: every metric,      PPO, for its logs
+                               `sum_reward` and `length`
+      info["final_obs"]        the observation after this step, of the old      adapters
+                               episode even where a new one has begun
+      metrics["nonfinite_envs"]
+                               1 where this step was not finite                 PPO, viewers
+
+    The order within a step:
+
+      1. If the previous step ended an episode, `steps` and `episode_metrics` start from zero.
+      2. Step the environment up to `action_repeat` times, until the task or the time limit ends
+         the episode. Reward and metrics of the repeated steps are summed.
+      3. If state, observation or reward is not finite, discard the step: the state before it
+         remains, reward and metrics are 0, and the episode is truncated.
+      4. Compute truncation and `done`: terminated excludes truncated.
+      5. Add reward, length and metrics of the step to `episode_metrics`.
     """
 
     env: _Env
@@ -84,16 +114,20 @@ class EpisodeWrapper(Wrapper):
         """Wrap one environment.
 
         Args:
-          env: unbatched.
+          env: the environment, unbatched.
           episode_length: environment steps after which an episode is truncated.
-          action_repeat: environment steps for which each action is held.
+          action_repeat: environment steps for which each action is repeated.
         """
         super().__init__(env)
         self.episode_length = episode_length
         self.action_repeat = action_repeat
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begin an episode with empty books."""
+        """Begin an episode with zero counters and sums.
+
+        Args:
+          rng: a random key.
+        """
         state = self.env.reset(rng)
         zero = jnp.zeros(())
         metrics = {**state.metrics, "nonfinite_envs": zero}
@@ -112,19 +146,28 @@ class EpisodeWrapper(Wrapper):
         return state.replace(metrics=metrics, info=info)
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Make one step: `action_repeat` environment steps, unless the episode ends before."""
+        """Make one step of up to `action_repeat` environment steps.
+
+        Args:
+          state: the state after `reset` or after the previous step.
+          action: the action, in [-1, 1]².
+        """
+        # Step the environment; after an episode's end the counters begin again.
         begins = state.info["episode_done"] > 0
         steps = jnp.where(begins, 0.0, state.info["steps"])
         nstate, length = self._repeat(state, action, steps)
+        # Replace a non-finite state.
         finite = _all_finite((nstate.pipeline_state, nstate.obs, nstate.reward))
-        nstate = _select(finite, nstate, _discarded(state))
+        nstate = _select(finite, nstate, _without_step(state))
 
+        # Decide how the episode ends, if it does.
         steps = steps + length
         out_of_time = steps >= self.episode_length
         terminated = nstate.info["terminated"]
         truncation = jnp.where(out_of_time | ~finite, 1.0 - terminated, 0.0)
         done = jnp.maximum(terminated, truncation)
 
+        # Add the step to the sums of the episode.
         metrics = {**nstate.metrics, "nonfinite_envs": 1.0 - finite.astype(jnp.float32)}
         step_values = {"sum_reward": nstate.reward, "length": length, **metrics}
         sums = {
@@ -144,103 +187,122 @@ class EpisodeWrapper(Wrapper):
     def _repeat(
         self, state: State, action: Float[Array, "2"], steps: Float[Array, ""]
     ) -> tuple[State, Float[Array, ""]]:
-        """Hold an action until it was held long enough, the task has ended or the time is out.
+        """Repeat an action `action_repeat` times, or until the episode ends.
 
         Args:
-          state: where to start.
-          action: in [-1, 1]².
+          state: the state before the first step.
+          action: the action, in [-1, 1]².
           steps: environment steps of this episode so far.
 
         Returns:
-          The last state, its reward and metrics added up over the environment steps that were
-          made, and how many these were.
+          The last state, with reward and metrics summed over the steps made, and their number.
         """
         nstate = self.env.step(state.replace(done=jnp.zeros(())), action)
         length = jnp.ones(())
         if self.action_repeat == 1:
             return nstate, length
 
-        def again(carry: tuple[State, PyTree, Array], _: None) -> tuple[PyTree, None]:
+        def repeat_once(carry: tuple[State, PyTree, Array], _: None) -> tuple[PyTree, None]:
             state, sums, length = carry
-            going = (state.done == 0) & (steps + length < self.episode_length)
+            is_running = (state.done == 0) & (steps + length < self.episode_length)
             nstate = self.env.step(state, action)
             added = jax.tree.map(jnp.add, sums, (nstate.reward, nstate.metrics))
-            carry = _select(going, (nstate, added), (state, sums))
-            return (*carry, length + going), None
+            carry = _select(is_running, (nstate, added), (state, sums))
+            return (*carry, length + is_running), None
 
         first = (nstate, (nstate.reward, nstate.metrics), length)
         (nstate, (reward, metrics), length), _ = jax.lax.scan(
-            again, first, length=self.action_repeat - 1
+            repeat_once, first, length=self.action_repeat - 1
         )
         return nstate.replace(reward=reward, metrics=metrics), length
 
 
 class NewEpisodeWrapper(Wrapper):
-    """A wrapper that begins the next episode where one ends, with everything about it drawn anew.
+    """A wrapper that begins a new episode in the step in which one ends.
 
-    `reward`, `done`, `metrics` and `info` still tell of the step that ended the old episode;
-    physics, goal, `obs` and the robot's `episode_params` are already the new one's.
+    Brax's `AutoResetWrapper` restores the first state it ever saw, goal included. This wrapper
+    draws goal and robot parameters anew, from the key in the state.
+
+    After a step that ended an episode, `reward`, `done`, `metrics` and `info` belong to the old
+    episode; `pipeline_state`, `obs`, `goal`, `key` and `episode_params` belong to the new one.
     """
 
     env: _Env
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Make one step, and a reset where it ended the episode."""
+        """Make one step, and reset the environment if the episode ended.
+
+        Args:
+          state: the state before the step.
+          action: the action, in [-1, 1]².
+        """
         state = self.env.step(state, action)
-        fresh = self.env.reset(state.key)
-        begun = _select(state.done > 0, _episode(fresh), _episode(state))
-        physics, obs, goal, key, episode_params = begun
+        new_episode = self.env.reset(state.key)
+        fields = _select(state.done > 0, _episode_fields(new_episode), _episode_fields(state))
+        physics, obs, goal, key, episode_params = fields
         return state.replace(
             pipeline_state=physics, obs=obs, goal=goal, key=key, episode_params=episode_params
         )
 
 
 class RandomizedVmapWrapper(Wrapper):
-    """A batch of environments, each with a physics model of its own."""
+    """A batch of environments, each with its own fixed physics model.
+
+    It has the place of Brax's `DomainRandomizationVmapWrapper`.
+    """
 
     env: JetBotEnv
 
     def __init__(
         self,
         env: JetBotEnv,
-        chain: Callable[[JetBotEnv], Any],
+        wrap_one: Callable[[JetBotEnv], Any],
         randomization_fn: RandomizationFn,
     ) -> None:
         """Draw the models.
 
         Args:
-          env: one environment.
-          chain: the wrappers to put around it.
+          env: one environment, unwrapped.
+          wrap_one: adds the wrappers of a single environment.
           randomization_fn: draws the batch of models.
         """
         super().__init__(env)
-        self._chain = chain
+        self._wrap_one = wrap_one
         self._models, self._axes = randomization_fn(env.mjx_model)
 
     def reset(self, rng: UInt32[Array, "n 2"]) -> State:
-        """Begin an episode in every environment."""
+        """Begin an episode in every environment.
+
+        Args:
+          rng: one random key per environment.
+        """
 
         def reset(model: mjx.Model, rng: UInt32[Array, "2"]) -> State:
-            return self._chain(self.env.with_model(model)).reset(rng)
+            return self._wrap_one(self.env.with_model(model)).reset(rng)
 
         return jax.vmap(reset, in_axes=(self._axes, 0))(self._models, rng)
 
     def step(self, state: State, action: Float[Array, "n 2"]) -> State:
-        """Step every environment."""
+        """Step every environment.
+
+        Args:
+          state: the batch of states.
+          action: one action per environment, in [-1, 1]².
+        """
 
         def step(model: mjx.Model, state: State, action: Float[Array, "2"]) -> State:
-            return self._chain(self.env.with_model(model)).step(state, action)
+            return self._wrap_one(self.env.with_model(model)).step(state, action)
 
         return jax.vmap(step, in_axes=(self._axes, 0, 0))(self._models, state, action)
 
 
-def _episode(state: State) -> tuple[PyTree, ...]:
-    """Return what belongs to an episode, as against the step that led here."""
+def _episode_fields(state: State) -> tuple[PyTree, ...]:
+    """Return the fields that belong to the episode and not to the last step."""
     return state.pipeline_state, state.obs, state.goal, state.key, state.episode_params
 
 
-def _discarded(state: State) -> State:
-    """Return a state in place of a non-finite one: the state before the step, and no step taken."""
+def _without_step(state: State) -> State:
+    """Return the state before a step, with zero reward and metrics, to replace a non-finite one."""
     zeros = jax.tree.map(jnp.zeros_like, state.metrics)
     return state.replace(
         reward=jnp.zeros(()),

@@ -1,4 +1,4 @@
-"""Render a policy that drives to the report's fixed goals: videos, and trajectories from above."""
+"""Render a policy that split_trajectories to the report's fixed goals: videos, and trajectories from above."""
 
 import io
 import re
@@ -21,7 +21,15 @@ from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
-from jetbot_mjx.viewers.video import GIF_STRIDE, Frame, Studio, drives, shrunk, write_gif, write_mp4
+from jetbot_mjx.viewers.video import (
+    GIF_STRIDE,
+    Frame,
+    VideoRenderer,
+    resize_frame,
+    split_trajectories,
+    write_gif,
+    write_mp4,
+)
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # relative to the video
@@ -95,8 +103,10 @@ def render_run(
     # Plot the trajectories and render the videos.
     with writing_to(rendered.trajectories):
         _trajectory_plot(checkpoint, env, rolled_out, goals).save(rendered.trajectories)
-    with Studio(env) as studio:
-        videos = [studio.film_episode(drive) for drive in drives(env, rolled_out, goals)]
+    with VideoRenderer(env) as renderer:
+        videos = [
+            renderer.render_episode(drive) for drive in split_trajectories(env, rolled_out, goals)
+        ]
         _write_videos(rendered.mp4, rendered.gif, videos, _GIF_SIZE)
     return rendered
 
@@ -144,10 +154,10 @@ def render_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
         Image.fromarray(np.hstack(plots)).save(gallery.plots)
     # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
-    by_goal = zip(*(drives(env, each, goals) for each in rolled_out), strict=True)
-    with Studio(env) as studio:
+    by_goal = zip(*(split_trajectories(env, each, goals) for each in rolled_out), strict=True)
+    with VideoRenderer(env) as renderer:
         videos = [
-            studio.film_together(list(zip(headings, same_goal, strict=True)))
+            renderer.render_side_by_side(list(zip(headings, same_goal, strict=True)))
             for same_goal in by_goal
         ]
         _write_videos(gallery.mp4, gallery.gif, videos, _GALLERY_GIF_SIZE)
@@ -201,7 +211,7 @@ def _write_videos(mp4: Path, gif: Path, videos: Sequence[Iterable[Frame]], size:
         for place, video in enumerate(videos):
             for index, frame in enumerate(video):
                 if place < _GIF_EPISODES and index % GIF_STRIDE == 0:
-                    gif_frames.append(shrunk(frame, size))
+                    gif_frames.append(resize_frame(frame, size))
                 yield frame
 
     with writing_to(mp4):

@@ -33,7 +33,7 @@ def play_live(
     allow: Sequence[str] = (),
     tell: Callable[[str], None],
 ) -> Played:
-    """Drive in real time until the user interrupts or closes the window.
+    """Trajectory in real time until the user interrupts or closes the window.
 
     Args:
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
@@ -62,7 +62,7 @@ def play_live(
     player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed)
     try:
         if viewer == "browser":
-            with server.Browser(player, host=host, port=free, allow=allow, tell=tell) as page:
+            with server.ViserViewer(player, host=host, port=free, allow=allow, tell=tell) as page:
                 for line in addresses(host, free):
                     tell(line)
                 page.run()
@@ -91,7 +91,7 @@ def addresses(host: str, port: int) -> list[str]:
     with contextlib.suppress(KeyError, OSError):
         name = f"{getpass.getuser()}@{name}"
     lines = [
-        f"it drives at http://{here}:{port} (Ctrl-C ends it)",
+        f"it split_trajectories at http://{here}:{port} (Ctrl-C ends it)",
         f"from elsewhere: ssh -N -L {port}:{here}:{port} {name}, and open"
         f" http://127.0.0.1:{port} there",
     ]

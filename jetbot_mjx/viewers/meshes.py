@@ -8,43 +8,45 @@ import numpy as np
 import trimesh
 from jaxtyping import Float
 
-_SHOWN_GROUPS = (0, 1, 2)  # as in MuJoCo's own viewer; colliders are in group 3
+_VISIBLE_GROUPS = (0, 1, 2)  # as in MuJoCo's viewer; collision geoms are in group 3
 _ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-_SECTIONS = 48  # of what is round
-_PLAIN = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's colour of a geom that has none of its own
+_SECTIONS = 48  # faces around cylinders and capsules
+_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
 class Geom(NamedTuple):
-    """One geom that shows, in the frame of its body."""
+    """A `Geom` holds the mesh of a visible geom and its pose in the frame of its body."""
 
     name: str
-    """Its own, or its number where it has none."""
+    """Name of the geom, or its index if it has no name."""
     body: int
-    """Its number."""
+    """Index of its body."""
     position_b: Float[np.ndarray, "3"]
-    """[m]"""
+    """Position in the body frame [m]."""
     quat_b: Float[np.ndarray, "4"]
-    """(w, x, y, z)"""
+    """Orientation in the body frame (w, x, y, z)."""
     mesh: trimesh.Trimesh
+    """Surface in the frame of the geom [m]."""
     rgba: tuple[float, float, float, float]
+    """Colour and opacity, each in [0, 1]."""
     smooth: bool
-    """Whether it is round everywhere, and its shading may hide the triangles."""
+    """Whether to use smooth shading, as for spheres and ellipsoids."""
 
 
-def shown_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
-    """Return all geoms that show, except planes and height fields.
+def visible_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
+    """Return the meshes of all visible geoms, except for planes and height fields.
 
     Args:
-      model: with all that shows.
+      model: the model with all visual elements.
 
     Yields:
-      Geoms, in the model's order.
+      The geoms, in the order of the model.
     """
     for index in range(model.ngeom):
         geom = model.geom(index)
         mesh = _mesh(model, index)
         rgba = _rgba(model, index)
-        if mesh is None or geom.group[0] not in _SHOWN_GROUPS or rgba[3] == 0:
+        if mesh is None or geom.group[0] not in _VISIBLE_GROUPS or rgba[3] == 0:
             continue
         yield Geom(
             name=geom.name or str(index),
@@ -58,7 +60,7 @@ def shown_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
 
 
 def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh | None:
-    """Return a geom's surface about its own centre; None for what is no closed surface."""
+    """Return the surface of a geom around its centre; None for planes and height fields."""
     size = model.geom_size[index]
     match mujoco.mjtGeom(model.geom_type[index]):
         case mujoco.mjtGeom.mjGEOM_BOX:
@@ -81,9 +83,9 @@ def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh | None:
 
 
 def _rgba(model: mujoco.MjModel, index: int) -> tuple[float, float, float, float]:
-    """Return the colour that MuJoCo draws: the geom's own, else its material's."""
+    """Return the colour that MuJoCo draws: that of the geom if it is set, else its material's."""
     own, material = model.geom_rgba[index], model.geom_matid[index]
-    if material >= 0 and np.allclose(own, _PLAIN):
+    if material >= 0 and np.allclose(own, _DEFAULT_RGBA):
         own = model.mat_rgba[material]
     red, green, blue, alpha = map(float, own)
     return red, green, blue, alpha

@@ -1,4 +1,4 @@
-"""MuJoCo's own window, where there is a display, and a player in it."""
+"""Show a player in MuJoCo's own window, on machines with a display."""
 
 import queue
 import sys
@@ -15,22 +15,23 @@ from jaxtyping import Float
 
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.player import Player
+from jetbot_mjx.viewers.pose import set_pose
 
 _REMEDY = "use --viewer browser, which needs none"
-_ARROWS = {265: (1, 0), 264: (-1, 0), 263: (0, 1), 262: (0, -1)}  # GLFW's numbers of the keys
+_ARROWS = {265: (1, 0), 264: (-1, 0), 263: (0, 1), 262: (0, -1)}  # by the key codes of GLFW
 
 
 def require_window(remedy: str = _REMEDY) -> types.ModuleType:
-    """Look whether a window could be opened, before anything that takes time.
+    """Check that a window can be opened; call this before slow work.
 
     Args:
-      remedy: what to do where none can.
+      remedy: the advice in the error message.
 
     Returns:
-      MuJoCo's viewer.
+      The module `mujoco.viewer`.
 
     Raises:
-      UserError: on Linux there is no display; opening a window there would wait for ever.
+      UserError: GLFW is missing, or there is no display (on Linux, opening a window would hang).
     """
     try:
         import glfw
@@ -38,7 +39,7 @@ def require_window(remedy: str = _REMEDY) -> types.ModuleType:
     except (ImportError, RuntimeError) as error:
         raise UserError(f"no window can be opened here ({error}): {remedy}") from None
     with warnings.catch_warnings():
-        # GLFW says it as a warning beside its answer.
+        # GLFW returns False and warns as well.
         warnings.simplefilter("ignore")
         if sys.platform == "linux" and not glfw.init():
             raise UserError(f"no window can be opened here, there is no display: {remedy}")
@@ -46,7 +47,7 @@ def require_window(remedy: str = _REMEDY) -> types.ModuleType:
 
 
 class Window:
-    """A window on a model; a context manager that closes it."""
+    """A window that shows a model; a context manager that closes it."""
 
     def __init__(
         self,
@@ -58,13 +59,13 @@ class Window:
         """Open the window.
 
         Args:
-          mj_model: with all that shows.
-          key_callback: called with GLFW's number of every key that is pressed, in the window's
-            own thread.
-          remedy: what to do where no window can be opened.
+          mj_model: the model with all visual elements.
+          key_callback: a function that the window's thread calls with the GLFW key code of every
+            key press.
+          remedy: the advice in the error message.
 
         Raises:
-          UserError: there is no display, or it takes another Python to open a window (macOS).
+          UserError: there is no display, or Python is not `mjpython` (macOS).
         """
         self._model, self._data = mj_model, mujoco.MjData(mj_model)
         try:
@@ -91,26 +92,23 @@ class Window:
         """Show one pose.
 
         Args:
-          qpos: the robot's.
-          markers: positions [m] of mocap bodies, by name, as `Task.markers` gives them.
-          texts: names and figures, line by line, for the window's corner.
+          qpos: generalised position of the robot.
+          markers: positions [m] of the mocap bodies, by name, as `Task.markers` returns them.
+          texts: labels and values, line by line, for the corner of the window.
         """
         with self._viewer.lock():
-            self._data.qpos[:] = qpos
-            for name, position in markers.items():
-                mocap = self._model.body(name).mocapid[0]
-                self._data.mocap_pos[mocap] = np.asarray(position)
+            set_pose(self._model, self._data, qpos, markers)
             mujoco.mj_forward(self._model, self._data)
         if texts is not None:
             self._viewer.set_texts((None, None, *texts))
         self._viewer.sync()
 
     def close(self) -> None:
-        """Close it."""
+        """Close the window."""
         self._viewer.close()
 
     def __enter__(self) -> Self:
-        """Enter."""
+        """Return the window."""
         return self
 
     def __exit__(
@@ -124,31 +122,32 @@ class Window:
 
 
 def run(player: Player) -> None:
-    """Drive and shows, until the window is closed; the arrow keys ask for speed and turn.
+    """Drive and show a player until the window is closed; the arrow keys change the command.
 
     Args:
-      player: what drives.
+      player: the player.
 
     Raises:
-      UserError: there is no display, or it takes another Python to open a window (macOS).
+      UserError: there is no display, or Python is not `mjpython` (macOS).
     """
-    # The window has a thread of its own, and the player wants to be called from one.
+    # The window calls back from its own thread, but a player is not thread-safe.
     pressed: queue.SimpleQueue[int] = queue.SimpleQueue()
     with Window(player.env.mj_model, key_callback=pressed.put) as window:
         while window.is_running():
             while not pressed.empty():
                 player.nudge(*_ARROWS.get(pressed.get(), (0, 0)))
             player.advance()
-            window.show(np.asarray(player.shown.qpos), player.shown.markers, _texts(player))
+            window.show(np.asarray(player.snapshot.qpos), player.snapshot.markers, _texts(player))
             player.frames.count(time.monotonic())
             time.sleep(player.wait())
 
 
 def _texts(player: Player) -> tuple[str, str]:
-    figures = {
+    """Return labels and values, line by line."""
+    values = {
         "goals": f"{player.successes} of {player.episodes} reached",
         "episode": f"{player.time:.1f} of {player.time_limit:.1f} s",
         "distance": f"{player.distance:.2f} m",
         "agent": player.agent,
     }
-    return "\n".join(figures), "\n".join(figures.values())
+    return "\n".join(values), "\n".join(values.values())

@@ -1,8 +1,7 @@
-"""Pictures of the simulation without a screen.
+"""Render images of the simulation without a display.
 
-MuJoCo chooses its OpenGL back end once, when it is imported, from `MUJOCO_GL`; by then it is
-too late to find out that there is no display. Here a back end is tried in a process of its
-own, and only one that has worked there is used here.
+MuJoCo chooses its OpenGL back end from `MUJOCO_GL` when it is imported, before anybody knows
+whether it works. This module tries each back end in a subprocess, and uses the first that works.
 """
 
 import copy
@@ -25,6 +24,7 @@ from mujoco.rendering.classic import gl_context
 from PIL import Image
 
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.viewers.pose import set_pose
 
 _BACKENDS = ("egl", "osmesa", "glfw")
 
@@ -42,18 +42,18 @@ _UNDECIDED = (
     "off",
 )
 _UNDECIDED += ("on", "true", "wgl")
-"""What `MUJOCO_GL` may say besides, to MuJoCo; here it leaves the choice open."""
+"""Other values of `MUJOCO_GL` that MuJoCo accepts; with these, this module chooses."""
 
 _OVERSAMPLING = 2
-"""Pixels drawn for one of the picture, along each axis. As smooth as OpenGL's own four samples a
-pixel, and where a CPU draws it takes two thirds of the time, of small pictures one third."""
+"""Rendered pixels per pixel of the image, along each axis. This is as smooth as OpenGL's four
+samples per pixel, and on a CPU it takes two thirds of the time (one third for small images)."""
 
 _TRAIL_RGBA = (0.10, 0.35, 0.85, 1.0)
-_TRAIL_WIDTH = 0.01  # of the picture's width
+_TRAIL_WIDTH = 0.01  # fraction of the image's width
 
-_NEAR = 0.005  # [m] what is nearer is not drawn: the onboard camera comes close to the goal
-_ELEVATION = -50.0  # [degrees] of the overview's line of sight
-_NEAREST = 1.2  # [m] from the overview's camera to the nearest point
+_NEAR = 0.005  # [m] near clipping plane: the onboard camera comes close to the goal
+_ELEVATION = -50.0  # [degrees] elevation of the overview camera
+_NEAREST = 1.2  # [m] smallest distance from the overview camera to a point
 
 _PROBE = """
 import importlib, mujoco
@@ -69,18 +69,18 @@ _REMEDY = (
 
 
 class Renderer:
-    """Draws a model in given poses; a context manager that frees its OpenGL context."""
+    """A `Renderer` renders a model; it is a context manager that frees its OpenGL context."""
 
     def __init__(self, mj_model: mujoco.MjModel, *, width: int = 480, height: int = 480) -> None:
         """Open an OpenGL context.
 
         Args:
-          mj_model: with all that shows.
-          width: of a picture [pixels].
-          height: of a picture [pixels].
+          mj_model: the model with all visual elements.
+          width: the width of an image [pixels].
+          height: the height of an image [pixels].
 
         Raises:
-          UserError: this machine has no OpenGL that works without a screen.
+          UserError: this machine has no OpenGL that works without a display.
         """
         self._model = copy.copy(mj_model)
         self._data = mujoco.MjData(self._model)
@@ -90,7 +90,7 @@ class Renderer:
         self._model.vis.global_.offwidth = drawn_width
         self._model.vis.global_.offheight = drawn_height
         backend = importlib.import_module(f"mujoco.{find_backend()}")
-        # The one way to hand MuJoCo's renderer a back end after import.
+        # MuJoCo's renderer has no other way to set a back end after import.
         with mock.patch.object(gl_context, "GLContext", backend.GLContext, create=True):
             self._renderer = mujoco.Renderer(self._model, height=drawn_height, width=drawn_width)
 
@@ -103,22 +103,19 @@ class Renderer:
         shadows: bool = True,
         trail_w: Float[np.ndarray, "n 3"] | None = None,
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """Draw one pose.
+        """Render one pose.
 
         Args:
-          qpos: the robot's.
-          markers: positions [m] of mocap bodies, by name, as `Task.markers` gives them.
-          camera: `chase`, `top` or `onboard`, or one of your own.
-          shadows: whether things cast them; without, drawing takes less than half the time.
-          trail_w: points [m] to join by a line, such as the way so far.
+          qpos: generalised position of the robot.
+          markers: positions [m] of the mocap bodies, by name, as `Task.markers` returns them.
+          camera: `chase`, `top` or `onboard`, or a camera object.
+          shadows: whether to render shadows; without them, rendering takes less than half the time.
+          trail_w: points [m], world frame, to connect by a line, such as the path so far.
 
         Returns:
-          The picture, RGB.
+          The image, RGB.
         """
-        self._data.qpos[:] = qpos
-        for name, position in markers.items():
-            mocap = self._model.body(name).mocapid[0]
-            self._data.mocap_pos[mocap] = np.asarray(position)
+        set_pose(self._model, self._data, qpos, markers)
         mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, camera=camera)
@@ -128,6 +125,7 @@ class Renderer:
         return np.asarray(Image.fromarray(self._renderer.render()).reduce(_OVERSAMPLING))
 
     def _add_trail(self, points_w: Float[np.ndarray, "n 3"]) -> None:
+        """Add lines between consecutive points to the scene, as far as it has room."""
         scene, kind = self._renderer.scene, mujoco.mjtGeom.mjGEOM_LINE
         colour = np.array(_TRAIL_RGBA, np.float32)
         width = _TRAIL_WIDTH * self._renderer.width
@@ -140,7 +138,7 @@ class Renderer:
             scene.ngeom += 1
 
     def __enter__(self) -> Self:
-        """Enter."""
+        """Return the renderer."""
         return self
 
     def __exit__(
@@ -149,7 +147,7 @@ class Renderer:
         value: BaseException | None,
         traceback: TracebackType | None,
     ) -> None:
-        """Free the context."""
+        """Free the OpenGL context."""
         self._renderer.close()
 
 
@@ -161,23 +159,25 @@ def overview(
     above: float = 0.9,
     below: float = 0.9,
 ) -> mujoco.MjvCamera:
-    """Return the nearest camera that looks down along x and has all points in its frame.
+    """Return the nearest camera that looks down along x and sees all points.
 
-    A point at (x right, y up, z ahead) is below the upper border, of slope k, of a camera at height
-    s and d behind the origin where y - s ≤ k (z + d), and above the lower one, of slope k', where
-    s - y ≤ k' (z + d). One s does for all where (k + k') d ≥ max(y - k z) - min(y + k' z). The same
-    holds for left and right.
+    In camera axes (x right, y up, z forward), let the camera be at height s and at distance d
+    behind the origin, and let k and k' be the slopes of the upper and lower borders. A point is
+    below the upper border if y - s ≤ k (z + d), and above the lower border if s - y ≤ k' (z + d).
+    One s satisfies both for all points if (k + k') d ≥ max(y - k z) - min(y + k' z). The same holds
+    for left and right.
 
     Args:
-      points_w: what is to be seen [m].
-      fovy: the camera's field of view, of height and of width [degrees].
-      sides: how much of the picture they may fill, from its middle to the left and right.
-      above: likewise upwards.
-      below: likewise downwards.
+      points_w: the points [m], world frame.
+      fovy: the field of view in height and width [degrees].
+      sides: the fraction of the image that the points may fill, from its middle to each side.
+      above: the fraction from the middle upwards.
+      below: the fraction from the middle downwards.
 
     Returns:
       A free camera.
     """
+    # Express the points in camera axes, and find the distance.
     angle = math.radians(_ELEVATION)
     ahead = np.array([math.cos(angle), 0.0, math.sin(angle)])
     right, up = np.array([0.0, -1.0, 0.0]), np.array([-ahead[2], 0.0, ahead[0]])
@@ -189,7 +189,7 @@ def overview(
         (np.max(x - k * z) - np.min(x + k * z)) / (2 * k),
         (np.max(y - upper * z) - np.min(y + lower * z)) / (upper + lower),
     )
-    # Halfway between the least and the greatest that do.
+    # Centre the camera between the smallest and the largest offsets that see all points.
     aside = (np.max(x - k * z) + np.min(x + k * z)) / 2
     height = np.max(y - upper * (z + distance)) + np.min(y + lower * (z + distance))
     camera = mujoco.MjvCamera()
@@ -201,13 +201,13 @@ def overview(
 
 @functools.cache
 def find_backend() -> str:
-    """Return the first OpenGL back end that works; only `MUJOCO_GL`'s where it names one.
+    """Return the first OpenGL back end that works: `egl`, `osmesa` or `glfw`.
 
-    Returns:
-      `egl`, `osmesa` or `glfw`.
+    If `MUJOCO_GL` names one of them, only that one is tried.
 
     Raises:
-      UserError: none works, and the message names what to install; or there is none of that name.
+      UserError: `MUJOCO_GL` has an unknown value, or no back end works; the message names what to
+        install.
     """
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted not in (*_BACKENDS, *_UNDECIDED):
@@ -216,7 +216,7 @@ def find_backend() -> str:
         )
     candidates = (wanted,) if wanted in _BACKENDS else _BACKENDS
     for backend in candidates:
-        # A display is what glfw needs; without one it fails slowly and loudly.
+        # Without a display, glfw fails slowly and with much output.
         if backend == "glfw" and sys.platform == "linux" and "DISPLAY" not in os.environ:
             continue
         environment = {**os.environ, "MUJOCO_GL": backend}

@@ -1,8 +1,7 @@
-"""One robot that drives live, behind any viewer: its episodes, its clock, and what to show.
+"""Simulate one robot in real time, for any viewer.
 
-Episodes are those of a training: a goal is drawn, and the next one when it is reached, when the
-time limit is, or when the task ends the episode otherwise. All of it follows from one seed. A
-player is not safe to call from several threads.
+Episodes follow the rules of training: a new goal is drawn when the task or the time limit ends an
+episode. One seed determines all goals. A player is not thread-safe.
 """
 
 import time
@@ -18,17 +17,17 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 from jetbot_mjx.viewers.realtime import Clock, Rate
-from jetbot_mjx.viewers.step_fns import AGENTS, Inputs, Shown, make_programs, why_goals_stay
+from jetbot_mjx.viewers.step_fns import AGENTS, Inputs, Snapshot, make_viewer_fns, move_goal_error
 
 SPEEDS = (0.1, 4.0)
 """Slowest and fastest pace, as a multiple of real time."""
 
-_NUDGES = 8  # from standing to as fast as it goes
-_HOLD_SECONDS = 0.4  # of standing still after the end, so that the eye sees it
+_NUDGES = 8  # key presses from standstill to the largest command
+_HOLD_SECONDS = 0.4  # pause after the end of an episode, so that the user sees it
 
 
 class Player:
-    """Drives one robot with a policy of a run, a baseline, or what the user asks for."""
+    """A `Player` drives one robot with a policy of a run, a baseline, or commands of the user."""
 
     def __init__(
         self,
@@ -38,16 +37,17 @@ class Player:
         agent: str = "policy",
         seed: int = 0,
     ) -> None:
-        """Load the policy, compiles what all agents share, and draws a goal.
+        """Load the policy, compile the functions that all agents share, and begin an episode.
 
         Args:
           run_or_checkpoint: a run folder, or one checkpoint folder of it.
           which: the checkpoint of a run folder.
           agent: one of `AGENTS`.
-          seed: of goals and of the random agent.
+          seed: the seed of the goals and of the random agent.
 
         Raises:
-          UserError: there is no usable checkpoint, its task cannot be built, or the agent is none.
+          UserError: there is no usable checkpoint, its task cannot be built, or there is no such
+            agent.
         """
         self.agent = agent
         checkpoint = load_checkpoint(run_or_checkpoint, which)
@@ -55,49 +55,49 @@ class Player:
         self.run_dir = checkpoint.run_dir
         self.paused = False
         self.successes = 0
-        """Episodes that ended with success."""
+        """Number of episodes that ended with success."""
         self.episodes = 0
-        """Episodes that ended; one that the user broke off is none."""
+        """Number of episodes that ended; those that the user reset are not counted."""
         self.outcome: str | None = None
-        """How the last episode ended; None before."""
+        """How the last episode ended, in words; None before the first end."""
         self.frames = Rate()
-        """Of the viewer: it notes each picture that it hands out."""
-        # One robot is faster on a CPU than on the GPU that may stand beside it.
+        """Frame counter of the viewer, which counts every frame that it shows."""
+        # A single robot is faster on a CPU than on a GPU.
         self._device = _cpu()
-        self._programs = make_programs(self.env, checkpoint.networks)
+        self._fns = make_viewer_fns(self.env, checkpoint.networks)
         self._key, key = self._put(tuple(jax.random.split(jax.random.PRNGKey(seed))))
         self._count = 0
         self._rate = Rate()
         self._speed = 1.0
         self.drive(0.0, 0.0)
-        self._take(checkpoint)
+        self._use(checkpoint)
         self._begin(key)
-        self.cannot_move_goal = why_goals_stay(self.env, self._state)
-        """Why `move_goal` does nothing, in one line; empty where it moves the goal."""
-        self._programs.step(self._state, self._inputs())
+        self.cannot_move_goal = move_goal_error(self.env, self._state)
+        """Why `move_goal` does nothing, in one line; empty if it moves the goal."""
+        self._fns.step(self._state, self._inputs())
         self._restart_clock()
 
     def tick(self) -> None:
-        """Make one control step; after an episode's end the robot stands still for a moment."""
+        """Make one control step; after the end of an episode the robot pauses for a moment."""
         self._count += 1
         if self._hold > 0:
             self._hold -= 1
             if self._hold == 0:
                 self.reset()
             return
-        self._state, shown = self._programs.step(self._state, self._inputs())
-        self._show(shown)
-        if self.shown.done > 0:
+        self._state, snapshot = self._fns.step(self._state, self._inputs())
+        self._set_snapshot(snapshot)
+        if self.snapshot.done > 0:
             self.episodes += 1
-            self.successes += int(self.shown.success)
-            self.outcome = _outcome(self.shown)
+            self.successes += int(self.snapshot.success)
+            self.outcome = _outcome(self.snapshot)
             self._hold = round(_HOLD_SECONDS / self.env.dt)
 
     def advance(self) -> int:
-        """Take the steps that are due in real time, none while paused.
+        """Make the control steps that are due in real time, none while paused.
 
         Returns:
-          How many.
+          The number of steps made.
         """
         if self.paused:
             self._restart_clock()
@@ -109,64 +109,64 @@ class Player:
         return steps
 
     def wait(self) -> float:
-        """Return how long until the next step is due [s]."""
+        """Return the time until the next step is due [s]."""
         return self._clock.wait(time.monotonic())
 
     def reset(self) -> None:
-        """Begin the next episode: the robot at the origin, a new goal."""
+        """Begin the next episode: the robot is at the origin, and a new goal is drawn."""
         self._begin(self._state.key)
 
     def move_goal(self, x: float, y: float) -> bool:
-        """Put the goal elsewhere on the floor; the time limit begins anew.
+        """Move the goal on the floor and restart the time limit.
 
         Args:
-          x: world frame [m].
-          y: world frame [m].
+          x: the position along the world's x axis [m].
+          y: the position along the world's y axis [m].
 
         Returns:
-          Whether the task can; `cannot_move_goal` says why not.
+          Whether the task supports it; `cannot_move_goal` has the reason if not.
         """
         if self.cannot_move_goal:
             return False
-        position_w = np.array([x, y, self.shown.goal_w[2]], np.float32)
-        self._state, shown = self._programs.move(self._state, position_w)
-        self._show(shown)
+        position_w = np.array([x, y, self.snapshot.goal_w[2]], np.float32)
+        self._state, snapshot = self._fns.move(self._state, position_w)
+        self._set_snapshot(snapshot)
         self._hold = 0
         return True
 
     def switch_checkpoint(self, env_steps: int) -> None:
-        """Let another checkpoint of the run drive on from here.
+        """Continue with the policy of another checkpoint of the run.
 
         Args:
-          env_steps: by which it is named.
+          env_steps: the environment steps of the checkpoint.
 
         Raises:
-          CheckpointError: it is not there or cannot be used; the one before drives on.
+          CheckpointError: there is no such checkpoint, or it cannot be used; the policy stays.
         """
-        self._take(load_checkpoint(self.run_dir, env_steps))
+        self._use(load_checkpoint(self.run_dir, env_steps))
 
     def drive(self, speed: float, yaw_rate: float) -> None:
-        """Return what the user asks of the robot while the agent is `keyboard`; held until changed.
+        """Set the command of the agent `keyboard`; it holds until the next call.
 
         Args:
-          speed: forward [m/s], clipped to what an action can ask for.
-          yaw_rate: to the left [rad/s], clipped likewise.
+          speed: forward speed [m/s], clipped to what an action can command.
+          yaw_rate: yaw rate [rad/s], positive to the left, clipped likewise.
         """
         limits = self.env.config.task
-        self.asked = (
+        self.command = (
             float(np.clip(speed, 0.0, limits.max_speed)),
             float(np.clip(yaw_rate, -limits.max_yaw_rate, limits.max_yaw_rate)),
         )
-        """Speed [m/s] and yaw rate [rad/s] that are asked for."""
+        """Command of the agent `keyboard`: forward speed [m/s] and yaw rate [rad/s]."""
 
     def nudge(self, ahead: int, left: int) -> None:
-        """Ask for a little more than before: one press of a key.
+        """Change the command of the agent `keyboard` by one press of a key.
 
         Args:
-          ahead: 1 faster, -1 slower.
-          left: 1 more to the left, -1 to the right; against a turn, the first only ends it.
+          ahead: 1 for faster, -1 for slower, or 0.
+          left: 1 for left, -1 for right, or 0. A press against the present turn only stops it.
         """
-        speed, yaw_rate = self.asked
+        speed, yaw_rate = self.command
         limits = self.env.config.task
         turn = left * limits.max_yaw_rate / _NUDGES
         yaw_rate = 0.0 if turn * yaw_rate < 0 else yaw_rate + turn
@@ -174,7 +174,7 @@ class Player:
 
     @property
     def agent(self) -> str:
-        """Return who drives, one of `AGENTS`."""
+        """Return the agent that drives, one of `AGENTS`."""
         return AGENTS[self._agent]
 
     @agent.setter
@@ -195,57 +195,57 @@ class Player:
 
     @property
     def checkpoints(self) -> list[int]:
-        """Environment steps of the run's checkpoints, those written meanwhile included."""
+        """Environment steps of the run's checkpoints, including new ones of a running training."""
         return sorted({*checkpoint_steps(self.run_dir), self.checkpoint})
 
     @property
     def time(self) -> float:
-        """Since the episode began, or its goal was moved [s]."""
-        return float(self.shown.steps) * self.env.dt
+        """Simulated time since the episode began or its goal was moved [s]."""
+        return float(self.snapshot.steps) * self.env.dt
 
     @property
     def time_limit(self) -> float:
-        """After which an episode is cut off [s]."""
+        """Simulated time after which an episode is truncated [s]."""
         return self.env.config.task.episode_length * self.env.dt
 
     @property
     def distance(self) -> float:
-        """From the axle's midpoint to the goal, on the floor [m]."""
-        offset = self.shown.goal_w - self.shown.qpos[QPOS_XYZ]
+        """Horizontal distance from the axle midpoint to the goal [m]."""
+        offset = self.snapshot.goal_w - self.snapshot.qpos[QPOS_XYZ]
         return float(np.hypot(offset[0], offset[1]))
 
     @property
     def steps_per_second(self) -> float:
-        """Control steps of the last second, those of standing still included [1/s]."""
+        """Control steps within the last second, including those of pauses [1/s]."""
         return self._rate.per_second(time.monotonic())
 
     @property
     def frames_per_second(self) -> float:
-        """Return how many frames the viewer handed out within the last second [1/s]."""
+        """Return how many frames the viewer showed within the last second [1/s]."""
         return self.frames.per_second(time.monotonic())
 
-    def _take(self, checkpoint: Checkpoint) -> None:
+    def _use(self, checkpoint: Checkpoint) -> None:
         self._params = self._put(checkpoint.params)
         self.checkpoint = checkpoint.env_steps
-        """Environment steps of the policy that drives."""
+        """Environment steps of the current checkpoint."""
 
     def _inputs(self) -> Inputs:
         return Inputs(
             agent=np.int32(self._agent),
             params=self._params,
-            twist_b=np.array(self.asked, np.float32),
+            twist_b=np.array(self.command, np.float32),
             key=self._key,
             count=np.uint32(self._count),
         )
 
     def _begin(self, key: UInt32[Array, "2"]) -> None:
-        self._state, shown = self._programs.reset(key)
-        self._show(shown)
+        self._state, snapshot = self._fns.reset(key)
+        self._set_snapshot(snapshot)
         self._hold = 0
 
-    def _show(self, shown: Shown) -> None:
-        self.shown: Shown = jax.device_get(shown)
-        """What the viewer shows."""
+    def _set_snapshot(self, snapshot: Snapshot) -> None:
+        self.snapshot: Snapshot = jax.device_get(snapshot)
+        """What a viewer shows of the last step, on the host."""
 
     def _put(self, tree: Any) -> Any:
         return jax.device_put(tree, self._device)
@@ -254,17 +254,18 @@ class Player:
         self._clock = Clock(self.env.dt / self._speed, time.monotonic())
 
 
-def _outcome(shown: Shown) -> str:
-    if shown.success > 0:
+def _outcome(snapshot: Snapshot) -> str:
+    """Describe in words how an episode ended."""
+    if snapshot.success > 0:
         return "reached"
-    if shown.nonfinite > 0:
-        return "world blew up"
-    return "failed" if shown.terminated > 0 else "out of time"
+    if snapshot.nonfinite > 0:
+        return "non-finite state"
+    return "failed" if snapshot.terminated > 0 else "out of time"
 
 
 def _cpu() -> Any:
+    """Return the CPU as a JAX device, or the default device where `JAX_PLATFORMS` excludes it."""
     try:
         return jax.devices("cpu")[0]
     except RuntimeError:
-        # `JAX_PLATFORMS` leaves it out.
         return jax.devices()[0]

@@ -1,28 +1,31 @@
-"""Real time: when the next step is due, and how often something happens."""
+"""Keep real time: compute when steps are due, and count events per second."""
 
 import collections
 import math
 
-_CATCH_UP_SECONDS = 0.1  # what a clock that was held up makes good; the rest is lost
+_CATCH_UP_SECONDS = 0.1  # longest delay that a clock makes up for; steps beyond it are dropped
 
 
 class Clock:
-    """Says how many control steps are due, at an even pace that does not drift."""
+    """A `Clock` computes how many periodic steps are due, without drift."""
 
     def __init__(self, period: float, now: float) -> None:
-        """Start.
+        """Start the clock; the first step is due one period from now.
 
         Args:
-          period: from one step to the next [s].
-          now: the first step is due a period later [s].
+          period: the time between two steps [s].
+          now: the present time [s].
         """
         self._period = period
         self._next = now + period
 
     def due(self, now: float) -> int:
-        """Return how many steps to take, at most what is due within a tenth of a second.
+        """Return the number of steps that are due, at most those of a tenth of a second.
 
-        A clock that was held up for longer goes on from here: what it missed is not made good.
+        After a longer delay the clock continues from now, and the missed steps are dropped.
+
+        Args:
+          now: the present time [s].
         """
         steps = max(0, math.floor((now - self._next) / self._period) + 1)
         most = max(1, math.ceil(_CATCH_UP_SECONDS / self._period))
@@ -30,24 +33,37 @@ class Clock:
         return min(steps, most)
 
     def wait(self, now: float) -> float:
-        """Return how long until the next step is due [s]."""
+        """Return the time until the next step is due [s].
+
+        Args:
+          now: the present time [s].
+        """
         return max(0.0, self._next - now)
 
 
 class Rate:
-    """A counter of events within the last second."""
+    """A `Rate` counts the events within the last second."""
 
     def __init__(self) -> None:
-        """Begin with nothing."""
+        """Start without events."""
         self._times: collections.deque[float] = collections.deque()
 
     def count(self, now: float, events: int = 1) -> None:
-        """Note events that happened just now [s]."""
+        """Add events.
+
+        Args:
+          now: the time of the events [s].
+          events: their number.
+        """
         self._times.extend([now] * events)
         self.per_second(now)
 
     def per_second(self, now: float) -> float:
-        """Return the number of events of the second up to now [1/s]."""
+        """Return the number of events within the last second [1/s].
+
+        Args:
+          now: the present time [s].
+        """
         while self._times and self._times[0] <= now - 1.0:
             self._times.popleft()
         return float(len(self._times))

@@ -1,4 +1,4 @@
-"""One robot, one step at a time: the programs behind a player, compiled once for all agents."""
+"""Compile the functions of a `Player`: reset, step and move the goal, once for all agents."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -21,62 +21,68 @@ from jetbot_mjx.evaluation.evaluator import BASELINES, policy_controller
 
 KEYBOARD = "keyboard"
 AGENTS = ("policy", *BASELINES, KEYBOARD)
-"""Who can drive: the run's policy, the baselines it is judged against, and the user."""
+"""Agents that can drive: the run's policy, the baselines of an evaluation, and the user."""
 
 
 class Inputs(NamedTuple):
-    """All that decides an action beside the state."""
+    """An `Inputs` holds everything that determines an action, except for the state."""
 
     agent: Int[np.ndarray, ""] | np.int32
-    """Index in `AGENTS`."""
+    """Index of the agent in `AGENTS`."""
     params: PolicyParams
-    """Of the checkpoint that drives; an argument, so that all of a run share one program."""
+    """Parameters of the policy; an argument, so that all checkpoints of a run share one program."""
     twist_b: Float[np.ndarray, "2"]
-    """What the user asks for: forward speed [m/s] and yaw rate [rad/s]."""
+    """Command of the user: forward speed [m/s] and yaw rate [rad/s]."""
     key: UInt32[Array, "2"]
-    """Of the random agent."""
+    """Random key of the random agent."""
     count: np.uint32
-    """Of the step, folded into the key."""
+    """Number of the step, which is folded into the key."""
 
 
-class Shown(NamedTuple):
-    """One moment as a viewer needs it; on the host once it has been fetched."""
+class Snapshot(NamedTuple):
+    """A `Snapshot` holds what a viewer shows of one step.
+
+    Its arrays are on the device in `ViewerFns` and on the host in `Player.snapshot`.
+    """
 
     qpos: Float[Array | np.ndarray, " nq"]
-    """The robot's pose, as `PhysicsState` has it."""
+    """Generalised position of the robot, as in `PhysicsState`."""
     markers: Mapping[str, Float[Array | np.ndarray, "3"]]
-    """Where the scene's mocap bodies stand [m], by name."""
+    """Positions of the scene's mocap bodies [m], world frame, by name."""
     goal_w: Float[Array | np.ndarray, "3"]
-    """Where the robot has to go [m], world frame."""
+    """Position of the goal [m], world frame."""
     steps: Float[Array | np.ndarray, ""]
     """Environment steps since the episode began, or its goal was moved."""
     done: Float[Array | np.ndarray, ""]
-    """1 where this step ended the episode; the next three say how."""
+    """1 where this step ended the episode."""
     success: Float[Array | np.ndarray, ""]
+    """1 where the robot has solved the task."""
     terminated: Float[Array | np.ndarray, ""]
+    """1 where the task ended the episode."""
     nonfinite: Float[Array | np.ndarray, ""]
+    """1 where this step was not finite."""
 
 
 class ViewerFns(NamedTuple):
-    """Three compiled functions; each returns the state and what to show of it."""
+    """A `ViewerFns` holds three compiled functions, which return a state and its snapshot."""
 
-    reset: Callable[[UInt32[Array, "2"]], tuple[State, Shown]]
-    """Begins an episode from a key."""
-    step: Callable[[State, Inputs], tuple[State, Shown]]
-    """One control step, with the episode's books of `EpisodeWrapper`."""
-    move: Callable[[State, Float[np.ndarray, "3"]], tuple[State, Shown]]
-    """Puts the goal elsewhere [m], world frame, and lets the time limit begin anew."""
+    reset: Callable[[UInt32[Array, "2"]], tuple[State, Snapshot]]
+    """Begin an episode from a random key."""
+    step: Callable[[State, Inputs], tuple[State, Snapshot]]
+    """Make one environment step, with the episode statistics of `EpisodeWrapper`."""
+    move: Callable[[State, Float[np.ndarray, "3"]], tuple[State, Snapshot]]
+    """Move the goal to a position [m], world frame, and restart the time limit."""
 
 
-def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerFns:
-    """Prepare the programs; each compiles at its first use.
+def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerFns:
+    """Build the functions of a player; each one is compiled at its first use.
 
     Args:
       env: one environment, unwrapped.
-      networks: of the policies that will drive.
+      networks: the networks of the policies.
 
     Returns:
-      The programs; `move` is of use only where `why_goals_stay` finds no reason.
+      The functions; `move` may only be called if `move_goal_error` returns an empty string.
     """
     episode_env = EpisodeWrapper(env, env.config.task.episode_length)
     controllers = [policy_controller(networks), *(make(env) for make in BASELINES.values())]
@@ -85,8 +91,8 @@ def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerF
         "max_yaw_rate": env.config.task.max_yaw_rate,
     }
 
-    def show(state: State) -> Shown:
-        return Shown(
+    def snapshot(state: State) -> Snapshot:
+        return Snapshot(
             qpos=state.pipeline_state.qpos,
             markers=dict(env.task.markers(state.goal)),
             goal_w=env.task.goal_position(state.goal),
@@ -97,47 +103,47 @@ def make_programs(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerF
             nonfinite=state.metrics["nonfinite_envs"],
         )
 
-    def reset(key: UInt32[Array, "2"]) -> tuple[State, Shown]:
+    def reset(key: UInt32[Array, "2"]) -> tuple[State, Snapshot]:
         state = episode_env.reset(key)
-        return state, show(state)
+        return state, snapshot(state)
 
-    def step(state: State, inputs: Inputs) -> tuple[State, Shown]:
+    def step(state: State, inputs: Inputs) -> tuple[State, Snapshot]:
         key = jax.random.fold_in(inputs.key, inputs.count)
         branches = [
             *(lambda act=act: act(inputs.params, state, key) for act in controllers),
             lambda: kinematics.action_from_twist(jnp.asarray(inputs.twist_b), **limits),
         ]
         state = episode_env.step(state, jax.lax.switch(inputs.agent, branches))
-        return state, show(state)
+        return state, snapshot(state)
 
-    def move(state: State, position_w: Float[Array, "3"]) -> tuple[State, Shown]:
+    def move(state: State, position_w: Float[Array, "3"]) -> tuple[State, Snapshot]:
         assert isinstance(env.task, MovesGoal)
         goal = env.task.move_goal(state.goal, position_w)
         obs = env.task.observe(robot_state(state.pipeline_state), goal)
         info = {**state.info, "steps": jnp.zeros(())}
         state = state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
-        return state, show(state)
+        return state, snapshot(state)
 
     compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))
     return ViewerFns(compiled(reset), compiled(step), compiled(move))
 
 
-def why_goals_stay(env: JetBotEnv, state: State) -> str:
-    """Look whether a task's goals can be moved, without moving one.
+def move_goal_error(env: JetBotEnv, state: State) -> str:
+    """Check whether the goals of a task can be moved, without moving one.
 
     Args:
-      env: with the task.
-      state: any state of it.
+      env: the environment with the task.
+      state: any state of the environment.
 
     Returns:
-      Why not, in one line; empty where they can.
+      The reason why goals cannot be moved, in one line; empty if they can.
     """
     stays = f"the goal stays where it was drawn: {env.config.task.name}"
     if not isinstance(env.task, MovesGoal):
         return f"{stays} has no move_goal"
     try:
         moved = jax.eval_shape(env.task.move_goal, state.goal, jnp.zeros(3))
-    # One that was inherited from a task with another goal may fail in any way.
+    # A `move_goal` inherited from a task with another goal may raise anything.
     except Exception:
         moved = None
     if _shapes(moved) != _shapes(state.goal):

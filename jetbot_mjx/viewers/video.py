@@ -1,7 +1,7 @@
-"""Films of episodes, and the files they go into.
+"""Render episodes to video frames, and write videos and animations.
 
-Robots drive in real time, and every picture tells which of the report's fixed goals it shows,
-the time, the distance that is left, and the outcome once there is one.
+Videos play in real time. Every frame shows the number of the report's fixed goal, the time, the
+remaining distance, and the outcome at the end.
 """
 
 import contextlib
@@ -32,71 +32,72 @@ VIEW = 400
 """Side of one view [pixels]."""
 
 FPS = 25
-"""Frames a second of a film."""
+"""Frames per second of a video."""
 
 GIF_STRIDE = 2
-"""Every how manieth frame an animation shows; GIF counts in hundredths of a second."""
+"""Frames of a video per frame of a GIF, whose frame times are multiples of 10 ms."""
 
-_HOLD_SECONDS = 0.6  # after the end, so that the eye sees it
-_INSET = (0.30, 0.225)  # width and height of the onboard camera's picture, of the view's side
-_MARGIN = 0.03  # from the border to text and inset, of the view's side
-_TEXT = 0.05  # height of a letter, of the view's side
-_TRAIL_STEPS = 4  # environment steps that one piece of the trail spans
-# How much of a panel the way may fill; above is the room for text and inset.
+_HOLD_SECONDS = 0.6  # pause after the end, so that the viewer sees it
+# Lengths as fractions of the view's side.
+_INSET = (0.30, 0.225)  # width and height of the onboard camera's image
+_MARGIN = 0.03  # between the border and text or inset
+_TEXT = 0.05  # height of the font
+_TRAIL_STEPS = 4  # environment steps per segment of the trail
+# Fraction of a view, from its middle, that the trajectory may fill; text and inset are above.
 _FILLED = {"sides": 0.92, "above": 0.42, "below": 0.92}
-_AROUND = 0.12  # [m] about a position: the robot, or a cube, in any attitude
+_AROUND = 0.12  # [m] around a position, so that the robot and cubes are inside the frame
 
 Frame = UInt8[np.ndarray, "height width 3"]
 
 
-class Drive(NamedTuple):
-    """One recorded episode, on the host."""
+class Trajectory(NamedTuple):
+    """A `Trajectory` holds one recorded episode, on the host."""
 
     goal_number: int
-    """Index in the report's fixed goals."""
+    """Index of the goal in the report's fixed goals."""
     qpos: Float[np.ndarray, "time nq"]
-    """First state to last."""
+    """Generalised positions from the first state to the last."""
     goal_w: Float[np.ndarray, "3"]
-    """Where to go [m], world frame."""
+    """Position of the goal [m], world frame."""
     markers: Mapping[str, Float[np.ndarray, "3"]]
-    """Positions of mocap bodies [m]."""
+    """Positions of the mocap bodies [m], world frame, by name."""
     reached: bool
+    """Whether the episode ended with success."""
     dt: float
     """Duration of one environment step [s]."""
 
     @property
     def steps(self) -> int:
-        """Environment steps until the end."""
+        """Number of environment steps of the episode."""
         return len(self.qpos) - 1
 
     def step_at(self, seconds: float) -> int:
-        """Index of the state at a moment; after the end, that of the last one."""
+        """Return the index of the state at a time [s]; after the end, the index of the last one."""
         return min(round(seconds / self.dt), self.steps)
 
     def trail_w(self, step: int) -> Float[np.ndarray, "n 3"]:
-        """Return the points of the way until then [m], just above the floor."""
-        places = [*range(0, step, _TRAIL_STEPS), step]
-        return np.pad(self.qpos[places][:, QPOS_XYZ][:, :2], ((0, 0), (0, 1)), constant_values=0.01)
+        """Return the points of the path up to a step [m], just above the floor."""
+        steps = [*range(0, step, _TRAIL_STEPS), step]
+        return np.pad(self.qpos[steps][:, QPOS_XYZ][:, :2], ((0, 0), (0, 1)), constant_values=0.01)
 
     def distance(self, step: int) -> float:
-        """Return what is left to the goal then [m], on the floor."""
+        """Return the horizontal distance to the goal at a step [m]."""
         return float(np.linalg.norm(self.goal_w[:2] - self.qpos[step, QPOS_XYZ][:2]))
 
 
-def drives(env: JetBotEnv, episodes: Episodes, goal_numbers: Sequence[int]) -> list[Drive]:
-    """Take recorded episodes apart.
+def split_trajectories(
+    env: JetBotEnv, episodes: Episodes, goal_numbers: Sequence[int]
+) -> list[Trajectory]:
+    """Split a batch of recorded episodes into trajectories on the host.
 
     Args:
-      env: that they were driven in.
-      episodes: recorded.
-      goal_numbers: index of each one's goal in the report's fixed goals.
-
-    Returns:
-      One `Drive` for each.
+      env: the environment of the episodes.
+      episodes: the batch, recorded with `qpos`.
+      goal_numbers: the index of each episode's goal in the report's fixed goals.
     """
     host, markers = jax.device_get((episodes, jax.vmap(env.task.markers)(episodes.goal)))
     return [
-        Drive(
+        Trajectory(
             goal_number=number,
             qpos=host.qpos[index, : int(host.steps[index]) + 1],
             goal_w=host.goal_w[index],
@@ -108,19 +109,19 @@ def drives(env: JetBotEnv, episodes: Episodes, goal_numbers: Sequence[int]) -> l
     ]
 
 
-class Studio:
-    """The cameras of a film; a context manager that frees them."""
+class VideoRenderer:
+    """A `VideoRenderer` renders trajectories; it is a context manager that frees its cameras."""
 
     def __init__(self, env: JetBotEnv, side: int = VIEW, fps: float = FPS) -> None:
-        """Open what drawing needs.
+        """Open the renderers.
 
         Args:
-          env: whose robots are to be drawn.
-          side: of one view [pixels].
-          fps: frames a second.
+          env: the environment of the trajectories.
+          side: the side of one square view [pixels].
+          fps: frames per second.
 
         Raises:
-          UserError: this machine has no OpenGL that works without a screen.
+          UserError: this machine has no OpenGL that works without a display.
         """
         self._fovy = float(env.mj_model.vis.global_.fovy)
         self._side, self._fps = side, fps
@@ -130,72 +131,86 @@ class Studio:
             self._inset = stack.enter_context(Renderer(env.mj_model, width=width, height=height))
             self._stack = stack.pop_all()
 
-    def film_episode(self, drive: Drive) -> Iterator[Frame]:
-        """Draw one episode: chase camera, onboard camera in its corner, plan view beside them.
+    def render_episode(self, trajectory: Trajectory) -> Iterator[Frame]:
+        """Render one episode: chase camera with the onboard camera as inset, and the top view.
 
         Args:
-          drive: the episode.
+          trajectory: the episode.
 
         Yields:
-          Frames.
+          Frames, two views wide.
         """
-        shown, frame = -1, np.empty(0)
-        for seconds in self._clock([drive]):
-            step = drive.step_at(seconds)
-            if step != shown:
-                shown, frame = step, self._episode_frame(drive, step)
+        last_step, frame = -1, np.empty(0)
+        for seconds in self._frame_times([trajectory]):
+            step = trajectory.step_at(seconds)
+            if step != last_step:
+                last_step, frame = step, self._episode_frame(trajectory, step)
             yield frame
 
-    def film_together(self, shots: Sequence[tuple[str, Drive]]) -> Iterator[Frame]:
-        """Several robots side by side on one clock; whoever has finished stands where it ended.
+    def render_side_by_side(self, episodes: Sequence[tuple[str, Trajectory]]) -> Iterator[Frame]:
+        """Render several episodes side by side in the same time; finished robots stand still.
 
-        Each is seen from a fixed place behind the start, from where all of them, all their ways
-        and goals are in the picture: none of it behind text or inset.
+        All views have the same fixed camera behind the start, which sees all paths and goals
+        without overlap with text or inset.
 
         Args:
-          shots: a heading and an episode for each panel, from left to right.
+          episodes: a heading and a trajectory for each view, from left to right.
 
         Yields:
-          Frames.
+          Frames, one view wide per episode.
         """
-        extent = np.vstack([_extent(drive) for _, drive in shots])
+        extent = np.vstack([_extent(trajectory) for _, trajectory in episodes])
         camera = overview(extent, self._fovy, **_FILLED)
-        shown = [-1] * len(shots)
-        panels = [np.empty(0)] * len(shots)
-        for seconds in self._clock([drive for _, drive in shots]):
-            for index, (heading, drive) in enumerate(shots):
-                step = drive.step_at(seconds)
-                if step != shown[index]:
-                    shown[index] = step
-                    panels[index] = self._panel(heading, drive, step, camera)
-            yield np.hstack(panels)
+        last_steps = [-1] * len(episodes)
+        views = [np.empty(0)] * len(episodes)
+        for seconds in self._frame_times([trajectory for _, trajectory in episodes]):
+            for index, (heading, trajectory) in enumerate(episodes):
+                step = trajectory.step_at(seconds)
+                if step != last_steps[index]:
+                    last_steps[index] = step
+                    views[index] = self._episode_view(heading, trajectory, step, camera)
+            yield np.hstack(views)
 
-    def _episode_frame(self, drive: Drive, step: int) -> Frame:
-        chase = self._view.frame(drive.qpos[step], drive.markers, "chase")
+    def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
+        chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
         top = self._view.frame(
-            drive.qpos[step], drive.markers, "top", shadows=False, trail_w=drive.trail_w(step)
+            trajectory.qpos[step],
+            trajectory.markers,
+            "top",
+            shadows=False,
+            trail_w=trajectory.trail_w(step),
         )
-        # Below, beside the robot: a goal lies there only while the robot turns its back on it.
-        chase = self._with_inset(chase, drive, step, top=False)
-        return np.hstack([self._labelled(chase, drive, step), top])
+        # In the lower corner the inset hides a goal only while the robot drives away from it.
+        chase = self._with_inset(chase, trajectory, step, top=False)
+        return np.hstack([self._with_text(chase, trajectory, step), top])
 
-    def _clock(self, shown: Sequence[Drive]) -> Iterator[float]:
-        """Return the times of the frames [s], until the last robot has finished for a while."""
-        longest = max(drive.steps * drive.dt for drive in shown)
+    def _frame_times(self, trajectories: Sequence[Trajectory]) -> Iterator[float]:
+        """Return the times of the frames [s], up to a pause after the longest episode."""
+        longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
         count = math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps)
         return (frame / self._fps for frame in range(count + 1))
 
-    def _panel(self, heading: str, drive: Drive, step: int, camera: mujoco.MjvCamera) -> Frame:
+    def _episode_view(
+        self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
+    ) -> Frame:
         view = self._view.frame(
-            drive.qpos[step], drive.markers, camera, shadows=False, trail_w=drive.trail_w(step)
+            trajectory.qpos[step],
+            trajectory.markers,
+            camera,
+            shadows=False,
+            trail_w=trajectory.trail_w(step),
         )
-        # A line between neighbours.
+        # A white line between neighbouring views.
         view = np.pad(view[:, :-1], ((0, 0), (0, 1), (0, 0)), constant_values=255)
-        return self._labelled(self._with_inset(view, drive, step, top=True), drive, step, heading)
+        return self._with_text(
+            self._with_inset(view, trajectory, step, top=True), trajectory, step, heading
+        )
 
-    def _with_inset(self, view: Frame, drive: Drive, step: int, *, top: bool) -> Frame:
-        """Set the onboard camera's picture, in a white frame, into a corner on the right."""
-        inset = self._inset.frame(drive.qpos[step], drive.markers, "onboard", shadows=False)
+    def _with_inset(self, view: Frame, trajectory: Trajectory, step: int, *, top: bool) -> Frame:
+        """Insert the onboard camera's image with a white border in a corner on the right."""
+        inset = self._inset.frame(
+            trajectory.qpos[step], trajectory.markers, "onboard", shadows=False
+        )
         inset = np.pad(inset, ((2, 2), (2, 2), (0, 0)), constant_values=255)
         height, width = inset.shape[:2]
         margin = round(_MARGIN * self._side)
@@ -204,26 +219,33 @@ class Studio:
         view[first : first + height, self._side - margin - width : self._side - margin] = inset
         return view
 
-    def _labelled(self, frame: Frame, drive: Drive, step: int, heading: str = "") -> Frame:
+    def _with_text(
+        self, frame: Frame, trajectory: Trajectory, step: int, heading: str = ""
+    ) -> Frame:
+        """Write heading, goal number, time, remaining distance and outcome into a view."""
         lines = [(heading, "black")] if heading else []
         lines += [
-            (f"goal {drive.goal_number}  {step * drive.dt:4.2f} s", "black"),
-            (f"{drive.distance(step):4.2f} m to go", "black"),
+            (f"goal {trajectory.goal_number}  {step * trajectory.dt:4.2f} s", "black"),
+            (f"{trajectory.distance(step):4.2f} m to go", "black"),
         ]
-        if step == drive.steps:
-            lines.append(("reached", "darkgreen") if drive.reached else ("missed", "firebrick"))
+        if step == trajectory.steps:
+            lines.append(
+                ("reached", "darkgreen") if trajectory.reached else ("missed", "firebrick")
+            )
         image = Image.fromarray(frame)
         draw = ImageDraw.Draw(image)
         size, margin = _TEXT * self._side, round(_MARGIN * self._side)
         for row, (text, colour) in enumerate(lines):
-            place = (margin, margin + row * 1.15 * size)
-            # The halo keeps it readable on anything; it wants wider gaps between words.
-            wide = text.replace(" ", "  ")
-            draw.text(place, wide, colour, _font(size), stroke_width=size / 10, stroke_fill="white")
+            position = (margin, margin + row * 1.15 * size)
+            # The white outline makes text readable on any background, but narrows the spaces.
+            spaced = text.replace(" ", "  ")
+            draw.text(
+                position, spaced, colour, _font(size), stroke_width=size / 10, stroke_fill="white"
+            )
         return np.asarray(image)
 
     def __enter__(self) -> Self:
-        """Enter."""
+        """Return the renderer."""
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -236,78 +258,98 @@ def _font(size: float) -> Any:
     return ImageFont.load_default(size)
 
 
-def _extent(drive: Drive) -> Float[np.ndarray, "n 3"]:
-    """Return the corners of all that an episode shows [m]."""
-    way = np.pad(drive.qpos[:, QPOS_XYZ][:, :2], ((0, 0), (0, 1)))
-    places = np.vstack([way, *(p * [1, 1, 0] for p in (drive.goal_w, *drive.markers.values()))])
-    steps = np.meshgrid([-_AROUND, _AROUND], [-_AROUND, _AROUND], [0, _AROUND])
-    return (places[:, None] + np.stack(steps, -1).reshape(-1, 3)).reshape(-1, 3)
+def _extent(trajectory: Trajectory) -> Float[np.ndarray, "n 3"]:
+    """Return the corners of boxes around the path, the goal and the markers [m]."""
+    path = np.pad(trajectory.qpos[:, QPOS_XYZ][:, :2], ((0, 0), (0, 1)))
+    positions = np.vstack(
+        [path, *(p * [1, 1, 0] for p in (trajectory.goal_w, *trajectory.markers.values()))]
+    )
+    corners = np.meshgrid([-_AROUND, _AROUND], [-_AROUND, _AROUND], [0, _AROUND])
+    return (positions[:, None] + np.stack(corners, -1).reshape(-1, 3)).reshape(-1, 3)
 
 
 class EvaluationVideo:
-    """Films a training's policies on the report's first goals, by one small compiled program."""
+    """An `EvaluationVideo` renders policies of a training on the report's first goals."""
 
     GOALS = 4
-    """How many robots are seen side by side."""
+    """Number of episodes side by side."""
 
-    _SIDE, _FPS = 256, 12.5  # what a training can wait for
+    _SIDE, _FPS = 256, 12.5  # small, so that training waits only briefly
 
     def __init__(
         self, env: JetBotEnv, networks: ppo_networks.PPONetworks, programs: ProgramCache
     ) -> None:
-        """Prepare the program; it compiles at its first use.
+        """Prepare the program, which compiles at its first use.
 
         Args:
           env: one environment, unwrapped.
-          networks: of the policies.
+          networks: the networks of the policies.
           programs: the cache of compiled programs of the environment's configuration.
         """
         self._env = env
         self._evaluator = Evaluator(env, networks, programs, record=True)
 
     def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
-        """Drive and films.
+        """Run the episodes and write their video.
 
         Args:
-          path: of the mp4 file.
-          params: the policy's.
-          env_steps: that it was trained for.
+          path: the path of the mp4 file.
+          params: the parameters of the policy.
+          env_steps: the environment steps that the policy was trained for.
 
         Raises:
-          UserError: this machine has no OpenGL that works without a screen.
+          UserError: this machine has no OpenGL that works without a display.
         """
         episodes = self._evaluator.run(params, report_keys(self.GOALS))
-        shown = drives(self._env, episodes, range(self.GOALS))
-        with Studio(self._env, self._SIDE, self._FPS) as studio:
-            frames = studio.film_together([(f"{env_steps:,} steps", one) for one in shown])
+        trajectories = split_trajectories(self._env, episodes, range(self.GOALS))
+        with VideoRenderer(self._env, self._SIDE, self._FPS) as renderer:
+            frames = renderer.render_side_by_side(
+                [(f"{env_steps:,} steps", one) for one in trajectories]
+            )
             write_mp4(path, frames, self._FPS)
 
 
-def shrunk(frame: Frame, factor: float) -> Frame:
-    """Return a frame at a fraction of its size."""
+def resize_frame(frame: Frame, factor: float) -> Frame:
+    """Return a frame scaled in both directions.
+
+    Args:
+      frame: the frame, RGB.
+      factor: the factor on width and height, below 1.
+    """
     image = Image.fromarray(frame)
     size = (round(image.width * factor), round(image.height * factor))
     return np.asarray(image.resize(size, Image.Resampling.BOX))
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
-    """Write a film that every browser and notebook plays."""
-    # In memory, where nothing can go wrong half-way.
+    """Write a video in H.264, which browsers and notebooks play.
+
+    Args:
+      path: the path of the file; an existing file is replaced.
+      frames: the frames, RGB, all of the same size.
+      fps: frames per second.
+    """
+    # Encode in memory, so that a full disk leaves no partial file.
     file = io.BytesIO()
     with iio.imopen(file, "w", plugin="pyav", extension=".mp4") as opened:
         video: Any = opened
         video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
         for frame in frames:
             video.write_frame(frame)
-    _write_whole(path, file.getvalue())
+    _write_atomically(path, file.getvalue())
 
 
 def write_gif(path: Path, frames: Sequence[Frame]) -> None:
-    """Write an animation in one palette, each frame `GIF_STRIDE` times as long as a film's."""
-    # One palette for all frames: a palette each flickers.
+    """Write a GIF animation whose frames last `GIF_STRIDE` times as long as a video's.
+
+    Args:
+      path: the path of the file; an existing file is replaced.
+      frames: the frames, RGB, all of the same size.
+    """
+    # Use one palette for all frames: with one per frame, the colours flicker.
     images = [Image.fromarray(frame) for frame in frames]
     sample = Image.fromarray(np.vstack(frames[:: max(1, len(frames) // 8)]))
-    # An octree gives few pixels of a strong colour their own: the trail, the outcome.
+    # An octree keeps strong colours of few pixels: the trail, the outcome.
     palette = sample.quantize(256, Image.Quantize.FASTOCTREE)
     reduced = [image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images]
     file = io.BytesIO()
@@ -320,11 +362,11 @@ def write_gif(path: Path, frames: Sequence[Frame]) -> None:
         loop=0,
         optimize=True,
     )
-    _write_whole(path, file.getvalue())
+    _write_atomically(path, file.getvalue())
 
 
-def _write_whole(path: Path, content: bytes) -> None:
-    """Leave the file that was there until the one in its place is complete."""
+def _write_atomically(path: Path, content: bytes) -> None:
+    """Write a file under another name and rename it, so that no partial file is visible."""
     unfinished = path.with_name(f".{path.name}.unfinished")
     try:
         unfinished.write_bytes(content)

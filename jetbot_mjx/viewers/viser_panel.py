@@ -1,4 +1,4 @@
-"""A player's panel in viser: what there is to read, to press and to drive with."""
+"""Build the control panel of a player's page in viser."""
 
 import math
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from jetbot_mjx.viewers.viser_scene import CAMERAS, Scene
 _BUTTONS = ("Step", "New episode")
 
 
-class Panel:
-    """The controls of a page, shared by all pages."""
+class ControlPanel:
+    """A `ControlPanel` holds the controls of the page; all clients share one panel."""
 
     def __init__(
         self, server: viser.ViserServer, player: Player, scene: Scene, ask: Callable[..., None]
@@ -23,10 +23,11 @@ class Panel:
         """Build the panel.
 
         Args:
-          server: shows it.
-          player: what drives.
-          scene: what the page shows of it.
-          ask: has the loop that drives the player call something; viser has its own threads.
+          server: the viser server.
+          player: the player.
+          scene: the scene of the page.
+          ask: a function that queues a call for the player's thread, since viser calls back from
+            its own threads.
         """
         self._server, self._player, self._scene, self._ask = server, player, scene, ask
         gui = server.gui
@@ -36,26 +37,26 @@ class Panel:
         self.distance = gui.add_text("Distance", "", disabled=True)
         self.pace = gui.add_text("Pace", "", disabled=True)
         self._add_choices()
-        self._add_wheel()
+        self._add_drive_controls()
         gui.add_markdown(
             player.cannot_move_goal
             or "Click on the floor, or drag the cube, to move the goal. Its time limit then begins"
             " anew."
         )
         self._switch_agent()
-        self.tell()
+        self.update()
 
-    def tell(self) -> None:
-        """Write the present figures."""
+    def update(self) -> None:
+        """Show the present values of the player."""
         player = self._player
-        ended = f", {player.outcome}" if player.shown.done else ""
+        ended = f", {player.outcome}" if player.snapshot.done else ""
         self.goals.value = f"{player.successes} of {player.episodes} reached"
         self.episode.value = f"{player.time:.1f} of {player.time_limit:.1f} s{ended}"
         self.distance.value = f"{player.distance:.2f} m"
         self.pace.value = (
             f"{player.steps_per_second:.0f} steps/s, {player.frames_per_second:.0f} frames/s"
         )
-        # Setting what is set already would have the page build it anew.
+        # Do not assign equal values: the page would rebuild the control.
         checkpoints = _labels(player)
         if checkpoints != self.checkpoint.options:
             self.checkpoint.options = checkpoints
@@ -80,12 +81,12 @@ class Panel:
         camera.on_update(lambda _: self._ask(setattr, self._scene, "camera", camera.value))
         shadows.on_update(lambda _: self._ask(self._scene.cast_shadows, shadows.value))
 
-    def _add_wheel(self) -> None:
-        """Return what a user drives with: two sliders, and keys that move them."""
+    def _add_drive_controls(self) -> None:
+        """Add the controls of the agent `keyboard`: two sliders, and keys that move them."""
         gui, player, limits = self._server.gui, self._player, self._player.env.config.task
         fastest = math.ceil(math.degrees(limits.max_yaw_rate))
-        self.wheel = gui.add_folder("Drive")
-        with self.wheel:
+        self.drive_controls = gui.add_folder("Drive")
+        with self.drive_controls:
             self.ahead = ahead = gui.add_slider("Ahead m/s", 0.0, limits.max_speed, 0.01, 0.0)
             self.left = left = gui.add_slider("Left °/s", -fastest, fastest, 1, 0)
             gui.add_markdown(
@@ -98,8 +99,8 @@ class Panel:
 
         def press(do: Callable[..., None], *given: int) -> None:
             do(*given)
-            # The sliders call back when they are set, and round.
-            ahead.value, left.value = player.asked[0], round(math.degrees(player.asked[1]))
+            # Setting a slider rounds the value and calls `follow_sliders`.
+            ahead.value, left.value = player.command[0], round(math.degrees(player.command[1]))
 
         for slider in (ahead, left):
             slider.on_update(lambda _: self._ask(follow_sliders))
@@ -118,11 +119,11 @@ class Panel:
 
     def _switch_agent(self) -> None:
         self._player.agent = self.agent.value
-        by_hand = self.agent.value == KEYBOARD
-        # The wheel comes last: where a page shows it, the keys are heard.
+        is_keyboard = self.agent.value == KEYBOARD
+        # Show the sliders last: once a page has them, its keys work.
         for command in self._keys:
-            command.disabled = not by_hand
-        self.wheel.visible = by_hand
+            command.disabled = not is_keyboard
+        self.drive_controls.visible = is_keyboard
 
     def _switch_checkpoint(self) -> None:
         wanted = int(self.checkpoint.value.partition(" ")[0].replace(",", ""))

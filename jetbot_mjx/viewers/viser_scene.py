@@ -1,4 +1,4 @@
-"""A player's scene in viser: the robot, the floor, and a goal to click and to drag."""
+"""Build the 3-D scene of a player's page in viser: robot, floor and a goal that can be moved."""
 
 import time
 from collections.abc import Callable
@@ -13,41 +13,47 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.viewers.meshes import shown_geoms
+from jetbot_mjx.viewers.meshes import visible_geoms
 from jetbot_mjx.viewers.player import Player
+from jetbot_mjx.viewers.pose import set_pose
 
 FPS = 30
-"""Pictures a second that the page is sent."""
+"""Frames per second that the page receives."""
 
 Camera = Literal["free", "looks at the robot", "behind the robot"]
 CAMERAS: tuple[Camera, ...] = get_args(Camera)
 
-_FLOOR_PER_REACH = 2.5  # half the floor's side over the distance of the farthest goal
-_CELL, _SECTION = 0.25, 0.5  # [m] between the floor's lines, thin and thick
+_FLOOR_PER_REACH = 2.5  # half the side of the floor, relative to the largest goal distance
+_CELL, _SECTION = 0.25, 0.5  # [m] spacing of the thin and thick lines on the floor
 _LINES = (
     ("thin", _CELL, 0.003, (165, 170, 176)),
     ("thick", _SECTION, 0.006, (125, 131, 139)),
-)  # [m] from one to the next, and across
-_EYE_PER_REACH = (-0.43, -0.88, 1.0)  # where pages open, in the same measure
-_LOOK_AT_PER_REACH = (0.12, -0.08, 0.0)  # aside of the origin, which the panel would hide
-_BEHIND_B = (-0.65, 0.45)  # [m] camera behind and above the robot
-_AHEAD_B = 0.3  # [m] in front of it, where that camera looks
-_LAG_SECONDS = 0.35  # in which that camera makes up for most of a turn
+)  # name, spacing [m], width [m], colour
+_EYE_PER_REACH = (-0.43, -0.88, 1.0)  # initial camera position, relative to the same distance
+_LOOK_AT_PER_REACH = (
+    0.12,
+    -0.08,
+    0.0,
+)  # initial target: beside the origin, which the panel would hide
+_BEHIND_B = (-0.65, 0.45)  # [m] position of the following camera behind and above the robot
+_AHEAD_B = 0.3  # [m] its target in front of the robot
+_LAG_SECONDS = 0.35  # time constant of its yaw
 
 
 class Scene:
-    """The scene of a page, and the events that it hands back."""
+    """A `Scene` shows the player and handles clicks and drags."""
 
     def __init__(self, server: viser.ViserServer, player: Player, ask: Callable[..., None]) -> None:
         """Build the scene.
 
         Args:
-          server: shows it.
-          player: what drives.
-          ask: has the loop that drives the player call something; viser has its own threads.
+          server: the viser server.
+          player: the player.
+          ask: a function that queues a call for the player's thread, since viser calls back from
+            its own threads.
         """
         self.camera: Camera = "free"
-        """What the pages' cameras do."""
+        """Behaviour of the camera, one of `CAMERAS`."""
         self._server, self._player, self._ask = server, player, ask
         self._model = player.env.mj_model
         self._data = mujoco.MjData(self._model)
@@ -66,11 +72,9 @@ class Scene:
         self.show()
 
     def show(self) -> None:
-        """Send the pages the present moment."""
-        shown = self._player.shown
-        self._data.qpos[:] = shown.qpos
-        for name, position in shown.markers.items():
-            self._data.mocap_pos[self._model.body(name).mocapid[0]] = position
+        """Send the present poses to all clients."""
+        snapshot = self._player.snapshot
+        set_pose(self._model, self._data, np.asarray(snapshot.qpos), snapshot.markers)
         mujoco.mj_kinematics(self._model, self._data)
         with self._server.atomic():
             for body, frame in self._frames.items():
@@ -81,12 +85,13 @@ class Scene:
         self._player.frames.count(time.monotonic())
 
     def point(self, origin: Any, direction: Any, grabbed: Any = (0.0, 0.0, 0.0)) -> None:
-        """Ask for the goal to go where a ray meets a level plane, unless that is off the floor.
+        """Move the goal to where a ray meets a horizontal plane, if that is on the floor.
 
         Args:
-          origin: of the ray [m], world frame.
-          direction: of the ray, of any length.
-          grabbed: where the goal was grabbed [m]: from its position, and as high above the floor.
+          origin: the origin of the ray [m], world frame.
+          direction: the direction of the ray, of any length.
+          grabbed: the point by which the goal is dragged [m]: x and y relative to the goal, and
+            the height above the floor, which is that of the plane.
         """
         origin, direction, grabbed = map(np.asarray, (origin, direction, grabbed))
         if direction[2] >= 0:
@@ -96,7 +101,11 @@ class Scene:
             self._ask(self._player.move_goal, float(goal_w[0]), float(goal_w[1]))
 
     def cast_shadows(self, cast: bool) -> None:
-        """Let the sun cast shadows on a floor that takes them, or not."""
+        """Switch shadows on or off.
+
+        Args:
+          cast: whether to show shadows, on a solid floor instead of lines.
+        """
         with self._server.atomic():
             self._sun.cast_shadow = cast
             self._plane.visible = cast
@@ -104,8 +113,8 @@ class Scene:
 
     def _add_floor(self) -> None:
         scene = self._server.scene
-        # Without a GPU, a plane that fills the page takes half of every picture's time: there the
-        # floor is the page's own white with lines on it, and the plane waits for its shadows.
+        # Without a GPU in the browser, a plane that fills the page takes half of the render time.
+        # Therefore the floor is lines on the white page, and the plane is shown only with shadows.
         self._plane = scene.add_grid(
             "/floor",
             width=2 * self._edge,
@@ -125,7 +134,7 @@ class Scene:
 
     def _add_lights(self) -> None:
         scene = self._server.scene
-        # viser's own lights reflect and cast shadows; without a GPU, that makes two pictures a
+        # viser's default lights cast shadows and reflect; without a GPU, that gives two frames per
         # second.
         scene.configure_environment_map(None)
         scene.configure_default_lights(enabled=False)
@@ -134,7 +143,7 @@ class Scene:
 
     def _add_bodies(self) -> dict[int, viser.FrameHandle]:
         scene, frames = self._server.scene, {}
-        for geom in shown_geoms(self._model):
+        for geom in visible_geoms(self._model):
             name = self._model.body(geom.body).name or f"body {geom.body}"
             if geom.body not in frames:
                 frames[geom.body] = scene.add_frame(f"/{name}", show_axes=False)
@@ -157,14 +166,15 @@ class Scene:
 
     async def _on_drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
         if event.phase == "start":
-            self._grabbed_w = np.subtract(event.start_position, self._player.shown.goal_w)
+            self._grabbed_w = np.subtract(event.start_position, self._player.snapshot.goal_w)
             self._grabbed_w[2] = event.start_position[2]
-        # The pointer is told in a plane that faces the camera; the goal is to slide on the floor.
+        # viser reports the pointer in a plane that faces the camera; project it onto the floor.
         eye = event.client.camera.position
         self.point(eye, np.subtract(event.end_position, eye), self._grabbed_w)
 
     def _aim(self) -> None:
-        robot_w = np.asarray(self._player.shown.qpos[QPOS_XYZ])
+        """Turn the cameras of all clients to the robot."""
+        robot_w = np.asarray(self._player.snapshot.qpos[QPOS_XYZ])
         x_w = self._data.body("jetbot").xmat.reshape(3, 3)[:, 0]
         turn = np.arctan2(x_w[1], x_w[0]) - self._camera_yaw
         turn = (turn + np.pi) % (2 * np.pi) - np.pi
@@ -179,9 +189,14 @@ class Scene:
 
 
 def _lines(edge: float) -> bytes:
-    """Return a square's lattice [m] about the origin, flat on the floor, as binary glTF."""
+    """Return the grid lines of a square floor around the origin as binary glTF.
+
+    Args:
+      edge: half the side of the square [m].
+    """
     scene = trimesh.Scene()
     for name, spacing, width, color in _LINES:
+        # Each line is a rectangle with corners (low, -end) and (high, end), along x and along y.
         count = int(edge / spacing)
         middle = spacing * np.arange(-count, count + 1)
         low, high, end = middle - width / 2, middle + width / 2, np.full_like(middle, edge)
@@ -192,14 +207,14 @@ def _lines(edge: float) -> bytes:
         first = 4 * np.arange(len(boxes))[:, None, None]
         faces = (first + np.array([[0, 1, 2], [0, 2, 3]])).reshape(-1, 3)
         mesh = trimesh.Trimesh(np.pad(corners, ((0, 0), (0, 1))), faces, process=False)
-        paint = PBRMaterial(name=name, baseColorFactor=(*color, 255))
-        mesh.visual = TextureVisuals(material=paint)
+        material = PBRMaterial(name=name, baseColorFactor=(*color, 255))
+        mesh.visual = TextureVisuals(material=material)
         scene.add_geometry(mesh, geom_name=name)
     return gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
 
 
 def _unlit(tree: dict[str, Any]) -> None:
-    # Thin lines are many pixels' edges, and lighting each costs more than the robot does.
+    """Mark all materials as unlit: lighting the lines would cost more than the robot does."""
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     for material in tree["materials"]:
         material["extensions"] = {"KHR_materials_unlit": {}}

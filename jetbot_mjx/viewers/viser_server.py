@@ -1,14 +1,14 @@
-"""A player in the browser, by viser: one port on this machine serves the page and its data.
+"""Show a player in the browser with viser; one port serves the page and its data.
 
-viser, because the page draws (nothing is rendered here, so no OpenGL is needed, and little crosses
-an ssh tunnel) and hands clicks, drags and keys back to Python. rerun is made to record and to look
-back, not to interfere; MuJoCo in WebAssembly would run in the page, where the policy is not.
+With viser the page renders, so this machine needs no OpenGL and little data crosses an ssh tunnel,
+and clicks, drags and keys come back to Python. rerun records and shows recordings, without input;
+MuJoCo in WebAssembly would run in the page, where the policy is not.
 
-viser calls back from threads of its own. What a callback asks for waits in a queue, and the loop
-that drives the player does it between two steps.
+Threads: viser calls back from its own threads. A callback puts its request into a queue, and the
+thread that drives the player executes it between two steps.
 
-Any page that a browser shows may open a connection to this machine, and viser takes them all. The
-header `Origin` says where a page is from, and only this player's own page is let in.
+Security: any page in a browser may open a connection to this machine, and viser accepts them all.
+The header `Origin` names the page's server; `_OriginCheck` accepts only this player's own page.
 """
 
 import contextlib
@@ -30,25 +30,28 @@ import websockets.asyncio.server
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.realtime import Clock
-from jetbot_mjx.viewers.viser_panel import Panel
+from jetbot_mjx.viewers.viser_panel import ControlPanel
 from jetbot_mjx.viewers.viser_scene import FPS, Scene
 
 FIRST_PORT = 8080
 _PORTS_TRIED = 100
-_FIGURES_PER_SECOND = 5
-_ORIGINS_TOLD = 10
+_PANEL_UPDATES_PER_SECOND = 5
+_MAX_REPORTED_ORIGINS = 10
 
 
 class _Server(viser.ViserServer):
-    """viser's server without the tunnel through its makers' machine."""
+    """viser's server without its public tunnel."""
 
     def request_share_url(self, verbose: bool = True) -> str | None:
-        """Open nothing, whatever a page asks for."""
+        """Return no URL: pages cannot open a tunnel."""
         del verbose
 
 
-class Browser:
-    """Serves one player to any number of pages; a context manager that stops the server."""
+class ViserViewer:
+    """A `ViserViewer` serves one player to any number of clients.
+
+    It is a context manager that stops the server.
+    """
 
     def __init__(
         self,
@@ -59,52 +62,52 @@ class Browser:
         allow: Sequence[str] = (),
         tell: Callable[[str], None],
     ) -> None:
-        """Open the port and builds scene and panel.
+        """Open the port and build scene and panel.
 
         Args:
-          player: what drives.
-          host: the address to listen on; whoever reaches it can watch and interfere.
-          port: to listen on, as `free_port` gave it.
+          player: the player.
+          host: the address to listen on; everybody who can reach it can watch and interfere.
+          port: the port to listen on, from `free_port`.
           allow: origins of other pages that may connect, such as `https://hub.example.org`.
-          tell: is given a line for each origin that was refused, the first few.
+          tell: a function that receives one line for each of the first refused origins.
 
         Raises:
-          UserError: the port was taken meanwhile, or pages cannot be refused.
+          UserError: the port was taken meanwhile, or the origin check could not be installed.
         """
-        door = _Door(host, allow, tell)
-        with _quiet(), door.at_viser():
+        origin_check = _OriginCheck(host, allow, tell)
+        with _quiet(), origin_check.install():
             self.server = _Server(host, port, label=player.run_dir.name, verbose=False)
-        if not door.stands:
+        if not origin_check.installed:
             self.close()
             raise UserError(
                 f"viser {viser.__version__} lets in pages from anywhere: pip install viser==1.1.1"
             )
-        # Where a port is taken, viser goes on to the next.
+        # If the port is taken, viser uses the next one.
         if self.server.get_port() != port:
             self.close()
             raise UserError(f"--port {port} was taken meanwhile: try again")
         self._player = player
-        self._asked: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
         self.scene = Scene(self.server, player, self._ask)
-        self.panel = Panel(self.server, player, self.scene, self._ask)
-        self._pictures = Clock(1 / FPS, time.monotonic())
-        self._figures = Clock(1 / _FIGURES_PER_SECOND, time.monotonic())
+        self.panel = ControlPanel(self.server, player, self.scene, self._ask)
+        self._scene_clock = Clock(1 / FPS, time.monotonic())
+        self._panel_clock = Clock(1 / _PANEL_UPDATES_PER_SECOND, time.monotonic())
 
     def run(self) -> None:
-        """Drive and shows, until it is interrupted."""
+        """Drive and show the player until the user interrupts."""
         while True:
-            self.work()
-            time.sleep(min(self._player.wait(), self._pictures.wait(time.monotonic())))
+            self.step()
+            time.sleep(min(self._player.wait(), self._scene_clock.wait(time.monotonic())))
 
-    def work(self) -> None:
-        """Do what was asked for, take the steps that are due, and show the result."""
-        while not self._asked.empty():
-            self._asked.get()()
+    def step(self) -> None:
+        """Execute queued requests, make the steps that are due, and show the result."""
+        while not self._requests.empty():
+            self._requests.get()()
         self._player.advance()
-        if self._pictures.due(time.monotonic()):
+        if self._scene_clock.due(time.monotonic()):
             self.scene.show()
-        if self._figures.due(time.monotonic()):
-            self.panel.tell()
+        if self._panel_clock.due(time.monotonic()):
+            self.panel.update()
 
     def close(self) -> None:
         """Stop the server."""
@@ -112,7 +115,7 @@ class Browser:
             self.server.stop()
 
     def __enter__(self) -> Self:
-        """Enter."""
+        """Return the viewer."""
         return self
 
     def __exit__(
@@ -124,58 +127,60 @@ class Browser:
         """Stop the server."""
         self.close()
 
-    def _ask(self, do: Callable[..., Any], *given: Any) -> None:
-        self._asked.put(lambda: do(*given))
+    def _ask(self, function: Callable[..., Any], *arguments: Any) -> None:
+        """Queue a call for the player's thread."""
+        self._requests.put(lambda: function(*arguments))
 
 
-class _Door:
-    """Lets in this player's page and those that the user allows, and no other."""
+class _OriginCheck:
+    """An `_OriginCheck` accepts connections of this player's page and of allowed origins only."""
 
     def __init__(self, host: str, allow: Sequence[str], tell: Callable[[str], None]) -> None:
-        """Create the object without a place yet.
+        """Prepare the check; `install` adds it to viser's server.
 
         Args:
-          host: the address that is listened on.
-          allow: further origins.
-          tell: is given a line for each origin that was refused, the first few.
+          host: the address that the server listens on.
+          allow: further origins that may connect.
+          tell: a function that receives one line for each of the first refused origins.
         """
         name = socket.gethostname().lower()
         self._names = {host.lower(), "localhost", name, f"{name}.local"}
         self._allow, self._tell = set(allow), tell
         self._refused: set[str] = set()
-        self.stands = False
-        """Whether viser's server has it."""
+        self.installed = False
+        """Whether viser's server uses the check."""
 
     @contextlib.contextmanager
-    def at_viser(self) -> Iterator[None]:
-        """Give the door to the server that viser starts inside, for which viser has no option."""
+    def install(self) -> Iterator[None]:
+        """Add the check to a server that viser starts inside; viser has no option for this."""
         module = websockets.asyncio.server
         serve = module.serve
 
-        def serve_behind(*arguments: Any, process_request: Any, **options: Any) -> Any:
-            def look(connection: Any, request: Any) -> Any:
-                refusal = self._refuse(connection, request)
+        def serve_with_check(*arguments: Any, process_request: Any, **options: Any) -> Any:
+            def check(connection: Any, request: Any) -> Any:
+                refusal = self._refusal(connection, request)
                 return process_request(connection, request) if refusal is None else refusal
 
-            self.stands = True
-            return serve(*arguments, process_request=look, **options)
+            self.installed = True
+            return serve(*arguments, process_request=check, **options)
 
-        module.serve = serve_behind
+        module.serve = serve_with_check
         try:
             yield
         finally:
             module.serve = serve
 
-    def _refuse(self, connection: Any, request: Any) -> Any:
-        """Return the answer to a request that is refused, or None."""
+    def _refusal(self, connection: Any, request: Any) -> Any:
+        """Return the HTTP response that refuses a request; None if the request is accepted."""
         headers = request.headers
-        # The page itself is no secret, and a program that is no browser could send any header.
+        # Only websockets matter: the page is not secret. Programs other than browsers could send
+        # any header, so the check protects against foreign pages only.
         if not headers.get_all("Upgrade"):
             return None
         host = "".join(headers.get_all("Host"))
         for origin in headers.get_all("Origin"):
-            if not self.lets_in(origin, host):
-                if origin not in self._refused and len(self._refused) < _ORIGINS_TOLD:
+            if not self.is_allowed(origin, host):
+                if origin not in self._refused and len(self._refused) < _MAX_REPORTED_ORIGINS:
                     self._refused.add(origin)
                     self._tell(
                         f"refused: a page from {origin[:200]!r} asked to connect; to let it in,"
@@ -184,16 +189,14 @@ class _Door:
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "another page's origin\n")
         return None
 
-    def lets_in(self, origin: str, host: str) -> bool:
+    def is_allowed(self, origin: str, host: str) -> bool:
         """Return whether a page may connect.
 
         Args:
-          origin: where the page is from, as its browser says.
-          host: what the browser took this server for. It has to be the same, and no name that
-            someone else may point at this machine after he served a page of his own under it.
-
-        Returns:
-          Whether it may.
+          origin: the header `Origin`: the server of the page.
+          host: the header `Host`: the server that the page connects to. It must equal the origin's
+            and be an address or a name of this machine: an attacker could point any other name
+            at this machine after serving a page under it (DNS rebinding).
         """
         if origin in self._allow:
             return True
@@ -216,17 +219,14 @@ def _is_address(name: str) -> bool:
 
 
 def free_port(host: str, port: int | None) -> int:
-    """Look for a port to listen on.
+    """Return a free port to listen on.
 
     Args:
       host: the address to listen on.
-      port: the only one that will do; None: the first from 8080 on that is free.
-
-    Returns:
-      The port.
+      port: the port to check; None: take the first free port from 8080 on.
 
     Raises:
-      UserError: the address or the port cannot be had.
+      UserError: the address is invalid, or no port is free.
     """
     tried = [port] if port is not None else range(FIRST_PORT, FIRST_PORT + _PORTS_TRIED)
     reason = None
@@ -234,7 +234,7 @@ def free_port(host: str, port: int | None) -> int:
         try:
             for address in socket.getaddrinfo(host, one, type=socket.SOCK_STREAM):
                 with socket.socket(*address[:3]) as probe:
-                    # What was served here a minute ago does not count.
+                    # Ignore closed connections of an earlier server on this port.
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                     probe.bind(address[4])
         except socket.gaierror as error:
@@ -253,7 +253,7 @@ def free_port(host: str, port: int | None) -> int:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """Keep what viser tells on starting and stopping out of the terminal."""
+    """Suppress the messages that viser prints when it starts and stops."""
     console = rich.get_console()
     before, console.quiet = console.quiet, True
     try:

@@ -17,7 +17,7 @@ from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run
-from jetbot_mjx.viewers.video import Studio
+from jetbot_mjx.viewers.video import VideoRenderer
 
 
 @pytest.fixture(scope="module")
@@ -65,7 +65,7 @@ def evaluator(smoke_run):
 @pytest.fixture
 def coarse(monkeypatch):
     """Films in few and small pictures."""
-    monkeypatch.setattr(gallery, "Studio", functools.partial(Studio, side=80, fps=5))
+    monkeypatch.setattr(gallery, "VideoRenderer", functools.partial(VideoRenderer, side=80, fps=5))
 
 
 @pytest.fixture
@@ -83,15 +83,15 @@ def filmed(monkeypatch):
         def __exit__(self, *exception):
             pass
 
-        def film_episode(self, drive):
+        def render_episode(self, drive):
             shots.append([("", drive)])
             yield np.zeros((2, 2, 3), np.uint8)
 
-        def film_together(self, shown):
+        def render_side_by_side(self, shown):
             shots.append(shown)
             yield np.zeros((2, 2, 3), np.uint8)
 
-    monkeypatch.setattr(gallery, "Studio", Listener)
+    monkeypatch.setattr(gallery, "VideoRenderer", Listener)
     return shots
 
 

@@ -27,7 +27,7 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs.nan_dump import save_nan_dump
 from jetbot_mjx.viewers import gallery, mujoco_window
-from jetbot_mjx.viewers.video import Studio
+from jetbot_mjx.viewers.video import VideoRenderer
 
 TEXTS = {**PAGES, "README.md": (ROOT / "README.md").read_text("utf-8")}
 
@@ -111,7 +111,9 @@ def reader(checkout, monkeypatch):
     def sit(page):
         monkeypatch.chdir(checkout)
         # Pictures are looked at elsewhere.
-        monkeypatch.setattr(gallery, "Studio", functools.partial(Studio, side=64, fps=2))
+        monkeypatch.setattr(
+            gallery, "VideoRenderer", functools.partial(VideoRenderer, side=64, fps=2)
+        )
         for name, text in own_files(page).items() if page in PAGES else ():
             if name.endswith(".yaml"):
                 with Path(name).open("w") as file:
@@ -221,10 +223,10 @@ def test_a_documented_play_drives(page, words, reader, monkeypatch, capsys):
     browser = pytest.importorskip("jetbot_mjx.viewers.viser_server")
 
     def look_once(page):
-        page.work()
+        page.step()
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(browser.Browser, "run", look_once)
+    monkeypatch.setattr(browser.ViserViewer, "run", look_once)
     monkeypatch.setattr(mujoco_window, "require_window", lambda: None)
     monkeypatch.setattr(mujoco_window, "run", lambda player: player.tick())
     assert execute(page, words, reader, monkeypatch) == 0

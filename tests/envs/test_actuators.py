@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.actuators import drive_motors, motors_at_rest
+from jetbot_mjx.envs.actuators import initial_actuator_state, step_actuators
 from jetbot_mjx.envs.robot_model import WHEEL_RADIUS, WHEEL_SEPARATION
 from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, RobotParams
 
@@ -14,9 +14,9 @@ RAMP = np.arange(1.0, 25.0).reshape(12, 2)
 
 
 def drive(robot_params, commands, longest_delay=MAX_ACTION_DELAY):
-    motors, speeds = motors_at_rest(robot_params, longest_delay), []
+    motors, speeds = initial_actuator_state(robot_params, longest_delay), []
     for command in np.asarray(commands, np.float32):
-        motors, speed = drive_motors(
+        motors, speed = step_actuators(
             motors, jnp.asarray(command), robot_params, full_speed=FULL, ctrl_dt=1 / 60
         )
         speeds.append(speed)
@@ -85,4 +85,4 @@ def test_what_does_not_differ_leaves_every_bit_and_takes_no_place():
     np.testing.assert_array_equal(drive(RobotParams(), RAMP, longest_delay=0), RAMP)
     traced = RobotParams(*(jnp.float32(value) for value in RobotParams()))
     np.testing.assert_array_equal(drive(traced, RAMP), RAMP)
-    assert motors_at_rest(RobotParams(), 0) == (None, None)
+    assert initial_actuator_state(RobotParams(), 0) == (None, None)

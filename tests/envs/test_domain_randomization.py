@@ -179,7 +179,7 @@ def test_only_what_is_drawn_enters_the_physics():
     class Seen(JetBotEnv):
         def with_model(self, mjx_model):
             env = super().with_model(mjx_model)
-            varied.append(env.physics._varied)
+            varied.append(env.physics._traced_leaves)
             return env
 
     jax.eval_shape(

@@ -116,7 +116,7 @@ def test_what_mujoco_derives_from_masses_follows_them(preset_env):
     compiled = make_mj_model(heavy, preset_env.config.physics, visual=False)
     preset = make_model(preset_env, training_numerics(preset_env.config.physics))
     mass = compiled.body_mass[None].astype(np.float32)
-    (made,) = mujoco_simulator._Robots(preset).models({"body_mass": mass})
+    (made,) = mujoco_simulator._ModelCache(preset).models({"body_mass": mass})
     for name in ("body_subtreemass", "body_invweight0", "dof_invweight0"):
         before, after = getattr(preset, name), getattr(made, name)
         np.testing.assert_allclose(after, getattr(compiled, name), rtol=1e-3)

@@ -9,7 +9,7 @@ import pytest
 
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.robot_params import RobotParams
-from jetbot_mjx.envs.sensors import sense, sensors_at_start
+from jetbot_mjx.envs.sensors import initial_sensor_state, step_sensors
 from jetbot_mjx.envs.task import RobotState
 
 KEY = jax.random.PRNGKey(0)
@@ -23,10 +23,12 @@ def robot(x=0.0, heading=0.0):
 
 def test_a_robot_sees_itself_as_it_was():
     robot_params = RobotParams(observation_delay=jnp.float32(2.0))
-    sensors = sensors_at_start(robot(), KEY, robot_params, 4)
+    sensors = initial_sensor_state(robot(), KEY, robot_params, 4)
     seen = []
     for step in range(5):
-        sensors, now = sense(sensors, robot(1.0 + step, 0.1 * step), robot_params, jnp.int32(step))
+        sensors, now = step_sensors(
+            sensors, robot(1.0 + step, 0.1 * step), robot_params, jnp.int32(step)
+        )
         seen.append((float(now.position_w[0]), float(kinematics.yaw(now.quat))))
     expected = [(0.0, 0.0), (0.0, 0.0), (1.0, 0.0), (2.0, 0.1), (3.0, 0.2)]
     np.testing.assert_allclose(seen, expected, atol=1e-6)
@@ -41,7 +43,7 @@ def seen():
         speed_noise=jnp.float32(0.01),
         yaw_rate_noise=jnp.float32(0.04),
     )
-    one = functools.partial(sense, sensors_at_start(robot(), KEY, robot_params, 0))
+    one = functools.partial(step_sensors, initial_sensor_state(robot(), KEY, robot_params, 0))
     _, found = jax.jit(jax.vmap(lambda step: one(robot(heading=0.5), robot_params, step)))(
         jnp.arange(SAMPLES)
     )
@@ -74,9 +76,9 @@ def test_noise_leaves_height_and_level_and_is_new_at_every_step(seen):
 
 def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_heading():
     robot_params = RobotParams(observation_delay=1, height_offset=0.003, pitch_offset=0.02)
-    sensors = sensors_at_start(robot(), KEY, robot_params, 1)
-    sensors, _ = sense(sensors, robot(1.0, 0.7), robot_params, jnp.int32(0))
-    _, now = sense(sensors, robot(2.0, 0.9), robot_params, jnp.int32(1))
+    sensors = initial_sensor_state(robot(), KEY, robot_params, 1)
+    sensors, _ = step_sensors(sensors, robot(1.0, 0.7), robot_params, jnp.int32(0))
+    _, now = step_sensors(sensors, robot(2.0, 0.9), robot_params, jnp.int32(1))
     # Height and pitch differ, and nothing else; the delayed state has them once.
     np.testing.assert_allclose(now.position_w, (1.0, 0.0, 0.033), atol=1e-7)
     ahead = kinematics.rotate(now.quat, jnp.array([1.0, 0.0, 0.0]))
@@ -86,7 +88,7 @@ def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_headi
 
 
 def test_an_exact_robot_sees_every_bit_and_remembers_nothing():
-    sensors = sensors_at_start(robot(), KEY, RobotParams(), 0)
+    sensors = initial_sensor_state(robot(), KEY, RobotParams(), 0)
     assert sensors == (None, None)
-    _, now = sense(sensors, robot(1.5, 0.7), RobotParams(), jnp.int32(3))
+    _, now = step_sensors(sensors, robot(1.5, 0.7), RobotParams(), jnp.int32(3))
     jax.tree.map(np.testing.assert_array_equal, now, robot(1.5, 0.7))

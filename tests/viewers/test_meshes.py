@@ -2,7 +2,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx.viewers.meshes import shown_geoms
+from jetbot_mjx.viewers.meshes import visible_geoms
 
 SHAPES = """
 <mujoco>
@@ -35,7 +35,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def geoms(model):
-    return {geom.name: geom for geom in shown_geoms(model)}
+    return {geom.name: geom for geom in visible_geoms(model)}
 
 
 def test_what_shows_is_there_and_nothing_else(model, geoms):
@@ -84,6 +84,6 @@ def test_colours_are_those_that_mujoco_draws(geoms):
 
 
 def test_the_robot_shows_and_its_colliders_do_not(world_env):
-    names = {geom.name for geom in shown_geoms(world_env.mj_model)}
+    names = {geom.name for geom in visible_geoms(world_env.mj_model)}
     assert {"tray", "left_tyre", "right_rim", "camera_lens", "goal"} < names
     assert not {"floor", "left_wheel", "caster_front"} & names

@@ -60,9 +60,9 @@ def test_the_window_shows_the_robot_drive_and_hears_the_arrow_keys(player, monke
     assert window.closed
     assert len(window.shown) == 20
     qpos, mocap = window.shown[-1]
-    np.testing.assert_allclose(qpos, player.shown.qpos)
-    np.testing.assert_allclose(mocap[0], player.shown.goal_w)
-    assert player.asked[0] == pytest.approx(sign / 8)
+    np.testing.assert_allclose(qpos, player.snapshot.qpos)
+    np.testing.assert_allclose(mocap[0], player.snapshot.goal_w)
+    assert player.command[0] == pytest.approx(sign / 8)
     assert (qpos[0] > 1e-3) == (sign > 0)
     assert "keyboard" in window.texts[-1][3]
     assert player.frames_per_second > 10

@@ -21,7 +21,7 @@ from jetbot_mjx.runs.checkpoint import load_policy
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.viewers import player as module
 from jetbot_mjx.viewers.player import Player
-from jetbot_mjx.viewers.step_fns import AGENTS, why_goals_stay
+from jetbot_mjx.viewers.step_fns import AGENTS, move_goal_error
 
 SEED = 7
 HOLD = 24  # control steps of standing still after an end
@@ -34,7 +34,7 @@ def one(smoke_run):
 
 @pytest.fixture(scope="module")
 def first_goal(one):
-    return one.shown.goal_w
+    return one.snapshot.goal_w
 
 
 @pytest.fixture
@@ -74,12 +74,12 @@ def tick_to_the_end(player):
 
 
 def yaw(player):
-    w, x, y, z = player.shown.qpos[QPOS_QUAT]
+    w, x, y, z = player.snapshot.qpos[QPOS_QUAT]
     return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
 
 
 def position(player):
-    return np.array(player.shown.qpos[QPOS_XYZ][:2])
+    return np.array(player.snapshot.qpos[QPOS_XYZ][:2])
 
 
 # Time.
@@ -130,7 +130,7 @@ def test_a_paused_player_stands_and_takes_single_steps(player, wall):
 
 def test_an_end_draws_a_new_goal_and_puts_the_robot_back(player):
     player.agent = "scripted"
-    goal_w, key = player.shown.goal_w, player._state.key
+    goal_w, key = player.snapshot.goal_w, player._state.key
     tick_to_the_end(player)
     assert (player.successes, player.episodes, player.outcome) == (1, 1, "reached")
     end = position(player)
@@ -139,8 +139,8 @@ def test_an_end_draws_a_new_goal_and_puts_the_robot_back(player):
     player.tick()
     # As the wrapper of trainings does: from the key that the episode carried.
     expected = player.env.reset(key)
-    np.testing.assert_allclose(player.shown.goal_w, expected.goal, rtol=1e-6)
-    assert not np.allclose(player.shown.goal_w, goal_w)
+    np.testing.assert_allclose(player.snapshot.goal_w, expected.goal, rtol=1e-6)
+    assert not np.allclose(player.snapshot.goal_w, goal_w)
     np.testing.assert_array_equal(position(player), 0.0)
     assert (player.time, player.episodes) == (0.0, 1)
 
@@ -161,11 +161,11 @@ def test_the_time_limit_ends_an_episode(player):
 
 def test_breaking_off_is_no_episode(player):
     ticks(player, 10)
-    goal_w = player.shown.goal_w
+    goal_w = player.snapshot.goal_w
     player.reset()
     assert player.episodes == 0
     assert player.time == 0
-    assert not np.allclose(player.shown.goal_w, goal_w)
+    assert not np.allclose(player.snapshot.goal_w, goal_w)
 
 
 @pytest.mark.parametrize(
@@ -173,13 +173,13 @@ def test_breaking_off_is_no_episode(player):
     [
         ({"success": 1, "terminated": 1}, "reached"),
         ({"terminated": 1}, "failed"),
-        ({"nonfinite": 1}, "world blew up"),
+        ({"nonfinite": 1}, "non-finite state"),
         ({}, "out of time"),
     ],
 )
 def test_an_end_is_named(player, how, outcome):
     none = {"success": 0, "terminated": 0, "nonfinite": 0}
-    assert module._outcome(player.shown._replace(**none | how)) == outcome
+    assert module._outcome(player.snapshot._replace(**none | how)) == outcome
 
 
 # Goals that a user moves.
@@ -189,8 +189,8 @@ def test_a_goal_that_is_moved_is_reached(player):
     player.agent = "scripted"
     ticks(player, 20)
     assert player.move_goal(-0.5, 0.3)
-    np.testing.assert_allclose(player.shown.goal_w, [-0.5, 0.3, 0.05], rtol=1e-6)
-    np.testing.assert_array_equal(player.shown.markers["goal"], player.shown.goal_w)
+    np.testing.assert_allclose(player.snapshot.goal_w, [-0.5, 0.3, 0.05], rtol=1e-6)
+    np.testing.assert_array_equal(player.snapshot.markers["goal"], player.snapshot.goal_w)
     tick_to_the_end(player)
     assert player.outcome == "reached"
     assert np.linalg.norm(position(player) - [-0.5, 0.3]) < 0.1
@@ -218,7 +218,7 @@ def test_after_an_end_a_moved_goal_lets_the_robot_go_on_from_there(player):
     end = position(player)
     target = end + np.float32(0.4)
     player.move_goal(float(target[0]), float(target[1]))
-    assert player.shown.done == 0
+    assert player.snapshot.done == 0
     player.tick()
     assert np.linalg.norm(position(player) - end) < 0.05
     tick_to_the_end(player)
@@ -251,16 +251,16 @@ def state_of(task):
     [(StaysPut, "StaysPut has no move_goal"), (DrawsMore, "DrawsMore has a move_goal for another")],
 )
 def test_a_task_whose_goals_cannot_be_moved_says_so_in_one_line(task, reason):
-    why = why_goals_stay(*state_of(task))
+    why = move_goal_error(*state_of(task))
     assert reason in why
     assert "\n" not in why
 
 
 def test_the_players_goal_stays_where_the_task_says_so(player, monkeypatch):
     monkeypatch.setattr(player, "cannot_move_goal", "it stays")
-    before = player.shown
+    before = player.snapshot
     assert not player.move_goal(0.1, 0.1)
-    assert player.shown is before
+    assert player.snapshot is before
     ticks(player, 5)
 
 
@@ -268,7 +268,7 @@ def test_the_obstacles_goal_moves_and_its_pillar_stays(root, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "examples"))
     env = make_env(load_config(root / "examples" / "obstacle.yaml"))
     state = env.reset(jax.random.PRNGKey(0))
-    assert why_goals_stay(env, state) == ""
+    assert move_goal_error(env, state) == ""
     moved = env.task.move_goal(state.goal, jnp.array([0.1, 0.2, 0.05]))
     np.testing.assert_allclose(env.task.goal_position(moved), [0.1, 0.2, 0.05])
     np.testing.assert_array_equal(moved.pillar_w, state.goal.pillar_w)
@@ -283,11 +283,11 @@ def test_every_agent_drives_its_own_way(player):
         player._state, player.agent = start, agent
         player.drive(0.5, -1.0)
         ticks(player, 20)
-        ends[agent] = np.array(player.shown.qpos)
+        ends[agent] = np.array(player.snapshot.qpos)
     for first, second in itertools.combinations(AGENTS, 2):
         assert np.abs(ends[first] - ends[second]).max() > 1e-3, (first, second)
     # One program for all of them.
-    assert player._programs.step._cache_size() == 1
+    assert player._fns.step._cache_size() == 1
 
 
 def test_the_policy_drives_as_its_checkpoint_says(player, smoke_run):
@@ -298,7 +298,7 @@ def test_the_policy_drives_as_its_checkpoint_says(player, smoke_run):
         assert player.checkpoint == env_steps
         player._state, player.agent = start, "policy"
         ticks(player, 30)
-        ends.append(player.shown.qpos)
+        ends.append(player.snapshot.qpos)
         # The same by hand: what the policy wants, asked for as a user would.
         policy = load_policy(smoke_run, env_steps)
         player._state, player.agent = start, "keyboard"
@@ -310,9 +310,9 @@ def test_the_policy_drives_as_its_checkpoint_says(player, smoke_run):
             )
             player.drive(*map(float, twist_b))
             player.tick()
-        np.testing.assert_allclose(player.shown.qpos, ends[-1], atol=1e-4)
+        np.testing.assert_allclose(player.snapshot.qpos, ends[-1], atol=1e-4)
     assert np.linalg.norm(ends[0][:2] - ends[1][:2]) > 1e-3
-    assert player._programs.step._cache_size() == 1
+    assert player._fns.step._cache_size() == 1
 
 
 def test_a_checkpoint_that_cannot_be_used_leaves_the_one_before(player):
@@ -340,19 +340,19 @@ def test_a_user_drives_ahead_and_to_the_left(player):
 
 def test_what_a_user_asks_for_is_held_within_the_limits(player):
     player.drive(7.0, -70.0)
-    assert player.asked == pytest.approx((1.0, -math.pi))
+    assert player.command == pytest.approx((1.0, -math.pi))
     player.drive(-1.0, 0.0)
-    assert player.asked == (0.0, 0.0)
+    assert player.command == (0.0, 0.0)
 
 
 def test_presses_add_up_and_the_first_against_a_turn_ends_it(player):
     for _ in range(3):
         player.nudge(1, 1)
-    assert player.asked == pytest.approx((3 / 8, 3 / 8 * math.pi))
+    assert player.command == pytest.approx((3 / 8, 3 / 8 * math.pi))
     player.nudge(-1, -1)
-    assert player.asked == pytest.approx((2 / 8, 0.0))
+    assert player.command == pytest.approx((2 / 8, 0.0))
     player.nudge(0, -1)
-    assert player.asked == pytest.approx((2 / 8, -math.pi / 8))
+    assert player.command == pytest.approx((2 / 8, -math.pi / 8))
 
 
 def test_who_is_no_agent_is_refused(player):

@@ -14,7 +14,13 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.viewers import offscreen, video
-from jetbot_mjx.viewers.video import Drive, Studio, drives, write_gif, write_mp4
+from jetbot_mjx.viewers.video import (
+    Trajectory,
+    VideoRenderer,
+    split_trajectories,
+    write_gif,
+    write_mp4,
+)
 
 SIDE, FPS = 120, 10.0
 DT = 1 / 60
@@ -36,15 +42,15 @@ def drive(world_env):
         qpos = np.tile(world_env.mj_model.qpos0, (1 + round(np.hypot(*end_w) / DT), 1))
         qpos[:, :2] = np.linspace(0, 1, len(qpos))[:, None] * end_w
         goal_w = np.array([*goal_w, 0.05])
-        return Drive(number, qpos, goal_w, {"goal": goal_w}, reached, DT)
+        return Trajectory(number, qpos, goal_w, {"goal": goal_w}, reached, DT)
 
     return drive
 
 
 @pytest.fixture(scope="module")
-def studio(world_env, needs_opengl):
-    with Studio(world_env, SIDE, FPS) as studio:
-        yield studio
+def renderer(world_env, needs_opengl):
+    with VideoRenderer(world_env, SIDE, FPS) as renderer:
+        yield renderer
 
 
 @pytest.fixture
@@ -79,7 +85,7 @@ def test_an_episode_ends_where_its_robot_did(world_env):
         goal=goal,
         qpos=qpos,
     )
-    first, second = drives(world_env, episodes, [17, 3])
+    first, second = split_trajectories(world_env, episodes, [17, 3])
     assert [(one.goal_number, one.steps, one.reached) for one in (first, second)] == [
         (17, 5, True),
         (3, 8, False),
@@ -92,8 +98,8 @@ def test_an_episode_ends_where_its_robot_did(world_env):
 
 
 @pytest.mark.parametrize(("reached", "outcome"), [(True, "reached"), (False, "missed")])
-def test_goal_time_distance_and_outcome_are_written_in(studio, drive, written, reached, outcome):
-    frames = list(studio.film_episode(drive((0.5, 0.0), (0.5, 0.3), reached=reached)))
+def test_goal_time_distance_and_outcome_are_written_in(renderer, drive, written, reached, outcome):
+    frames = list(renderer.render_episode(drive((0.5, 0.0), (0.5, 0.3), reached=reached)))
     assert written[:2] == ["goal 7 0.00 s", "0.58 m to go"]
     assert written[-3:] == ["goal 7 0.50 s", "0.30 m to go", outcome]
     assert written.count(outcome) == 1
@@ -103,9 +109,9 @@ def test_goal_time_distance_and_outcome_are_written_in(studio, drive, written, r
     assert all(np.array_equal(frames[5], frame) for frame in frames[6:])
 
 
-def test_whoever_has_finished_stands_while_the_others_drive(studio, drive, written):
+def test_whoever_has_finished_stands_while_the_others_drive(renderer, drive, written):
     short, long = drive((0.3, 0.0), (0.4, 0.0)), drive((-0.9, 0.0), (0.4, 0.0), reached=False)
-    frames = list(studio.film_together([("0 steps", short), ("9 steps", long)]))
+    frames = list(renderer.render_side_by_side([("0 steps", short), ("9 steps", long)]))
     assert len(frames) == 1 + 0.9 * FPS + round(video._HOLD_SECONDS * FPS)
     assert frames[0].shape == (SIDE, 2 * SIDE, 3)
     left, right = ([frame[:, at : at + SIDE] for frame in frames] for at in (0, SIDE))
@@ -118,13 +124,13 @@ def test_whoever_has_finished_stands_while_the_others_drive(studio, drive, writt
     assert written[last - 3 : last] == ["9 steps", "goal 7 0.90 s", "1.30 m to go"]
 
 
-def test_text_and_inset_stay_above_what_happens(studio, drive):
+def test_text_and_inset_stay_above_what_happens(renderer, drive):
     """Their pixels are those that differ from the bare view."""
     one = drive((1.5, 1.5), (-1.0, -0.5), number=1023, reached=False)
     points = video._extent(one)
     camera = offscreen.overview(points, 45.0, **video._FILLED)
-    panel = studio._panel("123,456,789 steps", one, one.steps, camera)
-    bare = studio._view.frame(
+    panel = renderer._episode_view("123,456,789 steps", one, one.steps, camera)
+    bare = renderer._view.frame(
         one.qpos[-1], one.markers, camera, shadows=False, trail_w=one.trail_w(one.steps)
     )
     rows, columns = np.nonzero((panel != bare).any(axis=-1)[:, :-1])
@@ -135,10 +141,10 @@ def test_text_and_inset_stay_above_what_happens(studio, drive):
     assert set(range(columns.max())) - set(columns)
 
 
-def test_the_inset_is_what_the_robot_sees(studio, drive):
+def test_the_inset_is_what_the_robot_sees(renderer, drive):
     def red_in_corner(goal_w):
         one = drive((0.0, 0.2), goal_w)
-        frame = next(studio.film_episode(one)).astype(int)
+        frame = next(renderer.render_episode(one)).astype(int)
         corner = frame[-round(0.28 * SIDE) :, SIDE - round(0.34 * SIDE) : SIDE]
         r, g, b = np.moveaxis(corner, -1, 0)
         return int(((r > 90) & (r > 3 * g) & (r > 3 * b)).sum())

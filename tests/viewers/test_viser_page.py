@@ -13,7 +13,7 @@ import chromium
 
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
 from jetbot_mjx.viewers.player import Player
-from jetbot_mjx.viewers.viser_server import Browser
+from jetbot_mjx.viewers.viser_server import ViserViewer
 
 if chromium.find() is None:
     pytest.skip("no Chromium to look at the page with", allow_module_level=True)
@@ -35,11 +35,11 @@ def served(smoke_run, unused_port):
     player = Player(smoke_run, agent="scripted", seed=3)
     player.paused = True
     over = threading.Event()
-    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
+    with ViserViewer(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
 
         def loop():
             while not over.is_set():
-                browser.work()
+                browser.step()
                 time.sleep(0.005)
 
         thread = threading.Thread(target=loop)
@@ -94,7 +94,7 @@ def red(picture):
 def shows_the_goal(page, see, player):
     def shown():
         found = red(page.screenshot())
-        return found and math.dist(found, see(player.shown.goal_w)) < 12
+        return found and math.dist(found, see(player.snapshot.goal_w)) < 12
 
     return shown
 
@@ -109,14 +109,14 @@ def put(player, served, place):
     """Puts the goal somewhere; to the left of the robot, the panel does not hide it."""
     browser, _ = served
     browser._ask(player.move_goal, *place)
-    wait_for("the goal", lambda: np.allclose(player.shown.goal_w[:2], place))
+    wait_for("the goal", lambda: np.allclose(player.snapshot.goal_w[:2], place))
 
 
 def test_the_page_shows_the_robot_and_a_red_goal(served, page, see):
     _, player = served
     put(player, served, (-0.3, 0.2))
     wait_for("the goal on the page", shows_the_goal(page, see, player))
-    assert dark_near(page, see, player.shown.qpos[QPOS_XYZ]) > 50
+    assert dark_near(page, see, player.snapshot.qpos[QPOS_XYZ]) > 50
     assert page.evaluate("document.body.innerText").count("Checkpoint") == 1
 
 
@@ -131,9 +131,9 @@ def test_the_page_asks_nobody_else_for_anything(served, page):
 def test_a_click_on_the_floor_moves_the_goal_and_the_robot_drives_there(served, page, see):
     browser, player = served
     target = (-0.35, -0.25)
-    start_w = np.array(player.shown.qpos[QPOS_XYZ])
+    start_w = np.array(player.snapshot.qpos[QPOS_XYZ])
     page.click(*see((*target, 0.0)))
-    wait_for("the click", lambda: np.allclose(player.shown.goal_w[:2], target, atol=0.02))
+    wait_for("the click", lambda: np.allclose(player.snapshot.goal_w[:2], target, atol=0.02))
     wait_for("the goal on the page", shows_the_goal(page, see, player))
     assert dark_near(page, see, start_w) > 50
     before = player.successes
@@ -143,7 +143,7 @@ def test_a_click_on_the_floor_moves_the_goal_and_the_robot_drives_there(served, 
     assert player.distance < 0.1
     # On the page too it stands there, and no longer where it started.
     wait_for("the robot gone", lambda: dark_near(page, see, start_w) < 20)
-    assert dark_near(page, see, player.shown.qpos[QPOS_XYZ]) > 50
+    assert dark_near(page, see, player.snapshot.qpos[QPOS_XYZ]) > 50
     browser._ask(player.reset)
 
 
@@ -151,11 +151,11 @@ def test_the_goal_can_be_dragged_over_the_floor(served, page, see):
     _, player = served
     put(player, served, (-0.25, 0.2))
     wait_for("the goal on the page", shows_the_goal(page, see, player))
-    x, y, z = map(float, player.shown.goal_w)
+    x, y, z = map(float, player.snapshot.goal_w)
     places = [(x - step / 2, y - step, z) for step in np.linspace(0.0, 0.3, 6)]
     page.drag(*[see(place) for place in places])
-    wait_for("the drag", lambda: np.allclose(player.shown.goal_w[:2], places[-1][:2], atol=0.03))
-    assert player.shown.goal_w[2] == pytest.approx(0.05)
+    wait_for("the drag", lambda: np.allclose(player.snapshot.goal_w[:2], places[-1][:2], atol=0.03))
+    assert player.snapshot.goal_w[2] == pytest.approx(0.05)
 
 
 def middle(page, element):
@@ -198,11 +198,11 @@ def test_keys_drive_once_the_user_is_the_agent(served, page):
     page.press("i")
     choose(page, "scripted", "keyboard")
     wait_for("the agent", lambda: player.agent == "keyboard")
-    assert player.asked == (0.0, 0.0)
+    assert player.command == (0.0, 0.0)
     # The keys are heard once the page knows of it, some time after the player does.
     wait_for("the wheel", lambda: "Ahead" in page.evaluate("document.body.innerText"))
     # A key that is pressed while a field has the focus belongs to the field.
     page.evaluate("document.activeElement.blur()")
     for key in "iij":
         page.press(key)
-    wait_for("the keys", lambda: player.asked == pytest.approx((0.25, math.pi / 8), abs=0.02))
+    wait_for("the keys", lambda: player.command == pytest.approx((0.25, math.pi / 8), abs=0.02))

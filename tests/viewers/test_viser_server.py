@@ -24,9 +24,9 @@ import websockets.exceptions
 import websockets.sync.client
 
 from jetbot_mjx.viewers import viser_server as module
-from jetbot_mjx.viewers.viser_panel import Panel
+from jetbot_mjx.viewers.viser_panel import ControlPanel
 from jetbot_mjx.viewers.viser_scene import Scene
-from jetbot_mjx.viewers.viser_server import FIRST_PORT, Browser, free_port
+from jetbot_mjx.viewers.viser_server import FIRST_PORT, ViserViewer, free_port
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +36,7 @@ def player(smoke_run):
 
 @pytest.fixture(scope="module")
 def browser(player, unused_port):
-    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
+    with ViserViewer(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
         yield browser
 
 
@@ -48,9 +48,9 @@ def as_new(player):
 
 def answer(browser):
     """Lets the loop do what was asked for, and show it."""
-    browser.work()
+    browser.step()
     browser.scene.show()
-    browser.panel.tell()
+    browser.panel.update()
 
 
 # The server.
@@ -84,7 +84,7 @@ def knock(browser, origin, host=None):
 def test_a_page_from_elsewhere_is_refused_and_our_own_let_in(player, unused_port):
     port = unused_port()
     told = []
-    with Browser(
+    with ViserViewer(
         player,
         host="127.0.0.1",
         port=port,
@@ -129,7 +129,7 @@ def test_a_page_from_elsewhere_is_refused_and_our_own_let_in(player, unused_port
 )
 def test_a_page_is_let_in_from_where_the_player_is(listening, origin, host, lets_in, monkeypatch):
     monkeypatch.setattr(socket, "gethostname", lambda: "This-Machine")
-    assert module._Door(listening, [], print).lets_in(origin, host) is lets_in
+    assert module._OriginCheck(listening, [], print).is_allowed(origin, host) is lets_in
 
 
 def test_a_viser_that_lets_all_pages_in_is_refused(player, unused_port, monkeypatch):
@@ -137,7 +137,7 @@ def test_a_viser_that_lets_all_pages_in_is_refused(player, unused_port, monkeypa
     monkeypatch.setattr(module.websockets.asyncio, "server", elsewhere)
     monkeypatch.setattr(module, "_Server", lambda host, port, **options: Served(port))
     with pytest.raises(UserError, match="lets in pages from anywhere: pip install viser=="):
-        Browser(player, host="127.0.0.1", port=unused_port(), tell=print)
+        ViserViewer(player, host="127.0.0.1", port=unused_port(), tell=print)
     assert Served.stopped
 
 
@@ -162,7 +162,7 @@ def test_nothing_is_shared_through_other_machines(browser):
 
 
 def test_starting_and_stopping_say_nothing(player, capfd, unused_port):
-    with Browser(player, host="127.0.0.1", port=unused_port(), tell=print):
+    with ViserViewer(player, host="127.0.0.1", port=unused_port(), tell=print):
         pass
     assert capfd.readouterr() == ("", "")
 
@@ -188,7 +188,7 @@ def test_a_port_that_is_taken_meanwhile_is_refused(player):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         with pytest.raises(UserError, match=f"--port {port} was taken meanwhile"):
-            Browser(player, host="127.0.0.1", port=port, tell=print)
+            ViserViewer(player, host="127.0.0.1", port=port, tell=print)
 
 
 @pytest.mark.parametrize(
@@ -214,8 +214,8 @@ def test_every_visual_geom_stands_where_mujoco_puts_it(browser, player):
     browser.scene.show()
     model = player.env.mj_model
     data = mujoco.MjData(model)
-    data.qpos[:] = player.shown.qpos
-    data.mocap_pos[0] = player.shown.goal_w
+    data.qpos[:] = player.snapshot.qpos
+    data.mocap_pos[0] = player.snapshot.goal_w
     mujoco.mj_kinematics(model, data)
     seen = 0
     for index in range(model.ngeom):
@@ -235,7 +235,7 @@ def test_every_visual_geom_stands_where_mujoco_puts_it(browser, player):
         np.testing.assert_allclose(matrix, data.geom_xmat[index], atol=1e-6)
         seen += 1
     assert seen == 27  # the robot's 26 and the goal
-    assert np.linalg.norm(player.shown.qpos[QPOS_XYZ][:2]) > 0.2
+    assert np.linalg.norm(player.snapshot.qpos[QPOS_XYZ][:2]) > 0.2
 
 
 def test_the_goal_is_red_and_has_its_size(browser):
@@ -260,7 +260,7 @@ def test_only_shadows_need_a_floor_that_fills_the_page(browser):
 def test_a_ray_from_above_moves_the_goal_to_where_it_meets_the_floor(browser, player):
     browser.scene.point((1.0, 0.0, 2.0), (-0.1, 0.3, -1.0))
     answer(browser)
-    np.testing.assert_allclose(player.shown.goal_w, [0.8, 0.6, 0.05], atol=1e-6)
+    np.testing.assert_allclose(player.snapshot.goal_w, [0.8, 0.6, 0.05], atol=1e-6)
 
 
 def test_a_goal_that_is_dragged_keeps_under_the_pointer(browser, player):
@@ -268,15 +268,15 @@ def test_a_goal_that_is_dragged_keeps_under_the_pointer(browser, player):
     # Grabbed at the top of its edge, 0.1 m above the floor.
     browser.scene.point((0.0, 0.0, 1.1), (0.3, 0.4, -1.0), (0.05, 0.0, 0.1))
     answer(browser)
-    np.testing.assert_allclose(player.shown.goal_w, [0.25, 0.4, 0.05], atol=1e-6)
+    np.testing.assert_allclose(player.snapshot.goal_w, [0.25, 0.4, 0.05], atol=1e-6)
 
 
 @pytest.mark.parametrize("direction", [(1.0, 0.0, 0.0), (0.0, 0.0, 1.0), (1.0, 0.0, -0.01)])
 def test_a_ray_that_misses_the_floor_moves_nothing(browser, player, direction):
-    before = player.shown.goal_w
+    before = player.snapshot.goal_w
     browser.scene.point((0.0, 0.0, 1.0), direction)
     answer(browser)
-    np.testing.assert_array_equal(player.shown.goal_w, before)
+    np.testing.assert_array_equal(player.snapshot.goal_w, before)
 
 
 class Client:
@@ -301,7 +301,7 @@ def client(browser, monkeypatch):
 def test_the_camera_looks_at_the_robot_from_where_the_user_put_it(browser, player, client):
     browser.panel.camera.value = "looks at the robot"
     answer(browser)
-    np.testing.assert_allclose(client.camera.look_at, player.shown.qpos[QPOS_XYZ])
+    np.testing.assert_allclose(client.camera.look_at, player.snapshot.qpos[QPOS_XYZ])
     assert client.camera.position is None
 
 
@@ -313,8 +313,8 @@ def test_the_camera_drives_behind_the_robot(browser, player, client):
         player.tick()
     for _ in range(120):
         answer(browser)
-    robot_w = player.shown.qpos[QPOS_XYZ]
-    w, _, _, z = player.shown.qpos[QPOS_QUAT]
+    robot_w = player.snapshot.qpos[QPOS_XYZ]
+    w, _, _, z = player.snapshot.qpos[QPOS_QUAT]
     heading = 2 * math.atan2(z, w)
     behind = client.camera.position - robot_w
     assert math.atan2(-behind[1], -behind[0]) == pytest.approx(heading, abs=0.02)
@@ -341,8 +341,8 @@ def test_the_panel_reads_what_the_player_does(browser, player):
     assert panel.episode.value == "0.0 of 4.3 s"
     assert panel.distance.value == "0.50 m"
     assert "steps/s" in panel.pace.value
-    player.shown = player.shown._replace(done=np.float32(1))
-    panel.tell()
+    player.snapshot = player.snapshot._replace(done=np.float32(1))
+    panel.update()
     assert panel.episode.value == "0.0 of 4.3 s, reached"
 
 
@@ -351,11 +351,11 @@ def test_the_panel_changes_who_drives(browser, player):
     panel.agent.value = "keyboard"
     answer(browser)
     assert player.agent == "keyboard"
-    assert panel.wheel.visible
+    assert panel.drive_controls.visible
     panel.agent.value = "scripted"
     answer(browser)
     assert player.agent == "scripted"
-    assert not panel.wheel.visible
+    assert not panel.drive_controls.visible
 
 
 def test_the_panel_switches_the_checkpoint(browser, player):
@@ -372,7 +372,7 @@ def test_a_checkpoint_that_cannot_be_used_is_told_on_the_page(browser, player, c
     player.run_dir = tmp_path
     try:
         panel.checkpoint.value = f"{other:,} steps"
-        browser.work()
+        browser.step()
     finally:
         player.run_dir = run_dir
     assert len(client.notifications) == 1
@@ -396,10 +396,10 @@ def test_the_buttons_pause_step_and_begin_anew(browser, player):
     before = player.time
     press(browser, "Step")
     assert player.time == pytest.approx(before + 1 / 60)
-    goal_w = player.shown.goal_w
+    goal_w = player.snapshot.goal_w
     press(browser, "New episode")
     assert player.time == 0
-    assert not np.allclose(player.shown.goal_w, goal_w)
+    assert not np.allclose(player.snapshot.goal_w, goal_w)
     press(browser, "Go on")
     assert not player.paused
     assert browser.panel.buttons.options[0] == "Pause"
@@ -418,7 +418,7 @@ def test_sliders_and_keys_ask_for_the_same(browser, player):
     panel.agent.value = "keyboard"
     panel.ahead.value, panel.left.value = 0.5, -90
     answer(browser)
-    assert player.asked == pytest.approx((0.5, -math.pi / 2))
+    assert player.command == pytest.approx((0.5, -math.pi / 2))
     keys = {command.hotkey: command for command in panel._keys}
     assert not any(command.disabled for command in keys.values())
     for key in "IL":
@@ -426,13 +426,13 @@ def test_sliders_and_keys_ask_for_the_same(browser, player):
             call(None)
     answer(browser)
     answer(browser)  # what the sliders called back
-    assert player.asked == pytest.approx((0.625, -math.radians(112)), abs=0.01)
+    assert player.command == pytest.approx((0.625, -math.radians(112)), abs=0.01)
     assert panel.ahead.value == pytest.approx(0.625)
     for call in keys["H"]._impl.trigger_cb:
         call(None)
     answer(browser)
     answer(browser)
-    assert player.asked == (0.0, 0.0)
+    assert player.command == (0.0, 0.0)
     panel.agent.value = "policy"
     answer(browser)
     assert all(command.disabled for command in keys.values())
@@ -441,7 +441,7 @@ def test_sliders_and_keys_ask_for_the_same(browser, player):
 def test_a_checkpoint_written_meanwhile_can_be_chosen(browser, player, monkeypatch):
     steps = [*player.checkpoints, 999_424]
     monkeypatch.setattr(Player, "checkpoints", steps)
-    browser.panel.tell()
+    browser.panel.update()
     assert browser.panel.checkpoint.options[-1] == "999,424 steps"
 
 
@@ -457,13 +457,13 @@ def test_a_task_whose_goals_stay_says_so_and_plays_on(player, monkeypatch):
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     try:
         scene = Scene(server, player, ask)
-        Panel(server, player, scene, ask)
+        ControlPanel(server, player, scene, ask)
         assert "the goal stays: because" in said
-        before = player.shown.goal_w
+        before = player.snapshot.goal_w
         scene.point((0.0, 0.0, 1.0), (0.1, 0.1, -1.0))
         for do, given in asked:
             do(*given)
-        np.testing.assert_array_equal(player.shown.goal_w, before)
+        np.testing.assert_array_equal(player.snapshot.goal_w, before)
         player.tick()
     finally:
         server.stop()

@@ -1,1 +1,1 @@
-"""Check a task of one's own: what its methods return, its purity, its scene, its episodes."""
+"""Check a user's task: the results and the purity of its methods, its scene and its episodes."""

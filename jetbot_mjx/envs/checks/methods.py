@@ -1,4 +1,4 @@
-"""Checks of a task's methods; each yields a line for everything that is wrong."""
+"""Check the methods of a task; each check yields one line for every error."""
 
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -7,14 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jetbot_mjx.envs.checks.probe import DRAWS, TERMS, Subject, ask_all, first_key
+from jetbot_mjx.envs.checks.probe import DRAWS, TERMS, TaskProbe, call_methods, first_key
 from jetbot_mjx.envs.task import AdvancesGoal, Field, MovesGoal, Task, layout_size, min_std
 from jetbot_mjx.errors import UserError
 
 
-def layout(subject: Subject) -> Iterator[str]:
-    """Name, sizes, units, frames and smallest deviations of the observation."""
-    fields = subject.task.layout
+def layout(probe: TaskProbe) -> Iterator[str]:
+    """Check names, sizes, units, frames and smallest deviations of the observation."""
+    fields = probe.task.layout
     if not isinstance(fields, tuple) or not all(isinstance(field, Field) for field in fields):
         yield "layout is no tuple of Field(name, size, unit, frame): make it one"
         return
@@ -33,7 +33,7 @@ def layout(subject: Subject) -> Iterator[str]:
         ]
         for what in missing:
             yield f"layout: {field.name!r} has no {what}: say it, such as {_LIKE[what]}"
-        if not missing and subject.config.ppo.normalizer == "physical":
+        if not missing and probe.config.ppo.normalizer == "physical":
             try:
                 min_std(field)
             except UserError as error:
@@ -43,15 +43,15 @@ def layout(subject: Subject) -> Iterator[str]:
 _LIKE = {"name": "goal_distance", "unit": "m, or 1 for none", "frame": "world or body"}
 
 
-def purity(subject: Subject) -> Iterator[str]:
+def purity(probe: TaskProbe) -> Iterator[str]:
     """Check that methods trace, twice into the same program, and leave `self` alone."""
-    task = subject.task
+    task = probe.task
     before = _attributes(task)
-    for name, function, arguments in _calls(subject):
+    for name, function, arguments in _calls(probe):
         try:
             traced = [_traced(function, arguments) for _ in range(2)]
         except Exception as error:
-            yield subject.explain(error)
+            yield probe.explain(error)
             continue
         if traced[0] != traced[1]:
             yield (
@@ -67,13 +67,13 @@ def purity(subject: Subject) -> Iterator[str]:
             )
 
 
-def _calls(subject: Subject) -> list[tuple[str, Callable[..., Any], tuple[Any, ...]]]:
-    """Return every method that is traced, with arguments for it."""
-    task = subject.task
+def _calls(probe: TaskProbe) -> list[tuple[str, Callable[..., Any], tuple[Any, ...]]]:
+    """Return the name, function and example arguments of every method that is traced."""
+    task = probe.task
     try:
-        before, after, goal, action = subject.example
+        before, after, goal, action = probe.example
     except Exception:
-        # `sample` itself fails; being traced it says so.
+        # `sample` itself fails, and tracing it reports the error.
         return [("sample", task.sample, (first_key(),))]
     calls = [
         ("sample", task.sample, (first_key(),)),
@@ -90,20 +90,22 @@ def _calls(subject: Subject) -> list[tuple[str, Callable[..., Any], tuple[Any, .
 
 
 def _traced(function: Callable[..., Any], arguments: tuple[Any, ...]) -> tuple[str, list[bytes]]:
-    # A new function each time: JAX remembers what it has traced.
+    """Return the jaxpr of a function and its constants, to be compared."""
+    # A new function each time, since JAX caches traces.
     closed = jax.make_jaxpr(lambda *given: function(*given))(*arguments)
     return str(closed.jaxpr), [np.asarray(constant).tobytes() for constant in closed.consts]
 
 
 def _attributes(task: Task) -> dict[str, str]:
-    """Return what `self` holds, to be compared."""
-    held = getattr(task, "__dict__", {})
-    return {name: f"{type(value).__name__} {value!r}" for name, value in held.items()}
+    """Return the attributes of a task as strings, to be compared."""
+    attributes = getattr(task, "__dict__", {})
+    return {name: f"{type(value).__name__} {value!r}" for name, value in attributes.items()}
 
 
-def types(subject: Subject) -> Iterator[str]:
-    """Check that shapes and dtypes are those of the contract."""
-    task, (before, after, goal, action) = subject.task, subject.example
+def types(probe: TaskProbe) -> Iterator[str]:
+    """Check the shapes and dtypes of all results."""
+    # Check the containers first.
+    task, (before, after, goal, action) = probe.task, probe.example
     yield from _weak("sample", jax.eval_shape(task.sample, first_key()))
     rewarded = jax.eval_shape(task.reward, before, after, goal, action)
     if not (isinstance(rewarded, tuple) and len(rewarded) == 2 and isinstance(rewarded[1], dict)):
@@ -112,7 +114,8 @@ def types(subject: Subject) -> Iterator[str]:
     if not isinstance(jax.eval_shape(task.markers, goal), dict):
         yield "markers returns something else than {name: place}: return a dict"
         return
-    told = jax.eval_shape(ask_all(task), subject.example)
+    # Check each result.
+    results = jax.eval_shape(call_methods(task), probe.example)
     length = layout_size(task.layout)
     wanted = {
         "observe": ((length,), "float32", f"as long as layout says, {length}"),
@@ -122,16 +125,17 @@ def types(subject: Subject) -> Iterator[str]:
         "goal_position": ((3,), "float32", "x, y, z"),
     }
     for name, (shape, dtype, meaning) in wanted.items():
-        yield from _unlike(name, told[name], shape, dtype, meaning)
-    for name, term in told[TERMS].items():
+        yield from _unlike(name, results[name], shape, dtype, meaning)
+    for name, term in results[TERMS].items():
         yield from _unlike(f"reward's term {name!r}", term, (), "float32", "one number")
-    for name, place in told["markers"].items():
+    for name, place in results["markers"].items():
         yield from _unlike(f"markers' {name!r}", place, (3,), "float32", "x, y, z")
     if isinstance(task, AdvancesGoal):
-        yield from _other_tree("advance", told["advance"], goal)
+        yield from _other_tree("advance", results["advance"], goal)
 
 
 def _unlike(name: str, got: Any, shape: Any, dtype: str, meaning: str) -> Iterator[str]:
+    """Compare the shape and dtype of a result with those required."""
     if not hasattr(got, "shape"):
         yield f"{name} returns {type(got).__name__}: it should be an array, {meaning}"
     elif got.shape != shape:
@@ -146,28 +150,29 @@ _CAST = {"bool": ", such as a comparison gives", "float32": ", as .astype(jnp.fl
 
 
 def _weak(name: str, tree: Any) -> Iterator[str]:
-    """Find weak types of Python's numbers: a loop refuses them, or is compiled twice."""
+    """Find weakly typed results, with which JAX's loops fail or are compiled twice."""
     if any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(tree)):
         yield f"{name} has a weak type, of Python's own number: write jnp.float32(...) instead"
 
 
 def _other_tree(name: str, got: Any, goal: Any) -> Iterator[str]:
+    """Compare the tree structure, shapes and dtypes of a new goal with those of `sample`."""
     if jax.tree.structure(got) != jax.tree.structure(goal):
         yield f"{name} returns another tree than sample: change the goal's leaves alone"
         return
-    for ours, theirs in zip(jax.tree.leaves(got), jax.tree.leaves(goal), strict=True):
-        if (ours.shape, ours.dtype) != (theirs.shape, theirs.dtype):
+    for leaf, sampled in zip(jax.tree.leaves(got), jax.tree.leaves(goal), strict=True):
+        if (leaf.shape, leaf.dtype) != (sampled.shape, sampled.dtype):
             yield (
-                f"{name} makes {theirs.dtype}{list(theirs.shape)} of sample"
-                f" {ours.dtype}{list(ours.shape)}: shapes and dtypes must stay"
+                f"{name} makes {sampled.dtype}{list(sampled.shape)} of sample"
+                f" {leaf.dtype}{list(leaf.shape)}: shapes and dtypes must stay"
             )
             return
     yield from _weak(name, got)
 
 
-def draws(subject: Subject) -> Iterator[str]:
-    """Check that a key gives one draw, and another key another."""
-    draw = jax.jit(jax.vmap(subject.task.sample))
+def draws(probe: TaskProbe) -> Iterator[str]:
+    """Check that equal keys draw equal goals, and different keys draw different goals."""
+    draw = jax.jit(jax.vmap(probe.task.sample))
     keys = jax.random.split(first_key(), DRAWS)
     first, again = (jax.device_get(draw(keys)) for _ in range(2))
     if not all(map(np.array_equal, jax.tree.leaves(first), jax.tree.leaves(again))):
@@ -178,13 +183,13 @@ def draws(subject: Subject) -> Iterator[str]:
         yield "sample draws the same for every key: draw from key with jax.random"
 
 
-def batches(subject: Subject) -> Iterator[str]:
-    """`jax.vmap` gives what a loop gives."""
-    ask, count = ask_all(subject.task), 4
-    case = subject.cases["anywhere on the floor"]
-    few = jax.tree.map(lambda x: x[:count], case)
-    together = jax.device_get(jax.jit(jax.vmap(ask))(few))
-    one = jax.jit(ask)
+def batches(probe: TaskProbe) -> Iterator[str]:
+    """Check that `jax.vmap` gives the same results as a loop."""
+    call, count = call_methods(probe.task), 4
+    batch = probe.transitions["anywhere on the floor"]
+    few = jax.tree.map(lambda x: x[:count], batch)
+    together = jax.device_get(jax.jit(jax.vmap(call))(few))
+    one = jax.jit(call)
     alone = [jax.device_get(one(jax.tree.map(lambda x, i=i: x[i], few))) for i in range(count)]
     for name, value in together.items():
         apart = jax.tree.map(lambda *x: np.stack(x), *[each[name] for each in alone])
@@ -197,15 +202,15 @@ def batches(subject: Subject) -> Iterator[str]:
                 break
 
 
-def finite(subject: Subject) -> Iterator[str]:
-    """Whatever the robot, what a task says is finite."""
-    if not _is_finite(subject.goals):
+def finite(probe: TaskProbe) -> Iterator[str]:
+    """Check that all results are finite, for ordinary and extreme robots."""
+    if not _is_finite(probe.goals):
         yield "sample draws what is not finite: guard divisions and roots"
-    told: set[str] = set()
-    for where, answers in subject.answers.items():
-        for name, value in answers.items():
-            if name not in told and not _is_finite(value):
-                told.add(name)
+    reported: set[str] = set()
+    for where, results in probe.results.items():
+        for name, value in results.items():
+            if name not in reported and not _is_finite(value):
+                reported.add(name)
                 yield (
                     f"{name} is not finite for a robot {where}: guard the division or root, such"
                     " as x / jnp.maximum(length, 1e-3)"
@@ -216,11 +221,11 @@ def _is_finite(tree: Any) -> bool:
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 
-def reward(subject: Subject) -> Iterator[str]:
+def reward(probe: TaskProbe) -> Iterator[str]:
     """Check that the terms add up to the reward."""
-    for where, answers in subject.answers.items():
-        reward = answers["reward"]
-        total = sum(answers[TERMS].values(), np.zeros(DRAWS))
+    for where, results in probe.results.items():
+        reward = results["reward"]
+        total = sum(results[TERMS].values(), np.zeros(DRAWS))
         wrong = ~np.isclose(reward, total, rtol=1e-3, atol=1e-4) & np.isfinite(reward + total)
         if wrong.any():
             at = int(np.argmax(wrong))
@@ -231,18 +236,18 @@ def reward(subject: Subject) -> Iterator[str]:
             return
 
 
-def endings(subject: Subject) -> Iterator[str]:
-    """Success ends an episode, and none ends where it begins."""
-    told = subject.answers
-    for where, answers in told.items():
-        if (answers["success"] & ~answers["terminated"]).any():
+def endings(probe: TaskProbe) -> Iterator[str]:
+    """Check that success terminates an episode, and that no episode ends at its start."""
+    by_robot = probe.results
+    for where, results in by_robot.items():
+        if (results["success"] & ~results["terminated"]).any():
             yield (
                 f"success without terminated (a robot {where}): what is done has ended for good,"
                 " so terminated must hold wherever success does"
             )
             break
-    ended = told["at the start"]["terminated"]
-    if all(answers["terminated"].all() for answers in told.values()):
+    ended = by_robot["at the start"]["terminated"]
+    if all(results["terminated"].all() for results in by_robot.values()):
         yield "terminated is always true: no episode lasts longer than a step"
     elif ended.any():
         yield (
@@ -251,9 +256,9 @@ def endings(subject: Subject) -> Iterator[str]:
         )
 
 
-def goal(subject: Subject) -> Iterator[str]:
-    """`goal_position` follows `move_goal`."""
-    task, goal = subject.task, subject.example.goal
+def goal(probe: TaskProbe) -> Iterator[str]:
+    """Check that `goal_position` follows `move_goal`."""
+    task, goal = probe.task, probe.example.goal
     if not isinstance(task, MovesGoal):
         return
     wanted = jnp.array([0.31, -0.47, 0.0]).at[2].set(task.goal_position(goal)[2])
@@ -264,10 +269,10 @@ def goal(subject: Subject) -> Iterator[str]:
             yield f"{unlike[0]}; {remedy}"
             return
         reached = jax.vmap(lambda goal: task.goal_position(task.move_goal(goal, wanted)))(
-            subject.goals
+            probe.goals
         )
     except Exception as error:
-        yield f"{subject.explain(error)}; {remedy}"
+        yield f"{probe.explain(error)}; {remedy}"
         return
     if not np.allclose(reached[:, :2], wanted[:2], atol=1e-4):
         yield f"goal_position is not where move_goal has put the goal: {remedy}"

@@ -1,4 +1,4 @@
-"""A task on trial: what it says of ordinary and extreme robots, and what it raises, in one line."""
+"""Call the methods of a task for ordinary and extreme robots, and describe its errors."""
 
 import functools
 import sys
@@ -15,16 +15,16 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.envs.task import METHODS, AdvancesGoal, RobotState, Task
 
 DRAWS = 256
-"""Goals and robots of each kind."""
+"""Number of goals, and of robots of each kind."""
 
 TERMS = "the terms of reward"
-"""Their name among what a task says."""
+"""Key of the reward terms among the results of `call_methods`."""
 
 _PACKAGE = Path(__file__).parents[2]
 _AXLE_HEIGHT = 0.0325  # [m]
 
 
-# What a task raises, in one line.
+# Error messages.
 
 _REMEDIES = {
     "TracerBool": "Python cannot decide on an array: use jnp.where, & and | and ~",
@@ -33,23 +33,23 @@ _REMEDIES = {
     "Concretization": "Python needs a number where there is an array: stay within jax.numpy",
     "UnexpectedTracer": "a value of another call was kept in self: methods must be pure",
 }
-"""By what the name of JAX's exception begins with."""
+"""Advice by the first letters of the name of JAX's exception."""
 
 
-def in_one_line(error: Exception, who: str, homes: Sequence[Path]) -> str:
-    """Return what was raised, by whom and where.
+def describe_error(error: Exception, who: str, folders: Sequence[Path]) -> str:
+    """Describe an exception in one line, with the advice for it if there is one.
 
     Args:
-      error: as it was raised.
-      who: raised it.
-      homes: folders, of which the last place in the traceback is told; empty: of any user's file.
-
-    Returns:
-      The line, with what to do where that is known.
+      error: the exception.
+      who: the name of the method or class that raised it.
+      folders: the last line of the traceback in one of these folders is reported; if empty, the
+        last line in any file of the user.
     """
+    # Choose the message.
     kind = type(error).__name__
     remedy = next((text for name, text in _REMEDIES.items() if kind.startswith(name)), None)
     what = remedy or next(iter(str(error).strip().splitlines()), "")
+    # Find the line of code.
     places = [
         (Path(frame.filename), frame.lineno) for frame in traceback.extract_tb(error.__traceback__)
     ]
@@ -59,7 +59,7 @@ def in_one_line(error: Exception, who: str, homes: Sequence[Path]) -> str:
     places = [
         (file, line)
         for file, line in places
-        if (file.parent in homes if homes else file.parent != _PACKAGE)
+        if (file.parent in folders if folders else file.parent != _PACKAGE)
         and "site-packages" not in file.parts
         and not str(file).startswith("<")
     ]
@@ -67,32 +67,40 @@ def in_one_line(error: Exception, who: str, homes: Sequence[Path]) -> str:
     return " ".join(f"{who} raises {kind}{': ' * bool(what)}{what}{where}".split())
 
 
-# What the checks try a task on.
+# Inputs and results of the methods.
 
 
-class Case(NamedTuple):
-    """One step of one robot."""
+class Transition(NamedTuple):
+    """A `Transition` holds one step of one robot, or a batch of steps."""
 
     before: RobotState
+    """Robot state before the step."""
     after: RobotState
+    """Robot state after the step."""
     goal: Any
+    """Goal of the episode."""
     action: jax.Array
+    """Action of the step."""
 
 
-class Subject:
-    """A task, and what it says of ordinary and extreme robots."""
+class TaskProbe:
+    """A `TaskProbe` calls a task for ordinary and extreme robots, and caches the results."""
 
     def __init__(self, task: Task, config: Config) -> None:
-        """Ask nothing yet.
+        """Hold a task; its methods are called at the first use of a property.
 
         Args:
-          task: to be tried.
-          config: of the run that it is built for.
+          task: the task.
+          config: the configuration that it was built from.
         """
         self.task, self.config = task, config
 
     def explain(self, error: Exception) -> str:
-        """Return what was raised somewhere inside the task, in one line."""
+        """Describe an exception of the task in one line.
+
+        Args:
+          error: the exception.
+        """
         inside = (
             frame.f_code.co_name
             for frame, _ in traceback.walk_tb(error.__traceback__)
@@ -104,43 +112,46 @@ class Subject:
             for one in type(self.task).__mro__
             if one.__module__ not in sys.stdlib_module_names
         ]
-        homes = {Path(file).parent for file in files if file}
-        return in_one_line(error, next(inside, "the task"), list(homes - {_PACKAGE} or {_PACKAGE}))
+        folders = {Path(file).parent for file in files if file}
+        return describe_error(
+            error, next(inside, "the task"), list(folders - {_PACKAGE} or {_PACKAGE})
+        )
 
     @functools.cached_property
     def goals(self) -> Any:
-        """Return what is drawn for `DRAWS` episodes."""
+        """Return the goals of `DRAWS` episodes, as a batch."""
         return jax.jit(jax.vmap(self.task.sample))(jax.random.split(first_key(), DRAWS))
 
     @functools.cached_property
-    def example(self) -> Case:
-        """Make a step in which the robot stands still."""
+    def example(self) -> Transition:
+        """Return one transition in which the robot stands still."""
         quat = jnp.array([1.0, 0.0, 0.0, 0.0])
         robot = RobotState(jnp.array([0.1, 0.2, _AXLE_HEIGHT]), quat, *jnp.zeros((2, 3)))
-        return Case(robot, robot, self.task.sample(first_key()), jnp.zeros(2))
+        return Transition(robot, robot, self.task.sample(first_key()), jnp.zeros(2))
 
     @functools.cached_property
-    def cases(self) -> dict[str, Case]:
-        """`DRAWS` steps of each kind, by what a robot is like in them."""
+    def transitions(self) -> dict[str, Transition]:
+        """Return batches of `DRAWS` transitions, by a description of the robot."""
         random = np.random.default_rng(0)
 
-        def spread(scale: float, size: int = 3) -> jax.Array:
+        def normal(scale: float, size: int = 3) -> jax.Array:
             return jnp.asarray(scale * random.standard_normal((DRAWS, size)), jnp.float32)
 
-        def robots(place: jax.Array, quat: jax.Array, speed: float = 0.0) -> RobotState:
+        def robots(position: jax.Array, quat: jax.Array, speed: float = 0.0) -> RobotState:
             quat = quat / jnp.linalg.norm(quat, axis=1, keepdims=True)
-            return RobotState(place, quat, spread(speed), spread(4 * speed))
+            return RobotState(position, quat, normal(speed), normal(4 * speed))
 
-        def on_floor(place: jax.Array) -> jax.Array:
-            return place.at[:, 2].set(_AXLE_HEIGHT)
+        def on_floor(position: jax.Array) -> jax.Array:
+            return position.at[:, 2].set(_AXLE_HEIGHT)
 
+        # The order of the draws is part of the fixed test data.
         ahead = jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (DRAWS, 1))
-        level = spread(1.0, 4) * jnp.array([1.0, 0.0, 0.0, 1.0])
+        level = normal(1.0, 4) * jnp.array([1.0, 0.0, 0.0, 1.0])
         goal_w = jax.vmap(self.task.goal_position)(self.goals)
         start = robots(jnp.tile(jnp.array([0.0, 0.0, _AXLE_HEIGHT]), (DRAWS, 1)), ahead)
-        place = spread(0.6)
-        before = robots(on_floor(place), level)
-        after = robots(on_floor(place + spread(0.01)), level, 0.5)
+        position = normal(0.6)
+        before = robots(on_floor(position), level)
+        after = robots(on_floor(position + normal(0.01)), level, 0.5)
         at_goal = robots(on_floor(goal_w), level)
         action = jnp.asarray(random.choice([-1.0, 0.0, 1.0], (DRAWS, 2)), jnp.float32)
         steps = {
@@ -148,40 +159,40 @@ class Subject:
             "anywhere on the floor": (before, after, action),
             "standing exactly on the goal": (at_goal, at_goal, action),
             "at the very point of goal_position": (before, robots(goal_w, level), action),
-            "far away, tumbling and fast": (before, robots(spread(100), spread(1, 4), 50), action),
+            "far away, tumbling and fast": (before, robots(normal(100), normal(1, 4), 50), action),
             "under actions of ±100": (before, after, 100 * action),
         }
         return {
-            where: Case(before, after, self.goals, action)
+            where: Transition(before, after, self.goals, action)
             for where, (before, after, action) in steps.items()
         }
 
     @functools.cached_property
-    def answers(self) -> dict[str, dict[str, Any]]:
-        """Return all that the task says of the cases."""
-        ask = jax.jit(jax.vmap(ask_all(self.task)))
-        return {where: jax.device_get(ask(case)) for where, case in self.cases.items()}
+    def results(self) -> dict[str, dict[str, Any]]:
+        """Return the results of all methods, on the host, by kind of robot and by method."""
+        call = jax.jit(jax.vmap(call_methods(self.task)))
+        return {where: jax.device_get(call(batch)) for where, batch in self.transitions.items()}
 
 
 def first_key() -> jax.Array:
-    """Return the key of all that is drawn here, or its root."""
+    """Return the random key that all checks start from."""
     return jax.random.PRNGKey(0)
 
 
-def ask_all(task: Task) -> Callable[[Case], dict[str, Any]]:
-    """Return all that a task says of a step, as one function.
+def call_methods(task: Task) -> Callable[[Transition], dict[str, Any]]:
+    """Return a function that calls all methods of a task for one transition.
 
     Args:
-      task: to be asked.
+      task: the task.
 
     Returns:
-      A function of one step; it gives the answers by the method's name.
+      A function from a transition to the results, by the name of the method.
     """
 
-    def ask(case: Case) -> dict[str, Any]:
-        before, after, goal, action = case
+    def call(transition: Transition) -> dict[str, Any]:
+        before, after, goal, action = transition
         reward, terms = task.reward(before, after, goal, action)
-        answers = {
+        results = {
             "observe": task.observe(after, goal),
             "reward": reward,
             TERMS: dict(terms),
@@ -191,7 +202,7 @@ def ask_all(task: Task) -> Callable[[Case], dict[str, Any]]:
             "markers": dict(task.markers(goal)),
         }
         if isinstance(task, AdvancesGoal):
-            answers["advance"] = task.advance(before, after, goal)
-        return answers
+            results["advance"] = task.advance(before, after, goal)
+        return results
 
-    return ask
+    return call

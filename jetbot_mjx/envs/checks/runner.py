@@ -1,7 +1,7 @@
-"""Check a task without training: each fault in one line, with the remedy.
+"""Check a task without training, and report each error in one line with a remedy.
 
-The environment, the trainer and the reports rely on it. A task that breaks one of these rules
-often trains all the same, on something else than was meant.
+Environment, trainer and reports rely on these rules. A task that breaks one often trains without
+an error message, but on another problem than intended.
 """
 
 import collections
@@ -15,7 +15,7 @@ import mujoco
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.checks import methods
-from jetbot_mjx.envs.checks.probe import DRAWS, Subject, first_key, in_one_line
+from jetbot_mjx.envs.checks.probe import DRAWS, TaskProbe, describe_error, first_key
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model
 from jetbot_mjx.envs.task import make_task
@@ -23,60 +23,64 @@ from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 
 DRIVE_ENVS, DRIVE_STEPS = 16, 64
-"""Of the test drive: robots, and environment steps of each."""
+"""Number of robots of the test drive, and of environment steps of each."""
 
 
 class Finding(NamedTuple):
-    """A rule that a task breaks."""
+    """A `Finding` describes a rule that a task breaks."""
 
     check: str
-    """By which check it was found: a key of `CHECKS`."""
+    """Name of the check, a key of `CHECKS`."""
     message: str
-    """What is wrong and what would be right, in one line."""
+    """The error and its remedy, in one line."""
 
 
 def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
     """Check the task that a configuration names.
 
     Args:
-      config: the run.
+      config: the configuration of the run.
 
     Yields:
-      Each check's name and what it found, in the order of `CHECKS`. Nothing is found twice. Where
-      the next checks could but fail as well, they are left out.
+      The name and the findings of each check, in the order of `CHECKS`. No finding is repeated. If
+      a check in `_PREREQUISITES` has findings, the checks after it are skipped.
 
     Raises:
-      UserError: there is no such task, or it refuses the configuration.
+      UserError: there is no such task, or it rejects the configuration.
     """
+    # Build the task.
     try:
-        subject = Subject(make_task(config.task), config)
+        probe = TaskProbe(make_task(config.task), config)
     except UserError:
         raise
     except Exception as error:
-        yield "layout", [Finding("layout", in_one_line(error, config.task.name, ()))]
+        yield "layout", [Finding("layout", describe_error(error, config.task.name, ()))]
         return
+    # Run the checks.
     seen: set[str] = set()
     for name, check in CHECKS.items():
         messages: list[str] = []
         try:
-            messages.extend(check(subject))
+            messages.extend(check(probe))
         except UserError as error:
             messages.append(str(error))
         except Exception as error:
-            messages.append(subject.explain(error))
+            messages.append(probe.explain(error))
         found = [Finding(name, one) for one in dict.fromkeys(messages) if one not in seen]
         seen.update(messages)
         yield name, found
-        if found and name in _NEEDED:
+        if found and name in _PREREQUISITES:
             return
 
 
-# Those of the scene and the whole environment.
+# Checks of the scene and of the whole environment.
 
 
-def _scene(subject: Subject) -> Iterator[str]:
-    task, config = subject.task, subject.config
-    placed = set(task.markers(subject.example.goal))
+def _scene(probe: TaskProbe) -> Iterator[str]:
+    """Check that MuJoCo and MJX accept the scene, and that its mocap bodies match `markers`."""
+    task, config = probe.task, probe.config
+    # Build the scene for both simulators.
+    placed = set(task.markers(probe.example.goal))
 
     def build(*, visual: bool) -> mujoco.MjModel:
         robot = ROBOTS[config.robot.preset]
@@ -95,13 +99,15 @@ def _scene(subject: Subject) -> Iterator[str]:
     except NotImplementedError as error:
         yield f"build_scene: MJX cannot simulate it: {error}: pair spheres and capsules"
         return
+    # Compare the mocap bodies with `markers`.
     names, solids = _mocap_bodies(model), _mocap_bodies(solid)
     for name in sorted(placed - names):
         yield f"markers places {name!r}, no mocap body: add_body(name={name!r}, mocap=True)"
     for name in sorted((names | solids) - placed - {"goal"}):
         yield f"markers does not say where {name!r} stands, a mocap body of build_scene"
+    # Look for contacts at the start of episodes, and for geoms without a contact pair.
     if not solids - placed:
-        yield from _touching(subject, solid)
+        yield from _touching(probe, solid)
     paired = set(solid.pair_geom1) | set(solid.pair_geom2)
     for i in range(solid.ngeom):
         if i not in paired and (solid.geom_contype[i] or solid.geom_conaffinity[i]):
@@ -111,9 +117,9 @@ def _scene(subject: Subject) -> Iterator[str]:
             )
 
 
-def _touching(subject: Subject, solid: mujoco.MjModel) -> Iterator[str]:
-    """Return what the robot stands in when episodes begin."""
-    places = jax.device_get(jax.vmap(subject.task.markers)(subject.goals))
+def _touching(probe: TaskProbe, solid: mujoco.MjModel) -> Iterator[str]:
+    """Find bodies that touch the robot when episodes begin."""
+    places = jax.device_get(jax.vmap(probe.task.markers)(probe.goals))
     data, touched = mujoco.MjData(solid), collections.Counter()
     for draw in range(DRAWS if solid.nmocap else 1):
         for name in _mocap_bodies(solid):
@@ -121,9 +127,9 @@ def _touching(subject: Subject, solid: mujoco.MjModel) -> Iterator[str]:
         mujoco.mj_forward(solid, data)
         pairs = data.contact.geom[data.contact.dist < 0]
         touched.update({solid.geom(geom).name for pair in pairs for geom in pair})
-    ours = {"floor", "left_wheel", "right_wheel", "caster_front", "caster_rear"}
+    robot_geoms = {"floor", "left_wheel", "right_wheel", "caster_front", "caster_rear"}
     for name, often in sorted(touched.items()):
-        if name not in ours:
+        if name not in robot_geoms:
             yield (
                 f"{name!r} touches something in {often} of {DRAWS if solid.nmocap else 1} episodes"
                 " as they begin: leave room about the robot, 0.2 m from the origin"
@@ -134,14 +140,16 @@ def _mocap_bodies(model: mujoco.MjModel) -> set[str]:
     return {model.body(i).name for i in range(model.nbody) if model.body(i).mocapid[0] >= 0}
 
 
-def _drive(subject: Subject) -> Iterator[str]:
-    """Step a training's environment under random and extreme actions."""
-    env = make_env(subject.config)
-    begun = jax.eval_shape(env.reset, first_key())
-    gone = jax.eval_shape(env.step, begun, jax.eval_shape(lambda: jnp.zeros(2)))
-    if unlike := _changed(begun, gone):
+def _drive(probe: TaskProbe) -> Iterator[str]:
+    """Step the environment of a training with random and extreme actions."""
+    # Compare the trees of the states before and after a step.
+    env = make_env(probe.config)
+    first = jax.eval_shape(env.reset, first_key())
+    second = jax.eval_shape(env.step, first, jax.eval_shape(lambda: jnp.zeros(2)))
+    if unlike := _changed(first, second):
         yield f"a step changes the state's {unlike}: keep names, tree, shapes and dtypes"
         return
+    # Count how often a step is traced.
     batch = wrap_for_training(env, episode_length=DRIVE_STEPS // 2)
     traces = 0
 
@@ -152,7 +160,7 @@ def _drive(subject: Subject) -> Iterator[str]:
 
     keys = jax.random.split(first_key(), DRIVE_ENVS)
     actions = jax.random.uniform(keys[0], (DRIVE_STEPS, DRIVE_ENVS, 2), minval=-1.0)
-    # Half of the robots are driven with all they have.
+    # Half of the robots get the largest actions.
     actions = jnp.where(jnp.arange(DRIVE_ENVS)[:, None] % 2, actions, jnp.sign(actions))
     state = jax.jit(batch.reset)(keys)
     compiled, nonfinite = jax.jit(step), 0
@@ -169,7 +177,7 @@ def _drive(subject: Subject) -> Iterator[str]:
 
 
 def _changed(first: Any, last: Any) -> str:
-    """Return which part of two states differs in more than its numbers; empty where none does."""
+    """Return the first leaf whose shape or dtype differs between two states; empty if none."""
     sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
     for path in (*sides[0], *sides[1]):
         one, other = (side.get(path) for side in sides)
@@ -182,7 +190,7 @@ def _type(leaf: Any) -> tuple[Any, ...]:
     return leaf.shape, leaf.dtype, leaf.weak_type
 
 
-CHECKS: Mapping[str, Callable[[Subject], Iterator[str]]] = {
+CHECKS: Mapping[str, Callable[[TaskProbe], Iterator[str]]] = {
     "layout": methods.layout,
     "purity": methods.purity,
     "types": methods.types,
@@ -195,7 +203,7 @@ CHECKS: Mapping[str, Callable[[Subject], Iterator[str]]] = {
     "scene": _scene,
     "drive": _drive,
 }
-"""The checks by name, in their order: each yields a line for everything that is wrong."""
+"""Checks by name, in their order; each one yields a line for every error."""
 
 MEANINGS: Mapping[str, str] = {
     "layout": "names, sizes, units, frames and smallest deviations of the observation",
@@ -210,7 +218,7 @@ MEANINGS: Mapping[str, str] = {
     "scene": "MuJoCo and MJX build it, markers place its bodies",
     "drive": f"{DRIVE_ENVS} robots for {DRIVE_STEPS} steps, traced once and finite",
 }
-"""What each check looks at, in words."""
+"""Descriptions of the checks."""
 
-_NEEDED = ("layout", "purity", "types")
-"""With what these find, the checks after them could but fail as well."""
+_PREREQUISITES = ("layout", "purity", "types")
+"""Checks without which all checks after them would fail as well."""
