@@ -1,8 +1,8 @@
-"""Compiled programs, kept from one process to the next without being traced again.
+"""Cache compiled programs from one process to the next, so that they need not be traced again.
 
-JAX keeps what XLA compiled under the program that it was compiled from; to look there, a process
-must first trace and lower that program, which takes far longer than to load it. Here a program is
-kept under a key that its user computes from all that it depends on.
+JAX's own compilation cache uses the lowered program as its key, so a process must trace and lower a
+program before it can look it up, which takes far longer than to load it. This cache uses a key that
+the caller computes from everything that the program depends on.
 """
 
 import contextlib
@@ -31,7 +31,7 @@ _DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 class ProgramCache:
-    """The compiled programs of one configuration, by name."""
+    """A `ProgramCache` holds the compiled programs of one configuration by name."""
 
     def __init__(self, options: Options, folder: Path | None = None, key: str = "") -> None:
         """Set the options, folder and key of the cache.
@@ -44,39 +44,39 @@ class ProgramCache:
         self._options = options
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
-        self._coming: dict[str, Future[jax.stages.Compiled | None]] = {}
+        self._pending: dict[str, Future[jax.stages.Compiled | None]] = {}
 
     def prefetch(self, *names: str) -> None:
-        """Start to load programs in threads, and return at once."""
-        with_folder = names if self._folder else ()
-        for name in with_folder:
+        """Start to load programs in background threads, and return at once."""
+        cached_names = names if self._folder else ()
+        for name in cached_names:
             pool = ThreadPoolExecutor(1)
-            self._coming[name] = pool.submit(_load, self._path(name))
+            self._pending[name] = pool.submit(_load, self._path(name))
             pool.shutdown(wait=False)
 
     def find(self, name: str) -> jax.stages.Compiled | None:
         """Return a program if it was compiled before.
 
         Args:
-          name: name of the program, unique within the configuration.
+          name: the name of the program, unique within the configuration.
 
         Returns:
-          The program, or None.
+          The program; None if it is not in the cache.
         """
         if self._folder is None:
             return None
-        coming = self._coming.pop(name, None)
-        return coming.result() if coming else _load(self._path(name))
+        pending = self._pending.pop(name, None)
+        return pending.result() if pending else _load(self._path(name))
 
     def compile(self, name: str, trace: Callable[[], jax.stages.Traced]) -> jax.stages.Compiled:
         """Return a program, and compile it if it is not cached.
 
         Args:
-          name: name of the program.
-          trace: traces it.
+          name: the name of the program, unique within the configuration.
+          trace: a function that traces the program.
 
         Returns:
-          The program. It takes arguments of the shapes and shardings that it was traced with.
+          The program, which takes arguments of the shapes and shardings it was traced with.
         """
         program = self.find(name)
         if program is not None:
@@ -85,10 +85,10 @@ class ProgramCache:
         with _CacheHits() as hits:
             lowered = trace().lower()
             program = lowered.compile(compiler_options=self._options)
-        # What XLA loaded for a CPU it cannot write again: some functions would be missing.
+        # XLA cannot serialise a CPU program that it loaded from its cache: functions are missing.
         if self._folder and not (hits.count and jax.default_backend() == "cpu"):
             seconds = time.perf_counter() - began
-            _keep(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
+            _save(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
         return program
 
     def _path(self, name: str) -> Path:
@@ -111,12 +111,13 @@ def use_compilation_cache() -> None:
     """Enable JAX's compilation cache in the user's cache folder, for later processes.
 
     `JAX_COMPILATION_CACHE_DIR` names another folder, and `JAX_ENABLE_COMPILATION_CACHE=false`
-    turns it off. What is compiled for one kind of processor does not run on every other: each
-    has a folder of its own. One that others may write to is not used, since JAX runs what it finds.
+    turns it off. Each kind of processor has its own folder, because a program compiled for one may
+    not run on another. A folder that other users may write to is not used, because JAX runs the
+    programs that it finds there.
     """
     settings: Any = jax.config
     given = settings.jax_compilation_cache_dir
-    # JAX alone knows of places such as gs://.
+    # Leave remote folders such as gs:// to JAX.
     if not settings.jax_enable_compilation_cache or "://" in (given or ""):
         return
     folder = _cache_folder(given)
@@ -173,21 +174,21 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
     if hashlib.sha256(body).digest() != digest:
         return None
-    seconds, kernels, ids, kept = pickle.loads(body)
+    seconds, kernels, ids, serialized = pickle.loads(body)
     llvm_backend.register(kernels)
     devices = {device.id: device for device in jax.devices()}
     try:
         program = serialize_executable.deserialize_and_load(
-            # Else it would be one program for all devices, whatever it was.
-            *kept,
+            *serialized,
+            # Without this argument, the program would be loaded for all devices.
             execution_devices=[devices[number] for number in ids],
         )
     except jax.errors.JaxRuntimeError:
-        # A driver that knows it no longer, say: compiling says what is wrong, if anything is.
+        # For example, the driver was updated. Compile the program again, which reports any fault.
         return None
     with contextlib.suppress(OSError):
         path.touch()
-    # As JAX does when it finds a program in its own cache, for those who listen.
+    # Report the same events as JAX does when it finds a program in its own cache.
     loaded = time.perf_counter() - began
     monitoring = jax.monitoring
     monitoring.record_event(_CACHE_HIT)
@@ -198,21 +199,21 @@ def _load(path: Path) -> jax.stages.Compiled | None:
     return program
 
 
-def _keep(
+def _save(
     path: Path, program: jax.stages.Compiled, kernels: dict[str, bytes], seconds: float
 ) -> None:
     """Write a program, the kernels that it calls and its compile time to a file.
 
-    A full folder only costs time.
+    If the file cannot be written, the program is compiled again next time.
     """
     try:
-        kept = serialize_executable.serialize(program)
+        serialized = serialize_executable.serialize(program)
         loaded: Any = program.runtime_executable()
         ids = [device.id for device in loaded.local_devices()]
     except (NotImplementedError, ValueError):
-        # This kind of device cannot.
+        # This kind of device cannot serialise programs.
         return
-    body = pickle.dumps((seconds, kernels, ids, kept))
+    body = pickle.dumps((seconds, kernels, ids, serialized))
     with contextlib.suppress(OSError):
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
