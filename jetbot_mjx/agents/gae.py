@@ -29,7 +29,7 @@ from brax.training.agents.ppo import losses
 from jaxtyping import Array, Float
 
 _MAX_UNROLL_LENGTH = 64
-"""Longest unroll that is computed without a loop; the program would grow too large for longer ones."""
+"""Longest unroll that is computed without a loop; the program grows with its length."""
 
 _brax = losses.compute_gae
 _lock = threading.Lock()

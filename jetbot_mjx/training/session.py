@@ -187,7 +187,7 @@ def _result(
 
 
 def _welcome_back(run_dir: Path, resumption: Resumption) -> str:
-    lines = [f"passed over: {reason}" for reason in resumption.passed_over]
+    lines = [f"skipped: {reason}" for reason in resumption.skipped]
     if changes := changed_versions(run_dir):
         lines.append(f"not as it was, so the bits may differ: {'; '.join(changes)}")
     lines.append(f"going on after {resumption.env_steps:,} steps")

@@ -57,7 +57,7 @@ def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undi
     [
         "run folder: run",
         "going on after 4,096 steps\nrun folder: run",
-        "passed over: checkpoint 8192\ngoing on after 8,192 steps\nrun folder: run",
+        "skipped: checkpoint 8192\ngoing on after 8,192 steps\nrun folder: run",
         "Traceback (most recent call last):",
     ],
 )
