@@ -303,7 +303,7 @@ def _judge(
             config=checkpoint.config,
             policy=summarize(driven, env.dt),
             baselines=baselines,
-            cells=by_goal(driven, env.dt),
+            goal_bins=by_goal(driven, env.dt),
             failures=find_failures(driven, run_dir, checkpoint.env_steps),
             learning_curve=_learning_curve(checkpoint.run_dir),
             episodes=driven,

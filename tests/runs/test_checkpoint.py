@@ -167,10 +167,10 @@ def test_an_explanation_that_was_changed_is_refused(run_copy, key):
         assert "about/metadata changed after it was written" in use()
 
 
-@pytest.mark.parametrize("number", ["jetbot_mjx/1", "jetbot_mjx/3", None, 2])
+@pytest.mark.parametrize("number", ["jetbot_mjx/1", "jetbot_mjx/2", None, 2])
 def test_another_format_is_refused_by_name(write, number):
     said = refused(write((1, 0.5), format=number))
-    assert f"in the format {number!r}, and only {FORMAT!r} can be read" in said
+    assert f"has the format {number!r}, and only {FORMAT!r} can be read" in said
 
 
 @pytest.mark.parametrize("config", [{}, {"seed": -1}, {"sede": 0}, 3, None])
