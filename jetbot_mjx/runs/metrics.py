@@ -2,8 +2,8 @@
 
 Metrics have the same names in all sinks. A line of metrics.jsonl also holds env_steps and
 timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.py`):
-  eval/episodes             episodes of the deterministic policy on fixed goals; eval/successes
-  eval/success_rate         success rate; with its interval, eval/success_low and success_high
+  eval/episodes             episodes of the deterministic policy on fixed goals; likewise successes
+  eval/success_rate         success rate; interval: success_low, success_high
   eval/time_to_goal_median  [s] median time of the successes; 95th percentile: time_to_goal_p95
   eval/path_efficiency      straight line over distance travelled, mean over the successes
   eval/episode_return       [m] mean sum of rewards, about the distance covered
@@ -15,7 +15,7 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   policy/std                standard deviation of the action distribution, before squashing
   policy/learning_rate      Adam's step size
   rollout/episodes          episodes of the exploring policy that ended during collection
-  rollout/success_rate      their success rate; rollout/episode_return, rollout/episode_length
+  rollout/success_rate      their success rate; likewise episode_return, episode_length
   train/nonfinite_envs      non-finite states during collection; the first one is saved for replay
   train/nonfinite_updates   updates that were skipped because their gradient was not finite
   time/env_steps_per_second environment steps per second of training, without compilation
