@@ -88,7 +88,7 @@ def _range(low: float, high: float, *, whole: bool = False) -> Any:
     return Field(None, json_schema_extra={"low": low, "high": high, "whole": whole})
 
 
-_MOST_SUBSTEPS = 10_000
+_MAX_SUBSTEPS = 10_000
 
 
 class _Section(BaseModel):
@@ -113,9 +113,9 @@ class TaskConfig(_Section):
     """The task class, as `package.module:Class`, built as `Class(task_config)`; this package's own
     is named by the package alone."""
     observation: Literal["world", "egocentric"] = "world"
-    """`world`: the tutorial's 16 numbers; `egocentric`: the goal as the robot sees it."""
+    """`world`: the tutorial's 16-number observation; `egocentric`: the goal in robot frame."""
     episode_length: Count = 256
-    """Control steps after which an episode is cut off."""
+    """Control steps after which an episode is truncated."""
     max_speed: Positive = 1.0
     """[m/s] forward speed commanded by a₀ = 1."""
     max_yaw_rate: Positive = math.pi
@@ -135,24 +135,24 @@ class PhysicsConfig(_Section):
     """Time steps and the solver's accuracy. Integrator: Euler, without implicit joint damping."""
 
     ctrl_dt: Positive = 1 / 60
-    """[s] one environment step: how long an action is held."""
+    """[s] duration of one environment step, during which an action is held."""
     sim_dt: Annotated[float, Field(ge=1e-5, allow_inf_nan=False)] = 1 / 120
-    """[s] one physics step; `ctrl_dt` is a whole multiple of it."""
+    """[s] duration of one physics step; `ctrl_dt` is a whole multiple of it."""
     tolerance: Annotated[float, Field(ge=0, le=1e-3, allow_inf_nan=False)] = 1e-6
     """The contact solver stops when an iteration improves its cost by less than this, or its
-    gradient is smaller, both relative to the trace of the inertia matrix; MuJoCo's default of 1e-8
-    is beyond float32's reach."""
+    gradient is smaller, both relative to the trace of the inertia matrix. MuJoCo's default of 1e-8
+    is below the resolution of float32."""
     iterations: Count = 20
-    """Newton iterations per physics step at most; one or two are the rule."""
+    """Largest number of Newton iterations per physics step; usually one or two are needed."""
     ls_iterations: Count = 4
-    """Line-search steps per Newton iteration at most."""
+    """Largest number of line-search steps per Newton iteration."""
     cholesky: Literal["unrolled", "library"] = "unrolled"
-    """How MJX factorises its matrices: `unrolled` into scalar arithmetic, or by a call of LAPACK or
-    cuSOLVER, which keeps a GPU from running a step as one kernel or CUDA graph."""
+    """How MJX factorises its matrices. `unrolled`: as scalar arithmetic; `library`: by a call of
+    LAPACK or cuSOLVER, which prevents a step from running as one kernel or CUDA graph."""
     impl: Literal["auto", "llvm", "ptx", "xla"] = "auto"
-    """Who makes a step of MJX's arithmetic: one kernel, written number by number, `ptx` for NVIDIA
-    GPUs and `llvm` for CPUs; `xla`, as many kernels as XLA makes of it; `auto`: one kernel where it
-    can be had."""
+    """How a physics step is compiled. `ptx`: as one kernel for NVIDIA GPUs; `llvm`: as one kernel
+    for CPUs; `xla`: by XLA, as many kernels; `auto`: as one kernel if that is possible, otherwise
+    by XLA."""
 
     @property
     def n_substeps(self) -> int:
@@ -162,12 +162,12 @@ class PhysicsConfig(_Section):
     @model_validator(mode="after")
     def _whole_substeps(self) -> Self:
         ratio = self.ctrl_dt / self.sim_dt
-        if ratio > _MOST_SUBSTEPS:
+        if ratio > _MAX_SUBSTEPS:
             raise ValueError(
                 f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
-                f" make it at most {_MOST_SUBSTEPS} times"
+                f" make it at most {_MAX_SUBSTEPS} times"
             )
-        # A decimal in YAML cannot hold 1/120: accept what rounds to a whole ratio.
+        # A decimal in YAML cannot represent 1/120 exactly: accept a ratio that is nearly whole.
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-3 * ratio:
             nearest = self.ctrl_dt / max(1, round(ratio))
             raise ValueError(
@@ -180,8 +180,8 @@ class PhysicsConfig(_Section):
 class RandomizationConfig(_Section):
     """Domain randomization: parameters drawn uniformly from [low, high] for every episode.
 
-    Each parameter is drawn independently for each robot of a training. null: the preset's value;
-    all null: nothing is drawn.
+    Each parameter is drawn independently for each robot of a training. null: the preset's value is
+    used; if all are null, nothing is drawn.
     """
 
     friction: Range = _range(0.05, 5)
@@ -189,47 +189,47 @@ class RandomizationConfig(_Section):
     mass: Range = _range(0.2, 5)
     """Factor on mass and inertia of the chassis."""
     com_x: Range = _range(-0.03, 0.03)
-    """[m] shift of the chassis's centre of mass, forward."""
+    """[m] shift of the chassis's centre of mass forwards."""
     com_y: Range = _range(-0.03, 0.03)
-    """[m] likewise, to the left."""
+    """[m] shift of the centre of mass to the left."""
     com_z: Range = _range(-0.03, 0.03)
-    """[m] likewise, up."""
+    """[m] shift of the centre of mass upwards."""
     wheel_radius: Range = _range(0.5, 2)
     """Factor on the radius of both wheels."""
     wheel_radius_mismatch: Range = _range(-0.5, 0.5)
-    """Radii, (left - right) / mean."""
+    """Difference of the wheel radii, (left - right) / mean."""
     wheel_separation: Range = _range(0.5, 2)
     """Factor on the distance between the wheels; above 1 the robot turns less."""
     motor_gain: Range = _range(0.1, 2)
-    """Factor on the wheel speeds that the motors make of a command."""
+    """Factor on the wheel speed that a command produces."""
     motor_gain_mismatch: Range = _range(-0.5, 0.5)
-    """Gains, (left - right) / mean."""
+    """Difference of the motor gains, (left - right) / mean."""
     supply_voltage: Range = _range(0.5, 2)
     """Factor on the motors' voltage."""
     dead_band: Range = _range(0, 0.9)
     """Fraction of full voltage below which a wheel stands still."""
     motor_lag: Range = _range(0, 1)
-    """[s] time constant of a first-order lag, ahead of the motors' own run-up."""
+    """[s] time constant of a first-order lag in front of the motors' own dynamics."""
     action_delay: Range = _range(0, 60, whole=True)
-    """[control steps] from command to motor."""
+    """[control steps] delay from command to motor."""
     position_noise: Range = _range(0, 0.5)
-    """[m] deviation of the position that the robot takes itself to be at, at every step anew."""
+    """[m] standard deviation of the noise on the observed position, drawn at every step."""
     yaw_noise: Range = _range(0, 1)
-    """[rad] likewise of the heading."""
+    """[rad] standard deviation of the noise on the observed heading."""
     speed_noise: Range = _range(0, 1)
-    """[m/s] likewise of the velocity."""
+    """[m/s] standard deviation of the noise on the observed velocity."""
     yaw_rate_noise: Range = _range(0, 1)
-    """[rad/s] likewise of the yaw rate."""
+    """[rad/s] standard deviation of the noise on the observed yaw rate."""
     observation_delay: Range = _range(0, 60, whole=True)
-    """[control steps] by which the robot sees itself late."""
+    """[control steps] delay of the observation of the robot's own state."""
     height_offset: Range = _range(-0.05, 0.05)
-    """[m] by how much higher than it is the robot takes itself to be, in the whole episode."""
+    """[m] offset of the observed height, constant over an episode."""
     pitch_offset: Range = _range(-0.5, 0.5)
-    """[rad] likewise by how much its nose is lower."""
+    """[rad] offset of the observed pitch, positive nose down, constant over an episode."""
     start_x: Range = _range(-5, 5)
-    """[m] where an episode starts, forward of the origin."""
+    """[m] start position of the robot, forwards from the origin."""
     start_y: Range = _range(-5, 5)
-    """[m] likewise, to the left."""
+    """[m] start position of the robot, to the left of the origin."""
     start_yaw: Range = _range(-math.pi - 1e-3, math.pi + 1e-3)
     """[rad] heading at the start, counter-clockwise."""
 
@@ -296,10 +296,10 @@ class PPOConfig(_Section):
     num_updates_per_batch: Count = 4
     """Passes over the collected data before new data is collected."""
     learning_rate: Positive = 1e-3
-    """Adam's step size; where the schedule starts."""
+    """Adam's step size at the start of the schedule."""
     learning_rate_schedule: Literal["NONE", "LINEAR", "ADAPTIVE_KL"] = "LINEAR"
-    """`LINEAR` falls to zero at `num_timesteps`; `ADAPTIVE_KL` steers the step size so that an
-    update moves the policy by `desired_kl`."""
+    """`LINEAR` decreases to zero at `num_timesteps`; `ADAPTIVE_KL` adapts the step size so that an
+    update changes the policy by `desired_kl`."""
     desired_kl: Positive = 0.01
     """Target of `ADAPTIVE_KL`."""
     learning_rate_schedule_min_lr: Positive = 1e-5
@@ -315,7 +315,7 @@ class PPOConfig(_Section):
     clipping_epsilon: Positive = 0.2
     """PPO's clip range of the probability ratio."""
     vf_loss_coefficient: Positive = 1.0
-    """Weight of the value loss; Brax halves it once more."""
+    """Weight of the value loss, in addition to Brax's factor of one half."""
     max_grad_norm: Positive | None = 1.0
     """Global norm that gradients are clipped to; null: no clipping."""
     reward_scaling: Positive = 10.0
@@ -323,9 +323,9 @@ class PPOConfig(_Section):
     normalize_observations: bool = True
     """Normalise observations by running mean and deviation."""
     normalizer: Literal["physical", "brax"] = "physical"
-    """Smallest deviation to normalise by. `physical`: by the units of the observation, 1 cm,
-    0.05 m/s, 0.05 rad, 0.1 rad/s, 0.05 of what has none, or a field's own `min_std`; `brax`: 1e-6
-    of anything, which ties a policy to the contact of the simulator that it was trained in."""
+    """Smallest standard deviation to normalise by. `physical`: by the unit of the observation,
+    1 cm, 0.05 m/s, 0.05 rad, 0.1 rad/s, 0.05 without a unit, or a field's own `min_std`; `brax`:
+    1e-6 for all, with which a policy overfits to the contact of its training simulator."""
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
     network: NetworkConfig = NetworkConfig()
@@ -365,7 +365,7 @@ class EvaluationConfig(_Section):
     """The evaluations during training; `python -m jetbot_mjx.evaluate` has its own arguments."""
 
     episodes: Count = 256
-    """Deterministic episodes per evaluation, on goals set apart from the final test's."""
+    """Deterministic episodes per evaluation, on other goals than those of the report."""
     video: bool = False
     """Whether every evaluation also renders the first four goals of the report, into
     `videos/<env_steps>/`; without OpenGL a line says so, and the training continues."""
@@ -377,24 +377,24 @@ class Config(_Section):
     seed: Annotated[int, BeforeValidator(_integral), Field(ge=0, lt=2**32)] = 0
     """Seed of networks, environments and exploration."""
     seeds: Annotated[int, BeforeValidator(_integral), Field(ge=1, le=1024)] = 1
-    """How many policies to train at once in one program, from `seed` on."""
+    """Number of policies to train at once in one program, with consecutive seeds from `seed` on."""
     trainer: Literal["resumable", "brax"] = "resumable"
-    """`resumable`: this project's loop of Brax's parts; `brax`: the stock
+    """`resumable`: this project's training loop with Brax's PPO; `brax`: Brax's own
     `brax.training.agents.ppo.train.train`, which cannot resume."""
     deterministic: bool = False
-    """On a GPU: the same seed gives the same bits, more slowly. A CPU always does."""
+    """Whether a GPU computes bit-identical results for a seed, more slowly; a CPU always does."""
     checkpoint_interval: Steps = 100_000
     """Environment steps between two checkpoints, each with an evaluation and a log line."""
     checkpoints_to_keep: Count = 50
-    """How many of the latest checkpoints stay, besides the first and the best."""
+    """Number of latest checkpoints to keep, besides the first and the best."""
     preemption_notice: Annotated[float, Field(ge=2, allow_inf_nan=False)] = 30.0
-    """[s] how soon after SIGTERM or SIGINT the process must have saved and gone."""
+    """[s] time after SIGTERM or SIGINT within which the process must save and exit."""
     stop_at_success: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
     """Training ends at the first evaluation with this success rate; null: never before the end."""
     tensorboard: bool = True
     """Whether to write TensorBoard's event files beside `metrics.jsonl`."""
     wandb: Annotated[str, AfterValidator(_wandb_project)] | None = None
-    """Project of Weights & Biases that the run is logged to as well; null: to none."""
+    """Project of Weights & Biases that the run is also logged to; null: none."""
     robot: RobotConfig = RobotConfig()
     task: TaskConfig = TaskConfig()
     physics: PhysicsConfig = PhysicsConfig()

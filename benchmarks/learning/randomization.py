@@ -32,7 +32,7 @@ from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
-from jetbot_mjx.evaluation.robustness import CARRIES_AT, Sweeper, as_json
+from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, Sweeper, as_json
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.run_dir import seed_folders
 from jetbot_mjx.training import session
@@ -187,7 +187,7 @@ def plot(rows: Sequence[dict[str, Any]]) -> Figure:
                 label=setting,
             )
         axes.axvline(quantity["nominal"], color="black", linestyle="--", linewidth=0.8)
-        axes.axhline(CARRIES_AT, color="black", linestyle=":", linewidth=0.8)
+        axes.axhline(ROBUST_SUCCESS_RATE, color="black", linestyle=":", linewidth=0.8)
         axes.set(ylim=(-0.03, 1.03), title=quantity["label"], xlabel=f"[{quantity['unit']}]")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.grid(alpha=0.3)
@@ -248,7 +248,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             plot(rows).savefig(output.with_suffix(".png"), dpi=100)
     print(f"\n{table(rows)}\n\n{output}\n{output.with_suffix('.png')}")
     worst = min(row["ranges"]["success_rate"] for row in _rows_of(rows, "randomised"))
-    return 1 if worst < CARRIES_AT else 0
+    return 1 if worst < ROBUST_SUCCESS_RATE else 0
 
 
 def _about(config: Config, options: argparse.Namespace) -> dict[str, Any]:
@@ -256,7 +256,7 @@ def _about(config: Config, options: argparse.Namespace) -> dict[str, Any]:
         **conditions(config, Sizes()),
         "episodes": options.episodes,
         "goals": options.goals,
-        "carries_at": CARRIES_AT,
+        "carries_at": ROBUST_SUCCESS_RATE,
     }
 
 

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 
 from jetbot_mjx import cli
+from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config, parse_config

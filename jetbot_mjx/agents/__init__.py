@@ -1,4 +1,4 @@
-"""Learn: Brax's networks and PPO, as pure functions of one training state."""
+"""Train policies with Brax's networks and PPO, as pure functions of one training state."""
 
 from typing import TYPE_CHECKING
 

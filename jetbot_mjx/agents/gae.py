@@ -4,11 +4,15 @@ Motivation: Brax runs backwards through an unroll with `jax.lax.scan` in every m
 each iteration launches several very small kernels, a third of all launches of a minibatch.
 Unrolled, the same operations in the same order are one or two kernels.
 
-Equation, backwards in time:
+Equation, backwards in time, with dₜ = 1 if the task terminated the episode at step t and cₜ = 1 if
+the time limit truncated it:
 
-    δₜ = rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ,  Aₜ = δₜ + γ λ (1 - dₜ) Aₜ₊₁
+    δₜ = (1 - cₜ) (rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ)
+    Aₜ = δₜ + γ λ (1 - dₜ) (1 - cₜ) Aₜ₊₁
 
-where δₜ and Aₜ are 0 at a truncated step. The value targets are Aₜ + Vₜ.
+A termination stops bootstrapping from Vₜ₊₁, but a truncation does not end the task: Vₜ₊₁ already
+belongs to the next episode, so the truncated step has no advantage at all. The value targets are
+Aₜ + Vₜ.
 
 Source: J. Schulman et al., High-Dimensional Continuous Control Using Generalized Advantage
 Estimation, arXiv:1506.02438.
@@ -24,8 +28,8 @@ import jax.numpy as jnp
 from brax.training.agents.ppo import losses
 from jaxtyping import Array, Float
 
-_LONGEST = 64
-"""Longest unroll to write out; beyond it Brax's loop is better, for the program grows."""
+_MAX_UNROLL_LENGTH = 64
+"""Longest unroll that is computed without a loop; the program grows with its length."""
 
 _brax = losses.compute_gae
 _lock = threading.Lock()
@@ -48,36 +52,34 @@ def compute_gae(
     lambda_: float = 1.0,
     discount: float = 0.99,
 ) -> tuple[Float[Array, "time batch"], Float[Array, "time batch"]]:
-    """Compute the targets of the value function, and the advantages.
-
-        δₜ = rₜ + γ (1 - dₜ) Vₜ₊₁ - Vₜ,  Aₜ = δₜ + γ λ (1 - dₜ) Aₜ₊₁
-
-    where δₜ and Aₜ are 0 at a truncated step.
+    """Compute the value targets and the advantages by the equation that the module states.
 
     Args:
-      truncation: 1 where an episode was truncated.
-      termination: dₜ, 1 where the task terminated an episode.
-      rewards: rₜ.
-      values: Vₜ.
-      bootstrap_value: V after the last step.
-      lambda_: λ.
-      discount: γ.
+      truncation: cₜ, 1 at steps where the time limit truncated an episode.
+      termination: dₜ, 1 at steps where the task terminated an episode.
+      rewards: rₜ, scaled as in the loss.
+      values: Vₜ, the value estimate before each step.
+      bootstrap_value: the value estimate after the last step.
+      lambda_: λ, from 0 (one-step estimates) to 1 (discounted returns).
+      discount: γ, the discount per environment step.
 
     Returns:
-      The targets Aₜ + Vₜ, and one-step advantages that use the next target in place of Vₜ₊₁; no
-      gradient passes through either.
+      The targets Vₜ' = Aₜ + Vₜ, and the advantages that Brax's loss uses,
+      (1 - cₜ) (rₜ + γ (1 - dₜ) Vₜ₊₁' - Vₜ). No gradient passes through either.
     """
-    if len(rewards) > _LONGEST:
+    if len(rewards) > _MAX_UNROLL_LENGTH:
         return _brax(truncation, termination, rewards, values, bootstrap_value, lambda_, discount)
-    kept = 1 - truncation
-    goes_on = discount * (1 - termination)
+    # Compute δₜ and the factor of Aₜ₊₁ for all steps at once, in the order of Brax's operations.
+    not_truncated = 1 - truncation
+    discounts = discount * (1 - termination)
     next_values = jnp.concatenate([values[1:], bootstrap_value[None]])
-    deltas = (rewards + goes_on * next_values - values) * kept
-    factors = goes_on * kept * lambda_
-    over_value = [deltas[-1]]
+    deltas = (rewards + discounts * next_values - values) * not_truncated
+    factors = discounts * not_truncated * lambda_
+    # Accumulate Aₜ backwards in time, which gives the targets and from them the advantages.
+    gae = [deltas[-1]]
     for delta, factor in zip(deltas[-2::-1], factors[-2::-1], strict=True):
-        over_value.append(delta + factor * over_value[-1])
-    targets = jnp.stack(over_value[::-1]) + values
+        gae.append(delta + factor * gae[-1])
+    targets = jnp.stack(gae[::-1]) + values
     next_targets = jnp.concatenate([targets[1:], bootstrap_value[None]])
-    advantages = (rewards + goes_on * next_targets - values) * kept
+    advantages = (rewards + discounts * next_targets - values) * not_truncated
     return jax.lax.stop_gradient(targets), jax.lax.stop_gradient(advantages)

@@ -27,7 +27,7 @@ class PolicyParams(NamedTuple):
     """A `PolicyParams` holds Brax's positional triple of parameters by name."""
 
     normalizer: Any
-    """Running mean and deviation of the observation."""
+    """Running mean and standard deviation of the observation."""
     policy: Any
     """Weights of the policy network."""
     value: Any
@@ -36,12 +36,12 @@ class PolicyParams(NamedTuple):
 
 @runtime_checkable
 class Policy(Protocol):
-    """A policy as a callable of observations."""
+    """A `Policy` maps observations to actions."""
 
     def __call__(
         self, obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
-        """Return an action: the distribution's mode without a key, a sample with one."""
+        """Return actions: the mode of the distribution without a key, a sample with one."""
         ...
 
 
@@ -49,10 +49,10 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
     """Return Brax's `network_factory` argument for a network configuration.
 
     Args:
-      config: layer sizes, activation, distribution.
+      config: the layer sizes, the activation and the action distribution.
 
     Returns:
-      A function of (observation size, action size, preprocess_observations_fn=...).
+      A function of (observation_size, action_size, preprocess_observations_fn=...).
     """
 
     def factory(
@@ -76,19 +76,19 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
 def make_networks(
     config: NetworkConfig, observation_size: int, action_size: int, *, normalize: bool
 ) -> ppo_networks.PPONetworks:
-    """Build policy and value networks.
+    """Build Brax's policy and value networks.
 
     Args:
-      config: layer sizes, activation, distribution.
-      observation_size: length of the observation.
-      action_size: length of the action.
-      normalize: whether observations pass through the running normaliser.
+      config: the layer sizes, the activation and the action distribution.
+      observation_size: the length of the observation.
+      action_size: the length of the action.
+      normalize: whether the networks normalise observations by running statistics.
 
     Returns:
       Brax's networks.
     """
     preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
-    # Brax's networks keep an observation of zeros, which has no need of a GPU.
+    # Brax's networks hold an observation of zeros, which need not be on the GPU.
     with jax.ensure_compile_time_eval(), default_device_cpu():
         return network_factory(config)(
             observation_size, action_size, preprocess_observations_fn=preprocess
@@ -99,11 +99,11 @@ def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Pol
     """Bind networks and parameters into a policy.
 
     Args:
-      networks: as built by `make_networks`.
-      params: their parameters.
+      networks: the networks from `make_networks`.
+      params: the parameters of the networks and of the normaliser.
 
     Returns:
-      The policy; it takes one observation or any batch of them.
+      The policy, which takes one observation or any batch of observations.
     """
     inference = ppo_networks.make_inference_fn(networks)
     greedy, exploring = inference(params, deterministic=True), inference(params)
@@ -112,7 +112,7 @@ def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Pol
         obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
         if key is None:
-            # Brax asks for a key that the mode does not use.
+            # Brax requires a key, although the mode does not use it.
             return greedy(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
         return exploring(jnp.asarray(obs), key)[0]
 

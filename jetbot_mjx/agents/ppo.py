@@ -4,17 +4,35 @@ Motivation: `brax.training.agents.ppo.train` keeps its training state in local v
 state is one value, `TrainState`, that can be saved and restored, and non-finite environment states
 and gradients are stopped and counted.
 
-Equation: each minibatch minimises Brax's loss
+Equation: each minibatch minimises Brax's loss, the sum of the clipped surrogate objective, the
+value loss and the entropy bonus:
 
-    L = -mean(min(ρ A, clip(ρ, 1 - ε, 1 + ε) A)) + ½ c_v mean((V_target - V)²) - c_e mean(H)
+    L = L_policy + L_value + L_entropy
+    L_policy  = -mean(min(ρ A, clip(ρ, 1 - ε, 1 + ε) A)),  ρ = π(a|s) / π_old(a|s)
+    L_value   = ½ c_v mean((V_target - V)²)
+    L_entropy = -c_e mean(H)
 
-with ρ = π(a|s) / π_old(a|s), A and V_target from `gae`, A normalised over the minibatch if
-`normalize_advantage`, ε = `clipping_epsilon`, c_v = `vf_loss_coefficient`, c_e = `entropy_cost`
-and H the entropy of the policy.
+A and V_target come from `gae`, H is the entropy of the policy, ε = `clipping_epsilon`,
+c_v = `vf_loss_coefficient` and c_e = `entropy_cost`. With `normalize_advantage`, A is normalised
+over the minibatch.
 
-Networks, action distribution, loss, running statistics, unrolls, gradients and the ADAPTIVE_KL
-rule are Brax's; so is the order of the random keys: on one device, step for step and with
-`normalizer: brax`, this is `brax.training.agents.ppo.train`.
+Protocol of a training step:
+
+1. `collect` runs the current policy for `unroll_length` steps in every environment, until there are
+   `batch_size * num_minibatches` unrolls.
+2. The normaliser takes in all collected observations.
+3. `update` makes `num_updates_per_batch` passes over the unrolls. Each pass shuffles them, splits
+   them into `num_minibatches` and applies one step of Adam to each minibatch.
+
+Networks, action distribution, loss, running statistics, unrolls, gradients and the ADAPTIVE_KL rule
+are Brax's, and so is the order of the random keys. On one device and with `normalizer: brax`, every
+step equals a step of `brax.training.agents.ppo.train`. The deviations from Brax are:
+
+- An update with a non-finite gradient is skipped and counted.
+- The first non-finite environment state is returned as a `NanDump`.
+- `normalizer: physical` bounds the standard deviation from below by the observation's scale.
+- `learning_rate_schedule: LINEAR` lowers the step size to zero over the training.
+- GAE is unrolled, and of the next observations only those that the loss needs are stored.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`
 each device steps and shuffles its own environments; only gradients, the normaliser's sums and
@@ -56,7 +74,7 @@ LOSSES = {
     "policy_dist_mean_std": "policy/std",
     "learning_rate": "policy/learning_rate",
 }
-"""Brax's names of a minibatch's metrics, and ours."""
+"""Our names of a minibatch's metrics, by Brax's names."""
 
 _EPISODE_SUMS = {
     "sum_reward": "rollout/return",
@@ -64,29 +82,30 @@ _EPISODE_SUMS = {
     "success": "rollout/successes",
     "nonfinite_envs": "nonfinite_envs",
 }
-"""Metrics summed over the episodes that end, by their name in `info["episode_metrics"]`."""
+"""Our names of metrics that are summed over finished episodes, by those in `episode_metrics`."""
 
 
 class TrainState(struct.PyTreeNode):
-    """The complete training state: a training that is restored from it continues exactly.
+    """A `TrainState` holds everything that a training needs to continue bit-identically.
 
-    Its leaves are `Any`: they also travel stacked, on the host, and as bare shapes.
+    The leaves have the type `Any`, because they are also stacked over seeds, moved to the host, and
+    replaced by their shapes.
     """
 
     params: Any
-    """Weights of the policy and value networks, `policy` and `value`."""
+    """Weights of the networks, in the fields `policy` and `value`."""
     optimizer_state: PyTree
-    """Adam's moments, its step count and step size."""
+    """Adam's moments, step count and step size."""
     normalizer: running_statistics.RunningStatisticsState
-    """Running mean and deviation of the observation."""
+    """Running mean and standard deviation of the observation."""
     env_state: Any
-    """Every environment's state, batched."""
+    """Batched state of all environments."""
     key: Any
     """Random key of the next training step."""
     env_steps: UInt64
-    """Environment steps so far, over all devices."""
+    """Number of environment steps so far, over all devices."""
     tally: dict[str, Any]
-    """Sums of the metrics of the training steps since `tally["training_steps"]` was 0."""
+    """Sums of the metrics over the last `tally["training_steps"]` training steps."""
 
     @property
     def policy_params(self) -> PolicyParams:
@@ -95,29 +114,29 @@ class TrainState(struct.PyTreeNode):
 
 
 class NanDump(struct.PyTreeNode):
-    """The first non-finite state of an unroll, and the actions that led to it."""
+    """A `NanDump` holds the first non-finite state of an unroll and the actions that led to it."""
 
     found: Any
-    """Whether there is one; otherwise the other fields have no meaning."""
+    """Whether there is a non-finite state; otherwise the other fields have no meaning."""
     env_state: Any
-    """The environment's state where the unroll began."""
+    """The state of one environment at the start of the unroll."""
     actions: Any
-    """The actions from there on, shape (time, action)."""
+    """The actions of the unroll, shape (time, action)."""
     step: Any
     """Index of the action that led to the non-finite state."""
 
 
 class StepOutput(NamedTuple):
-    """A `StepOutput` holds what one training step reports beside its state."""
+    """A `StepOutput` holds the metrics of one training step."""
 
     metrics: dict[str, Float[Array, ""]]
-    """Means over the minibatches, and counts over the collected steps."""
+    """Means over the minibatches, and sums over the episodes that ended during collection."""
     nan_dump: NanDump
     """The first non-finite state of this shard."""
 
 
 class PPO:
-    """PPO for one configuration and one environment; the object itself holds no state."""
+    """A `PPO` object trains one configuration in one environment; it holds no training state."""
 
     def __init__(
         self,
@@ -133,11 +152,12 @@ class PPO:
 
         Args:
           config: the hyperparameters.
-          env: wrapped for training: batched, resets itself, keeps `episode_metrics`.
+          env: the environment from `wrap_for_training`, which is batched, resets itself and reports
+            `episode_metrics`.
           networks: the policy and value networks, from `make_networks`.
-          num_envs: environments, all devices together; `config.num_envs` by default.
-          axis_name: mesh axis that the environments are sharded over; None: no sharding.
-          device_count: its size.
+          num_envs: the number of environments over all devices; None: `config.num_envs`.
+          axis_name: the mesh axis over which the environments are sharded; None: no sharding.
+          device_count: the size of that axis.
         """
         self.config = config
         self.num_envs = num_envs or config.num_envs
@@ -161,17 +181,18 @@ class PPO:
         """Return the training state before the first step.
 
         Args:
-          key: `jax.random.PRNGKey(seed)`.
+          key: the key of the training, `jax.random.PRNGKey(seed)`.
 
         Returns:
-          The state, all environments in it: to be computed outside `jax.shard_map`.
+          The state with all environments, so this must be called outside `jax.shard_map`.
         """
-        # The order of Brax's train(), up to the first epoch.
+        # Split the keys in the order of Brax's train(), up to the first epoch.
         global_key, local_key = jax.random.split(key)
         local_key = jax.random.fold_in(local_key, 0)
         local_key, env_key, _ = jax.random.split(local_key, 3)
         policy_key, value_key = jax.random.split(global_key)
         epoch_key, _ = jax.random.split(local_key)
+        # Initialise networks, optimizer, normaliser and environments.
         params = _NetworkParams(
             policy=self.networks.policy_network.init(policy_key),
             value=self.networks.value_network.init(value_key),
@@ -189,30 +210,30 @@ class PPO:
             env_steps=_UInt64(hi=0, lo=0),
             tally=dict.fromkeys(TALLIED, jnp.zeros(())),
         )
-        # Python's numbers make weakly typed arrays, for which the step would compile again.
+        # Remove weak types, which Python numbers have and for which the step would compile again.
         return jax.tree.map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), state)
 
     def advance(
         self, state: TrainState, num_steps: Int[Array, ""], restart: Bool[Array, ""]
     ) -> tuple[TrainState, NanDump]:
-        """Run several training steps; their number is an argument, so that one program serves all.
+        """Run several training steps; one program serves any number of them.
 
         Args:
-          state: where to start.
-          num_steps: training steps.
-          restart: whether the tally starts from nothing.
+          state: the training state of this shard.
+          num_steps: the number of training steps.
+          restart: whether to reset the tally before the first step.
 
         Returns:
-          The state after them, and the first nan_dump among them on this shard.
+          The state after the last step, and the first `NanDump` of these steps on this shard.
         """
         tally = jax.tree.map(lambda x: jnp.where(restart, 0.0, x), state.tally)
 
         def body(_: Array, carry: tuple[TrainState, NanDump]) -> tuple[TrainState, NanDump]:
             before, nan_dump = carry
             state, output = self.train_step(before)
-            added = {**output.metrics, "training_steps": jnp.ones(())}
-            tally = {name: total + added[name] for name, total in before.tally.items()}
-            nan_dump = _first(nan_dump, output.nan_dump)
+            metrics = {**output.metrics, "training_steps": jnp.ones(())}
+            tally = {name: total + metrics[name] for name, total in before.tally.items()}
+            nan_dump = _first_found(nan_dump, output.nan_dump)
             return state.replace(tally=tally), nan_dump
 
         none = NanDump(
@@ -227,23 +248,26 @@ class PPO:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
-          state: the state of this shard.
+          state: the training state of this shard.
 
         Returns:
-          The next state and what happened on the way.
+          The next state, and the metrics and first non-finite state of the step.
         """
+        # Each device draws its own keys, and all devices continue from the same one.
         update_key, rollout_key, next_key = jax.random.split(state.key, 3)
         if self._device_count > 1:
             index = jax.lax.axis_index(self._axis)
             update_key = jax.random.fold_in(update_key, index)
             rollout_key = jax.random.fold_in(rollout_key, index)
+        # Collect experience, and update the normaliser with all of its observations.
         env_state, data, nan_dump = self.collect(state, rollout_key)
-        seen = self._with_floor(
+        updated_normalizer = self._with_floor(
             running_statistics.update(state.normalizer, data.observation, pmap_axis_name=self._axis)
         )
-        # As Brax does it: ADAPTIVE_KL compares with distributions under the old normaliser.
+        # Update the networks. As in Brax, ADAPTIVE_KL uses the old normaliser, because it compares
+        # the new action distributions with those of the collection.
         adaptive = self.config.learning_rate_schedule == "ADAPTIVE_KL"
-        normalizer = state.normalizer if adaptive else seen
+        normalizer = state.normalizer if adaptive else updated_normalizer
         params, optimizer_state, metrics = self.update(
             state.params, state.optimizer_state, normalizer, data, update_key
         )
@@ -251,7 +275,7 @@ class PPO:
         state = state.replace(
             params=params,
             optimizer_state=optimizer_state,
-            normalizer=seen,
+            normalizer=updated_normalizer,
             env_state=env_state,
             key=next_key,
             env_steps=state.env_steps + self.config.steps_per_training_step,
@@ -261,11 +285,11 @@ class PPO:
     def _with_floor(
         self, normalizer: running_statistics.RunningStatisticsState
     ) -> running_statistics.RunningStatisticsState:
-        """Raise each standard deviation to at least the observation's physical scale.
+        """Bound each standard deviation from below by the observation's physical scale.
 
-        A robot that never leaves its floor sees heights and tilts that differ by micrometres.
-        Divided by such a deviation, another simulator's contact is far outside of all that was
-        seen. The sums from which `std` is computed at the next update are left as they are.
+        The height and tilt of a robot on a flat floor vary by micrometres. Normalised by such a
+        deviation, the slightly different contact of another simulator would be far outside of the
+        training's range. The sums from which the next update computes `std` do not change.
         """
         if self._min_std is None:
             return normalizer
@@ -275,15 +299,15 @@ class PPO:
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]
     ) -> tuple[PyTree, Transition, NanDump]:
-        """Collect unrolls, one after the other, until there are enough for all minibatches.
+        """Collect unrolls until there are enough for all minibatches.
 
         Args:
-          state: the state of this shard.
-          key: random key for the actions' noise.
+          state: the training state of this shard.
+          key: the random key of the actions' noise.
 
         Returns:
-          The environments' states after it, the unrolls of shape (unrolls, time, ...), of whose
-          `next_observation` only the last is kept, and the first non-finite state.
+          The environment states after the last unroll; the unrolls, of shape (unrolls, time, ...),
+          with `next_observation` of their last step only; and the first non-finite state.
         """
         policy = self._make_policy(tuple(state.policy_params))
 
@@ -298,17 +322,18 @@ class PPO:
                 self.config.unroll_length,
                 extra_fields=("truncation", "episode_metrics", "episode_done"),
             )
-            nan_dump = _find_fault(env_state, data)
+            nan_dump = _find_nan_dump(env_state, data)
             # The loss needs the next observation only at the end of an unroll.
             data = data._replace(next_observation=data.next_observation[-1:])
             return (after, next_key), (data, nan_dump)
 
+        # Run the unrolls one after the other, and return the first non-finite state of all.
         count = self.config.batch_size * self.config.num_minibatches // self.num_envs
         (env_state, _), (data, nan_dumps) = jax.lax.scan(
             unroll, (state.env_state, key), length=count
         )
         nan_dump = jax.tree.map(lambda x: x[jnp.argmax(nan_dumps.found)], nan_dumps)
-        # From (unrolls, time, environments) to (unrolls x environments, time).
+        # Reshape from (unrolls, time, environments) to (unrolls x environments, time).
         data = jax.tree.map(lambda x: jnp.swapaxes(x, 1, 2), data)
         data = jax.tree.map(lambda x: x.reshape((-1, *x.shape[2:])), data)
         return env_state, data, nan_dump
@@ -323,17 +348,21 @@ class PPO:
     ) -> tuple[PyTree, PyTree, dict[str, Float[Array, ""]]]:
         """Update the networks in several passes over the collected data, in minibatches.
 
+        Each minibatch applies one step of Adam along the gradient of the loss L that the module
+        states, clipped to the global norm `max_grad_norm`.
+
         Args:
-          params: parameters of the networks.
-          optimizer_state: state of the optimizer of `make_optimizer`.
-          normalizer: statistics that normalise the observations.
-          data: unrolls, shape (unrolls, time, ...); `next_observation` may hold the last only.
-          key: random key for the shuffles and the entropy's samples.
+          params: the parameters of the networks.
+          optimizer_state: the state of the optimizer from `make_optimizer`.
+          normalizer: the statistics that normalise the observations.
+          data: the unrolls, shape (unrolls, time, ...); `next_observation` may hold only the last.
+          key: the random key of the shuffles and of the samples that estimate the entropy.
 
         Returns:
-          Parameters, optimizer state, and the mean metrics of the minibatches.
+          The new parameters, the new optimizer state, and the mean metrics of the minibatches whose
+          gradient was finite.
         """
-        # Episode statistics are not shuffled.
+        # Drop the episode statistics, which need not be shuffled.
         extras = {
             "policy_extras": data.extras["policy_extras"],
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
@@ -356,6 +385,7 @@ class PPO:
             )
             return (params, optimizer_state, key), metrics
 
+        # Make the passes, and average the metrics over the applied updates of all devices.
         (params, optimizer_state, _), metrics = jax.lax.scan(
             one_pass, (params, optimizer_state, key), length=self.config.num_updates_per_batch
         )
@@ -364,8 +394,8 @@ class PPO:
         applied = metrics.pop("applied")
         count = jnp.maximum(applied.sum(), 1.0)
         means = {
-            ours: jnp.where(applied > 0, metrics[theirs], 0.0).sum() / count
-            for theirs, ours in LOSSES.items()
+            name: jnp.where(applied > 0, metrics[brax_name], 0.0).sum() / count
+            for brax_name, name in LOSSES.items()
         }
         return params, optimizer_state, {**means, "nonfinite_updates": (1.0 - applied).sum()}
 
@@ -375,16 +405,17 @@ class PPO:
         batch: Transition,
         normalizer: running_statistics.RunningStatisticsState,
     ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
-        """Apply one gradient step, or skip it where the gradient is not finite."""
+        """Apply one gradient step, or skip it if the gradient is not finite."""
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
         (_, metrics), gradient = self._loss_and_gradient(params, normalizer, batch, loss_key)
         finite = jnp.isfinite(optax.tree.norm(gradient))
+        # Adapt the step size to the KL divergence, and compute the update.
         before = params, optimizer_state
         if self.config.learning_rate_schedule == "ADAPTIVE_KL":
             kl = metrics["kl_mean"]
             optimizer_state, _ = optimizer.adaptive_kl_learning_rate(
-                # It modifies the state that it is given.
+                # Pass a copy, because the function modifies its argument.
                 jax.tree.map(lambda x: x, optimizer_state),
                 kl if self._axis is None else jax.lax.pmean(kl, self._axis),
                 self.config.desired_kl,
@@ -393,6 +424,7 @@ class PPO:
             )
         change, optimizer_state = self._optimizer.update(gradient, optimizer_state, params)
         after = optax.apply_updates(params, change), optimizer_state
+        # Keep the old parameters and optimizer state if the gradient is not finite.
         params, optimizer_state = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), after, before
         )
@@ -410,7 +442,7 @@ class PPO:
         batch: Transition,
         key: UInt32[Array, "2"],
     ) -> tuple[Array, Mapping[str, Array]]:
-        """Compute Brax's PPO loss under this configuration; the module states the equation."""
+        """Compute Brax's PPO loss L = L_policy + L_value + L_entropy, as the module states it."""
         with gae.unrolled():
             return losses.compute_ppo_loss(
                 params,
@@ -428,12 +460,12 @@ class PPO:
             )
 
     def _episode_sums(self, data: Transition) -> dict[str, Float[Array, ""]]:
-        """Sum the metrics of the episodes that ended during collection, over all devices."""
+        """Sum the metrics of the episodes that ended during collection over all devices."""
         ended = data.extras["state_extras"]["episode_done"]
         statistics: Any = data.extras["state_extras"]["episode_metrics"]
         sums = {
-            ours: (ended * statistics.get(theirs, jnp.zeros(()))).sum()
-            for theirs, ours in _EPISODE_SUMS.items()
+            name: (ended * statistics.get(brax_name, jnp.zeros(()))).sum()
+            for brax_name, name in _EPISODE_SUMS.items()
         }
         sums["rollout/episodes"] = ended.sum()
         return sums if self._axis is None else jax.lax.psum(sums, self._axis)
@@ -446,14 +478,14 @@ TALLIED = (
     *_EPISODE_SUMS.values(),
     *LOSSES.values(),
 )
-"""The names in `TrainState.tally`."""
+"""Names of the metrics in `TrainState.tally`."""
 
 
 def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     """Return Adam, preceded by clipping of the global gradient norm if configured.
 
     Args:
-      config: step size, its schedule, and the norm.
+      config: the hyperparameters, of which the step size, its schedule and the norm are used.
 
     Returns:
       A chain whose last state holds the step size in `hyperparams["learning_rate"]`.
@@ -469,22 +501,22 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
 
 
-def _find_fault(start: PyTree, data: Transition) -> NanDump:
-    """Return the first non-finite state of an unroll, from data of shape (time, world)."""
+def _find_nan_dump(start: PyTree, data: Transition) -> NanDump:
+    """Return the first non-finite state of an unroll, from data of shape (time, environment)."""
     statistics: Any = data.extras["state_extras"]["episode_metrics"]
     ended = data.extras["state_extras"]["episode_done"]
-    blown = ended * statistics.get("nonfinite_envs", jnp.zeros(())) > 0
-    # In order of time, then of the worlds.
-    first = jnp.argmax(blown)
-    step, world = jnp.divmod(first, blown.shape[1])
+    nonfinite = ended * statistics.get("nonfinite_envs", jnp.zeros(())) > 0
+    # The flat index is ordered by time and then by environment.
+    first = jnp.argmax(nonfinite)
+    step, env_index = jnp.divmod(first, nonfinite.shape[1])
     return NanDump(
-        found=blown.any(),
-        env_state=jax.tree.map(lambda x: x[world], start),
-        actions=data.action[:, world],
+        found=nonfinite.any(),
+        env_state=jax.tree.map(lambda x: x[env_index], start),
+        actions=data.action[:, env_index],
         step=step,
     )
 
 
-def _first(one: NanDump, other: NanDump) -> NanDump:
-    """Return the earlier of two non-finite states, if there is one."""
+def _first_found(one: NanDump, other: NanDump) -> NanDump:
+    """Return the first of two dumps if it holds a non-finite state, otherwise the second."""
     return jax.tree.map(lambda a, b: jnp.where(one.found, a, b), one, other)

@@ -1,10 +1,9 @@
 """Compile a JAX function of one robot into one kernel that steps all robots.
 
-`lower_jaxpr` takes the function apart into operations on single numbers (`scalar_ir`, `indexing`),
-`schedule` orders them, and `llvm_codegen` writes them as LLVM's text. `llvm_backend` compiles that
-text for CPUs and `ptx_backend` for NVIDIA GPUs; `kernel` makes a JAX primitive of both.
-`program_cache` keeps whole compiled programs from one process to the next. Nothing here knows of
-robots.
+`lower_jaxpr` lowers the function to operations on scalars (`scalar_ir`, `indexing`), `schedule`
+orders them, and `llvm_codegen` writes them as LLVM IR. `llvm_backend` compiles that IR for CPUs and
+`ptx_backend` for NVIDIA GPUs; `kernel` wraps both as one JAX primitive. `program_cache` caches
+whole compiled programs from one process to the next. This package knows nothing of robots.
 """
 
 from typing import TYPE_CHECKING

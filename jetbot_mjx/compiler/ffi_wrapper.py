@@ -1,12 +1,12 @@
-"""Wrap a kernel as a function that XLA calls on a CPU, in LLVM's intermediate representation.
+"""Wrap a kernel as a function that XLA calls on a CPU, written as LLVM IR.
 
-XLA hands over one address, of a call frame. Around a `step` of as many robots as a vector register
-has lanes, what is written here reads the frame, deals blocks of robots to XLA's own threads, and
-moves each block between XLA's arrays and a tile, of which a row holds one number of every robot.
-No Python takes part.
+XLA passes the address of a call frame. `kernel_text` writes a function that reads the frame,
+distributes blocks of robots to XLA's own threads, and copies each block between XLA's arrays and a
+tile, whose rows hold one scalar of every robot of the block. A block has as many robots as a vector
+register has lanes, and `step` advances all of them. No Python runs during the call.
 
-Offsets are those of XLA's C header `xla/ffi/api/c_api.h`, version 0.3. Every structure tells its
-size; where one is other than expected, nothing is done.
+The offsets are those of XLA's C header `xla/ffi/api/c_api.h`, version 0.3. Every structure states
+its size, and the function returns without a result if a size differs from the expected one.
 """
 
 from collections.abc import Sequence
@@ -16,16 +16,16 @@ from string import Template
 from jetbot_mjx.compiler.llvm_codegen import STEP
 
 VERSION = (0, 3)
-"""Version of the foreign function interface."""
+"""Version of XLA's foreign function interface."""
 
 SYMBOLS = ("malloc", "free", "sched_yield")
 """Functions of the C library that a kernel calls."""
 
 _BLOCKS_PER_THREAD = 4
-"""With fewer blocks, one thread finishes before another wakes up."""
+"""Smallest number of blocks per thread; with fewer, a thread finishes before the next wakes up."""
 
 _PATIENCE = 1000
-"""Polls for the other threads to finish, about 20 µs, before the thread yields its core."""
+"""Number of polls for the other threads, about 20 µs, before a thread yields its core."""
 
 # Flush subnormal numbers to zero on every thread: XLA's threads do so, and others may not.
 _PROCESSORS = {
@@ -94,19 +94,19 @@ def kernel_text(
 ) -> str:
     """Write the LLVM module whose function XLA calls.
 
-    It takes float32 arrays of (robots, ...) and returns as many as are carried.
+    The function takes float32 arrays of shape (robots, ...) and returns the carried ones.
 
     Args:
-      step: the text of one step of `lanes` robots.
-      sizes: how many numbers of each argument one robot has.
-      carried: how many of the arguments change, and are the results.
-      lanes: robots in a block.
-      steps: how often each robot makes the step.
-      name: name of the function, a C identifier.
-      machine: the processor, of `MACHINES`.
+      step: the text of a function that makes one step of `lanes` robots.
+      sizes: the number of scalars per robot in each argument.
+      carried: the number of arguments that are carried from step to step and returned.
+      lanes: the number of robots in a block.
+      steps: the number of steps.
+      name: the name of the function, a C identifier.
+      machine: the processor, one of `MACHINES`.
 
     Returns:
-      The text of a module.
+      The text of an LLVM module.
     """
     arrays = len(sizes) + carried
     values = {
@@ -152,6 +152,7 @@ def _pointer(i: int, arguments: int) -> str:
 
 
 def _reads(sizes: Sequence[int], lanes: int) -> list[str]:
+    """Return the lines that copy one robot's arguments into its lane of the tile."""
     lines, row = [], 0
     for i, size in enumerate(sizes):
         lines.append(f"%r{i} = mul i64 %robot, {size}")
@@ -168,6 +169,7 @@ def _reads(sizes: Sequence[int], lanes: int) -> list[str]:
 
 
 def _writes(sizes: Sequence[int], first: int, lanes: int) -> list[str]:
+    """Return the lines that copy one robot's results from its lane of the tile."""
     lines, row = [], 0
     for i, size in enumerate(sizes, start=first):
         lines.append(f"%w{i} = mul i64 %to, {size}")

@@ -1,6 +1,6 @@
-"""Arrays of scalars, and the JAX operations that only move them: slices, gathers and the like.
+"""Lower the JAX operations that only rearrange scalars: slices, gathers, transposes and the like.
 
-None of it is arithmetic: where a number goes is known before the program runs.
+They cost nothing in the program, because every index is a constant when the function is lowered.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -10,46 +10,46 @@ import numpy as np
 
 from jetbot_mjx.compiler.scalar_ir import Scalar, UnsupportedError, is_constant
 
-Numbers = np.ndarray
+ScalarArray = np.ndarray
 """An array of `Scalar`, dtype object."""
 
 
-def filled(shape: Sequence[int], make: Callable[[], Scalar]) -> Numbers:
-    """Return an array of this shape, with one call of `make` for each element."""
-    numbers = np.empty(shape, object)
+def full_array(shape: Sequence[int], make: Callable[[], Scalar]) -> ScalarArray:
+    """Return an array of the given shape whose elements are results of `make`."""
+    array = np.empty(shape, object)
     for place in np.ndindex(*shape):
-        numbers[place] = make()
-    return numbers
+        array[place] = make()
+    return array
 
 
-def numbers_of(scalars: Iterable[Scalar], shape: Sequence[int]) -> Numbers:
-    """Return an array of this shape from its elements in row-major order."""
-    numbers = iter(list(scalars))
-    return filled(shape, lambda: next(numbers))
+def scalar_array(scalars: Iterable[Scalar], shape: Sequence[int]) -> ScalarArray:
+    """Return an array of the given shape from its elements in row-major order."""
+    elements = iter(list(scalars))
+    return full_array(shape, lambda: next(elements))
 
 
-def known_array(array: Any) -> Numbers:
-    """Return an array of constants as an array of scalars."""
+def constant_array(array: Any) -> ScalarArray:
+    """Convert an array of constants to an array of scalars."""
     array = np.asarray(array)
-    return numbers_of(array.ravel(), array.shape)
+    return scalar_array(array.ravel(), array.shape)
 
 
-def known_values(numbers: Numbers, dtype: Any) -> np.ndarray:
+def constant_values(array: ScalarArray, dtype: Any) -> np.ndarray:
     """Convert scalars that are all constants to a plain NumPy array.
 
     Args:
-      numbers: the scalars.
-      dtype: dtype of the array.
+      array: the scalars.
+      dtype: the dtype of the result.
 
     Returns:
       The array.
 
     Raises:
-      UnsupportedError: they depend on what the program is given.
+      UnsupportedError: a scalar depends on an input of the program.
     """
-    if not all(map(is_constant, numbers.ravel())):
+    if not all(map(is_constant, array.ravel())):
         raise UnsupportedError("an index that depends on the state")
-    return np.asarray(list(numbers.ravel()), dtype).reshape(numbers.shape)
+    return np.asarray(list(array.ravel()), dtype).reshape(array.shape)
 
 
 def shape_of(variable: Any) -> tuple[int, ...]:
@@ -74,19 +74,21 @@ def windows(
     Source: the semantics of gather and scatter in the StableHLO specification.
 
     Args:
-      shape: shape of the operand.
-      indices: where windows begin, along the last axis.
-      offset_dims: axes of the result, or of the updates, that lie within a window.
-      collapsed: axes of the operand that a window has not.
-      index_map: the operand's axis for each number of an index.
-      batching: axes of the operand that go along with axes of the indices.
-      indices_batching: those axes of the indices.
-      sizes: size of a window, along each axis of the operand.
-      clip: moves windows inside that reach beyond.
+      shape: the shape of the operand.
+      indices: the start indices of the windows, whose components lie along the last axis.
+      offset_dims: the axes of the result, or of the updates, that lie within a window.
+      collapsed: the axes of the operand that a window drops.
+      index_map: the operand's axis of each component of a start index.
+      batching: the batch axes of the operand.
+      indices_batching: the axes of the indices that correspond to `batching`.
+      sizes: the size of a window along each axis of the operand.
+      clip: whether windows that reach beyond the operand are moved inside it; otherwise they are
+        dropped.
 
     Returns:
-      Places, in the shape of the result or of the updates.
+      Flat indices in the shape of the result or of the updates.
     """
+    # Cut the window of every start index out of the flat indices of the operand.
     places = np.arange(int(np.prod(shape, dtype=int))).reshape(shape)
     fixed = (*collapsed, *batching)
     window = [size for axis, size in enumerate(sizes) if axis not in fixed]
@@ -104,7 +106,7 @@ def windows(
         inside = bool(np.all((start >= 0) & (start <= most)))
         cut = tuple(slice(a, a + n) for a, n in zip(start, sizes, strict=True))
         result[at] = places[cut].reshape(window) if inside else -1
-    # Batch axes came first; put each axis where it belongs.
+    # Move the window axes from the end to `offset_dims`.
     order = np.argsort([*batch_dims, *offset_dims])
     return result.transpose(order)
 
@@ -117,101 +119,101 @@ def _fill_value(equation: Any) -> float:
     return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
 
 
-def _copy(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _copy(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     return x
 
 
-def _reshape(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _reshape(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     return x.reshape(shape_of(equation.outvars[0]))
 
 
-def _slice(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _slice(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     strides = params["strides"] or [1] * x.ndim
     bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return x[tuple(slice(*bound) for bound in bounds)]
 
 
-def _broadcast_in_dim(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _broadcast_in_dim(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     shape = [1] * len(params["shape"])
     for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
         shape[axis] = size
     return np.broadcast_to(x.reshape(shape), params["shape"])
 
 
-def _transpose(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _transpose(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     return x.transpose(params["permutation"])
 
 
-def _rev(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _rev(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     return np.flip(x, params["dimensions"])
 
 
-def _tile(equation: Any, params: Any, x: Numbers) -> Numbers:
+def _tile(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     return np.tile(x, params["reps"])
 
 
-def _concatenate(equation: Any, params: Any, *operands: Numbers) -> Numbers:
+def _concatenate(equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
     return np.concatenate(operands, params["dimension"])
 
 
-def _stack(equation: Any, params: Any, *operands: Numbers) -> Numbers:
+def _stack(equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
     return np.stack(operands, params["axis"])
 
 
-def _unstack(equation: Any, params: Any, x: Numbers) -> list[Numbers]:
+def _unstack(equation: Any, params: Any, x: ScalarArray) -> list[ScalarArray]:
     parts = np.split(x, x.shape[params["axis"]], params["axis"])
     return [part.reshape(shape_of(equation.outvars[0])) for part in parts]
 
 
-def _split(equation: Any, params: Any, x: Numbers) -> list[Numbers]:
+def _split(equation: Any, params: Any, x: ScalarArray) -> list[ScalarArray]:
     return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
 
 
-def _pad(equation: Any, params: Any, x: Numbers, padding: Numbers) -> Numbers:
+def _pad(equation: Any, params: Any, x: ScalarArray, padding: ScalarArray) -> ScalarArray:
     if any(low < 0 or high < 0 or inside for low, high, inside in params["padding_config"]):
         raise UnsupportedError("padding that is negative or between numbers")
     widths = [(low, high) for low, high, _ in params["padding_config"]]
-    padded = filled(shape_of(equation.outvars[0]), padding.item)
+    padded = full_array(shape_of(equation.outvars[0]), padding.item)
     padded[tuple(slice(low, low + n) for (low, _), n in zip(widths, x.shape, strict=True))] = x
     return padded
 
 
-def _iota(equation: Any, params: Any) -> Numbers:
+def _iota(equation: Any, params: Any) -> ScalarArray:
     shape, axis = params["shape"], params["dimension"]
     counts = np.arange(shape[axis]).astype(params["dtype"])
     counts = counts.reshape([-1 if i == axis else 1 for i in range(len(shape))])
-    return known_array(np.broadcast_to(counts, shape))
+    return constant_array(np.broadcast_to(counts, shape))
 
 
-def _empty(equation: Any, params: Any) -> Numbers:
+def _empty(equation: Any, params: Any) -> ScalarArray:
     variable = equation.outvars[0]
-    return known_array(np.zeros(shape_of(variable), variable.aval.dtype))
+    return constant_array(np.zeros(shape_of(variable), variable.aval.dtype))
 
 
-def _gather(equation: Any, params: Any, x: Numbers, indices: Numbers) -> Numbers:
-    numbers = params["dimension_numbers"]
+def _gather(equation: Any, params: Any, x: ScalarArray, indices: ScalarArray) -> ScalarArray:
+    dims = params["dimension_numbers"]
     places = windows(
         x.shape,
-        known_values(indices, np.int64),
-        offset_dims=numbers.offset_dims,
-        collapsed=numbers.collapsed_slice_dims,
-        index_map=numbers.start_index_map,
-        batching=numbers.operand_batching_dims,
-        indices_batching=numbers.start_indices_batching_dims,
+        constant_values(indices, np.int64),
+        offset_dims=dims.offset_dims,
+        collapsed=dims.collapsed_slice_dims,
+        index_map=dims.start_index_map,
+        batching=dims.operand_batching_dims,
+        indices_batching=dims.start_indices_batching_dims,
         sizes=params["slice_sizes"],
         # XLA also clips indices that are promised to be in bounds.
         clip="FILL" not in str(params["mode"]),
     )
     fill = equation.outvars[0].aval.dtype.type(_fill_value(equation))
     flat = x.ravel()
-    numbers = (flat[place] if place >= 0 else fill for place in places.ravel())
-    return numbers_of(numbers, shape_of(equation.outvars[0]))
+    scalars = (flat[place] if place >= 0 else fill for place in places.ravel())
+    return scalar_array(scalars, shape_of(equation.outvars[0]))
 
 
-def _sort(equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
+def _sort(equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
     if params["num_keys"] != 1:
         raise UnsupportedError("sorting by more than one key")
-    keys = known_values(operands[0], equation.outvars[0].aval.dtype)
+    keys = constant_values(operands[0], equation.outvars[0].aval.dtype)
     order = np.argsort(keys, params["dimension"], kind="stable")
     return [np.take_along_axis(x, order, params["dimension"]) for x in operands]
 
@@ -237,5 +239,6 @@ RULES: dict[str, Callable[..., Any]] = {
     "transpose": _transpose,
     "unstack": _unstack,
 }
-"""What operations do that only move numbers, by their name in JAX: a function of the equation, its
-parameters and its operands."""
+"""Lowering rules of operations that only rearrange scalars, by the name of the JAX primitive.
+
+A rule is a function of the equation, its parameters and its operands."""

@@ -1,18 +1,18 @@
 """Run a step of one robot as one kernel for all robots.
 
 Motivation: `jax.vmap` and XLA compile MJX's step to hundreds of kernels, and every value that
-passes from one kernel to the next goes through memory. Lowered to scalars (`scalarize`), the same
-step is one kernel that reads a robot's state, runs all physics steps of an environment step, and
-writes the state back.
+passes from one kernel to the next goes through memory. Lowered to scalars (`lower_jaxpr`), the
+same step is one kernel that reads a robot's state, runs all physics steps of an environment step,
+and writes the state back.
 
-Protocol: for JAX the kernel is a primitive.
+Protocol: JAX sees the kernel as a primitive.
 
 1. `as_step` binds the primitive to the leaves of (carry, consts) of one robot, all float32.
 2. The batching rule of `jax.vmap` puts any number of batch axes into one launch.
 3. The primitive is lowered for the platform that a program is compiled for, whatever the
    process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
-   (`ptx_backend` or `llvm_backend`) compiles and launches the kernel; without one, `auto` runs the
-   fallback in JAX, and any other `physics.impl` raises a `UserError`.
+   (`ptx_backend` or `llvm_backend`) compiles and launches the kernel. Without a back end,
+   `physics.impl = auto` runs the fallback in JAX, and any other value raises a `UserError`.
 4. Differentiation raises a `UserError`.
 """
 
@@ -42,7 +42,10 @@ Step = Callable[[PyTree, PyTree], PyTree]
 
 
 class Kernel:
-    """A step of one robot that a back end can run for many; kernels are compared by identity."""
+    """A `Kernel` holds a step of one robot that a back end can run for many robots.
+
+    Kernels are compared by identity.
+    """
 
     def __init__(
         self,
@@ -53,15 +56,16 @@ class Kernel:
         fallback: Callable[..., list[Array]],
         impl: str = "auto",
     ) -> None:
-        """Describe a kernel that repeats a program, its results becoming its first arguments.
+        """Describe a kernel that repeats a step; its results replace its first arguments.
 
         Args:
-          program: a step; its results have the shapes of its first `carried` arguments.
-          carried: how many leaves of the arguments are carried from step to step.
-          steps: how often it is repeated.
-          fallback: the same in JAX, of one robot and a flat list of all leaves, for platforms
-            without a back end.
-          impl: the back end that must run it; `auto`: the one of the platform, or the fallback.
+          program: the step; its results have the shapes of its first `carried` arguments.
+          carried: the number of argument leaves that are carried from step to step.
+          steps: the number of steps.
+          fallback: the same computation in JAX, as a function of all leaves of one robot, for
+            platforms without a back end.
+          impl: the name of the back end that must run the kernel; `auto` takes the back end of the
+            platform, or the fallback if there is none.
         """
         self.program = program
         self.carried = carried
@@ -69,11 +73,11 @@ class Kernel:
         self.fallback = fallback
         self.impl = impl
         self._texts: dict[str, str] = {}
-        # ProgramCache are lowered in several threads.
+        # Programs are lowered in several threads.
         self._lock = threading.Lock()
 
     def text(self, name: str, write: Callable[[], str]) -> str:
-        """Return the text under a name, written when it is first asked for."""
+        """Return the text that is cached under a name; call `write` for it on first use."""
         with self._lock:
             if name not in self._texts:
                 self._texts[name] = write()
@@ -81,7 +85,7 @@ class Kernel:
 
 
 class Backend(Protocol):
-    """The interface of a back end, which compiles and launches kernels."""
+    """A `Backend` compiles and launches kernels for one platform."""
 
     @property
     def IMPL(self) -> str:
@@ -95,22 +99,22 @@ class Backend(Protocol):
 
     @property
     def NEEDS(self) -> str:
-        """Return a description of what must be installed or present."""
+        """Return one line that names the hardware and packages that the back end needs."""
         ...
 
     def is_available(self) -> bool:
-        """Return whether JAX knows the platform and all requirements of the back end are met."""
+        """Return whether JAX has the platform and every requirement of the back end is met."""
         ...
 
     def launch(self, kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
-        """Run a kernel; called while a program for the platform is lowered.
+        """Run a kernel; JAX calls this while it lowers a program for the platform.
 
         Args:
           kernel: the kernel.
-          leaves: its arguments, float32 of (robots, ...).
+          leaves: its arguments, float32 arrays of shape (robots, ...).
 
         Returns:
-          The new values of the carried arguments.
+          The new values of the carried arguments, in the same shapes.
         """
         ...
 
@@ -119,11 +123,11 @@ def as_step(kernel: Kernel) -> Step:
     """Return a kernel as a JAX function of one robot, which `jax.vmap` can batch.
 
     Args:
-      kernel: the kernel of a step.
+      kernel: the kernel.
 
     Returns:
-      A function of (carry, consts), pytrees with the leaves of the kernel's arguments, which must
-      be float32. It cannot be differentiated.
+      A function of (carry, consts) that returns the new carry. The leaves of both pytrees are the
+      kernel's arguments and must be float32. The function cannot be differentiated.
     """
 
     def step(carry: PyTree, consts: PyTree) -> PyTree:
@@ -142,9 +146,9 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
 
     Raises:
       UserError: an argument is not float32.
-      ValueError: an argument has another shape.
+      ValueError: an argument does not have the shape that the kernel expects.
     """
-    shapes = [numbers.shape for numbers in kernel.program.inputs]
+    shapes = [array.shape for array in kernel.program.inputs]
     batch = leaves[0].shape[: leaves[0].ndim - len(shapes[0])]
     for leaf, shape in zip(leaves, shapes, strict=True):
         if leaf.dtype != np.float32:
@@ -165,7 +169,7 @@ def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
 
 @_kernel_p.def_impl
 def _run(*leaves: Any, kernel: Kernel) -> list[Array]:
-    # Also within `jax.disable_jit`, where this would otherwise call itself.
+    # Enable jit here: within `jax.disable_jit` this function would call itself.
     with jax.disable_jit(False):
         return _compiled(*leaves, kernel=kernel)
 
@@ -201,14 +205,14 @@ ad.primitive_jvps[_kernel_p] = _differentiate
 
 
 def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
-    """Return the function that is lowered for a platform; None stands for any other platform."""
+    """Return the function that JAX lowers for a back end's platform; None: all other platforms."""
 
     def lowered(*leaves: Array, kernel: Kernel) -> list[Array]:
         batch = _batch_shape(kernel, leaves)
         robots = math.prod(batch)
         flat = [
-            x.reshape(robots, *numbers.shape)
-            for x, numbers in zip(leaves, kernel.program.inputs, strict=True)
+            x.reshape(robots, *array.shape)
+            for x, array in zip(leaves, kernel.program.inputs, strict=True)
         ]
         if backend and kernel.impl in ("auto", backend.IMPL) and backend.is_available():
             results = backend.launch(kernel, flat)
@@ -235,13 +239,13 @@ def register(*backends: Backend) -> None:
         )
 
 
-def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
+def cached_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     """Return cached bytes from the folder of compiled programs, or make and cache them.
 
     Args:
       kind: the prefix of the file's name.
-      key: everything that the content depends on.
-      make: returns the content when it is not cached.
+      key: the cache key: everything that the content depends on.
+      make: a function that returns the content if it is not cached.
 
     Returns:
       The content.
@@ -254,7 +258,7 @@ def kept_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     if digest == _digest(content):
         return content
     content = make()
-    # As with compiled programs, a folder that cannot be written only costs time.
+    # A folder that cannot be written only costs time: the content is made again next time.
     with contextlib.suppress(OSError):
         write_private(path, _digest(content) + b"\n" + content)
     return content

@@ -1,8 +1,8 @@
-"""Kernels in LLVM's representation on CPUs: a `jetbot_mjx.compiler.kernel.Backend`.
+"""Compile and launch kernels on CPUs; this module is a `jetbot_mjx.compiler.kernel.Backend`.
 
-`llvmlite` compiles them for the very processor; XLA calls them by its foreign function interface,
-of which `is_available` tries a small one. Each has a name of its own, from its content: a compiled
-program that JAX kept asks for the kernel that it was compiled with.
+`llvmlite` compiles a kernel for the present processor, and XLA calls it through its foreign
+function interface; `is_available` tries both with a small kernel. The name of a kernel is a hash of
+its content, so a cached program always finds the kernel that it was compiled with.
 """
 
 import ctypes
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.compiler import ffi_wrapper, llvm_codegen
-from jetbot_mjx.compiler.kernel import Kernel, kept_bytes
+from jetbot_mjx.compiler.kernel import Kernel, cached_bytes
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 
 IMPL = "llvm"
@@ -29,13 +29,13 @@ NEEDS = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it co
 
 _NAME = "physics"
 _LEVEL = 2
-"""Of code generation; there are no passes before it, for a program has nothing left to shorten."""
+"""Optimisation level of code generation; the program is already simplified, so no passes run."""
 
 _XLA_NAME = re.compile(r"jetbot_mjx_[0-9a-f]{64}")
 
 
 class _Loaded(NamedTuple):
-    """Machine code that XLA may call as long as the process lives."""
+    """A `_Loaded` holds machine code that XLA may call until the process ends."""
 
     engine: Any
     code: bytes
@@ -43,19 +43,19 @@ class _Loaded(NamedTuple):
 
 _lock = threading.Lock()
 _loaded: dict[str, _Loaded] = {}
-"""By the name that XLA knows it by."""
+"""Loaded kernels by the name under which XLA calls them."""
 
 
 class _Host(NamedTuple):
-    """The processor, as LLVM describes it."""
+    """A `_Host` describes the processor in LLVM's terms."""
 
     machine: str
     name: str
     features: str
     lanes: int
-    """Numbers in a vector register."""
+    """Number of float32 values in a vector register."""
     version: str
-    """Of what compiles for it."""
+    """Version of llvmlite and LLVM."""
 
 
 @functools.cache
@@ -65,8 +65,8 @@ def is_available() -> bool:
         device = jax.local_devices(backend=PLATFORM)[0]
         host = _host()
     except (ImportError, OSError, RuntimeError, AttributeError, TypeError):
-        # No llvmlite, one that knows this processor not, a C library that lacks a function, or
-        # JAX_PLATFORMS without cpu.
+        # llvmlite is missing or does not know this processor, the C library lacks a function, or
+        # JAX_PLATFORMS leaves out the CPU.
         return False
     if host.machine not in ffi_wrapper.MACHINES:
         return False
@@ -76,18 +76,18 @@ def is_available() -> bool:
         steps=2,
         fallback=lambda x: [4.0 * x + 3.0],
     )
-    numbers = np.arange(4 * host.lanes + 2, dtype=np.float32).reshape(-1, 2)
-    # Whoever asks may be in the middle of tracing something else.
+    values = np.arange(4 * host.lanes + 2, dtype=np.float32).reshape(-1, 2)
+    # Run the probe at once, because the caller may be tracing another function.
     with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
-            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(numbers))
+            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(values))
         except jax.errors.JaxRuntimeError:
             return False
-        return bool((np.asarray(result) == 4 * numbers + 3).all())
+        return bool((np.asarray(result) == 4 * values + 3).all())
 
 
 def kernel_text(kernel: Kernel) -> str:
-    """Write a kernel in LLVM's representation, for this processor.
+    """Write a kernel as LLVM IR for this processor.
 
     Args:
       kernel: the kernel.
@@ -96,12 +96,12 @@ def kernel_text(kernel: Kernel) -> str:
       The text of a module.
 
     Raises:
-      UnsupportedError: the program has an operation that is not written in LLVM.
+      UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     host = _host()
     return ffi_wrapper.kernel_text(
         llvm_codegen.step_text(kernel.program, carried=kernel.carried, lanes=host.lanes),
-        [numbers.size for numbers in kernel.program.inputs],
+        [array.size for array in kernel.program.inputs],
         carried=kernel.carried,
         lanes=host.lanes,
         steps=kernel.steps,
@@ -119,9 +119,9 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 
 
 def _registered(text: str) -> str:
-    """Return the name by which XLA knows a kernel, and compile the kernel on first use."""
+    """Return the name under which XLA calls a kernel; compile and register it on first use."""
     name = f"jetbot_mjx_{hashlib.sha256(_key(text)).hexdigest()}"
-    # ProgramCache are traced in several threads.
+    # Programs are traced in several threads.
     with _lock:
         if name not in _loaded:
             _register(name, _machine_code(text))
@@ -139,10 +139,10 @@ def kernels_in(lowered: str) -> dict[str, bytes]:
     """Return the kernels that a program calls.
 
     Args:
-      lowered: the program's text.
+      lowered: the text of the lowered program.
 
     Returns:
-      Their machine code by the names that XLA knows them by.
+      Their machine code, by the names under which XLA calls them.
     """
     return {name: _loaded[name].code for name in sorted(set(_XLA_NAME.findall(lowered)))}
 
@@ -151,7 +151,7 @@ def register(kernels: Mapping[str, bytes]) -> None:
     """Register kernels with XLA, before XLA loads a program that calls them.
 
     Args:
-      kernels: of `kernels_in`, from this processor and these versions of all libraries.
+      kernels: a result of `kernels_in` on the same processor with the same library versions.
     """
     with _lock:
         for name, code in kernels.items():
@@ -167,7 +167,7 @@ def _key(text: str) -> bytes:
 
 def _machine_code(text: str) -> bytes:
     """Return a kernel's object file, from the folder of compiled programs if it is cached there."""
-    return kept_bytes("object", _key(text), lambda: _compile(text))
+    return cached_bytes("object", _key(text), lambda: _compile(text))
 
 
 def _compile(text: str) -> bytes:

@@ -1,10 +1,10 @@
-"""Write a scalar program in LLVM's intermediate representation, for CPUs and GPUs.
+"""Write a scalar program as LLVM IR, for CPUs and GPUs.
 
-On a CPU every number is a vector register wide: each lane does the whole program for one robot. On
-a GPU each thread does. A loop ends when it has ended for all lanes, or for the thread: a finished
-lane keeps its values, so that they do not depend on the other lanes. A side of a branch is skipped
-if no lane takes it. Lanes that have left an enclosing loop, or that took the other side of an
-enclosing branch, delay neither.
+On a CPU every scalar is a vector register, and each lane runs the whole program for one robot. On a
+GPU each thread runs it for one robot, with plain scalars. A loop ends when it has ended for all
+lanes; a lane that ends earlier keeps its values, so they do not depend on the other lanes. A side
+of a branch is skipped if no lane takes it. Lanes that have left an enclosing loop, or took the
+other side of an enclosing branch, do not count for either.
 
 Source: LLVM Language Reference Manual.
 """
@@ -19,50 +19,50 @@ from jetbot_mjx.compiler.scalar_ir import COMPARISONS, Expr, Scalar, Unsupported
 from jetbot_mjx.compiler.schedule import Block, PlacedBranch, PlacedLoop
 
 STEP = "step"
-"""The function's name."""
+"""Name of the function that runs one step."""
 
 _ELEMENTS = {"f": "float", "i": "i32", "b": "i1"}
-"""Of each kind of dtype: LLVM's type."""
+"""LLVM's type by the kind of a dtype."""
 
 _EXTREMES = {"max": "maximum", "min": "minimum"}
 _INTRINSICS = {"abs": "fabs", "floor": "floor", "sqrt": "sqrt"}
 
 
 def step_text(program: ScalarProgram, *, carried: int, lanes: int) -> str:
-    """Write a function that runs a program once and stores the results in the first arguments.
+    """Write an LLVM function that replaces its first arguments by the results of a program.
 
-    The function's parameter is the address of a tile: a row for each number of the arguments, of
-    as many float32 as there are lanes, aligned to the length of a row.
+    The function's parameter is the address of a tile. The tile has a row of `lanes` float32 values
+    for each scalar of the arguments and is aligned to the size of a row.
 
     Args:
-      program: a step; its results have the shapes of its first `carried` arguments.
-      carried: how many leaves of the arguments the results replace.
-      lanes: robots side by side.
+      program: the step; its results have the shapes of its first `carried` arguments.
+      carried: the number of argument leaves that the results replace.
+      lanes: the number of robots that the function steps side by side.
 
     Returns:
-      The function's text, and the declarations that it needs.
+      The text of the function and of the declarations that it needs.
 
     Raises:
-      UnsupportedError: the program has an operation that is not written here.
+      UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
-    writer = LlvmEmitter(program, lanes)
-    number = writer.type("f")
+    emitter = LlvmEmitter(program, lanes)
+    vector = emitter.type("f")
 
     def row(place: int) -> str:
-        address = writer.do(f"getelementptr {number}, ptr %tile, i64 {place}")
+        address = emitter.do(f"getelementptr {vector}, ptr %tile, i64 {place}")
         return f"ptr {address}, align {4 * lanes}"
 
     count = sum(array.size for array in program.inputs)
-    results = writer.step([writer.do(f"load {number}, {row(i)}") for i in range(count)])
-    kept = sum(array.size for array in program.outputs[:carried])
-    for i, result in enumerate(results[:kept]):
-        writer.add(f"store {number} {result}, {row(i)}")
+    results = emitter.step([emitter.do(f"load {vector}, {row(i)}") for i in range(count)])
+    carried_scalars = sum(array.size for array in program.outputs[:carried])
+    for i, result in enumerate(results[:carried_scalars]):
+        emitter.add(f"store {vector} {result}, {row(i)}")
     return "\n".join(
         [
-            *writer.declarations(),
+            *emitter.declarations(),
             f"define internal void @{STEP}(ptr noalias %tile) noinline {{",
             "entry:",
-            *writer.lines,
+            *emitter.lines,
             "ret void",
             "}\n",
         ]
@@ -70,24 +70,24 @@ def step_text(program: ScalarProgram, *, carried: int, lanes: int) -> str:
 
 
 def require(program: ScalarProgram) -> None:
-    """Check that a program can be written.
+    """Check that a program can be written as LLVM IR.
 
     Raises:
-      UnsupportedError: it has an operation that is not written here.
+      UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
     LlvmEmitter(program, lanes=1).step([""] * sum(array.size for array in program.inputs))
 
 
 class LlvmEmitter:
-    """An `LlvmEmitter` holds the lines of a function and the names of its values."""
+    """An `LlvmEmitter` collects the lines of an LLVM function and the names of its values."""
 
     def __init__(self, program: ScalarProgram, lanes: int, label: str = "entry") -> None:
         """Begin with no lines.
 
         Args:
-          program: what is done; its arguments are float32.
-          lanes: robots side by side; 1: numbers are no vectors.
-          label: of the block that the lines are in.
+          program: the program, whose arguments must be float32.
+          lanes: the number of robots side by side; with 1, values are scalars instead of vectors.
+          label: the label of the basic block that the first lines belong to.
 
         Raises:
           UnsupportedError: an argument is not float32.
@@ -100,17 +100,17 @@ class LlvmEmitter:
         self._lanes = lanes
         self._count = 0
         self._names: dict[int, str] = {}
-        # The lanes whose numbers matter here; none written: those of all.
+        # The value that is true in the lanes that execute the current block; empty: all lanes do.
         self._mask = ""
 
     def step(self, arguments: Sequence[str]) -> list[str]:
         """Write one run of the program.
 
         Args:
-          arguments: the names of its arguments' numbers.
+          arguments: the names of the scalars of the program's arguments.
 
         Returns:
-          The names of its results' numbers.
+          The names of the scalars of the program's results.
         """
         inputs = [x for array in self._program.inputs for x in array.ravel()]
         self._names = {x.index: name for x, name in zip(inputs, arguments, strict=True)}
@@ -118,7 +118,7 @@ class LlvmEmitter:
         return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
 
     def declarations(self) -> list[str]:
-        """Return the lines outside of any function that the program needs."""
+        """Return the declarations of the LLVM intrinsics that programs call."""
         number, whole, truth = self.type("f"), self.type("i"), self.type("b")
         lines = [f"declare {number} {self._function(x)}({number})" for x in _INTRINSICS.values()]
         lines.append(f"declare {whole} {self._function('fptosi.sat')}({number})")
@@ -131,12 +131,12 @@ class LlvmEmitter:
         return lines
 
     def type(self, kind: str) -> str:
-        """Return LLVM's type of a number by the kind of its dtype."""
+        """Return LLVM's type of a value by the kind of its dtype."""
         element = _ELEMENTS[kind]
         return element if self._lanes == 1 else f"<{self._lanes} x {element}>"
 
     def do(self, instruction: str) -> str:
-        """Add an instruction that has a result; return its name."""
+        """Add an instruction that has a result, and return the name of the result."""
         name = self._new()
         self.lines.append(f"{name} = {instruction}")
         return name
@@ -146,7 +146,7 @@ class LlvmEmitter:
         self.lines.append(line)
 
     def begin(self, label: str) -> None:
-        """Begin another basic block."""
+        """Begin a new basic block."""
         self.lines.append(f"{label}:")
         self.label = label
 
@@ -172,12 +172,12 @@ class LlvmEmitter:
         kind = x.dtype.kind
         return self._splat(kind, _float(x) if kind == "f" else str(int(x)))
 
-    def _any(self, which: str) -> str:
-        """Return a value that is true if a condition holds in any lane."""
+    def _any(self, condition: str) -> str:
+        """Return the name of an `i1` that is true if a condition holds in any lane."""
         if self._lanes == 1:
-            return which
+            return condition
         function = f"@llvm.vector.reduce.or.v{self._lanes}i1"
-        return self.do(f"call i1 {function}({self.type('b')} {which})")
+        return self.do(f"call i1 {function}({self.type('b')} {condition})")
 
     def _block(self, block: Block) -> None:
         for item in block.items:
@@ -189,77 +189,87 @@ class LlvmEmitter:
                 self._operation(item)
 
     def _masked_block(self, block: Block, mask: str) -> None:
-        """Open a block in which only some of the enclosing block's active lanes matter."""
-        around = self._mask
-        # The only lane is there, or the block is not.
+        """Write a block that only some of the active lanes execute."""
+        enclosing = self._mask
+        # With a single lane the block is executed by that lane or skipped: no mask is needed.
         self._mask = mask if self._lanes > 1 else ""
         self._block(block)
-        self._mask = around
+        self._mask = enclosing
 
     def _loop(self, item: PlacedLoop) -> None:
+        # Begin the block of the condition with one phi for each carry and one for the active lanes.
         loop, before = item.loop, self.label
         head, body, end = self._labels("head", "body", "end")
         carries = [loop.carries[place] for place in item.places]
-        first = [self._operand(loop.first[place]) for place in item.places]
+        initial = [self._operand(loop.initial[place]) for place in item.places]
         self.add(f"br label %{head}")
         self.begin(head)
-        # What a trip ends with is not written yet: these lines are filled in below.
+        # These lines stay empty until the values at the end of an iteration have names.
         start = len(self.lines)
         for carry in carries:
             self._names[carry.index] = self._new()
             self.add("")
-        going_before = self._new()
+        active_before = self._new()
         self.add("")
+        # Compute the condition, and then an iteration for the lanes in which it holds.
         self._block(item.head)
-        truth = self.type("b")
-        going = self.do(f"and {truth} {going_before}, {self._operand(loop.going)}")
-        self.add(f"br i1 {self._any(going)}, label %{body}, label %{end}")
+        mask_type = self.type("b")
+        active = self.do(f"and {mask_type} {active_before}, {self._operand(loop.condition)}")
+        self.add(f"br i1 {self._any(active)}, label %{body}, label %{end}")
         self.begin(body)
-        self._masked_block(item.body, going)
-        following = [self._operand(loop.following[place]) for place in item.places]
+        self._masked_block(item.body, active)
+        updated = [self._operand(loop.updated[place]) for place in item.places]
         if self._lanes > 1:
-            following = [
-                self.do(self._chosen(going, carry.dtype.kind, new, self._names[carry.index]))
-                for carry, new in zip(carries, following, strict=True)
+            updated = [
+                self.do(self._select_text(active, carry.dtype.kind, new, self._names[carry.index]))
+                for carry, new in zip(carries, updated, strict=True)
             ]
-        for i, (carry, a, b) in enumerate(zip(carries, first, following, strict=True), start):
+        # Fill in the phis, and take the results from the block of the condition.
+        for i, (carry, a, b) in enumerate(zip(carries, initial, updated, strict=True), start):
             kind = self.type(carry.dtype.kind)
             self.lines[i] = (
                 f"{self._names[carry.index]} = phi {kind} [{a}, %{before}], [{b}, %{self.label}]"
             )
         self.lines[start + len(carries)] = (
-            f"{going_before} = phi {truth} [{self._mask or self._splat('b', 'true')}, %{before}],"
-            f" [{going}, %{self.label}]"
+            f"{active_before} = phi {mask_type}"
+            f" [{self._mask or self._splat('b', 'true')}, %{before}],"
+            f" [{active}, %{self.label}]"
         )
         self.add(f"br label %{head}")
         self.begin(end)
         for result in item.results:
-            self._names[result.index] = self._operand(loop.outcomes[result.place])
+            self._names[result.index] = self._operand(loop.results[result.place])
 
     def _branch(self, item: PlacedBranch) -> None:
         branch = item.branch
-        which = self._operand(branch.which)
-        yes = self._side(item.yes, which, [branch.yes[x.place] for x in item.results])
-        other = self.do(f"xor {self.type('b')} {which}, {self._splat('b', 'true')}")
-        no = self._side(item.no, other, [branch.no[x.place] for x in item.results])
-        for result, a, b in zip(item.results, yes, no, strict=True):
-            self._names[result.index] = self.do(self._chosen(which, result.dtype.kind, a, b))
+        condition = self._operand(branch.condition)
+        if_true = self._side(
+            item.if_true, condition, [branch.if_true[x.place] for x in item.results]
+        )
+        inverse = self.do(f"xor {self.type('b')} {condition}, {self._splat('b', 'true')}")
+        if_false = self._side(
+            item.if_false, inverse, [branch.if_false[x.place] for x in item.results]
+        )
+        for result, a, b in zip(item.results, if_true, if_false, strict=True):
+            self._names[result.index] = self.do(
+                self._select_text(condition, result.dtype.kind, a, b)
+            )
 
-    def _side(self, block: Block, which: str, numbers: Sequence[Scalar]) -> list[str]:
-        """Write one side of a branch; its values are arbitrary if no lane takes that side."""
+    def _side(self, block: Block, condition: str, scalars: Sequence[Scalar]) -> list[str]:
+        """Write one side of a branch; its values are arbitrary where no lane takes that side."""
         if not block.items:
-            return [self._operand(x) for x in numbers]
+            return [self._operand(x) for x in scalars]
         if self._mask:
-            which = self.do(f"and {self.type('b')} {which}, {self._mask}")
+            condition = self.do(f"and {self.type('b')} {condition}, {self._mask}")
         before = self.label
         taken, end = self._labels("taken", "end")
-        self.add(f"br i1 {self._any(which)}, label %{taken}, label %{end}")
+        self.add(f"br i1 {self._any(condition)}, label %{taken}, label %{end}")
         self.begin(taken)
-        self._masked_block(block, which)
-        names, after = [self._operand(x) for x in numbers], self.label
+        self._masked_block(block, condition)
+        names, after = [self._operand(x) for x in scalars], self.label
         self.add(f"br label %{end}")
         self.begin(end)
-        kinds = [self.type(x.dtype.kind) for x in numbers]
+        kinds = [self.type(x.dtype.kind) for x in scalars]
         return [
             self.do(f"phi {kind} [{name}, %{after}], [zeroinitializer, %{before}]")
             for kind, name in zip(kinds, names, strict=True)
@@ -267,13 +277,13 @@ class LlvmEmitter:
 
     def _operation(self, value: Expr) -> None:
         kind = value.operands[0].dtype.kind if value.op != "select" else value.dtype.kind
-        write = _WRITERS.get((value.op, kind))
-        if write is None:
+        emit = _EMIT.get((value.op, kind))
+        if emit is None:
             raise UnsupportedError(f"{value.op} of {value.operands[0].dtype}")
         operands = [self._operand(x) for x in value.operands]
-        self._names[value.index] = self.do(write(self, value, operands))
+        self._names[value.index] = self.do(emit(self, value, operands))
 
-    # Of an operation, the last instruction; what comes before it is already among the lines.
+    # Each method below returns the last instruction of an operation, and adds those before it.
 
     def _call(self, value: Expr, operands: list[str]) -> str:
         (x,) = operands
@@ -286,17 +296,17 @@ class LlvmEmitter:
         if self._lanes == 1:
             function = self._function(_EXTREMES[value.op])
             return f"call {number} {function}({number} {operands[0]}, {number} {operands[1]})"
-        # One instruction on x86, which takes the second where one is not a number.
+        # This is one instruction on x86, which returns the second operand if either is NaN.
         ordered = sorted(
             zip(value.operands, operands, strict=True), key=lambda x: not is_constant(x[0])
         )
         (first, a), (_, b) = ordered
         better = "ogt" if value.op == "max" else "olt"
-        best = self._chosen(self.do(f"fcmp {better} {number} {a}, {b}"), "f", a, b)
+        best = self._select_text(self.do(f"fcmp {better} {number} {a}, {b}"), "f", a, b)
         if is_constant(first):
             return best
         best = self.do(best)
-        return self._chosen(self.do(f"fcmp uno {number} {a}, {a}"), "f", a, best)
+        return self._select_text(self.do(f"fcmp uno {number} {a}, {a}"), "f", a, best)
 
     def _finite(self, value: Expr, operands: list[str]) -> str:
         number = self.type("f")
@@ -307,7 +317,7 @@ class LlvmEmitter:
         whole, (x,) = self.type("i"), operands
         zero = self._splat("i", "0")
         below = self.do(f"icmp slt {whole} {x}, {zero}")
-        return self._chosen(below, "i", self.do(f"sub {whole} {zero}, {x}"), x)
+        return self._select_text(below, "i", self.do(f"sub {whole} {zero}, {x}"), x)
 
     def _negative(self, value: Expr, operands: list[str]) -> str:
         return f"sub {self.type('i')} {self._splat('i', '0')}, {operands[0]}"
@@ -318,14 +328,15 @@ class LlvmEmitter:
     def _larger(self, value: Expr, operands: list[str]) -> str:
         a, b = operands
         better = "sgt" if value.op == "max" else "slt"
-        return self._chosen(self.do(f"icmp {better} {self.type('i')} {a}, {b}"), "i", a, b)
+        return self._select_text(self.do(f"icmp {better} {self.type('i')} {a}, {b}"), "i", a, b)
 
-    def _chosen(self, which: str, kind: str, yes: str, no: str) -> str:
-        return f"select {self.type('b')} {which}, {self.type(kind)} {yes}, {self.type(kind)} {no}"
+    def _select_text(self, condition: str, kind: str, if_true: str, if_false: str) -> str:
+        cases = f"{self.type(kind)} {if_true}, {self.type(kind)} {if_false}"
+        return f"select {self.type('b')} {condition}, {cases}"
 
     def _select(self, value: Expr, operands: list[str]) -> str:
-        which, no, yes = operands
-        return self._chosen(which, value.dtype.kind, yes, no)
+        condition, if_false, if_true = operands
+        return self._select_text(condition, value.dtype.kind, if_true, if_false)
 
     def _convert(self, value: Expr, operands: list[str]) -> str:
         source, to = value.operands[0].dtype.kind, value.dtype.kind
@@ -339,20 +350,20 @@ class LlvmEmitter:
         kind = value.operands[0].dtype.kind
         pair = f"{self.type(kind)} {', '.join(operands)}"
         if kind == "f":
-            # What is not a number differs from all.
+            # NaN differs from every number, so `ne` is the only unordered comparison.
             return f"fcmp {'une' if value.op == 'ne' else f'o{value.op}'} {pair}"
         sign = "" if value.op in ("eq", "ne") else "s"
         return f"icmp {sign}{value.op} {pair}"
 
 
-_Writer = Callable[[LlvmEmitter, Expr, list[str]], str]
+_Emit = Callable[[LlvmEmitter, Expr, list[str]], str]
 
 
-def _plain(instruction: str, kind: str) -> _Writer:
-    def write(text: LlvmEmitter, value: Expr, operands: list[str]) -> str:
+def _instruction(instruction: str, kind: str) -> _Emit:
+    def emit(text: LlvmEmitter, value: Expr, operands: list[str]) -> str:
         return f"{instruction} {text.type(kind)} {', '.join(operands)}"
 
-    return write
+    return emit
 
 
 def _float(x: float) -> str:
@@ -360,13 +371,13 @@ def _float(x: float) -> str:
     return f"0x{struct.pack('>d', float(x)).hex().upper()}"
 
 
-# A product and a sum may be rounded once instead of twice.
+# Allow fused multiply-add, which rounds once instead of twice.
 _FUSED = "contract"
 
-_WRITERS: dict[tuple[str, str], _Writer] = {
-    **{(op, "f"): _plain(f"f{op} {_FUSED}", "f") for op in ("add", "div", "mul", "sub")},
-    **{(op, "i"): _plain(op, "i") for op in ("add", "mul", "sub")},
-    **{(op, "b"): _plain(op, "b") for op in ("and", "or", "xor")},
+_EMIT: dict[tuple[str, str], _Emit] = {
+    **{(op, "f"): _instruction(f"f{op} {_FUSED}", "f") for op in ("add", "div", "mul", "sub")},
+    **{(op, "i"): _instruction(op, "i") for op in ("add", "mul", "sub")},
+    **{(op, "b"): _instruction(op, "b") for op in ("and", "or", "xor")},
     **{(op, kind): LlvmEmitter._comparison for op in COMPARISONS for kind in "fi"},
     **{(op, "b"): LlvmEmitter._comparison for op in ("eq", "ne")},
     **{(op, "f"): LlvmEmitter._call for op in _INTRINSICS},
@@ -376,8 +387,8 @@ _WRITERS: dict[tuple[str, str], _Writer] = {
     **{("convert", kind): LlvmEmitter._convert for kind in "fib"},
     ("abs", "i"): LlvmEmitter._magnitude,
     ("is_finite", "f"): LlvmEmitter._finite,
-    ("neg", "f"): _plain("fneg", "f"),
+    ("neg", "f"): _instruction("fneg", "f"),
     ("neg", "i"): LlvmEmitter._negative,
     ("not", "b"): LlvmEmitter._negation,
 }
-"""By operation and kind of the operands' dtype."""
+"""Functions that return an operation's last instruction, by operation and kind of the operands."""

@@ -1,18 +1,30 @@
-"""Lower a JAX function of one robot to arithmetic on scalars.
+"""Lower a JAX function of one robot to a program of operations on scalars.
 
-JAX describes a function by operations on arrays; here every array is split into its scalars.
-Slices, gathers, transposes and the like then cost nothing, and everything that depends only on the
-model's constants is evaluated. The rest can run for thousands of robots in parallel, each in one
-thread of a GPU, and no intermediate value goes through memory.
+Motivation: XLA compiles a robot's step to hundreds of kernels, and every array between two kernels
+goes through memory. A robot's arrays are small and mostly constant, so the same step can be one
+straight program on scalars that runs for thousands of robots in parallel, one per thread of a GPU
+or per lane of a CPU, with all intermediate values in registers.
 
-Small loops of known length are written out, and small branches become selections. The others stay
-loops and branches. What a loop carries is first taken to be as constant as it begins, and only what
-proves otherwise is carried. And what is the same function of other carried numbers before the loop
-and after every trip is computed when a trip begins: of a solver that tests for convergence at the
-end of an iteration and prepares the next one there, the last preparation is then not made.
+Protocol, in the order in which a function passes through the package:
 
-The arithmetic is the function's own: results differ from JAX's by round-off alone, as
-long as all numbers are finite.
+1. `jax.make_jaxpr` traces the function to a jaxpr, a list of equations on arrays.
+2. `_JaxprLowering` splits every array into its scalars and records each equation's arithmetic in an
+   `ExprGraph` (`scalar_ir`). Slices, gathers and transposes only rearrange scalars and record
+   nothing (`indexing`). Everything that depends on constants alone is evaluated.
+3. Short loops of known length are unrolled, and short branches become selections. All others stay
+   loops and branches:
+
+   - A value that a loop carries is first assumed to be constant. Values that prove to change are
+     carried in the next round, until a round finds no more of them.
+   - A carried value that is the same function of other carried values before the loop and after
+     each iteration is not carried, but computed at the start of the iteration (`_Derivation`). In a
+     solver that prepares the next iteration at the end of each one, this saves the last one.
+
+4. `schedule` places the operations in blocks, and `llvm_codegen` writes the blocks as LLVM IR.
+
+Arguments for this protocol: the operations and their order are those of the function, so results
+differ from JAX's by round-off only, as long as all numbers are finite. The lowering knows nothing
+of robots, and `ScalarProgram.evaluate` runs any program in NumPy as a reference for the back ends.
 """
 
 import contextlib
@@ -26,11 +38,11 @@ from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
 
 from jetbot_mjx.compiler.indexing import (
     RULES,
-    Numbers,
-    filled,
-    known_array,
-    known_values,
-    numbers_of,
+    ScalarArray,
+    constant_array,
+    constant_values,
+    full_array,
+    scalar_array,
     shape_of,
     windows,
 )
@@ -41,35 +53,35 @@ from jetbot_mjx.compiler.scalar_ir import (
     Loop,
     Scalar,
     UnsupportedError,
-    converted,
+    convert_constant,
     is_constant,
     is_same,
 )
 from jetbot_mjx.compiler.schedule import Block, PlacedBranch, PlacedLoop, schedule
 
-MOST_TRIPS = 64
-"""Of a loop that is written out."""
+MAX_UNROLLED_TRIPS = 64
+"""Largest number of iterations of a loop that is unrolled."""
 
-MOST_WRITTEN_OUT = 512
-"""Operations of a loop that is written out although it could stay one."""
+MAX_UNROLLED_OPERATIONS = 512
+"""Largest number of operations of a loop that is unrolled although it could stay a loop."""
 
-MOST_IN_PROGRAM = 100_000
-"""Operations of a program: a CPU's compiler takes 15 s for so many, and for more soon minutes."""
+MAX_PROGRAM_OPERATIONS = 100_000
+"""Largest number of operations of a program; LLVM takes 15 s to compile that many for a CPU."""
 
-LEAST_IN_BRANCH = 24
-"""Operations for which a branch is better than computing both sides."""
+MIN_BRANCH_OPERATIONS = 24
+"""Smallest number of operations for which a branch is faster than computing both sides."""
 
 
 @dataclasses.dataclass(frozen=True)
 class ScalarProgram:
     """A `ScalarProgram` holds a function's operations on scalars."""
 
-    inputs: list[Numbers]
-    """The numbers of each leaf of the arguments, in their shapes."""
-    outputs: list[Numbers]
-    """The numbers of each leaf of the result."""
+    inputs: list[ScalarArray]
+    """The scalars of each leaf of the arguments, in the leaf's shape."""
+    outputs: list[ScalarArray]
+    """The scalars of each leaf of the result, in the leaf's shape."""
     block: Block
-    """All that is computed."""
+    """All operations, in an order in which they can be executed."""
 
     @property
     def size(self) -> int:
@@ -87,28 +99,28 @@ class ScalarProgram:
         """
         batch = leaves[0].shape[: leaves[0].ndim - self.inputs[0].ndim]
         run = _Evaluation(batch)
-        for numbers, leaf in zip(self.inputs, leaves, strict=True):
-            columns = leaf.reshape(*batch, numbers.size)
-            run.known |= {x.index: columns[..., i] for i, x in enumerate(numbers.ravel())}
+        for array, leaf in zip(self.inputs, leaves, strict=True):
+            columns = leaf.reshape(*batch, array.size)
+            run.values |= {x.index: columns[..., i] for i, x in enumerate(array.ravel())}
         with np.errstate(all="ignore"):
             run.block(self.block)
         return [
-            np.stack([run.look_up(x) for x in numbers.ravel()], -1).reshape(*batch, *numbers.shape)
-            for numbers in self.outputs
+            np.stack([run.look_up(x) for x in array.ravel()], -1).reshape(*batch, *array.shape)
+            for array in self.outputs
         ]
 
 
 class _Evaluation:
-    """The values of a program that runs in NumPy, for all robots."""
+    """An `_Evaluation` holds the values of a program that runs in NumPy for a batch of robots."""
 
     def __init__(self, batch: tuple[int, ...]) -> None:
         self._batch = batch
-        # Of which robots the numbers matter here.
+        # The robots that execute the current block; the values of the others are arbitrary.
         self._mask = np.ones(batch, bool)
-        self.known: dict[int, np.ndarray] = {}
+        self.values: dict[int, np.ndarray] = {}
 
     def look_up(self, x: Scalar) -> np.ndarray:
-        return np.broadcast_to(x, self._batch) if is_constant(x) else self.known[x.index]
+        return np.broadcast_to(x, self._batch) if is_constant(x) else self.values[x.index]
 
     def block(self, block: Block) -> None:
         for item in block.items:
@@ -117,141 +129,154 @@ class _Evaluation:
             elif isinstance(item, PlacedBranch):
                 self._branch(item)
             else:
-                self.known[item.index] = self._operation(item)
+                self.values[item.index] = self._operation(item)
 
     def _masked_block(self, block: Block, mask: np.ndarray) -> None:
-        around, self._mask = self._mask, mask
+        enclosing, self._mask = self._mask, mask
         self.block(block)
-        self._mask = around
+        self._mask = enclosing
 
     def _operation(self, value: Expr) -> np.ndarray:
         operands = [self.look_up(x) for x in value.operands]
         if value.op == "select":
             return np.where(operands[0], operands[2], operands[1])
         if value.op == "convert":
-            return converted(operands[0], value.dtype)
+            return convert_constant(operands[0], value.dtype)
         return EVALUATE[value.op](*operands)
 
     def _loop(self, item: PlacedLoop) -> None:
         loop = item.loop
-        state = [self.look_up(loop.first[place]) for place in item.places]
-        going = self._mask
+        state = [self.look_up(loop.initial[place]) for place in item.places]
+        active = self._mask
         while True:
-            for place, numbers in zip(item.places, state, strict=True):
-                self.known[loop.carries[place].index] = numbers
+            for place, value in zip(item.places, state, strict=True):
+                self.values[loop.carries[place].index] = value
             self.block(item.head)
-            going = going & self.look_up(loop.going)
-            if not going.any():
+            active = active & self.look_up(loop.condition)
+            if not active.any():
                 break
-            self._masked_block(item.body, going)
-            following = [self.look_up(loop.following[place]) for place in item.places]
-            state = [np.where(going, b, a) for a, b in zip(state, following, strict=True)]
+            self._masked_block(item.body, active)
+            updated = [self.look_up(loop.updated[place]) for place in item.places]
+            state = [np.where(active, b, a) for a, b in zip(state, updated, strict=True)]
         for result in item.results:
-            self.known[result.index] = self.look_up(loop.outcomes[result.place])
+            self.values[result.index] = self.look_up(loop.results[result.place])
 
     def _branch(self, item: PlacedBranch) -> None:
         branch = item.branch
-        which = self.look_up(branch.which)
-        self._masked_block(item.no, ~which & self._mask)
-        self._masked_block(item.yes, which & self._mask)
+        condition = self.look_up(branch.condition)
+        self._masked_block(item.if_false, ~condition & self._mask)
+        self._masked_block(item.if_true, condition & self._mask)
         for result in item.results:
-            sides = [self.look_up(side[result.place]) for side in (branch.yes, branch.no)]
-            self.known[result.index] = np.where(which, *sides)
+            sides = [self.look_up(side[result.place]) for side in (branch.if_true, branch.if_false)]
+            self.values[result.index] = np.where(condition, *sides)
 
 
 def scalarize(function: Callable[..., Any], *arguments: Any) -> ScalarProgram:
-    """Lower a function to arithmetic on scalars.
+    """Lower a function to a program on scalars; the module states the protocol.
 
     Args:
-      function: a jittable function; its shapes and indices must not depend on its arguments.
-      *arguments: pytrees of arrays, or of objects with their shape and dtype.
+      function: a jittable function, whose indices must not depend on its arguments.
+      *arguments: pytrees of arrays, or of objects with a shape and a dtype.
 
     Returns:
       The program.
 
     Raises:
-      UnsupportedError: the function has an operation that cannot be lowered.
+      UnsupportedError: the function has an operation that cannot be lowered, or too many of them.
     """
     closed = jax.make_jaxpr(function)(*arguments)
     graph = ExprGraph()
     inputs = [
-        filled(leaf.shape, lambda dtype=leaf.dtype: graph.input(dtype))
+        full_array(leaf.shape, lambda dtype=leaf.dtype: graph.input(dtype))
         for leaf in jax.tree.leaves(arguments)
     ]
-    outputs = _JaxprLowering(graph).closed(closed, inputs)
+    outputs = _JaxprLowering(graph).lower(closed, inputs)
     block = schedule(x for array in outputs for x in array.ravel())
     program = ScalarProgram(inputs, outputs, block)
-    if program.size > MOST_IN_PROGRAM:
-        raise UnsupportedError(f"{program.size:,} operations, more than {MOST_IN_PROGRAM:,}")
+    if program.size > MAX_PROGRAM_OPERATIONS:
+        raise UnsupportedError(f"{program.size:,} operations, more than {MAX_PROGRAM_OPERATIONS:,}")
     return program
 
 
 class _JaxprLowering:
-    """A `_JaxprLowering` walks a function's jaxpr and records its operations on scalars."""
+    """A `_JaxprLowering` records the operations of a jaxpr on scalars.
+
+    The lowering rule of the JAX primitive `name` is `RULES[name]` or the method `_name`: a function
+    of the equation, its parameters and its operands that returns the results.
+    """
 
     def __init__(self, graph: ExprGraph) -> None:
         self._graph = graph
 
-    def closed(self, closed: ClosedJaxpr, arguments: Sequence[Numbers]) -> list[Numbers]:
-        constants = [known_array(constant) for constant in closed.consts]
-        return self._write(closed.jaxpr, constants, arguments)
+    def lower(self, closed: ClosedJaxpr, arguments: Sequence[ScalarArray]) -> list[ScalarArray]:
+        constants = [constant_array(constant) for constant in closed.consts]
+        return self._lower_jaxpr(closed.jaxpr, constants, arguments)
 
-    def _write(
-        self, jaxpr: Jaxpr, constants: Sequence[Numbers], arguments: Sequence[Numbers]
-    ) -> list[Numbers]:
-        known: dict[Any, Numbers] = dict(zip(jaxpr.constvars, constants, strict=True))
-        known |= dict(zip(jaxpr.invars, arguments, strict=True))
+    def _lower_jaxpr(
+        self, jaxpr: Jaxpr, constants: Sequence[ScalarArray], arguments: Sequence[ScalarArray]
+    ) -> list[ScalarArray]:
+        env: dict[Any, ScalarArray] = dict(zip(jaxpr.constvars, constants, strict=True))
+        env |= dict(zip(jaxpr.invars, arguments, strict=True))
 
-        def read(atom: Any) -> Numbers:
+        def read(atom: Any) -> ScalarArray:
             if isinstance(atom, Literal):
                 aval: Any = atom.aval
-                return known_array(np.asarray(atom.val, aval.dtype))
-            return known[atom]
+                return constant_array(np.asarray(atom.val, aval.dtype))
+            return env[atom]
 
         for equation in jaxpr.eqns:
-            results = self._operation(equation, [read(atom) for atom in equation.invars])
-            known |= dict(zip(equation.outvars, results, strict=True))
+            results = self._lower_eqn(equation, [read(atom) for atom in equation.invars])
+            env |= dict(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in jaxpr.outvars]
 
-    def _operation(self, equation: Any, operands: list[Numbers]) -> list[Numbers]:
+    def _lower_eqn(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
         name = equation.primitive.name
         if name in EVALUATE:
-            return [self._each(name, *operands)]
+            return [self._elementwise(name, *operands)]
         rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
         if rule is None:
             raise UnsupportedError(f"the operation {name}")
         result = rule(equation, equation.params, *operands)
         return result if isinstance(result, list) else [result]
 
-    def _each(self, op: str, *operands: Numbers) -> Numbers:
+    def _elementwise(self, op: str, *operands: ScalarArray) -> ScalarArray:
         arrays = np.broadcast_arrays(*operands)
         rows = zip(*(array.ravel() for array in arrays), strict=True)
-        return numbers_of((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
+        return scalar_array((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
 
-    def _choose(self, which: Scalar, no: Numbers, yes: Numbers) -> Numbers:
+    def _where(self, condition: Scalar, if_false: ScalarArray, if_true: ScalarArray) -> ScalarArray:
         """Select one of two arrays by one condition for all elements."""
-        pairs = zip(no.ravel(), yes.ravel(), strict=True)
-        return numbers_of((self._graph.select(which, a, b) for a, b in pairs), no.shape)
+        pairs = zip(if_false.ravel(), if_true.ravel(), strict=True)
+        return scalar_array((self._graph.select(condition, a, b) for a, b in pairs), if_false.shape)
 
-    def _choose_rows(self, which: Numbers, no: Numbers, yes: Numbers) -> Numbers:
+    def _where_rows(
+        self, condition: ScalarArray, if_false: ScalarArray, if_true: ScalarArray
+    ) -> ScalarArray:
         """Select between two arrays by one condition for each index of the leading axes."""
-        which = which.reshape(*which.shape, *[1] * (no.ndim - which.ndim))
-        rows = zip(np.broadcast_to(which, no.shape).ravel(), no.ravel(), yes.ravel(), strict=True)
-        return numbers_of((self._graph.select(*row) for row in rows), no.shape)
+        condition = condition.reshape(*condition.shape, *[1] * (if_false.ndim - condition.ndim))
+        rows = zip(
+            np.broadcast_to(condition, if_false.shape).ravel(),
+            if_false.ravel(),
+            if_true.ravel(),
+            strict=True,
+        )
+        return scalar_array((self._graph.select(*row) for row in rows), if_false.shape)
 
-    # Functions within functions.
+    # Rules of primitives that call functions: jit, scan, while, cond.
 
-    def _jit(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
-        return self.closed(params["jaxpr"], operands)
+    def _jit(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        return self.lower(params["jaxpr"], operands)
 
     _pjit = _jit
 
-    def _custom_jvp_call(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
-        return self.closed(params["call_jaxpr"], operands)
+    def _custom_jvp_call(
+        self, equation: Any, params: Any, *operands: ScalarArray
+    ) -> list[ScalarArray]:
+        return self.lower(params["call_jaxpr"], operands)
 
-    def _scan(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
+    def _scan(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
         body, length = params["jaxpr"], params["length"]
-        # Only what is scanned over has one axis less inside.
+        # Split the operands into constants, carry and sequences, which have one axis less inside.
         scanned, stacked = (
             sum(len(shape_of(a)) != len(shape_of(b)) for a, b in zip(outer, inner, strict=True))
             for outer, inner in (
@@ -263,171 +288,190 @@ class _JaxprLowering:
         last = len(operands) - scanned
         constants, carry = operands[: last - carried], list(operands[last - carried : last])
         sequences = operands[last:]
+        # Record a scan without sequences as a loop, and unroll all others.
         if not scanned and not stacked:
             rolled = self._counted_loop(body, length, constants, carry)
             if rolled is not None:
                 return rolled
         order = range(length)
-        rows: dict[int, list[Numbers]] = {}
+        rows: dict[int, list[ScalarArray]] = {}
         for i in reversed(order) if params["reverse"] else order:
             slices = [_at(sequence, i) for sequence in sequences]
-            results = self.closed(body, [*constants, *carry, *slices])
+            results = self.lower(body, [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
         shapes = [shape_of(variable) for variable in equation.outvars[carried:]]
         columns = [
-            numbers_of((x for i in order for x in rows[i][k].ravel()), shape)
+            scalar_array((x for i in order for x in rows[i][k].ravel()), shape)
             for k, shape in enumerate(shapes)
         ]
         return [*carry, *columns]
 
     def _counted_loop(
-        self, body: ClosedJaxpr, length: int, constants: Sequence[Numbers], carry: list[Numbers]
-    ) -> list[Numbers] | None:
-        """Lower a scan without inputs; return None if it must be unrolled, however long it is."""
+        self,
+        body: ClosedJaxpr,
+        length: int,
+        constants: Sequence[ScalarArray],
+        carry: list[ScalarArray],
+    ) -> list[ScalarArray] | None:
+        """Lower a scan without sequences; return None if it can only be unrolled."""
 
-        def going(state: list[Numbers]) -> Scalar:
+        def condition(state: list[ScalarArray]) -> Scalar:
             return self._graph.apply("lt", state[0].item(), np.int32(length))
 
-        def trip(state: list[Numbers]) -> list[Numbers]:
-            counter = self._each("add", state[0], known_array(np.int32(1)))
-            return [counter, *self.closed(body, [*constants, *state[1:]])]
+        def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
+            counter = self._elementwise("add", state[0], constant_array(np.int32(1)))
+            return [counter, *self.lower(body, [*constants, *state[1:]])]
 
-        state = [known_array(np.int32(0)), *carry]
+        state = [constant_array(np.int32(0)), *carry]
         with contextlib.suppress(UnsupportedError):
-            return self._short_or_loop(state, going, trip)[1:]
-        # An index that counts the trips, say: written out it is known.
+            return self._unroll_or_loop(state, condition, next_state)[1:]
+        # For example, an index depends on the loop counter, which is constant once unrolled.
         return None
 
-    def _while(self, equation: Any, params: Any, *operands: Numbers) -> list[Numbers]:
+    def _while(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
         first = params["cond_nconsts"]
         second = first + params["body_nconsts"]
-        in_condition, in_body = operands[:first], operands[first:second]
+        cond_consts, body_consts = operands[:first], operands[first:second]
 
-        def rows_going(state: list[Numbers]) -> Numbers:
-            return self.closed(params["cond_jaxpr"], [*in_condition, *state])[0]
+        def row_conditions(state: list[ScalarArray]) -> ScalarArray:
+            return self.lower(params["cond_jaxpr"], [*cond_consts, *state])[0]
 
-        def going(state: list[Numbers]) -> Scalar:
-            # Several loops that `jax.vmap` made one go on as long as any of them does.
-            rows = rows_going(state)
+        def condition(state: list[ScalarArray]) -> Scalar:
+            # A loop under `jax.vmap` has a condition for each row, and runs while any is true.
+            rows = row_conditions(state)
             return self._reduce("or", np.bool_(False), {"axes": range(rows.ndim)}, rows).item()
 
-        def trip(state: list[Numbers]) -> list[Numbers]:
-            rows = rows_going(state)
-            following = self.closed(params["body_jaxpr"], [*in_body, *state])
-            pairs = zip(state, following, strict=True)
-            return [self._choose_rows(rows, *pair) for pair in pairs] if rows.ndim else following
+        def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
+            rows = row_conditions(state)
+            updated = self.lower(params["body_jaxpr"], [*body_consts, *state])
+            pairs = zip(state, updated, strict=True)
+            return [self._where_rows(rows, *pair) for pair in pairs] if rows.ndim else updated
 
         state = list(operands[second:])
         with contextlib.suppress(UnsupportedError):
-            return self._short_or_loop(state, going, trip)
-        # An index that counts the trips, say: written out it is known.
-        return self._written_out(state, going, trip)
+            return self._unroll_or_loop(state, condition, next_state)
+        # For example, an index depends on the loop counter, which is constant once unrolled.
+        return self._unroll(state, condition, next_state)
 
-    def _short_or_loop(
-        self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
-    ) -> list[Numbers]:
-        """Unroll a loop if it is small and its length is known, and else keep it as a loop."""
-        with contextlib.suppress(UnsupportedError):
-            return self._written_out(state, going, trip, is_short=True)
-        return self._loop(state, going, trip)
-
-    def _written_out(
+    def _unroll_or_loop(
         self,
-        state: list[Numbers],
-        going: Callable[..., Scalar],
-        trip: Callable[..., list[Numbers]],
-        is_short: bool = False,
-    ) -> list[Numbers]:
-        """Unroll a loop into all iterations that it may make.
+        state: list[ScalarArray],
+        condition: Callable[..., Scalar],
+        next_state: Callable[..., list[ScalarArray]],
+    ) -> list[ScalarArray]:
+        """Unroll a loop if it is short and its length is known; otherwise record it as a loop."""
+        with contextlib.suppress(UnsupportedError):
+            return self._unroll(state, condition, next_state, only_short=True)
+        return self._record_loop(state, condition, next_state)
+
+    def _unroll(
+        self,
+        state: list[ScalarArray],
+        condition: Callable[..., Scalar],
+        next_state: Callable[..., list[ScalarArray]],
+        only_short: bool = False,
+    ) -> list[ScalarArray]:
+        """Unroll a loop into all iterations that it can make.
 
         Args:
-          state: the carry of the first iteration.
-          going: a function of a state that returns whether there is another iteration.
-          trip: a function of a state that returns the next state.
-          is_short: refuses one that makes more operations than can be written out, or of which is
-            not known how often it runs.
+          state: the carried values count_before the first iteration.
+          condition: a function of a state that returns whether there is another iteration.
+          next_state: a function of a state that returns the next state.
+          only_short: whether to reject a loop that has more than `MAX_UNROLLED_OPERATIONS` or whose
+            number of iterations is not a constant.
 
         Returns:
-          The state at the end.
+          The state after the last iteration.
+
+        Raises:
+          UnsupportedError: the loop is rejected, or may make more than `MAX_UNROLLED_TRIPS`.
         """
-        before = self._graph.count
+        count_before = self._graph.count
         result = state
-        still: Scalar = np.bool_(True)
-        # The loop goes on past its end, on numbers that are then not taken: so a counter among
-        # them stays known, and with it how often the loop is written out.
-        for _ in range(MOST_TRIPS + 1):
-            still = self._graph.apply("and", still, going(state))
-            if is_constant(still) and not still:
+        active: Scalar = np.bool_(True)
+        # `state` advances even after the loop may have ended, while `result` keeps the value at the
+        # end. So a counter in `state` stays constant, and with it the number of iterations.
+        for _ in range(MAX_UNROLLED_TRIPS + 1):
+            active = self._graph.apply("and", active, condition(state))
+            if is_constant(active) and not active:
                 return result
-            if is_short and (
-                not is_constant(still) or self._graph.count - before > MOST_WRITTEN_OUT
+            if only_short and (
+                not is_constant(active)
+                or self._graph.count - count_before > MAX_UNROLLED_OPERATIONS
             ):
                 raise UnsupportedError("a loop that is not short")
-            state = trip(state)
-            result = [self._choose(still, *pair) for pair in zip(result, state, strict=True)]
-        raise UnsupportedError(f"a loop that may run more than {MOST_TRIPS} times")
+            state = next_state(state)
+            result = [self._where(active, *pair) for pair in zip(result, state, strict=True)]
+        raise UnsupportedError(f"a loop that may run more than {MAX_UNROLLED_TRIPS} times")
 
-    def _loop(
-        self, state: list[Numbers], going: Callable[..., Scalar], trip: Callable[..., list[Numbers]]
-    ) -> list[Numbers]:
+    def _record_loop(
+        self,
+        state: list[ScalarArray],
+        condition: Callable[..., Scalar],
+        next_state: Callable[..., list[ScalarArray]],
+    ) -> list[ScalarArray]:
         """Record a loop that is not unrolled.
 
         Args:
-          state: the carry of the first iteration.
-          going: a function of a state that returns whether there is another iteration.
-          trip: a function of a state that returns the next state.
+          state: the carried values before the first iteration.
+          condition: a function of a state that returns whether there is another iteration.
+          next_state: a function of a state that returns the next state.
 
         Returns:
-          The state at the end.
+          The state after the last iteration.
         """
-        first = _flat(state)
-        loop = self._graph.begin_loop(first)
+        initial = _flatten(state)
+        loop = self._graph.begin_loop(initial)
         carried: set[int] = set()
-        # Each round finds more that changes from trip to trip, until nothing else does.
+        # Find the values that change between iterations, until a round finds no more of them.
         while True:
-            begins = [loop.carries[k] if k in carried else x for k, x in enumerate(first)]
-            loop.following = _flat(trip(_like(state, begins)))
+            start = [loop.carries[k] if k in carried else x for k, x in enumerate(initial)]
+            loop.updated = _flatten(next_state(_unflatten(state, start)))
             changed = [
                 k
-                for k, x in enumerate(first)
-                if k not in carried and not is_same(x, loop.following[k])
+                for k, x in enumerate(initial)
+                if k not in carried and not is_same(x, loop.updated[k])
             ]
             if not changed:
                 break
             carried.update(changed)
+        # Compute derived values from the other carried values at the start of an iteration.
         derived = _Derivation(self._graph, loop, carried).derived()
         if derived:
-            begins = [derived.get(k, x) for k, x in enumerate(begins)]
-            loop.following = _flat(trip(_like(state, begins)))
-        loop.going = going(_like(state, begins))
-        loop.outcomes = begins
+            start = [derived.get(k, x) for k, x in enumerate(start)]
+            loop.updated = _flatten(next_state(_unflatten(state, start)))
+        # Finish the loop; values that it does not carry keep their initial value.
+        loop.condition = condition(_unflatten(state, start))
+        loop.results = start
         results = self._graph.end_loop(loop)
-        ends = [results[k] if k in carried else x for k, x in enumerate(first)]
-        return _like(state, ends)
+        end = [results[k] if k in carried else x for k, x in enumerate(initial)]
+        return _unflatten(state, end)
 
     def _cond(
-        self, equation: Any, params: Any, index: Numbers, *operands: Numbers
-    ) -> list[Numbers]:
-        branches, which = params["branches"], index.item()
-        if is_constant(which):
-            return self.closed(branches[min(max(int(which), 0), len(branches) - 1)], operands)
-        before = self._graph.count
-        sides = [self.closed(branch, operands) for branch in branches]
-        is_branch = self._graph.count - before >= LEAST_IN_BRANCH
+        self, equation: Any, params: Any, index: ScalarArray, *operands: ScalarArray
+    ) -> list[ScalarArray]:
+        branches, selected = params["branches"], index.item()
+        if is_constant(selected):
+            return self.lower(branches[min(max(int(selected), 0), len(branches) - 1)], operands)
+        count_before = self._graph.count
+        sides = [self.lower(branch, operands) for branch in branches]
+        is_branch = self._graph.count - count_before >= MIN_BRANCH_OPERATIONS
         result = sides[-1]
         for i in reversed(range(len(sides) - 1)):
-            later = self._graph.apply("gt", which, which.dtype.type(i))
+            later = self._graph.apply("gt", selected, selected.dtype.type(i))
             if is_branch:
-                flat = self._graph.branch(later, _flat(sides[i]), _flat(result))
-                result = _like(result, flat)
+                flat = self._graph.branch(later, _flatten(sides[i]), _flatten(result))
+                result = _unflatten(result, flat)
             else:
                 pairs = zip(sides[i], result, strict=True)
-                result = [self._choose(later, *pair) for pair in pairs]
+                result = [self._where(later, *pair) for pair in pairs]
         return result
 
-    # What depends on how numbers are moved.
+    # Rules of primitives whose indices may depend on the state.
 
-    def _dynamic_slice(self, equation: Any, params: Any, x: Numbers, *starts: Numbers) -> Numbers:
+    def _dynamic_slice(
+        self, equation: Any, params: Any, x: ScalarArray, *starts: ScalarArray
+    ) -> ScalarArray:
         for axis, (start, size) in enumerate(zip(starts, params["slice_sizes"], strict=True)):
             last = x.shape[axis] - size
             cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
@@ -437,30 +481,30 @@ class _JaxprLowering:
                 continue
             x = cases[last]
             for i in reversed(range(last)):
-                before = self._graph.apply("le", at, at.dtype.type(i))
-                x = self._choose(before, x, cases[i])
+                at_or_before = self._graph.apply("le", at, at.dtype.type(i))
+                x = self._where(at_or_before, x, cases[i])
         return x
 
     def _scatter(
         self,
         equation: Any,
         params: Any,
-        x: Numbers,
-        indices: Numbers,
-        updates: Numbers,
+        x: ScalarArray,
+        indices: ScalarArray,
+        updates: ScalarArray,
         op: str | None = None,
-    ) -> Numbers:
-        numbers = params["dimension_numbers"]
-        fixed = (*numbers.inserted_window_dims, *numbers.operand_batching_dims)
-        window = iter(updates.shape[axis] for axis in numbers.update_window_dims)
+    ) -> ScalarArray:
+        dims = params["dimension_numbers"]
+        fixed = (*dims.inserted_window_dims, *dims.operand_batching_dims)
+        window = iter(updates.shape[axis] for axis in dims.update_window_dims)
         places = windows(
             x.shape,
-            known_values(indices, np.int64),
-            offset_dims=numbers.update_window_dims,
-            collapsed=numbers.inserted_window_dims,
-            index_map=numbers.scatter_dims_to_operand_dims,
-            batching=numbers.operand_batching_dims,
-            indices_batching=numbers.scatter_indices_batching_dims,
+            constant_values(indices, np.int64),
+            offset_dims=dims.update_window_dims,
+            collapsed=dims.inserted_window_dims,
+            index_map=dims.scatter_dims_to_operand_dims,
+            batching=dims.operand_batching_dims,
+            indices_batching=dims.scatter_indices_batching_dims,
             sizes=[1 if axis in fixed else next(window) for axis in range(x.ndim)],
             clip="CLIP" in str(params["mode"]),
         )
@@ -471,150 +515,154 @@ class _JaxprLowering:
                 result[place] = update if op is None else self._graph.apply(op, old, update)
         return result.reshape(x.shape)
 
-    def _scatter_add(self, equation: Any, params: Any, *operands: Numbers) -> Numbers:
+    def _scatter_add(self, equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
         return self._scatter(equation, params, *operands, op="add")
 
-    def _scatter_mul(self, equation: Any, params: Any, *operands: Numbers) -> Numbers:
+    def _scatter_mul(self, equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
         return self._scatter(equation, params, *operands, op="mul")
 
-    # Arithmetic beyond one number at a time.
+    # Rules of primitives with arithmetic on more than single elements.
 
-    def _convert_element_type(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _convert_element_type(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         dtype = np.dtype(params["new_dtype"])
-        return numbers_of((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
+        return scalar_array((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
-    def _select_n(self, equation: Any, params: Any, which: Numbers, *cases: Numbers) -> Numbers:
+    def _select_n(
+        self, equation: Any, params: Any, which: ScalarArray, *cases: ScalarArray
+    ) -> ScalarArray:
         shape = cases[0].shape
         which = np.broadcast_to(which, shape)
         result = cases[-1]
         for i in reversed(range(len(cases) - 1)):
-            later = [self._is_after(number, i) for number in which.ravel()]
+            later = [self._is_later(index, i) for index in which.ravel()]
             rows = zip(later, cases[i].ravel(), result.ravel(), strict=True)
-            result = numbers_of((self._graph.select(*row) for row in rows), shape)
+            result = scalar_array((self._graph.select(*row) for row in rows), shape)
         return result
 
-    def _is_after(self, which: Scalar, case: int) -> Scalar:
+    def _is_later(self, which: Scalar, case: int) -> Scalar:
         """Return whether a branch index, bool or integer, selects a later case."""
         if which.dtype == bool:
             return which
         return self._graph.apply("gt", which, which.dtype.type(case))
 
     def _clamp(
-        self, equation: Any, params: Any, low: Numbers, x: Numbers, high: Numbers
-    ) -> Numbers:
-        return self._each("min", self._each("max", x, low), high)
+        self, equation: Any, params: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
+    ) -> ScalarArray:
+        return self._elementwise("min", self._elementwise("max", x, low), high)
 
-    def _square(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return self._each("mul", x, x)
+    def _square(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+        return self._elementwise("mul", x, x)
 
-    def _integer_pow(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        one = known_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
+    def _integer_pow(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+        one = constant_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
         result = one
         for _ in range(abs(params["y"])):
-            result = self._each("mul", result, x)
-        return result if params["y"] >= 0 else self._each("div", one, result)
+            result = self._elementwise("mul", result, x)
+        return result if params["y"] >= 0 else self._elementwise("div", one, result)
 
-    def _rsqrt(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return self._each("div", known_array(np.float32(1)), self._each("sqrt", x))
+    def _rsqrt(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+        return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
-    def _reduce(self, op: str, start: Scalar, params: Any, x: Numbers) -> Numbers:
+    def _reduce(self, op: str, initial: Scalar, params: Any, x: ScalarArray) -> ScalarArray:
         axes = tuple(params["axes"])
-        kept = [axis for axis in range(x.ndim) if axis not in axes]
-        shape = [x.shape[axis] for axis in kept]
-        results = filled(shape, lambda: start)
-        x = x.transpose(*kept, *axes)
+        free = [axis for axis in range(x.ndim) if axis not in axes]
+        shape = [x.shape[axis] for axis in free]
+        results = full_array(shape, lambda: initial)
+        x = x.transpose(*free, *axes)
         for place in np.ndindex(*shape):
-            for number in x[place].ravel() if axes else [x[place]]:
-                results[place] = self._graph.apply(op, results[place], number)
+            for scalar in x[place].ravel() if axes else [x[place]]:
+                results[place] = self._graph.apply(op, results[place], scalar)
         return results
 
-    def _reduce_sum(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _reduce_sum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("add", equation.outvars[0].aval.dtype.type(0), params, x)
 
-    def _reduce_and(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _reduce_and(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("and", np.bool_(True), params, x)
 
-    def _reduce_or(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _reduce_or(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("or", np.bool_(False), params, x)
 
-    def _reduce_max(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _reduce_max(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("max", _lowest(equation), params, x)
 
-    def _reduce_min(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _reduce_min(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("min", -_lowest(equation), params, x)
 
-    def _cumsum(self, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _cumsum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         result = np.moveaxis(x.copy(), params["axis"], 0)
         order = range(1, len(result))
         for i in [len(result) - 1 - i for i in order] if params["reverse"] else order:
-            before = _at(result, i + 1 if params["reverse"] else i - 1)
-            # Through a slice: a row of one axis would be stored as an array in an array.
-            result[i : i + 1] = self._each("add", before, _at(result, i))[None]
+            previous = _at(result, i + 1 if params["reverse"] else i - 1)
+            # Assign to a slice: assigned to an element, the array would become a nested object.
+            result[i : i + 1] = self._elementwise("add", previous, _at(result, i))[None]
         return np.moveaxis(result, 0, params["axis"])
 
-    def _argmin(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return self._extreme("lt", equation, params, x)
+    def _argmin(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+        return self._arg_extreme("lt", equation, params, x)
 
-    def _argmax(self, equation: Any, params: Any, x: Numbers) -> Numbers:
-        return self._extreme("gt", equation, params, x)
+    def _argmax(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+        return self._arg_extreme("gt", equation, params, x)
 
-    def _extreme(self, better: str, equation: Any, params: Any, x: Numbers) -> Numbers:
+    def _arg_extreme(self, better: str, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         (axis,) = params["axes"]
         kind = equation.outvars[0].aval.dtype.type
         x = np.moveaxis(x, axis, -1)
-        places = filled(x.shape[:-1], lambda: kind(0))
+        places = full_array(x.shape[:-1], lambda: kind(0))
         for row in np.ndindex(*x.shape[:-1]):
             best = x[row][0]
-            for i, number in enumerate(x[row][1:], start=1):
-                wins = self._graph.apply(better, number, best)
-                best = self._graph.select(wins, best, number)
+            for i, scalar in enumerate(x[row][1:], start=1):
+                wins = self._graph.apply(better, scalar, best)
+                best = self._graph.select(wins, best, scalar)
                 places[row] = self._graph.select(wins, places[row], kind(i))
         return places
 
-    def _dot_general(self, equation: Any, params: Any, a: Numbers, b: Numbers) -> Numbers:
+    def _dot_general(
+        self, equation: Any, params: Any, a: ScalarArray, b: ScalarArray
+    ) -> ScalarArray:
         (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
-        rows = _grouped(a, batch_a, sum_a)
-        columns = _grouped(b, batch_b, sum_b)
+        rows = _group_axes(a, batch_a, sum_a)
+        columns = _group_axes(b, batch_b, sum_b)
         dtype = np.dtype(equation.outvars[0].aval.dtype)
         sums = []
-        for block, other in zip(rows, columns, strict=True):
-            for row in block:
-                for column in other:
+        for row_group, column_group in zip(rows, columns, strict=True):
+            for row in row_group:
+                for column in column_group:
                     total: Scalar = dtype.type(0)
                     for pair in zip(row, column, strict=True):
-                        # JAX multiplies whole numbers by others here.
-                        x, y = (self._graph.convert(number, dtype) for number in pair)
+                        # The operands may have different dtypes, such as int32 and float32.
+                        x, y = (self._graph.convert(scalar, dtype) for scalar in pair)
                         product = self._graph.apply("mul", x, y)
                         total = self._graph.apply("add", total, product)
                     sums.append(total)
-        return numbers_of(sums, shape_of(equation.outvars[0]))
+        return scalar_array(sums, shape_of(equation.outvars[0]))
 
 
 class _Derivation:
-    """The carried values of a loop that are functions of its other carried values.
+    """A `_Derivation` finds carried values of a loop that are functions of other carried values.
 
-    A carried number follows from others if it is the same function of them before the first trip
-    and after every one. The two are compared operation by operation.
+    A carried value is derived if it is the same function of the others before the first iteration
+    and after every iteration. The two expressions are compared operation by operation.
     """
 
     def __init__(self, graph: ExprGraph, loop: Loop, carried: set[int]) -> None:
         self._graph = graph
         self._loop = loop
-        # What has fewer operations first: the others may follow from it.
-        self._places = sorted(carried, key=lambda k: _recorded(loop.following[k]))
+        # Begin with the values that were recorded first, because others may be derived from them.
+        self._places = sorted(carried, key=lambda k: _index(loop.updated[k]))
         self._known: dict[Any, Scalar] = {}
 
     def derived(self) -> dict[int, Scalar]:
         """Return which carried values are derived, and how each is computed from the others."""
         result: dict[int, Scalar] = {}
         for place in self._places:
-            ends = self._loop.first[place], self._loop.following[place]
-            number = self._known.get(_names(ends))
-            if number is None:
-                number = self._matched(*ends)
-            if number is not None:
-                result[place] = number
-            self._known[_names(ends)] = self._loop.carries[place] if number is None else number
+            pair = self._loop.initial[place], self._loop.updated[place]
+            derived = self._known.get(_pair_key(pair))
+            if derived is None:
+                derived = self._matched(*pair)
+            if derived is not None:
+                result[place] = derived
+            self._known[_pair_key(pair)] = self._loop.carries[place] if derived is None else derived
         return result
 
     def _matched(self, before: Scalar, after: Scalar) -> Scalar | None:
@@ -622,34 +670,36 @@ class _Derivation:
         pending = [(before, after)]
         found: dict[Any, Scalar | None] = {}
         while pending:
-            ends = pending[-1]
-            names = _names(ends)
-            if names in self._known or names in found:
+            pair = pending[-1]
+            key = _pair_key(pair)
+            if key in self._known or key in found:
                 pending.pop()
                 continue
-            parts = _parts(*ends)
+            parts = _parts(*pair)
             if parts is None:
-                # Nothing in common: then nothing above it has.
+                # The two have no common operation, so the expressions that contain them differ.
                 return None
             missing = [
                 part
                 for part in parts
-                if not is_same(*part) and _names(part) not in self._known.keys() | found.keys()
+                if not is_same(*part) and _pair_key(part) not in self._known.keys() | found.keys()
             ]
             if missing:
                 pending += missing
                 continue
             operands = [
-                a if is_same(a, b) else self._known.get(_names((a, b)), found.get(_names((a, b))))
+                a
+                if is_same(a, b)
+                else self._known.get(_pair_key((a, b)), found.get(_pair_key((a, b))))
                 for a, b in parts
             ]
-            found[names] = self._graph.repeat(ends[1], operands)
+            found[key] = self._graph.repeat(pair[1], operands)
             pending.pop()
-        return found[_names((before, after))]
+        return found[_pair_key((before, after))]
 
 
 def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
-    """Return the operands of two matching operations, in pairs."""
+    """Return the operands of two equal operations in pairs; None if the operations differ."""
     if is_constant(before) or is_constant(after) or not before.operands:
         return None
     if before.op != after.op or before.dtype != after.dtype or before.op == "input":
@@ -657,27 +707,27 @@ def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
     return list(zip(before.operands, after.operands, strict=True))
 
 
-def _names(numbers: tuple[Scalar, Scalar]) -> tuple[Any, ...]:
-    return tuple((x.dtype.str, x.tobytes()) if is_constant(x) else x.index for x in numbers)
+def _pair_key(pair: tuple[Scalar, Scalar]) -> tuple[Any, ...]:
+    return tuple((x.dtype.str, x.tobytes()) if is_constant(x) else x.index for x in pair)
 
 
-def _recorded(x: Scalar) -> int:
+def _index(x: Scalar) -> int:
     return -1 if is_constant(x) else x.index
 
 
-def _flat(arrays: Sequence[Numbers]) -> list[Scalar]:
+def _flatten(arrays: Sequence[ScalarArray]) -> list[Scalar]:
     return [x for array in arrays for x in array.ravel()]
 
 
-def _like(arrays: Sequence[Numbers], flat: Sequence[Scalar]) -> list[Numbers]:
-    """Return scalars in the shapes of the given arrays."""
-    numbers = iter(flat)
-    return [filled(array.shape, lambda: next(numbers)) for array in arrays]
+def _unflatten(arrays: Sequence[ScalarArray], flat: Sequence[Scalar]) -> list[ScalarArray]:
+    """Split scalars into arrays of the shapes of the given arrays."""
+    scalars = iter(flat)
+    return [full_array(array.shape, lambda: next(scalars)) for array in arrays]
 
 
-def _at(numbers: Numbers, i: int) -> Numbers:
-    """Return one entry along the leading axis, as an array even if it is a single number."""
-    return numbers[i : i + 1].reshape(numbers.shape[1:])
+def _at(array: ScalarArray, i: int) -> ScalarArray:
+    """Return one entry along the leading axis, as an array even if it is a single scalar."""
+    return array[i : i + 1].reshape(array.shape[1:])
 
 
 def _lowest(equation: Any) -> Any:
@@ -687,7 +737,7 @@ def _lowest(equation: Any) -> Any:
     return dtype.type(-np.inf)
 
 
-def _grouped(x: Numbers, batch: Sequence[int], summed: Sequence[int]) -> Numbers:
+def _group_axes(x: ScalarArray, batch: Sequence[int], summed: Sequence[int]) -> ScalarArray:
     """Return an array with its axes grouped as (batch, free, summed)."""
     free = [axis for axis in range(x.ndim) if axis not in batch and axis not in summed]
     sizes = [

@@ -59,10 +59,10 @@ class ProgramCache:
         """Return a program if it was compiled before.
 
         Args:
-          name: name of the program, unique within the configuration.
+          name: the name of the program, unique within the configuration.
 
         Returns:
-          The program, or None.
+          The program; None if it is not in the cache.
         """
         if self._folder is None:
             return None
@@ -77,7 +77,7 @@ class ProgramCache:
           trace: a function that traces the program.
 
         Returns:
-          The program. It takes arguments of the shapes and shardings that it was traced with.
+          The program, which takes arguments of the shapes and shardings it was traced with.
         """
         program = self.find(name)
         if program is not None:
@@ -112,12 +112,13 @@ def use_compilation_cache() -> None:
     """Enable JAX's compilation cache in the user's cache folder, for later processes.
 
     `JAX_COMPILATION_CACHE_DIR` names another folder, and `JAX_ENABLE_COMPILATION_CACHE=false`
-    turns it off. What is compiled for one kind of processor does not run on every other: each
-    has a folder of its own. One that others may write to is not used, since JAX runs what it finds.
+    turns it off. Each kind of processor has its own folder, because a program compiled for one may
+    not run on another. A folder that other users may write to is not used, because JAX runs the
+    programs that it finds there.
     """
     settings: Any = jax.config
     given = settings.jax_compilation_cache_dir
-    # JAX alone knows of places such as gs://.
+    # Leave remote folders such as gs:// to JAX.
     if not settings.jax_enable_compilation_cache or "://" in (given or ""):
         return
     folder = _cache_folder(given)

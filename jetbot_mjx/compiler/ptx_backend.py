@@ -1,8 +1,9 @@
-"""Kernels on NVIDIA GPUs: a `jetbot_mjx.compiler.kernel.Backend`.
+"""Compile and launch kernels on NVIDIA GPUs; this module is a `jetbot_mjx.compiler.kernel.Backend`.
 
-LLVM compiles them to PTX, NVIDIA's portable assembly, and XLA hands that to the driver by its
-custom call for PTX, an internal mechanism: `is_available` asks the installed XLA whether it knows
-it. Each thread does the whole program for one robot; all numbers in between stay in registers.
+LLVM compiles a kernel to PTX, NVIDIA's portable assembly, and XLA passes the PTX to the driver
+through its custom call for PTX kernels. That call is internal to XLA, so `is_available` tries
+whether the installed version has it. Each thread runs the whole program for one robot, with all
+intermediate values in registers.
 """
 
 import functools
@@ -24,28 +25,28 @@ IMPL = "ptx"
 PLATFORM = "cuda"
 NEEDS = "an NVIDIA GPU, llvmlite (pip install llvmlite) and an XLA that launches PTX"
 
-_MOST_THREADS = 256
-"""Robots in one block at most: with 255 registers each, one block fills a multiprocessor."""
+_MAX_THREADS = 256
+"""Largest number of robots in a block: with 255 registers each, it fills a multiprocessor."""
 
-_LEAST_THREADS = 32
+_MIN_THREADS = 32
 
 _BLOCKS = 128
-"""Blocks that there should be before they grow: a GPU has about as many multiprocessors."""
+"""Number of blocks above which blocks grow: a GPU has about as many multiprocessors."""
 
 _NAME = "physics"
 _TARGET = "__gpu$xla.gpu.ptx"
 _TRIPLE = "nvptx64-nvidia-cuda"
 _LEVEL = 3
 _ROBOTS = "ROBOTS"
-"""Where in the PTX their number goes."""
+"""Placeholder in the PTX for the number of robots."""
 
 _ARCHITECTURES = (70, 80, 90)
-"""What PTX is written for, tens of the compute capability; later GPUs take that of earlier ones."""
+"""Target architectures, as ten times the compute capability; newer GPUs run PTX of older ones."""
 
 
 @functools.cache
 def is_available() -> bool:
-    """Return whether JAX knows an NVIDIA GPU and its XLA launches a kernel that LLVM compiled."""
+    """Return whether JAX has an NVIDIA GPU and XLA can launch a kernel that LLVM compiled."""
     try:
         device = jax.local_devices(backend=PLATFORM)[0]
         _binding()
@@ -57,7 +58,7 @@ def is_available() -> bool:
         steps=1,
         fallback=lambda x: [x + 1.0],
     )
-    # Whoever asks may be in the middle of tracing something else.
+    # Run the probe at once, because the caller may be tracing another function.
     with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
             (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.zeros((2, 1)))
@@ -95,9 +96,9 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 
 
 def threads_in_block(robots: int) -> int:
-    """Return the robots per block: a power of two that leaves some for every multiprocessor."""
+    """Return the number of robots per block, a power of two that occupies every multiprocessor."""
     wanted = 2 ** math.ceil(math.log2(max(1, robots / _BLOCKS)))
-    return min(max(wanted, _LEAST_THREADS), _MOST_THREADS)
+    return min(max(wanted, _MIN_THREADS), _MAX_THREADS)
 
 
 def compiled(kernel: Kernel, architecture: int) -> str:
@@ -105,13 +106,13 @@ def compiled(kernel: Kernel, architecture: int) -> str:
 
     Args:
       kernel: the kernel.
-      architecture: what it is for, tens of the compute capability.
+      architecture: the target architecture, as ten times the compute capability.
 
     Returns:
-      The text.
+      The PTX.
 
     Raises:
-      UnsupportedError: the program has an operation that is not written in LLVM.
+      UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     binding = _binding()
     text = kernel_text(kernel.program, carried=kernel.carried, steps=kernel.steps)
@@ -125,63 +126,47 @@ def compiled(kernel: Kernel, architecture: int) -> str:
 
 
 def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
-    """Write a kernel in LLVM's representation.
+    """Write a kernel as LLVM IR.
 
-    Its parameters are the addresses of all leaves of the arguments and then of all leaves of the
-    results, float32 arrays of shape (robots, ...).
+    Its parameters are the addresses of all argument leaves, followed by the addresses of all result
+    leaves. Each is a float32 array of shape (robots, ...).
 
     Args:
-      program: a step; its results have the shapes of its first `carried` arguments.
-      carried: how many leaves of the arguments are carried from step to step.
-      steps: how often it is repeated.
+      program: the step; its results have the shapes of its first `carried` arguments.
+      carried: the number of argument leaves that are carried from step to step.
+      steps: the number of steps.
 
     Returns:
-      The text of a module.
+      The text of an LLVM module.
     """
-    writer = LlvmEmitter(program, lanes=1, label="steps")
+    # Write one step, which reads the carried values as %now and the others as %in.
+    emitter = LlvmEmitter(program, lanes=1, label="steps")
     sizes = [array.size for array in program.inputs]
-    first = _transfers(sizes, "load")
     arguments = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
-    changing = sum(sizes[:carried])
-    ahead = [f"%now{i}" for i in range(changing)]
-    # What a step ends with is not written yet: its first lines are filled in below.
-    results = writer.step([*ahead, *arguments[changing:]])[:changing]
-    end = writer.label
+    carried_scalars = sum(sizes[:carried])
+    now = [f"%now{i}" for i in range(carried_scalars)]
+    results = emitter.step([*now, *arguments[carried_scalars:]])[:carried_scalars]
+    # Write the loop over the steps around it, whose carries begin with the arguments.
+    end = emitter.label
     carries = [
-        f"{now} = phi float [{before}, %load], [{after}, %{end}]"
-        for now, before, after in zip(ahead, arguments, results, strict=False)
+        f"{name} = phi float [{before}, %load], [{after}, %{end}]"
+        for name, before, after in zip(now, arguments, results, strict=False)
     ]
     parameters = ", ".join(f"ptr addrspace(1) %a{i}" for i in range(len(sizes) + carried))
     lines = [
-        *writer.declarations(),
-        "declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
-        "declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
-        "declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()",
-        "declare void @llvm.nvvm.barrier0()",
+        *emitter.declarations(),
+        *_PTX_DECLARATIONS,
         f"define ptx_kernel void @{_NAME}({parameters}) {{",
-        "entry:",
-        "%thread = call i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
-        "%block = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
-        "%threads = call i32 @llvm.nvvm.read.ptx.sreg.ntid.x()",
-        "%before = mul i32 %block, %threads",
-        "%wanted = add i32 %before, %thread",
-        f'%robots = call i32 asm "mov.u32 $0, {_ROBOTS};", "=r"()',
-        "%is.there = icmp ult i32 %wanted, %robots",
-        # Threads beyond the last robot do what its thread does: a warp is always whole.
-        "%last = sub i32 %robots, 1",
-        "%robot = select i1 %is.there, i32 %wanted, i32 %last",
-        "br label %load",
-        "load:",
-        "%wide = zext i32 %robot to i64",
-        *first,
+        *_SELECT_ROBOT,
+        *_transfers(sizes, "load"),
         "br label %steps",
         "steps:",
         f"%count = phi i32 [0, %load], [%count.next, %{end}]",
         *carries,
-        # Threads whose loops take different numbers of trips drift apart, until each of them waits
-        # for instructions that the cache has no room for: 540 instead of 760 M steps/s.
+        # Without this barrier, threads whose loops make different numbers of iterations drift apart
+        # until their instructions no longer fit into the cache: 540 instead of 760 M steps/s.
         "call void @llvm.nvvm.barrier0()",
-        *writer.lines,
+        *emitter.lines,
         "%count.next = add i32 %count, 1",
         f"%again = icmp ult i32 %count.next, {steps}",
         "br i1 %again, label %steps, label %end",
@@ -189,20 +174,50 @@ def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
         "br i1 %is.there, label %store, label %done",
         "store:",
         *_transfers(sizes[:carried], "store", len(sizes), results),
-        "br label %done",
-        "done:",
-        "ret void",
-        "}",
-        "!nvvm.annotations = !{!0}",
-        f'!0 = !{{ptr @{_NAME}, !"maxntidx", i32 {_MOST_THREADS}}}',
+        *_RETURN,
     ]
     return "\n".join(lines) + "\n"
+
+
+_PTX_DECLARATIONS = (
+    "declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
+    "declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
+    "declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()",
+    "declare void @llvm.nvvm.barrier0()",
+)
+
+# Threads beyond the last robot step the last robot too, without storing it: so no thread of a warp
+# leaves early.
+_SELECT_ROBOT = (
+    "entry:",
+    "%thread = call i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
+    "%block = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
+    "%threads = call i32 @llvm.nvvm.read.ptx.sreg.ntid.x()",
+    "%before = mul i32 %block, %threads",
+    "%wanted = add i32 %before, %thread",
+    f'%robots = call i32 asm "mov.u32 $0, {_ROBOTS};", "=r"()',
+    "%is.there = icmp ult i32 %wanted, %robots",
+    "%last = sub i32 %robots, 1",
+    "%robot = select i1 %is.there, i32 %wanted, i32 %last",
+    "br label %load",
+    "load:",
+    "%wide = zext i32 %robot to i64",
+)
+
+_RETURN = (
+    "br label %done",
+    "done:",
+    "ret void",
+    "}",
+    "!nvvm.annotations = !{!0}",
+    f'!0 = !{{ptr @{_NAME}, !"maxntidx", i32 {_MAX_THREADS}}}',
+)
 
 
 def _transfers(
     sizes: Sequence[int], do: str, first: int = 0, results: Sequence[str] = ()
 ) -> list[str]:
-    """Return the lines that load a robot's rows of several arrays, or store results there."""
+    """Return the lines that load a robot's row of each array, or store results in them."""
     lines, names = [], iter(results)
     for i, size in enumerate(sizes):
         array = f"%a{i + first}"
@@ -221,7 +236,7 @@ def _transfers(
 
 @functools.cache
 def _architecture() -> int:
-    """Return the architecture to write PTX for, from the GPUs that are present."""
+    """Return the newest supported architecture that all present GPUs can run."""
     capability = min(
         round(10 * float(device.compute_capability))
         for device in jax.local_devices(backend=PLATFORM)
@@ -234,7 +249,7 @@ def _binding() -> Any:
     """Return the LLVM binding with its target for NVIDIA's GPUs.
 
     Raises:
-      RuntimeError: this LLVM has none.
+      RuntimeError: this LLVM has no such target.
     """
     binding = importlib.import_module("llvmlite.binding")
     binding.initialize_all_targets()

@@ -1,11 +1,11 @@
 """Record arithmetic on scalars as a graph of operations.
 
-An `ExprGraph` records operations on scalars. Operations on constants are computed at once, an
-operation that was recorded before is not recorded again, and products with zero are removed: most
-entries of the matrices of a robot's physics are zeros, so most of the arithmetic disappears. A
-`Loop` and a `Branch` are recorded as wholes; where each operation is done, `schedule` decides.
+An `ExprGraph` folds operations on constants, records equal operations once, and removes products
+with zero. Most entries of the matrices of a robot's physics are zeros, so most of the arithmetic
+disappears. A `Loop` and a `Branch` are recorded as units; `schedule` decides in which block of the
+program each operation is computed.
 
-Two rules hold for finite numbers only: 0·x is 0, and x - x is 0.
+Two simplifications hold for finite numbers only: 0·x is 0, and x - x is 0.
 """
 
 import dataclasses
@@ -20,11 +20,11 @@ class UnsupportedError(Exception):
 
 
 Scalar = Any
-"""An `Expr`, or a NumPy scalar where the number is known."""
+"""An `Expr`, or a NumPy scalar if the value is a constant."""
 
 
 class Expr:
-    """A scalar that is known only when the program runs."""
+    """An `Expr` is a scalar whose value is known only when the program runs."""
 
     __slots__ = ("dtype", "index", "op", "operands", "owner", "place")
 
@@ -40,13 +40,13 @@ class Expr:
         """Describe one operation.
 
         Args:
-          op: its name, as in `jax.lax`; `input` for what the program is given, `carry` for what a
-            loop hands from trip to trip, `result` for what a loop or a branch ends with.
-          operands: numbers that it takes.
-          dtype: dtype of the result: float32, int32 or bool.
-          index: place in the order of recording; operands have smaller ones.
-          owner: of a `carry` or a `result`: the loop or branch.
-          place: of a `carry` or a `result`: which of them it is.
+          op: the operation's name, as in `jax.lax`; `input` is an input of the program, `carry` a
+            value that a loop carries between iterations, `result` a result of a loop or branch.
+          operands: the operation's operands.
+          dtype: the dtype of the result: float32, int32 or bool.
+          index: the position in the order of recording; operands have smaller indices.
+          owner: the loop or branch that a `carry` or `result` belongs to.
+          place: the position of a `carry` or `result` among those of its owner.
         """
         self.op = op
         self.operands = operands
@@ -58,32 +58,32 @@ class Expr:
 
 @dataclasses.dataclass(eq=False)
 class Loop:
-    """A loop over scalars that are computed again as long as a condition on them holds."""
+    """A `Loop` is a while loop that carries scalars."""
 
     index: int
-    """Place in the order of recording, after all that a trip computes."""
+    """Position in the order of recording, after all operations of an iteration."""
     carries: list[Expr]
-    """The values that an iteration begins with."""
-    first: list[Scalar]
-    """The values that the first iteration begins with."""
-    following: list[Scalar] = dataclasses.field(default_factory=list)
-    """The values that the next iteration begins with."""
-    going: Scalar = None
+    """The carried values at the start of an iteration."""
+    initial: list[Scalar]
+    """The carried values at the start of the first iteration."""
+    updated: list[Scalar] = dataclasses.field(default_factory=list)
+    """The carried values at the end of an iteration, as functions of `carries`."""
+    condition: Scalar = None
     """Whether there is another iteration, as a function of `carries`."""
-    outcomes: list[Scalar] = dataclasses.field(default_factory=list)
-    """What the loop ends with, of the `carries` for which there is no trip."""
+    results: list[Scalar] = dataclasses.field(default_factory=list)
+    """The results of the loop, as functions of the `carries` for which `condition` is false."""
 
 
 @dataclasses.dataclass(eq=False)
 class Branch:
-    """A branch of which only one side is computed."""
+    """A `Branch` selects between two lists of scalars and computes only the selected side."""
 
     index: int
-    """Place in the order of recording, after all that either side computes."""
-    which: Scalar
-    """Which side."""
-    no: list[Scalar]
-    yes: list[Scalar]
+    """Position in the order of recording, after all operations of both sides."""
+    condition: Scalar
+    """Whether `if_true` is selected."""
+    if_false: list[Scalar]
+    if_true: list[Scalar]
 
 
 def is_constant(x: Scalar) -> bool:
@@ -102,7 +102,7 @@ def _divide(a: Any, b: Any) -> Any:
     return np.trunc(np.divide(a, b)).astype(a.dtype)
 
 
-def converted(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
+def convert_constant(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     """Convert to another dtype; integers saturate at their limits, and NaN becomes 0."""
     if x.dtype.kind == "f" and np.dtype(dtype).kind in "iu":
         ends = np.iinfo(dtype)
@@ -143,10 +143,10 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "tanh": np.tanh,
     "xor": np.bitwise_xor,
 }
-"""Every operation but `select` and `convert`, as NumPy does it."""
+"""The NumPy function of every operation except `select` and `convert`."""
 
-MOST_VALUES = 1_000_000
-"""Operations that are recorded at most, those that nothing needs included."""
+MAX_OPERATIONS = 1_000_000
+"""Largest number of recorded operations, including those that nothing depends on."""
 
 _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 
@@ -171,45 +171,47 @@ class ExprGraph:
           *operands: scalars of one dtype.
 
         Returns:
-          The number.
+          The result, possibly an existing or simpler scalar of the same value.
 
         Raises:
-          UnsupportedError: the operation or the dtype is not known here.
+          UnsupportedError: the operation or the dtype is not supported.
         """
         if op not in EVALUATE:
             raise UnsupportedError(f"the operation {op}")
         if all(is_constant(x) for x in operands):
             with np.errstate(all="ignore"):
                 return np.asarray(EVALUATE[op](*operands))[()]
-        kind = next(x.dtype for x in operands if not is_constant(x))
-        if kind not in (_FLOAT, _INT, _BOOL):
-            raise UnsupportedError(f"{op} of {kind}")
-        shorter = _SHORTER.get(op, _unchanged)(self, kind, *operands)
-        if shorter is not None:
-            return shorter
-        dtype = _BOOL if op in COMPARISONS or op == "is_finite" else kind
+        operand_dtype = next(x.dtype for x in operands if not is_constant(x))
+        if operand_dtype not in (_FLOAT, _INT, _BOOL):
+            raise UnsupportedError(f"{op} of {operand_dtype}")
+        simplified = _SIMPLIFY.get(op, _no_simplification)(self, operand_dtype, *operands)
+        if simplified is not None:
+            return simplified
+        dtype = _BOOL if op in COMPARISONS or op == "is_finite" else operand_dtype
         return self._record(op, operands, dtype)
 
-    def select(self, which: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
+    def select(self, condition: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
         """Select one of two scalars of one dtype by a bool scalar."""
-        if is_constant(which):
-            return on_true if which else on_false
-        if on_false is on_true or (_known_and(on_true, on_false) and on_false == on_true):
+        if is_constant(condition):
+            return on_true if condition else on_false
+        if on_false is on_true or (_are_constant(on_true, on_false) and on_false == on_true):
             return on_false
-        if which.op == "not":
-            return self.select(which.operands[0], on_true, on_false)
+        if condition.op == "not":
+            return self.select(condition.operands[0], on_true, on_false)
         dtype = on_true.dtype
         if dtype == _BOOL:
-            # which & on_true | ~which & on_false
-            yes = self.apply("and", which, on_true)
-            return self.apply("or", yes, self.apply("and", self.apply("not", which), on_false))
-        return self._record("select", (which, on_false, on_true), dtype)
+            # condition & on_true | ~condition & on_false
+            selected = self.apply("and", condition, on_true)
+            return self.apply(
+                "or", selected, self.apply("and", self.apply("not", condition), on_false)
+            )
+        return self._record("select", (condition, on_false, on_true), dtype)
 
     def convert(self, x: Scalar, dtype: np.dtype) -> Scalar:
         """Convert a scalar to another dtype."""
         if is_constant(x):
-            return converted(np.asarray(x), dtype)[()]
-        # Without 64-bit types, as JAX has them by default, only these are met.
+            return convert_constant(np.asarray(x), dtype)[()]
+        # JAX has no 64-bit types by default, so no other dtypes occur.
         if dtype not in (_FLOAT, _INT, _BOOL):
             raise UnsupportedError(f"a conversion to {dtype}")
         if x.dtype == dtype:
@@ -222,27 +224,29 @@ class ExprGraph:
         """Record an operation again with other operands, without simplifying it."""
         return self._record(value.op, tuple(operands), value.dtype)
 
-    def begin_loop(self, first: Sequence[Scalar]) -> Loop:
+    def begin_loop(self, initial: Sequence[Scalar]) -> Loop:
         """Begin a loop; the operations of its iterations are recorded before `end_loop`."""
-        loop = Loop(-1, [], list(first))
-        for place, number in enumerate(first):
-            loop.carries.append(self._new("carry", (), number.dtype, loop, place))
+        loop = Loop(-1, [], list(initial))
+        for place, scalar in enumerate(initial):
+            loop.carries.append(self._new("carry", (), scalar.dtype, loop, place))
         return loop
 
     def end_loop(self, loop: Loop) -> list[Expr]:
         """End a loop whose attributes are all set except `index`, and return its results."""
         loop.index = self._next()
         return [
-            self._new("result", (), number.dtype, loop, place)
-            for place, number in enumerate(loop.outcomes)
+            self._new("result", (), scalar.dtype, loop, place)
+            for place, scalar in enumerate(loop.results)
         ]
 
-    def branch(self, which: Expr, no: Sequence[Scalar], yes: Sequence[Scalar]) -> list[Scalar]:
+    def branch(
+        self, condition: Expr, if_false: Sequence[Scalar], if_true: Sequence[Scalar]
+    ) -> list[Scalar]:
         """Record a branch, of which only the selected side is computed, and return its results."""
-        branch = Branch(self._next(), which, list(no), list(yes))
+        branch = Branch(self._next(), condition, list(if_false), list(if_true))
         return [
             b if is_same(a, b) else self._new("result", (), b.dtype, branch, place)
-            for place, (a, b) in enumerate(zip(no, yes, strict=True))
+            for place, (a, b) in enumerate(zip(if_false, if_true, strict=True))
         ]
 
     @property
@@ -252,8 +256,8 @@ class ExprGraph:
 
     def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Expr:
         names = [_identity(x) for x in operands]
-        # Found in whichever order, but kept as given: what is recorded twice in the same way looks
-        # the same.
+        # The key ignores the order of commutative operands, but the operation keeps the order in
+        # which it was first recorded, so that the same function always lowers to the same text.
         key = (op, dtype, *(sorted(names, key=repr) if op in _COMMUTATIVE else names))
         if key not in self._values:
             self._values[key] = self._new(op, operands, dtype)
@@ -263,129 +267,129 @@ class ExprGraph:
         return Expr(op, operands, dtype, self._next(), *owner)
 
     def _next(self) -> int:
-        if self._count >= MOST_VALUES:
-            raise UnsupportedError(f"more than {MOST_VALUES:,} operations")
+        if self._count >= MAX_OPERATIONS:
+            raise UnsupportedError(f"more than {MAX_OPERATIONS:,} operations")
         self._count += 1
         return self._count - 1
 
 
 def is_same(x: Scalar, y: Scalar) -> bool:
     """Return whether two scalars are the same operation, or constants with equal bits."""
-    return x is y or (_known_and(x, y) and _identity(x) == _identity(y))
+    return x is y or (_are_constant(x, y) and _identity(x) == _identity(y))
 
 
 def _identity(x: Scalar) -> Any:
-    # By bits, or 0.0 would be -0.0, and NaN not itself.
+    # Compare bits: 0.0 == -0.0 although they differ, and NaN != NaN although they are the same.
     return x.index if isinstance(x, Expr) else (x.dtype.str, x.tobytes())
 
 
-def _known_and(x: Scalar, *others: Scalar) -> bool:
+def _are_constant(x: Scalar, *others: Scalar) -> bool:
     return is_constant(x) and all(is_constant(other) for other in others)
 
 
-def _is(x: Scalar, number: float) -> bool:
+def _equals(x: Scalar, number: float) -> bool:
     return is_constant(x) and x == number
 
 
-def _unchanged(graph: ExprGraph, kind: np.dtype, *operands: Scalar) -> None:
+def _no_simplification(graph: ExprGraph, dtype: np.dtype, *operands: Scalar) -> None:
     return None
 
 
-def _simplify_add(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if _is(x, 0):
+def _simplify_add(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if _equals(x, 0):
         return y
-    return x if _is(y, 0) else None
+    return x if _equals(y, 0) else None
 
 
-def _simplify_sub(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if x is y:
-        return kind.type(0)
-    if _is(x, 0):
+        return dtype.type(0)
+    if _equals(x, 0):
         return graph.apply("neg", y)
-    return x if _is(y, 0) else None
+    return x if _equals(y, 0) else None
 
 
-def _simplify_mul(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_mul(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     for one, other in ((x, y), (y, x)):
-        if _is(one, 0):
-            return kind.type(0)
-        if _is(one, 1):
+        if _equals(one, 0):
+            return dtype.type(0)
+        if _equals(one, 1):
             return other
-        if _is(one, -1):
+        if _equals(one, -1):
             return graph.apply("neg", other)
     return None
 
 
-def _simplify_div(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if _is(x, 0):
-        return kind.type(0)
-    if _is(y, 1):
+def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if _equals(x, 0):
+        return dtype.type(0)
+    if _equals(y, 1):
         return x
-    if is_constant(y) and kind == _FLOAT and y != 0:
+    if is_constant(y) and dtype == _FLOAT and y != 0:
         return graph.apply("mul", x, np.float32(1 / np.float64(y)))
     return None
 
 
-def _simplify_neg(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar | None:
+def _simplify_neg(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
     return x.operands[0] if x.op == "neg" else None
 
 
-def _simplify_not(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar | None:
+def _simplify_not(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
     return x.operands[0] if x.op == "not" else None
 
 
-def _simplify_and(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_and(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if x is y:
         return x
     for one, other in ((x, y), (y, x)):
-        if kind == _BOOL and is_constant(one):
+        if dtype == _BOOL and is_constant(one):
             return other if one else np.bool_(False)
     return None
 
 
-def _simplify_or(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_or(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if x is y:
         return x
     for one, other in ((x, y), (y, x)):
-        if kind == _BOOL and is_constant(one):
+        if dtype == _BOOL and is_constant(one):
             return np.bool_(True) if one else other
     return None
 
 
-def _simplify_xor(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_xor(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     for one, other in ((x, y), (y, x)):
-        if kind == _BOOL and is_constant(one):
+        if dtype == _BOOL and is_constant(one):
             return graph.apply("not", other) if one else other
     return None
 
 
-def _simplify_extreme(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+def _simplify_extreme(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     return x if x is y else None
 
 
-def _simplify_pow(graph: ExprGraph, kind: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if _is(y, 1):
+def _simplify_pow(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    if _equals(y, 1):
         return x
-    if _is(y, 2):
+    if _equals(y, 2):
         return graph.apply("mul", x, x)
-    return graph.apply("sqrt", x) if _is(y, 0.5) else None
+    return graph.apply("sqrt", x) if _equals(y, 0.5) else None
 
 
-def _simplify_sign(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar:
-    zero, one = kind.type(0), kind.type(1)
+def _simplify_sign(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    zero, one = dtype.type(0), dtype.type(1)
     below = graph.select(graph.apply("lt", x, zero), x, -one)
     return graph.select(graph.apply("gt", x, zero), below, one)
 
 
-# π/2 in three parts, of which the first two have so few bits that a whole number times them is
-# exact: what is left of an angle after so many quarter turns loses nothing.
+# π/2 as a sum of three parts (Cody-Waite range reduction). The first two have so few bits that
+# their products with a whole number are exact, so subtracting quarter turns loses no precision.
 _COARSE = np.float64(1.5703125)
 _FINE = np.float64((np.float32(np.pi / 2 - _COARSE).view(np.uint32) & 0xFFFFE000).view(np.float32))
 _QUARTER_TURN = [np.float32(part) for part in (_COARSE, _FINE, np.pi / 2 - _COARSE - _FINE)]
 
 
 def _polynomial(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[np.float32]:
-    """Return a function's coefficients in s = r², lowest first, for r up to an eighth of a turn."""
+    """Return polynomial coefficients of a function in s = r², lowest first, for |r| up to π/4."""
     end = (np.pi / 4) ** 2
     fit = np.polynomial.Chebyshev.interpolate(
         lambda s: function(np.sqrt(s)), degree, domain=[0.0, end]
@@ -398,8 +402,9 @@ _SINE = _polynomial(lambda r: np.sinc(r / np.pi), 4)  # sin(r)/r
 _COSINE = _polynomial(np.cos, 5)
 
 
-def _simplify_sine(graph: ExprGraph, kind: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
-    """Expand a sine to basic arithmetic, equal on every machine; for |x| up to some 10⁴."""
+def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
+    """Expand sin(x + ahead π/2) to basic arithmetic, equal on every machine, for |x| up to 10⁴."""
+    # Reduce the angle to r = x - turns π/2, with |r| at most π/4.
     do = graph.apply
     turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
     r = x
@@ -417,6 +422,7 @@ def _simplify_sine(graph: ExprGraph, kind: np.dtype, x: Scalar, ahead: int = 0) 
         whole = do("floor", do("mul", count, np.float32(1 / of)))
         return do("sub", count, do("mul", whole, np.float32(of)))
 
+    # Evaluate both polynomials, and select value and sign by the quadrant.
     sine, cosine = do("mul", r, horner(_SINE)), horner(_COSINE)
     quarter = modulo(do("add", turns, np.float32(ahead)), 4.0)
     odd = do("ge", modulo(quarter, 2.0), np.float32(1))
@@ -424,11 +430,11 @@ def _simplify_sine(graph: ExprGraph, kind: np.dtype, x: Scalar, ahead: int = 0) 
     return graph.select(do("ge", quarter, np.float32(2)), value, do("neg", value))
 
 
-def _simplify_cosine(graph: ExprGraph, kind: np.dtype, x: Scalar) -> Scalar:
-    return _simplify_sine(graph, kind, x, ahead=1)
+def _simplify_cosine(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    return _simplify_sine(graph, dtype, x, ahead=1)
 
 
-_SHORTER: dict[str, Callable[..., Scalar | None]] = {
+_SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
     "add": _simplify_add,
     "and": _simplify_and,
     "cos": _simplify_cosine,
@@ -445,4 +451,4 @@ _SHORTER: dict[str, Callable[..., Scalar | None]] = {
     "sub": _simplify_sub,
     "xor": _simplify_xor,
 }
-"""What else gives the same number; None: nothing does."""
+"""Functions that return an equal but simpler scalar; None: there is none."""

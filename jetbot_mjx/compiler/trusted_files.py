@@ -1,8 +1,8 @@
 """Read and write files of executable code that no other user can have written.
 
-A compiled program is machine code, and the folder that it is kept in may be shared. As ssh does
-with its keys, a file is trusted where it and its folder belong to this user or to root, and nobody
-else may write to either. Where the system knows no owners, as Windows, every file is trusted.
+A cached program is machine code, and the cache folder may be shared with other users. As ssh does
+with its keys, a file is trusted if it and its folder belong to this user or to root and nobody else
+may write to either. On a system without file owners, such as Windows, every file is trusted.
 """
 
 import os
@@ -13,8 +13,8 @@ import threading
 from pathlib import Path
 
 _lock = threading.Lock()
-_told: set[Path] = set()
-"""Folders of which a line has been written."""
+_warned: set[Path] = set()
+"""Folders that the user has been warned about."""
 
 
 def read_trusted(path: Path) -> bytes | None:
@@ -24,8 +24,8 @@ def read_trusted(path: Path) -> bytes | None:
       path: the file.
 
     Returns:
-      The content; None where there is no such file, or where it is not trusted, which one line on
-      stderr says, once for each folder.
+      The content; None if the file does not exist or is not trusted. A file that is not trusted
+      costs one line on stderr, once per folder.
     """
     try:
         reason = distrust(path.parent, path.parent.stat())
@@ -44,11 +44,11 @@ def write_private(path: Path, content: bytes) -> None:
     """Write a file that `read_trusted` trusts, atomically.
 
     Args:
-      path: the file. Nothing is written where its folder is not trusted: nobody would read it.
-      content: all of it.
+      path: the file. Nothing is written if its folder is not trusted, as it would not be read.
+      content: the whole content of the file.
 
     Raises:
-      OSError: the folder is not there, or the file cannot be written.
+      OSError: the folder does not exist, or the file cannot be written.
     """
     if distrust(path.parent, path.parent.stat()) is not None:
         return
@@ -60,11 +60,11 @@ def write_private(path: Path, content: bytes) -> None:
 
 
 def distrust(path: Path, status: os.stat_result) -> str | None:
-    """Return why a file or folder is not trusted, or None where it is.
+    """Return why a file or folder is not trusted, or None if it is trusted.
 
     Args:
       path: the file or folder, for the message.
-      status: its owner and mode.
+      status: the owner and mode of the file or folder.
 
     Returns:
       The reason and the remedy, on one line.
@@ -79,14 +79,14 @@ def distrust(path: Path, status: os.stat_result) -> str | None:
 
 
 def tell_once(folder: Path, reason: str) -> None:
-    """Write a line about a folder that is not trusted, or a file in it, to stderr.
+    """Warn on stderr that a folder or a file in it is not trusted, once per folder.
 
     Args:
-      folder: nothing is written where a line about it was.
-      reason: of `distrust`.
+      folder: the folder.
+      reason: the result of `distrust`.
     """
     with _lock:
-        if folder in _told:
+        if folder in _warned:
             return
-        _told.add(folder)
+        _warned.add(folder)
     print(f"compiled programs are not read, but made anew: {reason}", file=sys.stderr)

@@ -1,8 +1,8 @@
 """Choose XLA's compiler options, and pass only those that the installed version knows.
 
-Before the first step of a training a CPU does little else than compile, and at optimisation level 1
-that takes less. Do not turn the fusion emitters off as well, which saves still more: at level 2
-without them the same program has given other bits from one call to the next.
+On a CPU, most of the time before the first training step is spent on compilation, and optimisation
+level 1 shortens it. Do not turn off the fusion emitters to save even more: at level 2 without them,
+the same program has returned different bits from one call to the next.
 """
 
 import contextlib
@@ -18,7 +18,7 @@ Options = dict[str, Any]
 
 _QUICK: Options = {"xla_backend_optimization_level": 1}
 
-# No atomics, and no choice of kernels by timing them.
+# Use no atomics, and do not choose kernels by timing them.
 _DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_level": 0}
 
 
@@ -26,7 +26,7 @@ def compiler_options(config: Config) -> Options:
     """Return the compiler options for the programs of a run.
 
     Args:
-      config: the run.
+      config: the configuration of the run.
 
     Returns:
       The options as `jax.jit` takes them, without those that the installed XLA does not know.
@@ -57,12 +57,12 @@ def default_device_cpu() -> Iterator[Any]:
     """Run the computations inside on the host CPU, where small programs compile at once.
 
     Yields:
-      The device that stands for the host.
+      JAX's device of the host CPU.
     """
     try:
         device = jax.local_devices(backend="cpu")[0]
     except RuntimeError:
-        # JAX_PLATFORMS leaves it out.
+        # JAX_PLATFORMS leaves out the CPU: use the default device instead.
         device = jax.local_devices()[0]
     with jax.default_device(device):
         yield device

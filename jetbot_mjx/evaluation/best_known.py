@@ -1,8 +1,8 @@
 """Look up the best-known time to each of the report's goals, as a reference for a policy's time.
 
-The file in the package holds the results of `benchmarks/learning/best_known.py`. It searched
-commands for each goal with the true model and drove them open-loop, so their time is an upper
-bound of the shortest time. Each search states the settings that it is valid for; there are no
+The file in the package holds the results of `benchmarks/learning/best_known.py`. It searches
+commands for each goal with the true model and executes them open-loop, so their time is an upper
+bound of the shortest time. Each search states the settings for which it is valid; there are no
 times for any other task, robot or time step.
 """
 
@@ -35,16 +35,16 @@ SETTINGS = (
 )
 """Settings that the goals and the times to them depend on."""
 
-_SAME_GOAL = 1.5e-3  # [m] The file holds whole millimetres.
+_GOAL_TOLERANCE = 1.5e-3  # [m] The file holds whole millimetres.
 
 
-class Known(NamedTuple):
-    """A `Known` holds the best-known times of a report's goals, or why there are none."""
+class BestKnownSteps(NamedTuple):
+    """A `BestKnownSteps` holds the best-known times to a report's goals, or why there are none."""
 
     steps: Float[np.ndarray, " n"] | None
-    """Environment steps to each goal."""
+    """Number of environment steps to each goal."""
     missing: str | None
-    """Why there are none, in one line."""
+    """The reason why there are no times, in one line."""
 
 
 def settings_of(config: Config) -> dict[str, Any]:
@@ -53,15 +53,15 @@ def settings_of(config: Config) -> dict[str, Any]:
     return {name: flat[name] for name in SETTINGS}
 
 
-def find(config: Config, episodes: Episodes) -> Known:
-    """Find the best-known times of the goals that a policy was driven to.
+def find(config: Config, episodes: Episodes) -> BestKnownSteps:
+    """Find the best-known times to the goals on which a policy was evaluated.
 
     Args:
       config: the configuration of the policy's run.
-      episodes: episodes on the host, driven to the first of the report's goals.
+      episodes: the policy's episodes on the first goals of the report, with arrays on the host.
 
     Returns:
-      The times, or why there are none.
+      The times, or the reason why there are none.
     """
     # Choose the search whose settings differ least from this configuration's.
     searches = [
@@ -70,7 +70,7 @@ def find(config: Config, episodes: Episodes) -> Known:
         if one["goal_set_version"] == GOAL_SET_VERSION
     ]
     if not searches:
-        return Known(None, "no search was made for these goals")
+        return BestKnownSteps(None, "no search was made for these goals")
     ours = settings_of(config)
     differing = [
         [name for name in SETTINGS if one["settings"][name] != ours[name]] for one in searches
@@ -78,14 +78,14 @@ def find(config: Config, episodes: Episodes) -> Known:
     nearest = min(range(len(searches)), key=lambda index: len(differing[index]))
     search, names = searches[nearest], differing[nearest]
     if names:
-        told = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
+        stated = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
         own = ", ".join(str(ours[name]) for name in names)
-        return Known(None, f"it was searched for {told}, and this is {own}")
+        return BestKnownSteps(None, f"the search was made for {stated}, and this run has {own}")
     # Check that the search covers exactly these goals.
     count = episodes.steps.size
     goals, steps = np.asarray(search["goals"], float) / 1e3, np.asarray(search["steps"], float)
     if len(steps) < count:
-        return Known(None, f"it was searched for {len(steps):,} of these {count:,} goals")
-    if np.abs(goals[:count] - episodes.goal_w[:, :2]).max() > _SAME_GOAL:
-        return Known(None, "it was searched for goals that lie elsewhere")
-    return Known(steps[:count], None)
+        return BestKnownSteps(None, f"the search covers {len(steps):,} of these {count:,} goals")
+    if np.abs(goals[:count] - episodes.goal_w[:, :2]).max() > _GOAL_TOLERANCE:
+        return BestKnownSteps(None, "the search was made for goals at other positions")
+    return BestKnownSteps(steps[:count], None)

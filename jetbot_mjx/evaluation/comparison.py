@@ -1,10 +1,10 @@
 """Compare several policies or trainings on the same goals, with intervals over seeds or episodes.
 
-Two kinds of randomness are kept apart. The result of a training depends on its seed: if a run has
-two seeds or more, intervals come from a bootstrap that resamples whole seeds within each run. A run
-of one seed only shows how one policy performs on other goals: its interval is over episodes. Runs
-are also compared goal by goal, since all policies drive to the same goals; that comparison holds
-only for these policies, not for other trainings.
+Intervals describe one of two kinds of randomness. The result of a training depends on its seed: if
+a run has two seeds or more, intervals come from a bootstrap that resamples whole seeds within each
+run. A run of one seed only shows how one policy performs on other goals, so its interval is over
+episodes. Runs are also compared goal by goal, since all policies are evaluated on the same goals;
+that comparison holds only for these policies, not for other trainings.
 """
 
 import itertools
@@ -161,7 +161,7 @@ def check_comparable(configs: Mapping[str, Config]) -> None:
     Raises:
       UserError: the runs differ in the task, the robot, or the duration of an episode.
     """
-    (first, wanted), *others = ((name, _to_do(config)) for name, config in configs.items())
+    (first, wanted), *others = ((name, _task_settings(config)) for name, config in configs.items())
     for name, found in others:
         for key in sorted(wanted.keys() | found.keys()):
             if wanted.get(key) != found.get(key):
@@ -171,7 +171,8 @@ def check_comparable(configs: Mapping[str, Config]) -> None:
                 )
 
 
-def _to_do(config: Config) -> dict[str, Any]:
+def _task_settings(config: Config) -> dict[str, Any]:
+    """Return the settings of task, robot and time step, which compared runs must share."""
     return {
         key: value
         for key, value in config.flat().items()
@@ -180,6 +181,7 @@ def _to_do(config: Config) -> dict[str, Any]:
 
 
 def _differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
+    """Return the values of each run, by key, for the settings in which runs differ."""
     flat = [config.flat() for config in configs]
     keys = dict.fromkeys(key for one in flat for key in one if key not in ("seed", "seeds"))
     found = {key: [one.get(key) for one in flat] for key in keys}
@@ -187,7 +189,7 @@ def _differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
 
 
 def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Comparison:
-    """Compare runs on the goals that all of them drove to.
+    """Compare runs on the goals on which all of them were evaluated.
 
     Args:
       folder: the folder for the files of the comparison.
@@ -205,7 +207,7 @@ def compare(folder: Path, runs: Mapping[str, Mapping[str, Report]]) -> Compariso
     return Comparison(
         folder=folder,
         episodes=first.policy.episodes,
-        settings=_to_do(first.config),
+        settings=_task_settings(first.config),
         runs=rows,
         pairs=tuple(_pair(a, b) for a, b in itertools.combinations(rows, 2)),
         differences=_differences([next(iter(seeds.values())).config for seeds in runs.values()]),
@@ -222,8 +224,8 @@ def _check_goals(runs: Mapping[str, Mapping[str, Report]]) -> None:
         # Allow for a tolerance, because different compiled programs round differently.
         if not np.allclose(found, wanted, atol=1e-3):
             raise UserError(
-                f"{name} cannot be compared with {first}: its task drew other goals from the same"
-                " keys; let `sample` depend on what the runs have in common alone"
+                f"{name} cannot be compared with {first}: its task sampled other goals from the"
+                " same keys; let `sample` depend on what the runs have in common alone"
             )
 
 
@@ -262,6 +264,7 @@ def _over_seeds(values: Sequence[float]) -> Aggregate:
 
 
 def _band(curves: Sequence[Sequence[Any]]) -> tuple[BandPoint, ...]:
+    """Return the learning curve over seeds, at the steps that the curves of all seeds share."""
     if len(curves) == 1:
         return tuple(BandPoint(*point[:4]) for point in curves[0])
     by_steps = [{point.env_steps: point.success_rate for point in curve} for curve in curves]
@@ -280,16 +283,16 @@ def _band(curves: Sequence[Sequence[Any]]) -> tuple[BandPoint, ...]:
 def _pair(a: Run, b: Run) -> Pair:
     ours, theirs = list(a.seeds.values()), list(b.seeds.values())
     seeds = min(len(ours), len(theirs))
-    rate_a, steps_a = _goal_by_goal(ours[:seeds])
-    rate_b, steps_b = _goal_by_goal(theirs[:seeds])
+    rate_a, steps_a = _success_by_goal(ours[:seeds])
+    rate_b, steps_b = _success_by_goal(theirs[:seeds])
     both = (rate_a > 0) & (rate_b > 0)
     success = [[one.policy.success_rate for one in reports] for reports in (ours, theirs)]
     return Pair(
         a.name,
         b.name,
         seeds,
-        _duel(success[0], success[1], rate_a > rate_b, rate_a < rate_b),
-        _duel(
+        _compare_pairwise(success[0], success[1], rate_a > rate_b, rate_a < rate_b),
+        _compare_pairwise(
             _times(ours),
             _times(theirs),
             (steps_a < steps_b)[both],
@@ -299,7 +302,7 @@ def _pair(a: Run, b: Run) -> Pair:
     )
 
 
-def _goal_by_goal(
+def _success_by_goal(
     reports: Sequence[Report],
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Return for each goal the fraction of seeds that reached it, and their mean steps."""
@@ -310,7 +313,7 @@ def _goal_by_goal(
     return reached / len(reports), (won * steps).sum(axis=0) / np.maximum(reached, 1)
 
 
-def _duel(
+def _compare_pairwise(
     a: Sequence[float],
     b: Sequence[float],
     better: Bool[np.ndarray, " n"],

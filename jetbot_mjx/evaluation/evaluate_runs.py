@@ -316,7 +316,7 @@ def _write_reports(
             config=config,
             policy=summarize(finished, env.dt),
             baselines=evaluators.baselines,
-            cells=by_goal(finished, env.dt),
+            goal_bins=by_goal(finished, env.dt),
             failures=find_failures(finished, run_dir, checkpoint.env_steps),
             learning_curve=_learning_curve(checkpoint.run_dir),
             episodes=finished,

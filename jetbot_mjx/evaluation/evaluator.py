@@ -41,7 +41,7 @@ def report_keys(episodes: int) -> UInt32[Array, "n 2"]:
 
 
 def training_keys(episodes: int) -> UInt32[Array, "n 2"]:
-    """Return the reset keys of evaluations during training, none of which is in `report_keys`."""
+    """Return the reset keys of evaluations during training; `report_keys` has none of them."""
     return _fixed_keys(_TRAINING_SEED, episodes)
 
 
@@ -64,13 +64,13 @@ class Summary(NamedTuple):
     success_high: float
     """Upper end of the interval."""
     time_to_goal_median: float | None
-    """[s] Median over the successes; None without a success, like the next two."""
+    """[s] Median over the successes; None without a success, like the next two fields."""
     time_to_goal_p95: float | None
     """[s] 95th percentile over the successes."""
     path_efficiency: float | None
     """Mean ratio of straight-line distance to distance travelled, at most 1."""
     episode_return: float
-    """Mean over all episodes, which is near the mean distance covered for every good policy."""
+    """Mean over all episodes, close to the mean distance covered for every good policy."""
     final_distance_median: float
     """[m] Median over all episodes of the distance to the goal at the end, on the floor."""
     nonfinite_envs: int
@@ -263,7 +263,7 @@ def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     It turns in place until the goal lies ahead.
     """
     steering = 4.0  # [1/s] yaw rate per heading error
-    damping = 0.3  # yaw rate taken back per yaw rate, because the motors' lag would cause swinging
+    damping = 0.3  # reduction of the yaw rate per yaw rate, against oscillation by motor lag
     cone = 0.6  # [rad] heading error within which it drives
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:

@@ -1,7 +1,7 @@
 """Write reports as files: JSON with all values, figures, one HTML page and one Markdown page.
 
-A page takes each number from the values of its JSON file by key, so that the page and the file
-cannot differ. The HTML page embeds its figures and needs no network access.
+A page takes each number from the values of its JSON file by key, so the page and the file cannot
+differ. The HTML page embeds its figures and needs no network access.
 """
 
 import base64
@@ -37,10 +37,10 @@ from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, write_
 LISTED_FAILURES = 50
 """Largest number of failures on a page; the JSON file lists all of them."""
 
-_REPLAYED = 8
+_MAX_REPLAYED = 8
 
-_NOT_ALWAYS = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
-"""Images that a page may lack."""
+_OPTIONAL_FIGURES = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
+"""Names of the figures that a page may lack."""
 
 _FORMS = {
     "percent": "{:.2%}",
@@ -98,7 +98,7 @@ def write_report(report: Report) -> Path:
     shown = shown_trajectories(episodes)
     successes = sum(bool(episodes.success[index] > 0) for index in shown)
     figures = {
-        "by_goal": lambda: plot_by_goal(report.cells),
+        "by_goal": lambda: plot_by_goal(report.goal_bins),
         "trajectories": lambda: plot_trajectories(episodes, which=shown),
         "distributions": lambda: plot_distributions(report),
     }
@@ -107,7 +107,7 @@ def write_report(report: Report) -> Path:
     if report.robustness:
         figures["robustness"] = lambda: plot_robustness(report.robustness)
     # Write them with the commands that reproduce the report and show its failures.
-    goals = [failure.goal for failure in report.failures if failure.replay][:_REPLAYED]
+    goals = [failure.goal for failure in report.failures if failure.replay][:_MAX_REPLAYED]
     return _write(
         report.folder,
         "report",
@@ -118,7 +118,7 @@ def write_report(report: Report) -> Path:
             "listed": LISTED_FAILURES,
             "replay": replay_command(report.run, report.env_steps, goals),
             "replayed": len(goals),
-            "judge": report.judge_command(),
+            "evaluate_command": report.evaluate_command(),
         },
     )
 
@@ -154,23 +154,23 @@ def _write(
     more: Mapping[str, Any],
 ) -> Path:
     """Draw all figures and render all pages, then write the files, the HTML page last."""
-    drawn = {figure: _draw(draw) for figure, draw in figures.items()}
-    pictures = {
+    pngs_by_figure = {figure: _draw(draw) for figure, draw in figures.items()}
+    images = {
         figure: _Image(f"{figure}.png", *(_data_uri(png) for png in pngs))
-        for figure, pngs in drawn.items()
+        for figure, pngs in pngs_by_figure.items()
     }
     pages = {
         suffix: _PAGES.get_template(f"{name}{suffix}").render(
-            values=values, figures=pictures, number=_numbers(values, suffix), **more
+            values=values, figures=images, number=_numbers(values, suffix), **more
         )
         for suffix in (".md", ".html")
     }
     make_folder(folder)
     with writing_to(folder):
         # Remove figures of an earlier report that this one does not have.
-        for figure in sorted(_NOT_ALWAYS[name] - drawn.keys()):
+        for figure in sorted(_OPTIONAL_FIGURES[name] - pngs_by_figure.keys()):
             (folder / f"{figure}.png").unlink(missing_ok=True)
-        for figure, (light, _) in drawn.items():
+        for figure, (light, _) in pngs_by_figure.items():
             write_bytes(folder / f"{figure}.png", light)
         write_json(folder / f"{name}.json", values)
         for suffix, text in pages.items():

@@ -20,7 +20,7 @@ from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from jetbot_mjx.evaluation.evaluator import Summary, final_distances, path_efficiencies
 from jetbot_mjx.evaluation.report import SECTORS, GoalBin, Report
-from jetbot_mjx.evaluation.robustness import CARRIES_AT, SweepResult
+from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, SweepResult
 from jetbot_mjx.evaluation.rollout import Episodes
 
 Theme = Literal["light", "dark"]
@@ -36,8 +36,8 @@ _REACHED, _MISSED = "C0", "C1"
 
 _DPI = 160
 
-_MOST_SUCCESSES = 100
-_MOST_FAILURES = 200
+_MAX_SUCCESSES = 100
+_MAX_FAILURES = 200
 
 
 @contextlib.contextmanager
@@ -89,7 +89,7 @@ def shown_trajectories(episodes: Episodes) -> list[int]:
     """
     won = np.asarray(episodes.success) > 0
     failures, successes = np.flatnonzero(~won), np.flatnonzero(won)
-    return [*successes[:_MOST_SUCCESSES].tolist(), *failures[:_MOST_FAILURES].tolist()]
+    return [*successes[:_MAX_SUCCESSES].tolist(), *failures[:_MAX_FAILURES].tolist()]
 
 
 def plot_trajectories(
@@ -139,34 +139,38 @@ def plot_trajectories(
     return figure
 
 
-def plot_by_goal(cells: Sequence[GoalBin]) -> Figure:
+def plot_by_goal(goal_bins: Sequence[GoalBin]) -> Figure:
     """Plot success and time over the goal's distance and bearing, as seen from above the start.
 
     Args:
-      cells: the cells of a report.
+      goal_bins: the bins of a report.
 
     Returns:
-      The figure, in which cells without a goal or without a time are hatched.
+      The figure, in which bins without a goal or without a time are hatched.
     """
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     success, seconds = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
     middle, cycle = matplotlib.rcParams["grid.color"], _cycle()
     ramp = LinearSegmentedColormap.from_list
-    times = [cell.time_to_goal_median for cell in cells if cell.time_to_goal_median is not None]
+    times = [
+        goal_bin.time_to_goal_median
+        for goal_bin in goal_bins
+        if goal_bin.time_to_goal_median is not None
+    ]
     slowest, fastest = max(times, default=1.0), min(times, default=0.0)
     _polar(
         success,
-        cells,
-        [cell.success_rate for cell in cells],
-        [f"{cell.successes}\nof {cell.episodes}" for cell in cells],
+        goal_bins,
+        [goal_bin.success_rate for goal_bin in goal_bins],
+        [f"{goal_bin.successes}\nof {goal_bin.episodes}" for goal_bin in goal_bins],
         ramp("", [cycle[1], middle, cycle[0]]),
         Normalize(0, 1),
     )
     _polar(
         seconds,
-        cells,
-        [cell.time_to_goal_median for cell in cells],
-        [f"{cell.time_to_goal_median or 0:.2f}" for cell in cells],
+        goal_bins,
+        [goal_bin.time_to_goal_median for goal_bin in goal_bins],
+        [f"{goal_bin.time_to_goal_median or 0:.2f}" for goal_bin in goal_bins],
         ramp("", [middle, cycle[3]]),
         Normalize(fastest - 0.15 * (slowest - fastest) - 1e-6, slowest),
     )
@@ -181,19 +185,19 @@ def _cycle() -> list[str]:
 
 def _polar(
     axes: Any,
-    cells: Sequence[GoalBin],
+    goal_bins: Sequence[GoalBin],
     values: Sequence[float | None],
     labels: Sequence[str],
     colours: Colormap,
     scale: Normalize,
 ) -> None:
-    """Draw cells as rings and sectors, with straight ahead at the top and left on the left."""
-    # Fill each cell with its value and label it.
+    """Draw bins as rings and sectors, with straight ahead at the top and left on the left."""
+    # Fill each bin with its value and label it.
     ink, paper = (matplotlib.rcParams[key] for key in ("text.color", "figure.facecolor"))
-    for cell, value, label in zip(cells, values, labels, strict=True):
-        middle = np.radians(cell.bearing_low + cell.bearing_high) / 2
-        height = cell.distance_high - cell.distance_low
-        place = {"width": np.radians(360 / SECTORS), "bottom": cell.distance_low}
+    for goal_bin, value, label in zip(goal_bins, values, labels, strict=True):
+        middle = np.radians(goal_bin.bearing_low + goal_bin.bearing_high) / 2
+        height = goal_bin.distance_high - goal_bin.distance_low
+        place = {"width": np.radians(360 / SECTORS), "bottom": goal_bin.distance_low}
         if value is None:
             axes.bar(middle, height, **place, facecolor="none", hatch="////", lw=0)
             continue
@@ -201,10 +205,13 @@ def _polar(
         axes.bar(middle, height, **place, color=fill, edgecolor=paper, linewidth=1.5)
         # Choose the text colour that has more contrast with the fill.
         text = max((ink, paper), key=lambda colour, fill=fill: _contrast(colour, fill))
-        radius = cell.distance_low + 0.5 * height
+        radius = goal_bin.distance_low + 0.5 * height
         axes.text(middle, radius, label, ha="center", va="center", color=text, fontsize=7)
     # Label the rings with distances and the sectors with bearings.
-    edges = sorted({cell.distance_low for cell in cells} | {cell.distance_high for cell in cells})
+    edges = sorted(
+        {goal_bin.distance_low for goal_bin in goal_bins}
+        | {goal_bin.distance_high for goal_bin in goal_bins}
+    )
     axes.set_theta_zero_location("N")
     axes.set_ylim(0, edges[-1])
     axes.set_yticks(edges, [f"{edge:g} m" for edge in edges], fontsize=7)
@@ -303,7 +310,7 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
         for axes in (success, time):
             axes.axvline(result.sweep.nominal, color=ink, linestyle="--", linewidth=0.8)
             axes.grid(alpha=0.3)
-        success.axhline(CARRIES_AT, color=ink, linestyle=":", linewidth=0.8)
+        success.axhline(ROBUST_SUCCESS_RATE, color=ink, linestyle=":", linewidth=0.8)
         success.set(ylim=(-0.03, 1.03), title=result.sweep.label)
         success.yaxis.set_major_formatter(PercentFormatter(1.0))
         success.tick_params(labelbottom=False)

@@ -27,14 +27,13 @@ from jetbot_mjx.evaluation.rollout import Episodes
 
 TIME_LIMIT = "time limit"
 ENDED_BY_TASK = "ended by the task"
-NON_FINITE = "world not finite"
+NON_FINITE = "non-finite state"
 
 SECTORS = 8
-"""Number of sectors of the bearing. The first is centred straight ahead, the next are to the left
-of it."""
+"""Number of sectors of the bearing, counter-clockwise; the first is centred straight ahead."""
 
 _RINGS = 4
-_EDGE_STEP = 0.05  # [m] rounding of the rings' outer and inner edges
+_EDGE_STEP = 0.05  # [m] step to which the edges of the rings are rounded
 
 _SETTINGS = (
     "seed",
@@ -59,7 +58,7 @@ class GoalBin(NamedTuple):
     episodes: int
     successes: int
     success_rate: float | None
-    """None if the cell contains no goal, like its interval."""
+    """None if the bin contains no goal, like its interval."""
     success_low: float | None
     """Lower end of the 95 % Wilson interval."""
     success_high: float | None
@@ -80,7 +79,7 @@ class Failure(NamedTuple):
     final_distance: float
     """[m] Distance to the goal at the end, on the floor."""
     ended: str
-    """`time limit`, `ended by the task`, or `world not finite`."""
+    """`time limit`, `ended by the task`, or `non-finite state`."""
     replay: str | None
     """The command that renders the episode; None if the goal is beyond those that can be rendered.
     """
@@ -96,8 +95,8 @@ class CurvePoint(NamedTuple):
     time_to_goal_median: float | None
 
 
-class Gap(NamedTuple):
-    """A `Gap` compares a policy's time with the best-known time, over the goals that it reached."""
+class TimeGap(NamedTuple):
+    """A `TimeGap` compares a policy's time with the best-known time over the goals it reached."""
 
     bearing_low: float
     """[°] Lower limit of the goals' bearing; `bearing_high` is the upper limit."""
@@ -118,8 +117,8 @@ class BestKnown(NamedTuple):
     time_to_goal_median: float
     """[s] over all goals of the report, reached by the policy or not, like the next field."""
     time_to_goal_p95: float
-    total: Gap
-    by_direction: tuple[Gap, ...]
+    total: TimeGap
+    by_direction: tuple[TimeGap, ...]
     """The gap in each sector of the bearing, counter-clockwise from straight ahead."""
 
 
@@ -135,7 +134,7 @@ class Report(NamedTuple):
     config: Config
     policy: Summary
     baselines: Mapping[str, Summary]
-    cells: tuple[GoalBin, ...]
+    goal_bins: tuple[GoalBin, ...]
     failures: tuple[Failure, ...]
     learning_curve: tuple[CurvePoint, ...]
     """Evaluations during the training; empty if the run folder holds no metrics."""
@@ -164,7 +163,7 @@ class Report(NamedTuple):
         alone = not run_dir.name.startswith("seed-")
         return run_dir.name if alone else f"{run_dir.parent.name}/{run_dir.name}"
 
-    def judge_command(self) -> str:
+    def evaluate_command(self) -> str:
         """Return the command line that creates this report."""
         return (
             f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
@@ -188,9 +187,9 @@ class Report(NamedTuple):
             },
             "policy": self.policy._asdict(),
             "baselines": {name: one._asdict() for name, one in self.baselines.items()},
-            "best_known": _best_known_json(self.best_known),
+            "best_known": _best_known_to_json(self.best_known),
             "best_known_missing": self.best_known_missing,
-            "cells": [cell._asdict() for cell in self.cells],
+            "cells": [one._asdict() for one in self.goal_bins],
             "failures": [failure._asdict() for failure in self.failures],
             "learning_curve": [point._asdict() for point in self.learning_curve],
             "robustness": as_json(self.robustness) if self.robustness else None,
@@ -201,7 +200,7 @@ class Report(NamedTuple):
         }
 
 
-def goal_places(
+def goal_positions(
     episodes: Episodes,
 ) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Compute the distance and bearing of each goal relative to the robot at the start.
@@ -225,23 +224,24 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
       ctrl_dt: duration of one environment step [s].
 
     Returns:
-      Cells in rings from the inner to the outer one, each counter-clockwise from straight ahead.
+      The bins in rings from the inner to the outer one, each counter-clockwise from straight ahead.
       The rings are equally wide and together contain all goals.
     """
-    distance, bearing = goal_places(episodes)
+    # Assign each goal to a ring of the distance and a sector of the bearing.
+    distance, bearing = goal_positions(episodes)
     edges = _ring_edges(distance)
     ring = np.clip(np.digitize(distance, edges) - 1, 0, len(edges) - 2)
     width = 360 / SECTORS
     sector = _sectors(bearing)
     won = np.asarray(episodes.success) > 0
     seconds = np.asarray(episodes.steps) * ctrl_dt
-    cells = []
+    bins = []
     for r in range(len(edges) - 1):
         for s in range(SECTORS):
             here = (ring == r) & (sector == s)
-            place = (edges[r], edges[r + 1], (s - 0.5) * width, (s + 0.5) * width)
-            cells.append(_cell(place, won[here], seconds[here]))
-    return tuple(cells)
+            limits = (edges[r], edges[r + 1], (s - 0.5) * width, (s + 0.5) * width)
+            bins.append(_goal_bin(limits, won[here], seconds[here]))
+    return tuple(bins)
 
 
 def _sectors(bearing: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
@@ -257,23 +257,23 @@ def compare_with_best_known(
 
     Args:
       config: the configuration of the policy's run.
-      episodes: episodes on the host, driven to the first of the report's goals.
+      episodes: the policy's episodes on the first goals of the report, with arrays on the host.
 
     Returns:
-      The comparison, or None and why there is none.
+      The comparison and None, or None and the reason why there is no comparison.
     """
     known = best_known.find(config, episodes)
     if known.steps is None:
         return None, known.missing
     best = known.steps * config.physics.ctrl_dt
     seconds = np.asarray(episodes.steps, float) * config.physics.ctrl_dt
-    won, sector = np.asarray(episodes.success) > 0, _sectors(goal_places(episodes)[1])
+    won, sector = np.asarray(episodes.success) > 0, _sectors(goal_positions(episodes)[1])
 
-    def gap(low: float, high: float, here: np.ndarray) -> Gap:
+    def gap(low: float, high: float, here: np.ndarray) -> TimeGap:
         if not here.any():
-            return Gap(low, high, 0, None, None, None)
+            return TimeGap(low, high, 0, None, None, None)
         ours, theirs = float(seconds[here].mean()), float(best[here].mean())
-        return Gap(low, high, int(here.sum()), ours, theirs, ours / theirs - 1)
+        return TimeGap(low, high, int(here.sum()), ours, theirs, ours / theirs - 1)
 
     width = 360 / SECTORS
     by_direction = tuple(
@@ -283,7 +283,7 @@ def compare_with_best_known(
     return BestKnown(median, p95, gap(-180.0, 180.0, won), by_direction), None
 
 
-def _best_known_json(found: BestKnown | None) -> dict[str, Any] | None:
+def _best_known_to_json(found: BestKnown | None) -> dict[str, Any] | None:
     if found is None:
         return None
     by_direction = [one._asdict() for one in found.by_direction]
@@ -301,15 +301,15 @@ def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
     ]
 
 
-def _cell(
-    place: tuple[float, float, float, float],
+def _goal_bin(
+    limits: tuple[float, float, float, float],
     won: np.ndarray,
     seconds: Float[np.ndarray, " n"],
 ) -> GoalBin:
     count, wins = won.size, int(won.sum())
     low, high = wilson_interval(wins, count) if count else (None, None)
     return GoalBin(
-        *place,
+        *limits,
         episodes=count,
         successes=wins,
         success_rate=wins / count if count else None,
@@ -330,7 +330,7 @@ def find_failures(episodes: Episodes, run: Path, env_steps: int) -> tuple[Failur
     Returns:
       One entry for each of these goals.
     """
-    distance, bearing = goal_places(episodes)
+    distance, bearing = goal_positions(episodes)
     remaining = final_distances(episodes)
     return tuple(
         Failure(
@@ -338,14 +338,14 @@ def find_failures(episodes: Episodes, run: Path, env_steps: int) -> tuple[Failur
             distance=float(distance[goal]),
             bearing=float(bearing[goal]),
             final_distance=float(remaining[goal]),
-            ended=_how_it_ended(episodes, goal),
+            ended=_outcome(episodes, goal),
             replay=replay_command(run, env_steps, [goal]),
         )
         for goal in np.flatnonzero(~(np.asarray(episodes.success) > 0)).tolist()
     )
 
 
-def _how_it_ended(episodes: Episodes, goal: int) -> str:
+def _outcome(episodes: Episodes, goal: int) -> str:
     if episodes.nonfinite[goal] > 0:
         return NON_FINITE
     return ENDED_BY_TASK if episodes.terminated[goal] > 0 else TIME_LIMIT

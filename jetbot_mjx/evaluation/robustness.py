@@ -1,17 +1,17 @@
 """Evaluate the robustness of a policy on changed robots and in another simulator, C MuJoCo.
 
-One parameter at a time differs from the preset's value. Goals, rules and metrics are those of the
-report. One compiled program evaluates all robots, and the scripted controller besides the policy.
-The evaluation in C MuJoCo uses the same robot, with numerics that no training uses.
+A sweep changes one parameter at a time from the preset's value. Goals, rules and metrics are those
+of the report. One compiled program evaluates all robots, with the policy and with the scripted
+controller. The evaluation in C MuJoCo uses the same robot with numerics that no training uses.
 
-Sources, by tag; BOM, EST and SIM as in `model.py`:
-  CAD         the space for the battery, and the clearance of the casters; see `model.py`.
-  CSE276A     gassajor000/cse276a_jetbot: a JetBot's motors, calibrated.
-  DUCKIETOWN  gym-duckietown: the simulator of a robot with the same motors.
-  ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: how that randomises Isaac's JetBot.
-  PICOBOT     uni-obuda picobot: a robot with the same motors, identified.
-  TT          measurements of the same motors: newscrewdriver.com, SunFounder's data.
-  WHEELEDLAB  WheeledLab: how that randomises a drifting car.
+Sources of the ranges, by tag; BOM, EST and SIM are those of `envs/robot_model.py`:
+  CAD         the space for the battery and the clearance of the casters in the CAD model
+  CSE276A     gassajor000/cse276a_jetbot: calibration of a JetBot's motors
+  DUCKIETOWN  gym-duckietown: simulator of a robot with the same motors
+  ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: domain randomization of Isaac's JetBot
+  PICOBOT     uni-obuda picobot: system identification of a robot with the same motors
+  TT          measurements of the same motors: newscrewdriver.com, SunFounder's data
+  WHEELEDLAB  WheeledLab: domain randomization of a drifting car
 """
 
 from collections.abc import Sequence
@@ -43,7 +43,7 @@ from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
 SWEEP_GOALS = 128
 """Number of the report's fixed goals that a sweep uses for each robot."""
 
-CARRIES_AT = 0.95
+ROBUST_SUCCESS_RATE = 0.95
 """Lowest success rate at which a policy counts as robust to a changed value."""
 
 
@@ -184,7 +184,7 @@ SWEEPS = (
         "delay of observations",
         "control steps",
         (0.0, 1.0, 2.0, 3.0, 6.0),
-        "EST 30 to 60 ms of a camera of 30 pictures a second",
+        "EST 30 to 60 ms of a camera with 30 frames per second",
     ),
     Sweep(
         "height_offset",
@@ -249,19 +249,19 @@ class Sweeper:
         controllers = [policy_controller(networks), BASELINES["scripted"](env)]
         length = env.config.task.episode_length
 
-        def drive(
+        def run_episodes(
             index: int | Int[Array, ""],
             params: PolicyParams,
             keys: UInt32[Array, "n 2"],
             robot_params: Float[Array, "robots quantities"],
         ) -> Episodes:
             def one(robot_params: Float[Array, " quantities"]) -> Episodes:
-                varied = DomainRandomizationWrapper(env, RobotParams(*robot_params))
-                return rollout_fn(varied, controllers, length)(index, params, keys)
+                randomized_env = DomainRandomizationWrapper(env, RobotParams(*robot_params))
+                return rollout_fn(randomized_env, controllers, length)(index, params, keys)
 
             return jax.lax.map(one, robot_params, batch_size=at_once)
 
-        self._drive = jax.jit(drive, compiler_options=compiler_options(env.config))
+        self._run_episodes = jax.jit(run_episodes, compiler_options=compiler_options(env.config))
         self._scripted: dict[RobotParams, Summary] = {}
 
     def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
@@ -274,8 +274,8 @@ class Sweeper:
           One result for each sweep.
         """
         host = jax.device_get(params)
-        policy = self._judged(0, host)
-        self._scripted = self._scripted or self._judged(1, host)
+        policy = self._evaluate(0, host)
+        self._scripted = self._scripted or self._evaluate(1, host)
         return tuple(
             SweepResult(
                 one,
@@ -285,10 +285,10 @@ class Sweeper:
             for one in self._sweeps
         )
 
-    def _judged(self, controller: int, params: PolicyParams) -> dict[RobotParams, Summary]:
+    def _evaluate(self, controller: int, params: PolicyParams) -> dict[RobotParams, Summary]:
         robot_params = jnp.asarray(self._robots, jnp.float32)
-        driven = jax.device_get(self._drive(controller, params, self._keys, robot_params))
-        each = (jax.tree.map(lambda x, i=i: x[i], driven) for i in range(len(self._robots)))
+        episodes = jax.device_get(self._run_episodes(controller, params, self._keys, robot_params))
+        each = (jax.tree.map(lambda x, i=i: x[i], episodes) for i in range(len(self._robots)))
         summaries = (summarize(one, self._env.dt) for one in each)
         return dict(zip(self._robots, summaries, strict=True))
 
@@ -325,7 +325,7 @@ class MujocoResult(NamedTuple):
     """Metrics with a robot sampled for each goal; None without ranges to sample from."""
 
     def to_json(self) -> dict[str, Any]:
-        """Return all of it as plain values, for a report's file."""
+        """Return the numerics and metrics as JSON values."""
         numerics = self.numerics._asdict().items()
         return {
             "numerics": {k: list(v) if isinstance(v, tuple) else v for k, v in numerics},
@@ -360,10 +360,9 @@ class MujocoEvaluator:
         simulator = in_mujoco(env, numerics)
         programs = ProgramCache(compiler_options(env.config))
         self._preset = Evaluator(simulator, networks, programs)
-        drawn = ranges is not None and ranges.drawn
-        self._drawn = (
+        self._randomized = (
             Evaluator(DomainRandomizationWrapper(simulator, ranges=ranges), networks, programs)
-            if drawn
+            if ranges is not None and ranges.drawn
             else None
         )
 
@@ -378,12 +377,14 @@ class MujocoEvaluator:
             return MujocoResult(
                 self._numerics,
                 summarize(self._preset.run(params, keys), self._dt),
-                summarize(self._drawn.run(params, keys), self._dt) if self._drawn else None,
+                summarize(self._randomized.run(params, keys), self._dt)
+                if self._randomized
+                else None,
             )
 
 
-def carries(result: SweepResult) -> tuple[float, float] | None:
-    """Return the range of values over which the success rate stays at `CARRIES_AT` or above.
+def robust_range(result: SweepResult) -> tuple[float, float] | None:
+    """Return the range of values with a success rate of at least `ROBUST_SUCCESS_RATE`.
 
     Args:
       result: the result for one parameter.
@@ -393,7 +394,7 @@ def carries(result: SweepResult) -> tuple[float, float] | None:
       None if the success rate is lower already at the preset's value.
     """
     values = result.sweep.values
-    good = [summary.success_rate >= CARRIES_AT for summary in result.policy]
+    good = [summary.success_rate >= ROBUST_SUCCESS_RATE for summary in result.policy]
     low = high = values.index(result.sweep.nominal)
     if not good[low]:
         return None
@@ -415,13 +416,13 @@ def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
     """
     return {
         "goal_set_version": GOAL_SET_VERSION,
-        "carries_at": CARRIES_AT,
+        "carries_at": ROBUST_SUCCESS_RATE,
         "goals": results[0].policy[0].episodes,
         "quantities": [
             {
                 **result.sweep._asdict(),
                 "nominal": result.sweep.nominal,
-                "carries": _as_list(carries(result)),
+                "carries": _as_list(robust_range(result)),
                 "lowest": min(summary.success_rate for summary in result.policy),
                 "policy": [summary._asdict() for summary in result.policy],
                 "scripted": [summary._asdict() for summary in result.scripted],

@@ -5,6 +5,7 @@ that a scripted controller can be evaluated like a policy. This module adds the 
 `jax.vmap`.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -62,6 +63,8 @@ Rollout = Callable[[int | Int[Array, ""], Any, UInt32[Array, "n 2"]], Episodes]
 
 
 class _Tally(NamedTuple):
+    """A `_Tally` holds the episode statistics so far; `alive` is 1 until the episode has ended."""
+
     alive: Float[Array, ""]
     success: Float[Array, ""]
     steps: Float[Array, ""]
@@ -72,6 +75,8 @@ class _Tally(NamedTuple):
 
 
 class _Carry(NamedTuple):
+    """A `_Carry` holds what the loop over the environment steps carries."""
+
     time: Int[Array, ""]
     state: State
     tally: _Tally
@@ -99,32 +104,12 @@ def rollout_fn(
       randomness.
     """
     episode_env = EpisodeWrapper(env, episode_length)
-
-    # Step one environment and add to its episode statistics, unless its episode has ended.
-    def one_step(state: State, tally: _Tally, action: Float[Array, "2"]) -> tuple[State, _Tally]:
-        nstate = episode_env.step(state, action)
-        moved = jnp.linalg.norm(
-            nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
-        )
-        now = _Tally(
-            alive=-nstate.done,
-            success=nstate.metrics["success"],
-            steps=jnp.ones(()),
-            episode_return=nstate.reward,
-            terminated=nstate.info["terminated"],
-            nonfinite=nstate.metrics["nonfinite_envs"],
-            path_length=moved,
-        )
-        added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
-        # Keep the final state of an episode that has ended.
-        nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
-        return nstate, added
-
+    step = jax.vmap(functools.partial(_step_and_tally, episode_env))
     # Fold in twice: `fold_in(key, 1)` alone equals `split(key)[1]`, from which the goal is drawn.
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
 
-    # Run a batch of environments until the episode of each has ended.
     def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
+        # Reset the environments, and start with empty episode statistics.
         first = jax.vmap(episode_env.reset)(keys)
         zero = jnp.zeros(keys.shape[0])
         tally = _Tally(jnp.ones_like(zero), *[zero] * 6)
@@ -140,33 +125,64 @@ def rollout_fn(
         def body(carry: _Carry) -> _Carry:
             step_keys = fold_in(fold_in(keys, _ACTION_DRAWS), carry.time)
             actions = jax.vmap(act)(carry.state, step_keys)
-            state, tally = jax.vmap(one_step)(carry.state, carry.tally, actions)
+            state, tally = step(carry.state, carry.tally, actions)
             qpos = carry.qpos
             if qpos is not None:
                 qpos = qpos.at[:, carry.time + 1].set(state.pipeline_state.qpos)
             return _Carry(carry.time + 1, state, tally, qpos)
 
+        # Step all environments until the episode of each has ended.
         start = first.pipeline_state.qpos
         trail = jnp.repeat(start[:, None], episode_length + 1, axis=1) if record else None
-        time, last, tally, qpos = jax.lax.while_loop(
+        end = jax.lax.while_loop(
             goes_on, body, _Carry(jnp.zeros((), jnp.int32), first, tally, trail)
         )
-        if qpos is not None:
-            ended = jnp.arange(episode_length + 1) > time
-            qpos = jnp.where(ended[:, None], last.pipeline_state.qpos[:, None], qpos)
-        return Episodes(
-            success=tally.success,
-            steps=tally.steps,
-            episode_return=tally.episode_return,
-            terminated=tally.terminated,
-            nonfinite=tally.nonfinite,
-            path_length=tally.path_length,
-            start_w=start[:, QPOS_XYZ][:, :2],
-            start_yaw=jax.vmap(kinematics.yaw)(start[:, QPOS_QUAT]),
-            end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],
-            goal_w=jax.vmap(env.task.goal_position)(first.goal),
-            goal=first.goal,
-            qpos=qpos,
-        )
+        return _to_episodes(env, first, end)
 
     return run
+
+
+def _step_and_tally(
+    env: EpisodeWrapper, state: State, tally: _Tally, action: Float[Array, "2"]
+) -> tuple[State, _Tally]:
+    """Step one environment and add to its episode statistics, unless its episode has ended."""
+    nstate = env.step(state, action)
+    moved = jnp.linalg.norm(
+        nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
+    )
+    now = _Tally(
+        alive=-nstate.done,
+        success=nstate.metrics["success"],
+        steps=jnp.ones(()),
+        episode_return=nstate.reward,
+        terminated=nstate.info["terminated"],
+        nonfinite=nstate.metrics["nonfinite_envs"],
+        path_length=moved,
+    )
+    added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
+    # Keep the final state of an episode that has ended.
+    nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
+    return nstate, added
+
+
+def _to_episodes(env: JetBotEnv | Wrapper, first: State, end: _Carry) -> Episodes:
+    """Return the episodes between the reset states and the carry after the last step."""
+    start, last, tally, qpos = first.pipeline_state.qpos, end.state, end.tally, end.qpos
+    if qpos is not None:
+        # Repeat the final state in the rows that were not reached.
+        ended = jnp.arange(qpos.shape[1]) > end.time
+        qpos = jnp.where(ended[:, None], last.pipeline_state.qpos[:, None], qpos)
+    return Episodes(
+        success=tally.success,
+        steps=tally.steps,
+        episode_return=tally.episode_return,
+        terminated=tally.terminated,
+        nonfinite=tally.nonfinite,
+        path_length=tally.path_length,
+        start_w=start[:, QPOS_XYZ][:, :2],
+        start_yaw=jax.vmap(kinematics.yaw)(start[:, QPOS_QUAT]),
+        end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],
+        goal_w=jax.vmap(env.task.goal_position)(first.goal),
+        goal=first.goal,
+        qpos=qpos,
+    )

@@ -6,7 +6,7 @@ from jetbot_mjx.evaluation.bootstrap import Estimate
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.report import Report
-from jetbot_mjx.evaluation.robustness import CARRIES_AT, carries
+from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, robust_range
 
 
 def policies_table(policies: Mapping[str, Report]) -> str:
@@ -20,8 +20,8 @@ def policies_table(policies: Mapping[str, Report]) -> str:
         if report.mujoco:
             rows.append((f"{name} in C MuJoCo", report.mujoco.policy))
             if report.mujoco.randomized:
-                drawn = report.mujoco.randomized
-                rows.append((f"{name} in C MuJoCo, randomised robots", drawn))
+                randomized = report.mujoco.randomized
+                rows.append((f"{name} in C MuJoCo, randomised robots", randomized))
     rows += baselines.items()
     width = max(10, *(len(name) for name, _ in rows))
     head = (
@@ -51,7 +51,7 @@ def best_known_lines(report: Report) -> str:
     """Return lines with a policy's gap to the best-known times, or why there is none."""
     best = report.best_known
     if best is None:
-        return f"best known: not told, {report.best_known_missing}\n"
+        return f"best known: not available, {report.best_known_missing}\n"
     if best.total.gap is None:
         return "best known: the policy reached no goal to be compared on\n"
     directions = ", ".join(
@@ -70,14 +70,15 @@ def robustness_table(report: Report) -> str:
     """Return one line for each parameter with its robust range; empty if not evaluated."""
     lines = []
     for result in report.robustness:
-        span = carries(result)
-        far = f"{span[0]:g} to {span[1]:g} {result.sweep.unit}" if span else "not even the preset"
-        lines.append(f"  {result.sweep.label:26}  {far}\n")
+        span = robust_range(result)
+        text = (
+            f"{span[0]:g} to {span[1]:g} {result.sweep.unit}" if span else "not even at the preset"
+        )
+        lines.append(f"  {result.sweep.label:26}  {text}\n")
     if not lines:
         return ""
-    return (
-        f"success stays at {CARRIES_AT:.0%} or above (judged on fewer goals) over\n{''.join(lines)}"
-    )
+    rate = f"{ROBUST_SUCCESS_RATE:.0%}"
+    return f"success stays at {rate} or above (evaluated on fewer goals) over\n{''.join(lines)}"
 
 
 def runs_table(comparison: Comparison) -> str:
@@ -106,11 +107,11 @@ def pairs_table(comparison: Comparison) -> str:
             ("success", pair.success_rate, "{:+.2%}"),
             ("time", pair.time_to_goal, "{:+.3f} s"),
         )
-        for name, duel, form in quantities:
+        for name, result, form in quantities:
             lines.append(
-                f"  {name:8}  difference {_estimate(duel.difference, form)},"
-                f" improvement {_estimate(duel.improvement, '{:.0%}')},"
-                f" goals {duel.wins} : {duel.losses} (p {duel.p:.2g})"
+                f"  {name:8}  difference {_estimate(result.difference, form)},"
+                f" improvement {_estimate(result.improvement, '{:.0%}')},"
+                f" goals {result.wins} : {result.losses} (p {result.p:.2g})"
             )
     return "\n".join(lines)
 

@@ -23,7 +23,7 @@ from jetbot_mjx.runs.checkpoint_store import (
 )
 
 Which = Literal["best", "last"] | int
-"""A checkpoint of a run: the best, the last, or the one at that many environment steps."""
+"""Selects a checkpoint of a run: the best, the last, or one by its environment steps."""
 
 PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
 """Runs that come with the package, each named after its configuration."""
@@ -32,7 +32,7 @@ POLICY = "policy"
 """The tree that holds a policy's parameters."""
 
 FORMAT = "jetbot_mjx/3"
-"""Format of a checkpoint's content; a checkpoint with another number cannot be read here."""
+"""Format of a checkpoint's content; checkpoints of other formats cannot be read."""
 
 _KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "metrics")
 
@@ -42,7 +42,7 @@ class Checkpoint(NamedTuple):
 
     path: Path
     run_dir: Path
-    """The folder that reports and videos of this policy are written to."""
+    """The run folder, to which reports and videos of this policy are written."""
     env_steps: int
     config: Config
     params: PolicyParams
@@ -109,7 +109,7 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
         )
         template = policy_template(networks, about["observation_size"])
     except (KeyError, TypeError, ConfigError) as error:
-        raise CheckpointError(f"checkpoint {folder} does not explain itself: {error}") from None
+        raise CheckpointError(f"checkpoint {folder} has unusable metadata: {error}") from None
     return Checkpoint(
         path=folder,
         run_dir=folder.parent.parent,
@@ -136,8 +136,8 @@ def explanation(folder: Path) -> dict[str, Any]:
     about = read_about(folder, _KEYS)
     if about["format"] != FORMAT:
         raise CheckpointError(
-            f"checkpoint {folder} is in the format {about['format']!r}, and only {FORMAT!r} can be"
-            " read here"
+            f"checkpoint {folder} has the format {about['format']!r}, and only {FORMAT!r} can be"
+            " read"
         )
     return about
 

@@ -6,14 +6,18 @@ checkpoint, and a damaged checkpoint must never be loaded as if it were a good o
 
 Protocol:
 
-- Orbax writes each checkpoint under a temporary name and renames it to
-  `checkpoints/<env_steps>/` when it is complete.
-- The folder holds one or more trees of arrays and `about`, a JSON object. `about` also holds the
-  SHA-256 of each tree and of itself.
-- A reader recomputes the digests and compares the folder's name with the stored `env_steps`. It
-  refuses a checkpoint that does not match and states the reason.
-- A checkpoint that is removed is first moved to `.deleted`, so that a half-deleted one never
-  stands under a valid name.
+1. Write: Orbax writes each checkpoint under a temporary name and renames it to
+   `checkpoints/<env_steps>/` when it is complete. A process that dies leaves at most a temporary
+   folder, which the next one removes.
+2. Digests: the folder holds one or more trees of arrays and `about`, a JSON object. `about` also
+   holds the SHA-256 of each tree and of itself.
+3. Read: a reader recomputes the digests and compares the folder's name with the stored
+   `env_steps`. If anything differs, it raises a `CheckpointError` with the reason.
+4. Damage: a damaged checkpoint is never repaired or deleted. `resume` skips it, continues from the
+   newest usable one, and moves those that are newer to `set_aside/`, so that the training can write
+   its own under their names.
+5. Delete: a checkpoint that is removed is first moved to `.deleted`, so that a half-deleted one
+   never has a valid name.
 
 Arguments for this protocol: arrays are stored by name, as NumPy arrays from the host, so that the
 files depend neither on a Python class nor on the number of devices. The digests cover names,
@@ -50,7 +54,7 @@ _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
 _DELETED = ".deleted"
 
-_PLACES = re.compile(r"\s*\[source locations='[^']*'\]")
+_SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
 
 # Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
@@ -75,17 +79,16 @@ class CheckpointStore:
 
         Args:
           run_dir: the run folder, which must exist.
-          keep: how many of the latest checkpoints to keep, besides the first and the best.
+          keep: the number of latest checkpoints to keep, besides the first and the best.
         """
         self._success = {step: _success_rate(run_dir, step) for step in checkpoint_steps(run_dir)}
         options = ocp.CheckpointManagerOptions(
             create=False,
-            multiprocessing_options=_this_process_alone(),
+            multiprocessing_options=_single_process_options(),
             step_name_format=_step_names(),
-            preservation_policy=_KeepSome(keep, self._success),
+            preservation_policy=_PreserveBestAndLatest(keep, self._success),
             cleanup_tmp_directories=True,
-            # Orbax moves a checkpoint here before it deletes it, so that a half-deleted one never
-            # stands under a valid name.
+            # Orbax moves a checkpoint here before it deletes it.
             todelete_subdir=_DELETED,
         )
         self._folder = (run_dir / FOLDER).absolute()
@@ -104,11 +107,11 @@ class CheckpointStore:
         """Start to write one checkpoint in the background.
 
         Args:
-          env_steps: environment steps so far, which name the folder.
-          trees: trees of arrays on the host, by name.
-          about: metadata that describes them, as JSON values.
-          success_rate: success rate by which the best checkpoint is kept; None if the policy was
-            not evaluated.
+          env_steps: the number of environment steps so far, which is the name of the folder.
+          trees: the trees of arrays on the host, by name.
+          about: the metadata of the trees, as JSON values.
+          success_rate: the success rate, by which the best checkpoint is found; None if the policy
+            was not evaluated.
 
         Raises:
           CheckpointError: this checkpoint, or the one before, could not be written.
@@ -128,11 +131,11 @@ class CheckpointStore:
         items = {name: ocp.args.StandardSave(tree) for name, tree in flat.items()}
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
-            begun = self._manager.save(
+            started = self._manager.save(
                 env_steps,
                 args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)}),
             )
-            if not begun:
+            if not started:
                 raise ValueError(f"there is one after {env_steps} steps or more")
 
     def wait(self) -> None:
@@ -168,7 +171,7 @@ class CheckpointStore:
         if free < needed:
             raise CheckpointError(
                 f"{self._folder}: the disk is full: a checkpoint needs {needed / 1e6:.1f} MB, and"
-                f" {free / 1e6:.1f} MB are free; the checkpoints there are as they were"
+                f" {free / 1e6:.1f} MB are free; the earlier checkpoints are unchanged"
             )
 
     @contextlib.contextmanager
@@ -179,12 +182,12 @@ class CheckpointStore:
         except Exception as error:
             raise CheckpointError(
                 f"{self._folder}: a checkpoint could not be written: {_reason(error)}; the earlier"
-                " ones are as they were"
+                " ones are unchanged"
             ) from error
 
 
-class _KeepSome(checkpoint_managers.PreservationPolicy):
-    """A policy that keeps the latest, the first and the best checkpoints.
+class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
+    """A preservation policy of Orbax that keeps the latest, the first and the best checkpoints.
 
     Of equally good checkpoints the later one counts as the best.
     """
@@ -258,21 +261,21 @@ def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
     file = path / _ABOUT / "metadata"
     try:
         about = json.loads(file.read_text(encoding="utf-8"))
-        stated = about[_DIGESTS].pop(_ABOUT)
-        whole = stated == _digest_json(about)
+        stored_digest = about[_DIGESTS].pop(_ABOUT)
+        is_intact = stored_digest == _digest_json(about)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         raise CheckpointError(
             f"checkpoint {path} is not one of jetbot_mjx: {file.relative_to(path)} is missing"
             " or damaged"
         ) from None
-    if not whole:
+    if not is_intact:
         raise CheckpointError(
-            f"checkpoint {path} is damaged: {file.relative_to(path)} is not as it was written"
+            f"checkpoint {path} is damaged: {file.relative_to(path)} changed after it was written"
         )
     # Check the content: the required keys, and the step that the folder's name states.
     for key in required:
         if key not in about:
-            raise CheckpointError(f"checkpoint {path} does not explain itself: no {key}")
+            raise CheckpointError(f"checkpoint {path} has unusable metadata: no {key}")
     if path.name.isdecimal() and int(path.name) != about.get("env_steps"):
         raise CheckpointError(
             f"checkpoint {path} was renamed: it was written after {about.get('env_steps')} steps"
@@ -285,8 +288,8 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
 
     Args:
       path: the checkpoint folder.
-      name: name of the tree.
-      template: a tree of the same structure, whose leaves have the expected shape and dtype.
+      name: the name of the tree.
+      template: a tree of the expected structure, whose leaves have the expected shapes and dtypes.
 
     Returns:
       A tree of NumPy arrays with the structure of the template.
@@ -305,7 +308,7 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
     except Exception as error:
         raise CheckpointError(f"checkpoint {path} cannot be read: {_reason(error)}") from None
     if digest(flat) != about[_DIGESTS][name]:
-        raise CheckpointError(f"checkpoint {path} is damaged: {name} is not as it was written")
+        raise CheckpointError(f"checkpoint {path} is damaged: {name} changed after it was written")
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
 
 
@@ -373,7 +376,7 @@ def _reason(error: Exception) -> str:
 
     Locations in the source of other libraries are left out.
     """
-    text = _PLACES.sub("", str(error))
+    text = _SOURCE_LOCATIONS.sub("", str(error))
     lines = text.strip().splitlines() or [type(error).__name__]
     # A message of TensorStore begins with the operation and ends with the cause: keep both ends.
     return lines[0] if len(lines[0]) <= 300 else f"{lines[0][:150]} ... {lines[0][-150:]}"
@@ -386,8 +389,8 @@ def _describe(array: Any) -> str:
     return f"{np.dtype(dtype)}{list(array.shape)}"
 
 
-def _this_process_alone() -> Any:
-    """Return options by which Orbax does not wait for other processes, which do not write."""
+def _single_process_options() -> Any:
+    """Return options with which Orbax does not wait for other processes, which do not write."""
     me = jax.process_index()
     return ocp.options.MultiprocessingOptions(
         primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"

@@ -1,29 +1,29 @@
 """Log the metrics of a training to a file and to TensorBoard, with one `Sink` for each.
 
-The names are the same everywhere. A line of metrics.jsonl also holds env_steps and timestamp, and
-TensorBoard also shows the metrics under the names of Stable-Baselines3 (`sb3_tags.py`):
-  eval/episodes             of the deterministic policy, on fixed goals; likewise successes
-  eval/success_rate         of those; with success_low, success_high
-  eval/time_to_goal_median  [s] of the successes; likewise time_to_goal_p95
-  eval/path_efficiency      straight line over way travelled, mean over the successes
-  eval/episode_return       mean sum of rewards [m]: about the distance covered
-  eval/final_distance_median    [m] to the goal at the end, on the floor
-  eval/nonfinite_envs     episodes that were cut off because of a non-finite state
-  loss/total, policy, value, entropy    means over the interval, as Brax computes them
-  policy/entropy            of the actions, after squashing where they are squashed [nat]
-  policy/kl                 between the policy before and after an update, mean
-  policy/std                of the action distribution, before squashing
+Metrics have the same names in all sinks. A line of metrics.jsonl also holds env_steps and
+timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.py`):
+  eval/episodes             episodes of the deterministic policy on fixed goals; likewise successes
+  eval/success_rate         success rate; interval: success_low, success_high
+  eval/time_to_goal_median  [s] median time of the successes; 95th percentile: time_to_goal_p95
+  eval/path_efficiency      straight line over distance travelled, mean over the successes
+  eval/episode_return       [m] mean sum of rewards, about the distance covered
+  eval/final_distance_median  [m] distance to the goal at the end, on the floor
+  eval/nonfinite_envs       episodes that were cut off because of a non-finite state
+  loss/total, policy, value, entropy  means over the interval, as Brax computes them
+  policy/entropy            [nat] entropy of the actions, after squashing
+  policy/kl                 mean KL divergence between the policies before and after an update
+  policy/std                standard deviation of the action distribution, before squashing
   policy/learning_rate      Adam's step size
-  rollout/episodes          that ended while collecting, driven by the exploring policy
-  rollout/success_rate      of those; likewise rollout/episode_return, rollout/episode_length
-  train/nonfinite_envs    while collecting: each was reset, and the first one saved for replay
+  rollout/episodes          episodes of the exploring policy that ended during collection
+  rollout/success_rate      their success rate; likewise episode_return, episode_length
+  train/nonfinite_envs      non-finite states during collection; the first one is saved for replay
   train/nonfinite_updates   updates that were skipped because their gradient was not finite
-  time/env_steps_per_second environment steps per training second, without compilation
-  time/training_seconds     spent on training since the last report
-  time/evaluation_seconds   spent on this evaluation, its compilation included
-  time/recording_seconds    spent on logging, saving and rendering after the last evaluation
-  time/compile_seconds      spent tracing and compiling in this interval, evaluation included
-  time/wall_seconds         since training began, in all processes that worked on the run
+  time/env_steps_per_second environment steps per second of training, without compilation
+  time/training_seconds     time spent on training since the last report
+  time/evaluation_seconds   time spent on this evaluation, with its compilation
+  time/recording_seconds    time spent on logging, saving and rendering after the last evaluation
+  time/compile_seconds      time spent on tracing and compiling in this interval
+  time/wall_seconds         time since training began, in all processes that worked on the run
 """
 
 import contextlib
@@ -55,7 +55,7 @@ class Sink(Protocol):
     """A `Sink` receives metrics and writes them somewhere."""
 
     def write(self, env_steps: int, metrics: MetricValues) -> None:
-        """Write the metrics of one moment; a metric that has no value then is None."""
+        """Write the metrics at one environment step; a metric without a value is None."""
         ...
 
     def close(self) -> None:
@@ -70,7 +70,7 @@ class Sinks:
         """Combine sinks.
 
         Args:
-          sinks: the sinks, each of which receives every metric, in this order.
+          sinks: the sinks, which receive the metrics in this order.
         """
         self._sinks = sinks
 
@@ -116,7 +116,7 @@ def read_history(path: Path, last: int) -> list[History]:
 
     Args:
       path: path of `metrics.jsonl`; the file may be missing.
-      last: the last environment step to read.
+      last: the largest environment step to read.
 
     Returns:
       The lines up to that step, without those that are incomplete.

@@ -18,8 +18,8 @@ from jetbot_mjx.runs.checkpoint_store import flatten
 FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
 
-MOST = 20
-"""Largest number of dumps that a run keeps, as further ones would add no information."""
+MAX_DUMPS = 20
+"""Largest number of dumps that a run saves; further ones would add no information."""
 
 _FORMAT = "jetbot_mjx.nan_dump/1"
 
@@ -29,21 +29,21 @@ class StoredNanDump(NamedTuple):
 
     config: Config
     env_steps: int
-    """Environment steps of the training at the end of the call in which the nan_dump happened."""
+    """Environment steps of the training at the end of the call that found the non-finite state."""
     nan_dump: NanDump
 
 
 def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDump) -> Path | None:
-    """Save a nan_dump to `nan_dumps/<env_steps>.npz`, unless the run already holds `MOST` of them.
+    """Save a dump to `nan_dumps/<env_steps>.npz`, unless the run already has `MAX_DUMPS` of them.
 
     Args:
       run_dir: the run folder.
       config: the configuration of the run.
-      env_steps: environment steps so far.
-      nan_dump: the nan_dump, with arrays on the host.
+      env_steps: the number of environment steps so far.
+      nan_dump: the dump, with arrays on the host.
 
     Returns:
-      The path of the file; None if the nan_dump was not saved.
+      The path of the file; None if the dump was not saved.
 
     Raises:
       OSError: the file cannot be written.
@@ -51,7 +51,7 @@ def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDu
     folder = run_dir / FOLDER
     folder.mkdir(exist_ok=True)
     path = folder / f"{env_steps:012d}.npz"
-    if len(list(folder.glob("*.npz"))) >= MOST and not path.exists():
+    if len(list(folder.glob("*.npz"))) >= MAX_DUMPS and not path.exists():
         return None
     about = {"format": _FORMAT, "config": config.model_dump(mode="json"), "env_steps": env_steps}
     unfinished = path.with_suffix(".unfinished")
@@ -61,13 +61,13 @@ def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDu
 
 
 def load_nan_dump(path: Path) -> StoredNanDump:
-    """Load a nan_dump.
+    """Load a dump that `save_nan_dump` wrote.
 
     Args:
-      path: a file that `save_nan_dump` wrote.
+      path: the file.
 
     Returns:
-      The nan_dump with its configuration and environment steps.
+      The dump with its configuration and environment steps.
 
     Raises:
       UserError: there is no such file, or `save_nan_dump` did not write it.
@@ -83,7 +83,7 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():
             odd = sorted(wanted.keys() ^ arrays.keys())[0]
-            raise ValueError(f"{odd} is missing, or does not belong there")
+            raise ValueError(f"{odd} is missing or unexpected")
         nan_dump = jax.tree.unflatten(
             jax.tree.structure(template), [arrays[name] for name in wanted]
         )
@@ -95,10 +95,11 @@ def load_nan_dump(path: Path) -> StoredNanDump:
     # NumPy reports a damaged archive by many kinds of exception.
     except Exception as error:
         reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise UserError(f"{path} is not a nan_dump kept by a training: {reason[0]}") from None
+        raise UserError(f"{path} is not a NaN dump of a training: {reason[0]}") from None
 
 
 def _template(config: Config) -> NanDump:
+    """Return the shapes and dtypes of a dump of this configuration."""
     env = wrap_for_training(JetBotEnv(config), config.task.episode_length)
     batched: Any = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)

@@ -1,8 +1,8 @@
-"""Save the whole state of a training in a checkpoint and restore the newest usable one.
+"""Save the complete state of a training in checkpoints and restore the newest usable one.
 
-Besides the policy, a checkpoint of the resumable trainer holds the tree `training`, which is the
-rest of `ppo.TrainState`. A checkpoint is not restored if it differs in a name, a shape, a dtype or
-a bit from what was written, or if another configuration wrote it.
+A checkpoint of the resumable trainer holds two trees: the policy, and `training`, the rest of
+`ppo.TrainState`. A checkpoint is skipped if a name, a shape, a dtype or a bit changed after it was
+written, or if it was written under another configuration.
 """
 
 from collections.abc import Sequence
@@ -35,8 +35,8 @@ class Resumption(NamedTuple):
     states: list[TrainState]
     progress: list[dict[str, Any]]
     """The progress that the recorder of each seed stored in its checkpoint."""
-    passed_over: list[str]
-    """Error messages of newer checkpoints that were skipped because they cannot be used."""
+    skipped: list[str]
+    """Error messages of the newer checkpoints that were skipped."""
 
 
 def to_trees(state: TrainState) -> dict[str, Any]:
@@ -50,14 +50,14 @@ def to_trees(state: TrainState) -> dict[str, Any]:
 def resume(
     run_dirs: Sequence[Path], configs: Sequence[Config], template: TrainState
 ) -> Resumption | None:
-    """Find the newest checkpoint that is usable in every seed's folder, and read it.
+    """Read the newest checkpoint that is usable in the folder of every seed.
 
-    Newer checkpoints are moved to the run's `set_aside/` once an older one was read successfully.
+    Newer checkpoints are then moved to `set_aside/` in the run folder; nothing is deleted.
 
     Args:
       run_dirs: the run folder of each seed.
       configs: the configuration of each seed.
-      template: shapes and dtypes of a training state.
+      template: the shapes and dtypes of a training state.
 
     Returns:
       The restored state of each seed; None if there is no checkpoint at all.
@@ -67,7 +67,7 @@ def resume(
     """
     # Try the steps from the newest to the oldest, until all seeds can be read at one of them.
     known = sorted({step for run_dir in run_dirs for step in checkpoint_steps(run_dir)})
-    passed_over: list[str] = []
+    skipped: list[str] = []
     for step in reversed(known):
         try:
             found = [
@@ -75,7 +75,7 @@ def resume(
                 for run_dir, config in zip(run_dirs, configs, strict=True)
             ]
         except CheckpointError as error:
-            passed_over.append(str(error))
+            skipped.append(str(error))
             continue
         # Move newer checkpoints away, so that the resumed training can write its own.
         for run_dir in run_dirs:
@@ -83,16 +83,17 @@ def resume(
                 if newer > step:
                     set_aside(checkpoint_path(run_dir, newer))
         states, progress = zip(*found, strict=True)
-        return Resumption(step, list(states), list(progress), passed_over)
+        return Resumption(step, list(states), list(progress), skipped)
     if not known:
         return None
     raise CheckpointError(
-        f"no checkpoint in {run_dirs[0] / FOLDER} can be used. The newest: {passed_over[0]}."
+        f"no checkpoint in {run_dirs[0] / FOLDER} can be used. The newest: {skipped[0]}."
         " Train into a new folder"
     )
 
 
 def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState, dict[str, Any]]:
+    """Return the training state and the recorder's progress that a checkpoint holds."""
     if not path.is_dir():
         raise CheckpointError(f"checkpoint {path} is missing")
     about = explanation(path)

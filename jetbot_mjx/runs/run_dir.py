@@ -1,4 +1,4 @@
-"""Create, lock and read run folders; everything after training needs only the run folder.
+"""Create, lock and read run folders, which hold everything that is needed after training.
 
 A run folder holds config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/,
 checkpoints/<env_steps>/, evaluations/<env_steps>/, videos/, policy/ and nan_dumps/. If several
@@ -91,7 +91,7 @@ def stored_config(run_dir: Path) -> Config | None:
         raise UserError(f"--run-dir {run_dir} cannot be used: {error.strerror}") from None
     if in_use:
         raise UserError(
-            f"--run-dir {run_dir} is in use, and holds no run (no {CONFIG}): name a new folder"
+            f"--run-dir {run_dir} exists and is not a run (no {CONFIG}): name a new folder"
         )
     return None
 
@@ -117,11 +117,11 @@ def occupied(run_dir: Path) -> Iterator[None]:
         except BlockingIOError:
             file.seek(0)
             raise UserError(
-                f"--run-dir {run_dir} is held by another training (process"
+                f"--run-dir {run_dir} is locked by another training (process"
                 f" {file.read().strip() or 'unknown'}): wait for it, or name another folder"
             ) from None
         except OSError:
-            # The file system has no locks: go on without one rather than refuse to train.
+            # The file system has no locks: train without one.
             pass
         file.truncate(0)
         print(os.getpid(), file=file, flush=True)

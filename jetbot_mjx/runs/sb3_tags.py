@@ -1,4 +1,4 @@
-"""Log our metrics under the tags of Stable-Baselines3, which many users know."""
+"""Log metrics also under the tags of Stable-Baselines3."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from jetbot_mjx.config import PPOConfig
 class Alias(NamedTuple):
     """An `Alias` computes the value of another library's tag from one of our metrics."""
 
-    figure: str
+    metric: str
     """Name of our metric, or `env_steps`."""
     times: float = 1.0
     """Factor that the metric is multiplied by."""
@@ -60,17 +60,17 @@ def with_aliases(
     """Add the aliases to metrics, and leave out metrics without a value.
 
     Args:
-      env_steps: environment steps at that moment.
-      metrics: our metrics.
-      names: the aliases, from `aliases`.
+      env_steps: the number of environment steps so far.
+      metrics: our metrics by name.
+      names: the result of `aliases`.
 
     Returns:
       All metrics and aliases that have a value.
     """
     known: dict[str, float] = {name: value for name, value in metrics.items() if value is not None}
     ours = {**known, "env_steps": float(env_steps)}
-    for tag, (figure, times, over) in names.items():
+    for tag, (metric, times, over) in names.items():
         divisor = ours.get(over) if isinstance(over, str) else over
-        if figure in ours and divisor:
-            known[tag] = ours[figure] * times / divisor
+        if metric in ours and divisor:
+            known[tag] = ours[metric] * times / divisor
     return known

@@ -21,8 +21,8 @@ from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
 
 _FILE = "wandb.json"
 _INIT_SECONDS = 30.0
-_SHARE_OF_NOTICE = 0.3
-_LONGEST_TAG = 64
+_FINISH_SHARE_OF_NOTICE = 0.3
+_MAX_TAG_LENGTH = 64
 
 
 def check_tracking(config: Config) -> None:
@@ -69,11 +69,11 @@ class WandbSink:
         self._names = aliases(config.ppo)
         self._say = say
         self._path = run_dir / _FILE
-        self._told = _read(self._path, config.wandb)
+        self._progress = _read(self._path, config.wandb)
         self._run: Any = None
-        with self._or_without():
+        with self._disable_on_error():
             self._run = self._begin(config, run_dir, seeds)
-            write_json(self._path, self._told)
+            write_json(self._path, self._progress)
         for entry in history:
             self.write(entry.env_steps, entry.metrics)
 
@@ -84,12 +84,12 @@ class WandbSink:
         tags = (task, config.task.observation, config.robot.preset, config.trainer)
         run = wandb.init(
             project=config.wandb,
-            id=self._told["id"],
+            id=self._progress["id"],
             resume="allow",
             reinit="create_new",
             name=f"{group}-{run_dir.name}" if group else run_dir.name,
             group=group,
-            tags=[tag[:_LONGEST_TAG] for tag in tags],
+            tags=[tag[:_MAX_TAG_LENGTH] for tag in tags],
             config=config.model_dump(mode="json"),
             allow_val_change=True,
             dir=run_dir,
@@ -97,7 +97,7 @@ class WandbSink:
                 console="off",
                 silent=True,
                 init_timeout=_INIT_SECONDS,
-                finish_timeout=_SHARE_OF_NOTICE * config.preemption_notice / seeds,
+                finish_timeout=_FINISH_SHARE_OF_NOTICE * config.preemption_notice / seeds,
                 finish_timeout_raises=True,
             ),
         )
@@ -107,25 +107,25 @@ class WandbSink:
 
     def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Log the same metrics as TensorBoard, unless this step was logged already."""
-        if self._run is None or env_steps <= self._told["env_steps"]:
+        if self._run is None or env_steps <= self._progress["env_steps"]:
             return
-        with self._or_without():
+        with self._disable_on_error():
             self._run.log(with_aliases(env_steps, metrics, self._names), step=env_steps)
-            self._told["env_steps"] = env_steps
-            write_json(self._path, self._told)
+            self._progress["env_steps"] = env_steps
+            write_json(self._path, self._progress)
 
     def close(self) -> None:
         """Wait for pending uploads, for at most a share of `preemption_notice`."""
         if self._run is not None:
-            with self._or_without():
+            with self._disable_on_error():
                 self._run.finish()
         self._run = None
 
     @contextlib.contextmanager
-    def _or_without(self) -> Iterator[None]:
+    def _disable_on_error(self) -> Iterator[None]:
         try:
             yield
-        # It raises errors of its own, of the network, of the disk and of pydantic.
+        # Weights & Biases raises errors of its own, of the network, of the disk and of pydantic.
         except Exception as error:
             self._run = None
             reason = (str(error).splitlines() or [type(error).__name__])[0]
@@ -135,7 +135,11 @@ class WandbSink:
 def _read(path: Path, project: str | None) -> dict[str, Any]:
     """Return the id and last step of this project's run, or those of a new run if there is none."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        told = json.loads(path.read_text(encoding="utf-8"))
-        if told["project"] == project and isinstance(told["id"], str):
-            return {"project": project, "id": told["id"], "env_steps": int(told["env_steps"])}
+        progress = json.loads(path.read_text(encoding="utf-8"))
+        if progress["project"] == project and isinstance(progress["id"], str):
+            return {
+                "project": project,
+                "id": progress["id"],
+                "env_steps": int(progress["env_steps"]),
+            }
     return {"project": project, "id": uuid.uuid4().hex[:8], "env_steps": -1}

@@ -311,7 +311,7 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
 
 
 def _resume_message(run_dir: Path, resumption: Resumption) -> str:
-    lines = [f"skipped: {reason}" for reason in resumption.passed_over]
+    lines = [f"skipped: {reason}" for reason in resumption.skipped]
     if changes := changed_versions(run_dir):
         lines.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
     lines.append(f"resuming after {resumption.env_steps:,} steps")

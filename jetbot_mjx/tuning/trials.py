@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree, UInt32
 
+from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import PPO, TrainState
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
@@ -60,9 +61,14 @@ class Trials:
         env = make_env(config)
         self._env = wrap_for_training(env, config.task.episode_length)
         self._ctrl_dt = env.dt
-        ppo = PPO(config.ppo, self._env)
+        self._networks = make_networks(
+            config.ppo.network,
+            env.observation_size,
+            env.action_size,
+            normalize=config.ppo.normalize_observations,
+        )
         episodes = rollout_fn(
-            maybe_randomize(env), [policy_controller(ppo.networks)], config.task.episode_length
+            maybe_randomize(env), [policy_controller(self._networks)], config.task.episode_length
         )
         steps = np.linspace(0, config.ppo.training_steps, evaluations + 1).round().astype(np.int32)
         self._steps = np.diff(steps)
@@ -134,7 +140,7 @@ class Trials:
 
     def _ppo(self, traced: Mapping[str, Float[Array, ""]]) -> PPO:
         # `model_copy` does not validate, so that traced values pass.
-        return PPO(self._config.ppo.model_copy(update=dict(traced)), self._env)
+        return PPO(self._config.ppo.model_copy(update=dict(traced)), self._env, self._networks)
 
     def _init_one(
         self, traced: Mapping[str, Float[Array, ""]], seed: UInt32[Array, ""]

@@ -1,4 +1,4 @@
-"""Render a policy that split_trajectories to the report's fixed goals: videos, and trajectories from above."""
+"""Render a policy that drives to the fixed goals of the report: videos, and plots from above."""
 
 import io
 import re

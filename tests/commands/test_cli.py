@@ -185,14 +185,14 @@ def test_train_refuses_a_run_folder_in_use(refused, here):
     (here / "run").mkdir()
     (here / "run" / "metrics.jsonl").write_text("precious")
     line = refused(train, "--config", SMOKE, "--run-dir", "run")
-    assert "run is in use, and holds no run (no config.yaml): name a new folder" in line
+    assert "run exists and is not a run (no config.yaml): name a new folder" in line
     assert (here / "run" / "metrics.jsonl").read_text() == "precious"
 
 
 @pytest.mark.parametrize(
     ("run_dir", "said"),
     [
-        ("file", "--run-dir file is in use, and holds no run (no config.yaml): name a new folder"),
+        ("file", "--run-dir file exists and is not a run (no config.yaml): name a new folder"),
         ("file/run", "--run-dir file/run cannot be written: Not a directory"),
     ],
 )
@@ -341,15 +341,15 @@ DAMAGES = {
     ),
     "another format": (
         damage_about(lambda about: about.update(format="jetbot_mjx/9")),
-        "is in the format 'jetbot_mjx/9', and only 'jetbot_mjx/3' can be read here",
+        "has the format 'jetbot_mjx/9', and only 'jetbot_mjx/3' can be read",
     ),
     "no configuration": (
         damage_about(lambda about: about.pop("config")),
-        "does not explain itself: .*config",
+        "has unusable metadata: .*config",
     ),
     "a setting of another version": (
         damage_about(lambda about: about["config"]["ppo"].update(momentum=0.9)),
-        "does not explain itself: .*ppo.momentum = 0.9 is unknown",
+        "has unusable metadata: .*ppo.momentum = 0.9 is unknown",
     ),
     "no list of parameters": (
         lambda checkpoint: (checkpoint / "policy" / "manifest.ocdbt").unlink(),
@@ -468,7 +468,7 @@ def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
         "empty.npz": lambda path: path.touch(),
     }.items():
         write(tmp_path / name)
-        assert "is not a nan_dump kept by a training" in refused(replay, tmp_path / name)
+        assert "is not a NaN dump of a training" in refused(replay, tmp_path / name)
 
 
 def test_train_names_its_run_folder_after_the_configuration(asked):

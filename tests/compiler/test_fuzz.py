@@ -60,8 +60,8 @@ def check(seed, monkeypatch):
     theirs = np.asarray(jax.jit(jax.vmap(function), compiler_options=_quick())(x))
     if seed % 2:
         # Loops and branches where there would be none: all are small here.
-        monkeypatch.setattr(lower_jaxpr, "LEAST_IN_BRANCH", 2)
-        monkeypatch.setattr(lower_jaxpr, "MOST_WRITTEN_OUT", 8)
+        monkeypatch.setattr(lower_jaxpr, "MIN_BRANCH_OPERATIONS", 2)
+        monkeypatch.setattr(lower_jaxpr, "MAX_UNROLLED_OPERATIONS", 8)
     program = lower_jaxpr.scalarize(lambda result, x: function(x), RESULT, ARGUMENT)
     monkeypatch.undo()
     arguments = [np.zeros_like(theirs), x]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.compiler import lower_jaxpr
-from jetbot_mjx.compiler.lower_jaxpr import LEAST_IN_BRANCH, MOST_WRITTEN_OUT
+from jetbot_mjx.compiler.lower_jaxpr import MAX_UNROLLED_OPERATIONS, MIN_BRANCH_OPERATIONS
 from jetbot_mjx.compiler.scalar_ir import Expr, UnsupportedError
 from jetbot_mjx.compiler.schedule import PlacedBranch, PlacedLoop
 from jetbot_mjx.config import parse_config
@@ -344,7 +344,7 @@ def test_a_loop_of_known_length_is_written_out_only_if_it_is_small(length, loops
 
     program = check(function)
     assert len(list(items(program.block, PlacedLoop))) == loops
-    assert program.size < MOST_WRITTEN_OUT
+    assert program.size < MAX_UNROLLED_OPERATIONS
 
 
 def test_a_loop_with_a_flag_that_is_known_at_first_stays_one():
@@ -357,7 +357,7 @@ def test_a_loop_with_a_flag_that_is_known_at_first_stays_one():
 
     program = check(function)
     assert len(list(items(program.block, PlacedLoop))) == 1
-    assert program.size < MOST_WRITTEN_OUT
+    assert program.size < MAX_UNROLLED_OPERATIONS
 
 
 def test_a_loop_over_rows_is_written_out_because_an_index_counts_its_trips():
@@ -368,7 +368,7 @@ def test_a_loop_over_rows_is_written_out_because_an_index_counts_its_trips():
 
 
 def large(x):
-    for _ in range(LEAST_IN_BRANCH):
+    for _ in range(MIN_BRANCH_OPERATIONS):
         x = x * x[::-1] + 0.5
     return x / (1 + jnp.abs(x))
 
@@ -376,8 +376,8 @@ def large(x):
 def test_a_large_branch_stays_one_and_a_small_one_becomes_a_choice():
     program = check(lambda x: jax.lax.cond(x[0] > 0, large, lambda x: x, x))
     (branch,) = items(program.block, PlacedBranch)
-    assert list(branch.no.values()) == []
-    assert len(list(branch.yes.values())) > LEAST_IN_BRANCH
+    assert list(branch.if_false.values()) == []
+    assert len(list(branch.if_true.values())) > MIN_BRANCH_OPERATIONS
     program = check(lambda x: jax.lax.cond(x[0] > 0, lambda x: x + 1, lambda x: x, x))
     assert list(items(program.block, PlacedBranch)) == []
 
@@ -391,8 +391,8 @@ def test_of_many_cases_each_is_a_side_of_its_own():
     branches = list(items(program.block, PlacedBranch))
     assert len(branches) == 3
     # One inside the other: none is asked for once an earlier one was.
-    assert branches[1] in branches[0].yes.items
-    assert branches[2] in branches[1].yes.items
+    assert branches[1] in branches[0].if_true.items
+    assert branches[2] in branches[1].if_true.items
 
 
 def test_a_loop_holds_up_nobody_who_does_not_need_it():
@@ -406,7 +406,7 @@ def test_a_loop_holds_up_nobody_who_does_not_need_it():
     )
     (loop,) = items(program.block, PlacedLoop)
     (outer, _) = items(program.block, PlacedBranch)
-    assert loop in outer.yes.items
+    assert loop in outer.if_true.items
     x = np.float32([[1, 2], [0, 3], [-1, -1], [3, 0.5]])
     np.testing.assert_array_equal(
         program.evaluate([x])[0], [[64, 128], [0, 3], [-1, -1], [192, 32]]
@@ -427,7 +427,7 @@ def test_a_loop_in_a_loop_holds_up_nobody_who_is_done():
 
 
 def test_a_program_that_is_too_large_is_refused(monkeypatch):
-    monkeypatch.setattr(lower_jaxpr, "MOST_IN_PROGRAM", 50)
+    monkeypatch.setattr(lower_jaxpr, "MAX_PROGRAM_OPERATIONS", 50)
     lower_jaxpr.scalarize(lambda x: x + 1, VECTOR)
     with pytest.raises(UnsupportedError, match=r"^\d+ operations, more than 50$"):
         lower_jaxpr.scalarize(large, VECTOR)

@@ -29,10 +29,10 @@ def test_it_is_compiled_for_every_architecture(name, architecture):
     text = ptx_backend.compiled(kernel(FUNCTIONS[name]), architecture)
     assert f".target sm_{architecture}" in text
     assert text.count(ptx_backend._ROBOTS) == 1
-    assert f".maxntid {ptx_backend._MOST_THREADS}" in text
+    assert f".maxntid {ptx_backend._MAX_THREADS}" in text
     # All threads of a block begin a step together.
     assert len(re.findall(r"bar(rier)?\.(cta\.)?sync", text)) == 1
-    # Numbers in between stay in registers.
+    # ScalarArray in between stay in registers.
     assert text.count("st.global") == 4
     assert text.count("ld.global") <= 4
     assert not re.search(r"\b(ld|st)\.local", text)

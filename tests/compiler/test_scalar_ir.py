@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.compiler import scalar_ir
-from jetbot_mjx.compiler.indexing import numbers_of
+from jetbot_mjx.compiler.indexing import scalar_array
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 from jetbot_mjx.compiler.scalar_ir import ExprGraph, UnsupportedError, is_constant, is_same
 from jetbot_mjx.compiler.schedule import schedule
@@ -88,8 +88,8 @@ def test_selection_by_what_is_known_or_between_equals_needs_no_selection(graph, 
 def evaluate(result, *inputs):
     """A number for each robot; `inputs` are what it depends on, with an array of numbers each."""
     values, columns = zip(*inputs, strict=True)
-    leaves = [numbers_of([value], ()) for value in values]
-    (ends,) = ScalarProgram(leaves, [numbers_of([result], ())], schedule([result])).evaluate(
+    leaves = [scalar_array([value], ()) for value in values]
+    (ends,) = ScalarProgram(leaves, [scalar_array([result], ())], schedule([result])).evaluate(
         columns
     )
     return ends
@@ -152,7 +152,7 @@ def test_of_a_branch_what_both_sides_agree_on_is_no_choice(graph, x, flag):
 
 
 def test_too_many_operations_are_refused(graph, x, monkeypatch):
-    monkeypatch.setattr(scalar_ir, "MOST_VALUES", 10)
+    monkeypatch.setattr(scalar_ir, "MAX_OPERATIONS", 10)
     for _ in range(9):
         x = graph.apply("sqrt", x)
     with pytest.raises(UnsupportedError, match="more than 10 operations"):

@@ -27,9 +27,9 @@ def flag(graph, x):
 def loop_of(graph, first, body):
     """A loop of numbers below 9; `body` computes what the next trip begins with."""
     loop = graph.begin_loop(first)
-    loop.following = list(body(*loop.carries))
-    loop.going = graph.apply("lt", loop.carries[0], np.float32(9))
-    loop.outcomes = list(loop.carries)
+    loop.updated = list(body(*loop.carries))
+    loop.condition = graph.apply("lt", loop.carries[0], np.float32(9))
+    loop.results = list(loop.carries)
     return graph.end_loop(loop)
 
 
@@ -98,9 +98,9 @@ def test_what_the_condition_and_the_trip_need_is_done_once_a_trip(graph, x):
     loop = graph.begin_loop([x])
     (carry,) = loop.carries
     root = graph.apply("sqrt", carry)
-    loop.following = [graph.apply("add", root, ONE)]
-    loop.going = graph.apply("gt", root, ONE)
-    loop.outcomes = [graph.apply("neg", root)]
+    loop.updated = [graph.apply("add", root, ONE)]
+    loop.condition = graph.apply("gt", root, ONE)
+    loop.results = [graph.apply("neg", root)]
     placed = inside(schedule(graph.end_loop(loop)), PlacedLoop)
     assert sorted(ops(placed.head)) == ["gt", "neg", "sqrt"]
     assert ops(placed.body) == ["add"]
@@ -129,7 +129,7 @@ def test_what_only_one_side_of_a_branch_needs_is_done_there(graph, x, flag):
     root = schedule(graph.branch(flag, [no], [yes]))
     assert sorted(ops(root)[:-1]) == ["floor", "gt"]
     branch = inside(root, PlacedBranch)
-    assert (ops(branch.no), ops(branch.yes)) == (["sqrt"], ["neg"])
+    assert (ops(branch.if_false), ops(branch.if_true)) == (["sqrt"], ["neg"])
 
 
 def test_what_is_needed_after_a_branch_as_well_is_done_before_it(graph, x, flag):
@@ -137,7 +137,7 @@ def test_what_is_needed_after_a_branch_as_well_is_done_before_it(graph, x, flag)
     (result,) = graph.branch(flag, [x], [graph.apply("neg", root_of_x)])
     root = schedule([result, root_of_x])
     assert sorted(ops(root)) == ["PlacedBranch", "gt", "sqrt"]
-    assert ops(inside(root, PlacedBranch).yes) == ["neg"]
+    assert ops(inside(root, PlacedBranch).if_true) == ["neg"]
 
 
 def test_what_a_branch_decides_for_nobody_is_not_done(graph, x, flag):
@@ -145,14 +145,14 @@ def test_what_a_branch_decides_for_nobody_is_not_done(graph, x, flag):
     first, _ = graph.branch(flag, [x, x], yes)
     branch = inside(schedule([first]), PlacedBranch)
     assert branch.results == [first]
-    assert ops(branch.yes) == ["sqrt"]
+    assert ops(branch.if_true) == ["sqrt"]
 
 
 def test_branches_lie_in_branches(graph, x, flag):
     deeper = graph.branch(graph.apply("lt", x, -ONE), [x], [graph.apply("sqrt", x)])
     branch = inside(schedule(graph.branch(flag, [x], deeper)), PlacedBranch)
-    assert ops(branch.yes) == ["lt", "PlacedBranch"]
-    assert ops(inside(branch.yes, PlacedBranch).yes) == ["sqrt"]
+    assert ops(branch.if_true) == ["lt", "PlacedBranch"]
+    assert ops(inside(branch.if_true, PlacedBranch).if_true) == ["sqrt"]
 
 
 def test_what_a_branch_in_a_loop_needs_and_no_trip_changes_is_done_before_the_loop(graph, x):
@@ -164,14 +164,14 @@ def test_what_a_branch_in_a_loop_needs_and_no_trip_changes_is_done_before_the_lo
     assert ops(root) == ["sqrt", "PlacedLoop"]
     loop = inside(root, PlacedLoop)
     assert ops(loop.body) == ["gt", "PlacedBranch"]
-    assert ops(inside(loop.body, PlacedBranch).yes) == ["mul"]
+    assert ops(inside(loop.body, PlacedBranch).if_true) == ["mul"]
 
 
 def test_a_loop_that_only_one_side_needs_is_in_the_branch(graph, x, flag):
     (end,) = loop_of(graph, [graph.apply("neg", x)], lambda carry: [graph.apply("sqrt", carry)])
     root = schedule(graph.branch(flag, [x], [end]))
     assert ops(root) == ["gt", "PlacedBranch"]
-    assert ops(inside(root, PlacedBranch).yes) == ["neg", "PlacedLoop"]
+    assert ops(inside(root, PlacedBranch).if_true) == ["neg", "PlacedLoop"]
 
 
 def test_every_operand_of_a_large_program_is_there_before_it(graph, x):
@@ -193,15 +193,18 @@ def test_every_operand_of_a_large_program_is_there_before_it(graph, x):
                 check(item.operands)
                 known.add(item.index)
             elif isinstance(item, PlacedLoop):
-                check(item.loop.first[place] for place in item.places)
+                check(item.loop.initial[place] for place in item.places)
                 known.update(item.loop.carries[place].index for place in item.places)
                 visit(item.head)
-                check([item.loop.going, *(item.loop.outcomes[r.place] for r in item.results)])
+                check([item.loop.condition, *(item.loop.results[r.place] for r in item.results)])
                 visit(item.body)
-                check(item.loop.following[place] for place in item.places)
+                check(item.loop.updated[place] for place in item.places)
             else:
-                check([item.branch.which])
-                for side, numbers in ((item.no, item.branch.no), (item.yes, item.branch.yes)):
+                check([item.branch.condition])
+                for side, numbers in (
+                    (item.if_false, item.branch.if_false),
+                    (item.if_true, item.branch.if_true),
+                ):
                     visit(side)
                     check(numbers[result.place] for result in item.results)
             if not isinstance(item, Expr):

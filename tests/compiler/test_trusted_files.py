@@ -204,8 +204,8 @@ def keep_program(folder):
 
 def keep_kernel(folder):
     """Likewise machine code."""
-    kernel.kept_bytes("object", b"key", lambda: b"code")
-    return lambda: kernel.kept_bytes("object", b"key", lambda: b"anew") == b"code"
+    kernel.cached_bytes("object", b"key", lambda: b"code")
+    return lambda: kernel.cached_bytes("object", b"key", lambda: b"anew") == b"code"
 
 
 @pytest.mark.parametrize("keep", [keep_program, keep_kernel])

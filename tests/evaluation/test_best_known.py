@@ -69,14 +69,14 @@ def test_times_of_the_same_goals_and_settings_are_found(searched):
 @pytest.mark.parametrize(
     ("settings", "episodes", "missing"),
     [
-        ({"robot": {"preset": "real"}}, 8, "robot.preset = isaac, and this is real"),
-        ({"task": {"max_speed": 0.5}}, 8, "task.max_speed = 1.0, and this is 0.5"),
+        ({"robot": {"preset": "real"}}, 8, "robot.preset = isaac, and this run has real"),
+        ({"task": {"max_speed": 0.5}}, 8, "task.max_speed = 1.0, and this run has 0.5"),
         (
             {"task": {"name": "gates:Gates"}},
             8,
-            "task.name = jetbot_mjx:GoalTask, and this is gates",
+            "task.name = jetbot_mjx:GoalTask, and this run has gates",
         ),
-        ({}, 9, "it was searched for 8 of these 9 goals"),
+        ({}, 9, "the search covers 8 of these 9 goals"),
     ],
 )
 def test_elsewhere_the_reason_is_told(searched, settings, episodes, missing):
@@ -103,7 +103,7 @@ def test_what_a_policy_sees_and_how_it_learns_does_not_matter(searched):
 def test_other_goals_have_no_known_times(searched):
     searched(goals=np.rint(1000 * GOALS + [0, 3]).astype(int).tolist())
     driven = make_episodes(GOALS, np.ones(8))
-    assert "goals that lie elsewhere" in best_known.find(CONFIG, driven).missing
+    assert "goals at other positions" in best_known.find(CONFIG, driven).missing
     searched(goal_set_version=GOAL_SET_VERSION + 1)
     assert "no search was made for these goals" in best_known.find(CONFIG, driven).missing
 
@@ -150,7 +150,7 @@ def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
     assert values["best_known"]["total"]["gap"] == pytest.approx(found.total.gap)
     text = (tmp_path / "report" / "report.md").read_text()
     assert "| best known | - | - | 1.06 s | 1.11 s |" in text
-    assert "this policy takes 1.162 s in the mean, +9.42% above the best known" in text
+    assert "this policy takes 1.162 s on average, +9.42% above the best-known time" in text
     assert "| +68° to +112° | 0 | - | - | - |" in text
     page = (tmp_path / "report" / "report.html").read_text()
     assert 'data-json="best_known.total.gap">+9.42%</data>' in page
@@ -166,12 +166,12 @@ def test_a_report_without_it_says_why(searched, tmp_path):
     )
     assert found is None
     assert "best known" not in policies_table({"policy": report})
-    assert "robot.preset = real, and this is isaac" in best_known_lines(report)
+    assert "robot.preset = real, and this run has isaac" in best_known_lines(report)
     write_report(report)
     values = json.loads((tmp_path / "report" / "report.json").read_text())
     assert (values["best_known"], values["best_known_missing"]) == (None, missing)
     for name in ("report.md", "report.html"):
-        assert f"are not told: {missing}." in (tmp_path / "report" / name).read_text()
+        assert f"are not available: {missing}." in (tmp_path / "report" / name).read_text()
 
 
 def test_a_policy_that_reaches_nothing_has_no_gap(searched):

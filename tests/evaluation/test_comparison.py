@@ -141,7 +141,9 @@ def test_runs_that_had_something_else_to_do_are_refused(settings, said):
 
 def test_runs_that_drove_to_other_goals_are_refused():
     other = make_report(make_episodes(GOALS + 0.01, wins(5)))
-    with pytest.raises(UserError, match="b cannot be compared with a: its task drew other goals"):
+    with pytest.raises(
+        UserError, match="b cannot be compared with a: its task sampled other goals"
+    ):
         comparison_of(a=[report(wins(5))], b=[other])
 
 

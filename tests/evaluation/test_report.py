@@ -19,7 +19,7 @@ from jetbot_mjx.evaluation.report import (
     Report,
     by_goal,
     find_failures,
-    goal_places,
+    goal_positions,
     learning_curve,
 )
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -61,7 +61,7 @@ def make_report(episodes, run_dir="runs/a", curve=(), env_steps=2048, settings=N
         config=parse_config(settings or {}),
         policy=summarize(episodes, CTRL_DT),
         baselines={},
-        cells=by_goal(episodes, CTRL_DT),
+        goal_bins=by_goal(episodes, CTRL_DT),
         failures=find_failures(episodes, Path(run_dir), env_steps),
         learning_curve=tuple(curve),
         episodes=episodes,
@@ -76,13 +76,13 @@ def polar(distance, degrees):
 
 def test_bearings_are_those_of_the_robot_as_it_starts():
     goals = [[1, 0], [0, 1], [0, -1], [-1, 0]]
-    distance, bearing = goal_places(make_episodes(goals, np.ones(4)))
+    distance, bearing = goal_positions(make_episodes(goals, np.ones(4)))
     np.testing.assert_allclose(bearing, [0, 90, -90, 180], atol=1e-4)
     np.testing.assert_allclose(distance, 1)
     turned = make_episodes(goals, np.ones(4), start_yaw=np.full(4, math.pi / 2, np.float32))
-    np.testing.assert_allclose(goal_places(turned)[1], [-90, 0, 180, 90], atol=1e-4)
+    np.testing.assert_allclose(goal_positions(turned)[1], [-90, 0, 180, 90], atol=1e-4)
     moved = make_episodes(goals, np.ones(4), start_w=np.tile(np.float32([1, 1]), (4, 1)))
-    np.testing.assert_allclose(goal_places(moved)[1], [-90, 180, -116.565, -153.435], atol=1e-2)
+    np.testing.assert_allclose(goal_positions(moved)[1], [-90, 180, -116.565, -153.435], atol=1e-2)
 
 
 def test_a_cell_counts_the_goals_of_its_ring_and_sector():

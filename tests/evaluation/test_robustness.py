@@ -14,7 +14,14 @@ from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, MAX_OBSERVATION_DELAY
 from jetbot_mjx.evaluation import robustness
 from jetbot_mjx.evaluation.evaluator import Summary, report_keys, wilson_interval
 from jetbot_mjx.evaluation.plots import plot_robustness
-from jetbot_mjx.evaluation.robustness import SWEEPS, Sweep, SweepResult, as_json, carries, sweep
+from jetbot_mjx.evaluation.robustness import (
+    SWEEPS,
+    Sweep,
+    SweepResult,
+    as_json,
+    robust_range,
+    sweep,
+)
 
 EPISODES = 16
 
@@ -66,7 +73,7 @@ def test_the_page_tells_what_is_swept(root, one):
     ],
 )
 def test_a_policy_carries_from_the_presets_value_to_the_first_failure(policy, expected):
-    assert carries(result(policy)) == expected
+    assert robust_range(result(policy)) == expected
 
 
 def test_the_results_are_plain_values():

@@ -155,7 +155,7 @@ def test_another_shape_is_refused(smoke_run, write):
 
 @pytest.mark.parametrize("key", ["config", "observation_size", "format", "layout"])
 def test_an_incomplete_explanation_is_refused(write, key):
-    assert f"does not explain itself: no {key}" in refused(write((1, 0.5), without=[key]), 1)
+    assert f"has unusable metadata: no {key}" in refused(write((1, 0.5), without=[key]), 1)
 
 
 @pytest.mark.parametrize("key", ["config", "layout", "env_steps"])
@@ -164,13 +164,13 @@ def test_an_explanation_that_was_changed_is_refused(run_copy, key):
     path = folder / "about" / "metadata"
     path.write_text(path.read_text().replace(f'"{key}"', f'"{key}s"', 1))
     for use in (lambda: refused(folder), lambda: refused(run_copy, "last")):
-        assert "about/metadata is not as it was written" in use()
+        assert "about/metadata changed after it was written" in use()
 
 
 @pytest.mark.parametrize("number", ["jetbot_mjx/1", "jetbot_mjx/2", None, 2])
 def test_another_format_is_refused_by_name(write, number):
     said = refused(write((1, 0.5), format=number))
-    assert f"in the format {number!r}, and only {FORMAT!r} can be read" in said
+    assert f"has the format {number!r}, and only {FORMAT!r} can be read" in said
 
 
 @pytest.mark.parametrize("config", [{}, {"seed": -1}, {"sede": 0}, 3, None])
@@ -189,7 +189,7 @@ def test_a_policy_from_another_checkpoint_is_refused(run_copy):
     folder = find_checkpoint(run_copy, 65_536)
     shutil.rmtree(folder / POLICY)
     shutil.copytree(find_checkpoint(run_copy, 49_152) / POLICY, folder / POLICY)
-    assert "policy is not as it was written" in refused(folder)
+    assert "policy changed after it was written" in refused(folder)
 
 
 def test_what_acting_does_not_need_may_be_damaged(run_copy):

@@ -1,4 +1,4 @@
-"""Stopped and resumed is never stopped; what is damaged is passed over; what cannot go on says so.
+"""Stopped and resumed is never stopped; what is damaged is skipped; what cannot go on says so.
 
 All trainings here are of the smoke configuration, 16 training steps of 4,096 environment steps,
 with a report after every fourth: each is compared to the smoke run, which was never stopped.
@@ -128,7 +128,7 @@ def same(smoke_run, states, config, template):
 
     def same(run_dir):
         found = resume([run_dir], [config], template)
-        assert (found.env_steps, found.passed_over) == (LAST, [])
+        assert (found.env_steps, found.skipped) == (LAST, [])
         assert digest(found.states[0]) == digest(states[LAST])
         for env_steps in STEPS:
             ours, theirs = (
@@ -395,11 +395,11 @@ DAMAGES = {
     ),
     "about with other steps": (
         edit(lambda about: about.update(env_steps=65_537)),
-        "about/metadata is not as it was written",
+        "about/metadata changed after it was written",
     ),
     "about with another figure": (
         edit(lambda about: about["metrics"].update(success_rate=0.123)),
-        "about/metadata is not as it was written",
+        "about/metadata changed after it was written",
     ),
     "about without its hash": (
         edit(lambda about: about["sha256"].pop("about")),
@@ -407,8 +407,8 @@ DAMAGES = {
     ),
     "about without hashes": (edit(lambda about: about.pop("sha256")), "missing or damaged"),
     "about of another checkpoint": (replace("about"), "was renamed: it was written after 49152"),
-    "training of another checkpoint": (replace(TRAINING), "training is not as it was written"),
-    "policy of another checkpoint": (replace(POLICY), "policy is not as it was written"),
+    "training of another checkpoint": (replace(TRAINING), "training changed after it was written"),
+    "policy of another checkpoint": (replace(POLICY), "policy changed after it was written"),
     "another shape": (
         rewrite(change_trees=lambda trees: trees[POLICY].update({KERNEL: np.ones((7, 64))})),
         f"{KERNEL} is float64[7, 64], and should be float32[7, 32]",
@@ -473,7 +473,7 @@ DAMAGES = {
 
 
 @pytest.mark.parametrize("kind", DAMAGES)
-def test_a_damaged_checkpoint_is_passed_over_and_the_one_before_is_taken(
+def test_a_damaged_checkpoint_is_skipped_and_the_one_before_is_taken(
     run_copy, states, config, template, kind, capfd, caplog
 ):
     harm, reason = DAMAGES[kind]
@@ -483,7 +483,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_the_one_before_is_taken(
     found = resume([run_copy], [config], template)
     assert found.env_steps == BEFORE
     assert digest(found.states[0]) == digest(states[BEFORE])
-    (said,) = found.passed_over
+    (said,) = found.skipped
     assert f"checkpoint {newest} " in said
     assert reason in said
     assert "\n" not in said
@@ -492,7 +492,7 @@ def test_a_damaged_checkpoint_is_passed_over_and_the_one_before_is_taken(
     assert capfd.readouterr() == ("", "")
     assert not caplog.records
     again = resume([run_copy], [config], template)
-    assert (again.env_steps, again.passed_over) == (BEFORE, [])
+    assert (again.env_steps, again.skipped) == (BEFORE, [])
 
 
 def test_the_damages_are_of_many_kinds():
@@ -509,10 +509,10 @@ HARMLESS = {
 
 
 @pytest.mark.parametrize("kind", HARMLESS)
-def test_what_does_no_harm_is_not_passed_over(run_copy, states, config, template, kind, capfd):
+def test_what_does_no_harm_is_not_skipped(run_copy, states, config, template, kind, capfd):
     HARMLESS[kind](checkpoint_path(run_copy, LAST))
     found = resume([run_copy], [config], template)
-    assert (found.env_steps, found.passed_over) == (LAST, [])
+    assert (found.env_steps, found.skipped) == (LAST, [])
     assert digest(found.states[0]) == digest(states[LAST])
     assert not (run_copy / "set_aside").exists()
     assert capfd.readouterr() == ("", "")
@@ -540,7 +540,7 @@ def test_whatever_bit_is_flipped_the_state_is_right_or_older(
     assert not caplog.records
 
 
-def test_several_damaged_checkpoints_are_passed_over_from_the_newest_on(
+def test_several_damaged_checkpoints_are_skipped_from_the_newest_on(
     run_copy, states, config, template
 ):
     newest, second = (checkpoint_path(run_copy, steps) for steps in (LAST, BEFORE))
@@ -549,7 +549,7 @@ def test_several_damaged_checkpoints_are_passed_over_from_the_newest_on(
     found = resume([run_copy], [config], template)
     assert found.env_steps == STEPS[2]
     assert digest(found.states[0]) == digest(states[STEPS[2]])
-    assert [str(newest) in found.passed_over[0], str(second) in found.passed_over[1]] == [True] * 2
+    assert [str(newest) in found.skipped[0], str(second) in found.skipped[1]] == [True] * 2
     assert checkpoint_steps(run_copy) == STEPS[:3]
     assert sorted(os.listdir(run_copy / "set_aside")) == [f"{second.name}.0", f"{newest.name}.0"]
 
@@ -597,8 +597,8 @@ def test_several_seeds_go_on_from_the_newest_that_all_of_them_have(
     assert [digest(state) for state in found.states] == 2 * [digest(states[BEFORE])]
     assert [checkpoint_steps(folder) for folder in folders] == 2 * [STEPS[:-1]]
     assert os.listdir(folders[0] / "set_aside") == [f"{LAST:012d}.0"]
-    assert len(found.passed_over) == 1
-    assert str(folders[1]) in found.passed_over[0]
+    assert len(found.skipped) == 1
+    assert str(folders[1]) in found.skipped[0]
 
 
 @pytest.mark.parametrize("kind", ["data flipped", "about missing", "a file"])

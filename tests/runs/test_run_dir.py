@@ -47,7 +47,7 @@ def test_a_folder_is_made_held_and_free_again(tmp_path):
 def test_a_folder_that_another_training_holds_is_refused_and_the_process_named(tmp_path):
     with occupied(tmp_path):
         said = refused(occupy, tmp_path)
-        assert f"--run-dir {tmp_path} is held by another training (process {os.getpid()})" in said
+        assert f"--run-dir {tmp_path} is locked by another training (process {os.getpid()})" in said
         assert (tmp_path / ".lock").read_text() == f"{os.getpid()}\n"
     occupy(tmp_path)
 
@@ -115,13 +115,13 @@ def test_a_folder_with_anything_else_in_it_is_refused(tmp_path, occupant):
         (tmp_path / occupant).mkdir(parents=True)
     else:
         (tmp_path / occupant).write_text("")
-    assert "is in use, and holds no run (no config.yaml)" in refused(stored_config, tmp_path)
+    assert "exists and is not a run (no config.yaml)" in refused(stored_config, tmp_path)
 
 
 def test_a_file_is_no_run_folder(tmp_path):
     path = tmp_path / "file"
     path.write_text("")
-    assert "is in use" in refused(stored_config, path)
+    assert "exists and is not a run" in refused(stored_config, path)
 
 
 @pytest.mark.parametrize("text", ["ppo: [", "- 1", "sede: 3", "\udcff"])

@@ -46,14 +46,18 @@ def leaves(params):
     return [np.asarray(x) for x in jax.tree.leaves(params)]
 
 
-def test_a_trial_is_the_training_that_its_values_give(outcomes):
+def test_a_trial_is_the_training_that_its_values_give(trials, outcomes):
     # The same training with the values as constants of the program.
     from jetbot_mjx.agents.ppo import PPO
     from jetbot_mjx.envs.jetbot_env import make_env
     from jetbot_mjx.envs.wrappers import wrap_for_training
 
     config = with_values(CONFIG, VALUES[1], source="it")
-    ppo = PPO(config.ppo, wrap_for_training(make_env(config), config.task.episode_length))
+    ppo = PPO(
+        config.ppo,
+        wrap_for_training(make_env(config), config.task.episode_length),
+        trials._networks,
+    )
 
     @jax.jit
     def train(key):
