@@ -1,13 +1,16 @@
 """Search for hyperparameters, with many trials side by side in one compiled program."""
 
-from jetbot_mjx.imports import load_lazily as _load_lazily
+from typing import TYPE_CHECKING
 
-__getattr__, __dir__ = _load_lazily(
+from jetbot_mjx.imports import load_lazily
+
+if TYPE_CHECKING:
+    from jetbot_mjx.tuning.search import Search as Search
+    from jetbot_mjx.tuning.space import Parameter as Parameter
+    from jetbot_mjx.tuning.space import read_space as read_space
+    from jetbot_mjx.tuning.trials import Trials as Trials
+
+__getattr__, __dir__ = load_lazily(
     __name__,
-    {
-        "Parameter": "tuning.space",
-        "Trials": "tuning.trials",
-        "read_space": "tuning.space",
-        "tune": "tuning.search",
-    },
+    {"Parameter": "space", "Search": "search", "Trials": "trials", "read_space": "space"},
 )

@@ -1,0 +1,40 @@
+"""List the runs in a folder, the latest first, and the names by which commands find them."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from jetbot_mjx import cli
+from jetbot_mjx.interrupts import exit_on_interrupt
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and list the runs.
+
+    Args:
+      arguments: The arguments without the program's name, or None for those of the process.
+
+    Returns:
+      0.
+    """
+    parser = cli.Parser(prog="jetbot-mjx runs", description=__doc__)
+    parser.add_argument(
+        "folder", type=Path, nargs="?", metavar="DIR", help="the folder (default: runs)"
+    )
+    options = parser.parse_args(arguments)
+    with exit_on_interrupt():
+        from jetbot_mjx.runs import find_run
+
+    folder = options.folder or find_run.ROOT
+    if options.folder and not folder.is_dir():
+        parser.error(f"{folder} is no folder")
+    print(find_run.runs_table(find_run.list_runs(folder)))
+    if not options.folder:
+        print(
+            "\nwith the package, for every command that takes a run:\n"
+            f"{find_run.runs_table(find_run.list_runs(find_run.PRETRAINED))}"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)
