@@ -25,6 +25,9 @@ class Command(NamedTuple):
 COMMANDS: Mapping[str, Command] = {
     "pretrained": Command("pretrained", "copy the policies that come with the package"),
     "train": Command("train", "train a policy into a run folder"),
+    "configs": Command("training.configs", "list the configurations that come with the package"),
+    "runs": Command("runs.command", "list the runs there are"),
+    "tune": Command("tuning.command", "search for hyperparameters, many trials at once"),
     "plan": Command("plan", "predict the memory that a training needs"),
     "evaluate": Command("evaluate", "evaluate policies on fixed goals, and compare them"),
     "render": Command("render", "write videos and plots of a policy that drives"),

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "task", nargs="?", metavar="package.module:Class", help="default: that of --config"
     )
-    cli.add_config_arguments(parser)
+    cli.add_config_arguments(parser, positional=False)
     options = parser.parse_args(arguments)
     if not options.task and options.config is None:
         parser.error("name a task as package.module:Class, or a --config that does")

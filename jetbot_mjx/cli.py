@@ -10,6 +10,7 @@ installed the lazy imports. For the same reason this module imports JAX only whe
 
 import argparse
 import contextlib
+import difflib
 import io
 import os
 import sys
@@ -33,7 +34,19 @@ INTERRUPTED = 130
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that reports an error in one line."""
+    """An argument parser that reports an error in one line, with a likely remedy."""
+
+    def parse_args(  # pyright: ignore[reportIncompatibleMethodOverride]
+        self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
+    ) -> argparse.Namespace:
+        """Parse all arguments, and suggest an option for one that is unknown."""
+        options, unknown = self.parse_known_args(args, namespace)
+        if unknown:
+            given = unknown[0].partition("=")[0]
+            close = difflib.get_close_matches(given, self._option_string_actions, n=1)
+            hint = f": did you mean {close[0]}?" if close else ""
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
+        return options
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
@@ -205,6 +218,13 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 
 
+def existing_run(text: str) -> Path:
+    """Parse an argument that names a run or a checkpoint; raise an error if there is none."""
+    from jetbot_mjx.runs.find_run import find_run
+
+    return find_run(text)
+
+
 def add_checkpoint_arguments(
     parser: argparse.ArgumentParser, *, several: bool = False, default: str | None = None
 ) -> None:
@@ -216,13 +236,18 @@ def add_checkpoint_arguments(
       default: description of the policy that is used if no run is given; `run` is then None. None:
         a run must be given.
     """
-    what = "a run folder, or one checkpoint folder of it"
+    what = (
+        "a run folder or one checkpoint folder of it; or latest, the name of a folder in runs/, or"
+        " pretrained:NAME"
+    )
     if several:
-        parser.add_argument("run", nargs="+", help=f"{what}; several are compared")
+        what += "; several are compared"
+        parser.add_argument("run", nargs="+", type=existing_run, metavar="RUN", help=what)
     elif default is not None:
-        parser.add_argument("run", nargs="?", help=f"{what} (default: {default})")
+        what += f" (default: {default})"
+        parser.add_argument("run", nargs="?", type=existing_run, metavar="RUN", help=what)
     else:
-        parser.add_argument("run", help=what)
+        parser.add_argument("run", type=existing_run, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,
@@ -234,27 +259,36 @@ def add_checkpoint_arguments(
 
 def add_config_arguments(
     parser: argparse.ArgumentParser,
-    group: "argparse._ActionsContainer | None" = None,
+    group: "argparse._MutuallyExclusiveGroup | None" = None,
     *,
     required: bool = False,
+    positional: bool = True,
     default: Path | None = None,
 ) -> None:
-    """Add the arguments `--config` and `--set`, which select a configuration.
+    """Add the arguments `CONFIG`, `--config` and `--set`, which select a configuration.
 
     Args:
       parser: The parser of the command.
-      group: The group of arguments that `--config` belongs to, or None for none.
-      required: Whether `--config` must be given.
-      default: The file that is used without `--config`, or None for the defaults of `Config`.
+      group: The mutually exclusive group that both belong to, or None for one of their own.
+      required: Whether a configuration must be given.
+      positional: Whether the name alone is accepted, without `--config` before it.
+      default: The file that is used without one, or None for the defaults of `Config`.
     """
     suffix = f" (default: {default.parent.name}/{default.name})" if default else ""
-    (group or parser).add_argument(
+    group = group or parser.add_mutually_exclusive_group(required=required)
+    what = "YAML file, or the name of a configuration that comes with the package"
+    # Two names for one argument: SUPPRESS keeps either from overwriting the other by its default.
+    text = f"{what}; `{PROGRAM} configs` lists them{suffix}"
+    if positional:
+        group.add_argument(
+            "config", type=Path, nargs="?", default=default, metavar="CONFIG", help=text
+        )
+    group.add_argument(
         "--config",
         type=Path,
-        default=default,
-        metavar="FILE",
-        help=f"YAML file, see configs/{suffix}",
-        required=required,
+        default=argparse.SUPPRESS if positional else default,
+        metavar="CONFIG",
+        help="the same" if positional else text,
     )
     parser.add_argument(
         "--set",

@@ -12,6 +12,7 @@ is a number, and rejects a key that is given twice.
 import difflib
 import io
 import math
+import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -31,10 +32,10 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError
 
 
-class ConfigError(UserError):
+class ConfigError(InvalidError):
     """Raised when a configuration is invalid; states the key, the value and the remedy."""
 
 
@@ -533,11 +534,46 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
+def shipped_configs() -> dict[str, Path]:
+    """Return the configurations that come with the package, by name.
+
+    They are in `configs/` at the top level of the repository, which a wheel holds as a folder of
+    the package.
+    """
+    package = Path(__file__).parent
+    folders = package / "configs", package.parent / "configs"
+    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+
+
+def find_config(name: str | Path) -> Path:
+    """Return the path of a configuration file.
+
+    Args:
+      name: the path of a file, or the name of a configuration that comes with the package, such
+        as `jetbot_egocentric`.
+
+    Raises:
+      ConfigError: there is no such file.
+    """
+    path = Path(name)
+    if os.path.lexists(path):
+        return path
+    shipped = shipped_configs()
+    # A reader of the documentation may name `configs/gpu.yaml` in another folder.
+    plain = path.name if path.parent in (Path(), Path("configs")) else str(path)
+    if (found := shipped.get(plain.removesuffix(".yaml"))) is not None:
+        return found
+    close = difflib.get_close_matches(path.stem, shipped, n=1)
+    hint = f"did you mean {close[0]}?" if close else f"known by name are {', '.join(shipped)}"
+    raise ConfigError(f"config {name} does not exist: {hint}")
+
+
 def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Config:
     """Read a YAML file, apply overrides, and check the result.
 
     Args:
-      path: the YAML file with the settings that differ from the defaults. None: only defaults.
+      path: the YAML file with the settings that differ from the defaults, or the name of a
+        configuration that comes with the package. None: only defaults.
       overrides: `section.key=value`, the value read as YAML; the last one wins.
 
     Returns:
@@ -547,7 +583,7 @@ def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Confi
       ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
         type, out of bounds or at odds with another.
     """
-    values = {} if path is None else read_yaml(Path(path))
+    values = {} if path is None else read_yaml(find_config(path))
     for override in overrides:
         _apply_override(values, override)
     return parse_config(
@@ -647,7 +683,11 @@ def _explain(error: ErrorDetails) -> str:
         case "extra_forbidden":
             known = _known_keys(location[:-1])
             close = difflib.get_close_matches(location[-1], known, n=1)
-            hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(known)}"
+            # A key may also be that of another section, such as learning_rate without `ppo.`.
+            elsewhere = [name for name in _ALL_KEYS if name.rpartition(".")[2] == location[-1]]
+            hint = f"known are {', '.join(known)}"
+            if elsewhere or close:
+                hint = f"did you mean {(elsewhere or close)[0]}?"
             return f"{key} = {value!r} is unknown: {hint}"
         case "value_error":
             prefix = f"{key}: " if key else ""
@@ -667,3 +707,7 @@ def _known_keys(location: Sequence[str]) -> list[str]:
             return []
         model = annotation
     return list(model.model_fields)
+
+
+_ALL_KEYS = tuple(Config().flat())
+"""Every setting with its section, such as `ppo.learning_rate`."""

@@ -1,4 +1,4 @@
-"""Define the exception for errors that the user can correct, with a message of one line."""
+"""Define exceptions for errors that the user can correct, each with a message of one line."""
 
 
 class UserError(Exception):
@@ -7,6 +7,18 @@ class UserError(Exception):
     def __init__(self, message: str) -> None:
         """Join the lines of a message that quotes a key, a path or another library's message."""
         super().__init__(" ".join(message.splitlines()))
+
+
+class InvalidError(UserError, ValueError):
+    """Raised when a value is wrong, so that callers may also catch a `ValueError`."""
+
+
+class NotFoundError(UserError, FileNotFoundError):
+    """Raised when a file or folder is missing; callers may also catch a `FileNotFoundError`."""
+
+
+class MissingPackageError(UserError, ImportError):
+    """Raised when an optional package is missing; callers may also catch an `ImportError`."""
 
 
 def ran_out(error: Exception) -> bool:

@@ -16,17 +16,17 @@ from jetbot_mjx.envs.task import layout_data
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
+    CheckpointNotFoundError,
     checkpoint_path,
     checkpoint_steps,
     read_about,
     read_tree,
 )
+from jetbot_mjx.runs.find_run import PRETRAINED as PRETRAINED
+from jetbot_mjx.runs.find_run import find_run, list_runs
 
 Which = Literal["best", "last"] | int
 """Selects a checkpoint of a run: the best, the last, or one by its environment steps."""
-
-PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
-"""Runs that come with the package, each named after its configuration."""
 
 POLICY = "policy"
 """The tree that holds a policy's parameters."""
@@ -163,7 +163,7 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     """Find a checkpoint folder.
 
     Args:
-      path: a run folder, or one checkpoint folder of it.
+      path: a run folder, one checkpoint folder of it, or a run's name as for `find_run`.
       which: the checkpoint of a run folder.
 
     Returns:
@@ -172,16 +172,18 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     Raises:
       CheckpointError: there is no such checkpoint.
     """
-    path = Path(path).absolute()
+    path = find_run(path, must_exist=False).absolute()
     try:
         return _find(path, which)
+    except CheckpointError:
+        raise
     except OSError as error:
         raise CheckpointError(f"no checkpoint at {path}: {error.strerror}") from None
 
 
 def _find(path: Path, which: Which) -> Path:
     if not path.is_dir():
-        raise CheckpointError(
+        raise CheckpointNotFoundError(
             f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
         )
     # A run folder may contain `policy/` too, which `export` writes.
@@ -191,14 +193,19 @@ def _find(path: Path, which: Which) -> Path:
         raise CheckpointError(
             f"no checkpoint at {path}: it holds several seeds; name one, such as {seeds[0]}"
         )
+    if not (path / FOLDER).is_dir() and (runs := list_runs(path)):
+        names = ", ".join(run.path.name for run in runs[:8]) + (", ..." if runs[8:] else "")
+        raise CheckpointNotFoundError(
+            f"no checkpoint at {path}: it holds {len(runs)} runs; name one of {names}"
+        )
     if not (path / FOLDER).is_dir():
-        raise CheckpointError(
+        raise CheckpointNotFoundError(
             f"no checkpoint at {path}: it holds neither {FOLDER}/ nor {POLICY}/;"
             " give a run folder or a checkpoint in it"
         )
     steps = checkpoint_steps(path)
     if not steps:
-        raise CheckpointError(f"no checkpoint in {path / FOLDER}: the run saved none")
+        raise CheckpointNotFoundError(f"no checkpoint in {path / FOLDER}: the run saved none")
     if which == "last":
         step = steps[-1]
     elif which == "best":
@@ -208,7 +215,9 @@ def _find(path: Path, which: Which) -> Path:
         step = which
     else:
         known = ", ".join(str(step) for step in steps)
-        raise CheckpointError(f"no checkpoint at {which} steps in {path}: there are {known}")
+        raise CheckpointNotFoundError(
+            f"no checkpoint at {which} steps in {path}: there are {known}"
+        )
     return checkpoint_path(path, step)
 
 

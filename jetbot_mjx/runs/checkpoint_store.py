@@ -42,7 +42,7 @@ import orbax.checkpoint as ocp
 import tensorstore as ts
 from orbax.checkpoint import checkpoint_managers
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import NotFoundError, UserError
 
 FOLDER = "checkpoints"
 """Name of the folder of checkpoints in a run folder."""
@@ -64,6 +64,10 @@ logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 class CheckpointError(UserError):
     """Raised when a checkpoint is missing or cannot be used."""
+
+
+class CheckpointNotFoundError(CheckpointError, NotFoundError):
+    """Raised when there is no checkpoint at a path."""
 
 
 class CheckpointStore:

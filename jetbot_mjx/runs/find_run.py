@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jetbot_mjx.config import ConfigError, load_config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import NotFoundError, UserError
 from jetbot_mjx.runs.metrics import read_history
 from jetbot_mjx.runs.run_dir import CONFIG
 
@@ -49,15 +49,16 @@ class RunInfo(NamedTuple):
         return self.path.name if self.path.parent == ROOT else str(self.path)
 
 
-def find_run(name: str | Path, root: Path = ROOT) -> Path:
+def find_run(name: str | Path, root: Path = ROOT, *, must_exist: bool = True) -> Path:
     """Return the path of a run or of a checkpoint, which need not hold a usable one.
 
     Args:
       name: a path; the name of a folder in `root`; `latest`; or `pretrained:NAME`.
       root: the folder of runs.
+      must_exist: whether a path that does not exist is an error; otherwise it is returned.
 
     Raises:
-      UserError: there is no such run.
+      NotFoundError: there is no such run.
     """
     text = str(name)
     if text.startswith(_PREFIX):
@@ -67,11 +68,13 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
     if text == _LATEST:
         runs = list_runs(root)
         if not runs:
-            raise UserError(f"{_LATEST}: there is no run in {root}/: train one first")
+            raise NotFoundError(f"{_LATEST}: there is no run in {root}/: train one first")
         return runs[0].path
     if os.sep not in text and os.path.lexists(root / text):
         return root / text
-    raise UserError(f"there is no run {text}: {_suggest(text, root)}")
+    if must_exist:
+        raise NotFoundError(f"there is no run {text}: {_suggest(text, root)}")
+    return Path(name)
 
 
 def list_runs(root: Path = ROOT) -> list[RunInfo]:
@@ -144,7 +147,9 @@ def _find_pretrained(name: str) -> Path:
     known = sorted(path.name for path in PRETRAINED.iterdir())
     if name in known:
         return PRETRAINED / name
-    raise UserError(f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}")
+    raise NotFoundError(
+        f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}"
+    )
 
 
 def _suggest(text: str, root: Path) -> str:
