@@ -9,6 +9,7 @@ The subpackages, each of which imports only from those before it:
 - `evaluation`: scores, comparisons, reports
 - `viewers`: videos, browser, window
 - `training`: from a configuration to a finished run
+- `tuning`: search for hyperparameters
 - `deployment`: a policy without JAX
 - `adapters`: Gymnasium and Stable-Baselines3, for other people's programs
 

@@ -17,7 +17,7 @@ import sys
 import threading
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NoReturn
+from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.imports import install_lazy_imports
@@ -40,13 +40,15 @@ class Parser(argparse.ArgumentParser):
         self, args: Sequence[str] | None = None, namespace: argparse.Namespace | None = None
     ) -> argparse.Namespace:
         """Parse all arguments, and suggest an option for one that is unknown."""
-        options, unknown = self.parse_known_args(args, namespace)
-        if unknown:
-            given = unknown[0].partition("=")[0]
-            close = difflib.get_close_matches(given, self._option_string_actions, n=1)
-            hint = f": did you mean {close[0]}?" if close else ""
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-        return options
+        # Before the rest, because the value after an unknown option looks like another argument.
+        for word in sys.argv[1:] if args is None else args:
+            name = word.partition("=")[0]
+            options = self._option_string_actions
+            if name.startswith("--") and not any(one.startswith(name) for one in options):
+                close = difflib.get_close_matches(name, options, n=1)
+                hint = f": did you mean {close[0]}?" if close else ""
+                self.error(f"unrecognized arguments: {name}{hint}")
+        return super().parse_args(args, namespace)
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
@@ -218,8 +220,8 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 
 
-def existing_run(text: str) -> Path:
-    """Parse an argument that names a run or a checkpoint; raise an error if there is none."""
+def run_path(text: str) -> Path:
+    """Parse an argument that names a run or a checkpoint."""
     from jetbot_mjx.runs.find_run import find_run
 
     return find_run(text)
@@ -242,12 +244,12 @@ def add_checkpoint_arguments(
     )
     if several:
         what += "; several are compared"
-        parser.add_argument("run", nargs="+", type=existing_run, metavar="RUN", help=what)
+        parser.add_argument("run", nargs="+", type=run_path, metavar="RUN", help=what)
     elif default is not None:
         what += f" (default: {default})"
-        parser.add_argument("run", nargs="?", type=existing_run, metavar="RUN", help=what)
+        parser.add_argument("run", nargs="?", type=run_path, metavar="RUN", help=what)
     else:
-        parser.add_argument("run", type=existing_run, metavar="RUN", help=what)
+        parser.add_argument("run", type=run_path, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,
@@ -255,6 +257,15 @@ def add_checkpoint_arguments(
         metavar="best|last|STEPS",
         help="which checkpoint of a run folder (default: best)",
     )
+
+
+class _KeepIfAbsent(argparse.Action):
+    """An action of a positional argument that may be absent: another one may have set its value."""
+
+    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+        """Store the value if there is one."""
+        if values is not None:
+            setattr(namespace, self.dest, values)
 
 
 def add_config_arguments(
@@ -277,19 +288,12 @@ def add_config_arguments(
     suffix = f" (default: {default.parent.name}/{default.name})" if default else ""
     group = group or parser.add_mutually_exclusive_group(required=required)
     what = "YAML file, or the name of a configuration that comes with the package"
-    # Two names for one argument: SUPPRESS keeps either from overwriting the other by its default.
     text = f"{what}; `{PROGRAM} configs` lists them{suffix}"
+    group.add_argument("--config", type=Path, default=default, metavar="CONFIG", help=text)
     if positional:
         group.add_argument(
-            "config", type=Path, nargs="?", default=default, metavar="CONFIG", help=text
+            "config", type=Path, nargs="?", action=_KeepIfAbsent, metavar="CONFIG", help="the same"
         )
-    group.add_argument(
-        "--config",
-        type=Path,
-        default=argparse.SUPPRESS if positional else default,
-        metavar="CONFIG",
-        help="the same" if positional else text,
-    )
     parser.add_argument(
         "--set",
         dest="overrides",

@@ -564,7 +564,7 @@ def find_config(name: str | Path) -> Path:
     if (found := shipped.get(plain.removesuffix(".yaml"))) is not None:
         return found
     close = difflib.get_close_matches(path.stem, shipped, n=1)
-    hint = f"did you mean {close[0]}?" if close else f"known by name are {', '.join(shipped)}"
+    hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"
     raise ConfigError(f"config {name} does not exist: {hint}")
 
 

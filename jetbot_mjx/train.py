@@ -23,7 +23,7 @@ def _parser() -> cli.Parser:
     source = parser.add_mutually_exclusive_group(required=True)
     cli.add_config_arguments(parser, source)
     source.add_argument(
-        "--resume", type=cli.existing_run, metavar="RUN", help="continue the run in this folder"
+        "--resume", type=cli.run_path, metavar="RUN", help="continue the run in this folder"
     )
     parser.add_argument("--seed", type=int, help="the same as --set seed=N")
     parser.add_argument("--seeds", type=int, help="the same as --set seeds=N: N policies at once")

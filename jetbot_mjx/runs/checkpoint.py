@@ -23,7 +23,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     read_tree,
 )
 from jetbot_mjx.runs.find_run import PRETRAINED as PRETRAINED
-from jetbot_mjx.runs.find_run import find_run, list_runs
+from jetbot_mjx.runs.find_run import find_run, list_runs, suggest_run
 
 Which = Literal["best", "last"] | int
 """Selects a checkpoint of a run: the best, the last, or one by its environment steps."""
@@ -172,7 +172,7 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     Raises:
       CheckpointError: there is no such checkpoint.
     """
-    path = find_run(path, must_exist=False).absolute()
+    path = find_run(path).absolute()
     try:
         return _find(path, which)
     except CheckpointError:
@@ -184,7 +184,7 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
 def _find(path: Path, which: Which) -> Path:
     if not path.is_dir():
         raise CheckpointNotFoundError(
-            f"no checkpoint at {path}: no such folder; give a run folder or a checkpoint in it"
+            f"no checkpoint at {path}: no such folder; {suggest_run(path)}"
         )
     # A run folder may contain `policy/` too, which `export` writes.
     if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():

@@ -49,16 +49,15 @@ class RunInfo(NamedTuple):
         return self.path.name if self.path.parent == ROOT else str(self.path)
 
 
-def find_run(name: str | Path, root: Path = ROOT, *, must_exist: bool = True) -> Path:
-    """Return the path of a run or of a checkpoint, which need not hold a usable one.
+def find_run(name: str | Path, root: Path = ROOT) -> Path:
+    """Return the path of a run or of a checkpoint, which need not exist.
 
     Args:
       name: a path; the name of a folder in `root`; `latest`; or `pretrained:NAME`.
       root: the folder of runs.
-      must_exist: whether a path that does not exist is an error; otherwise it is returned.
 
     Raises:
-      NotFoundError: there is no such run.
+      NotFoundError: there is no latest run, or none of this name comes with the package.
     """
     text = str(name)
     if text.startswith(_PREFIX):
@@ -72,8 +71,6 @@ def find_run(name: str | Path, root: Path = ROOT, *, must_exist: bool = True) ->
         return runs[0].path
     if os.sep not in text and os.path.lexists(root / text):
         return root / text
-    if must_exist:
-        raise NotFoundError(f"there is no run {text}: {_suggest(text, root)}")
     return Path(name)
 
 
@@ -152,12 +149,12 @@ def _find_pretrained(name: str) -> Path:
     )
 
 
-def _suggest(text: str, root: Path) -> str:
-    """Return a remedy for a name that no run has."""
+def suggest_run(path: Path, root: Path = ROOT) -> str:
+    """Return a remedy for a path at which there is no run."""
     names = [run.path.name for run in list_runs(root)]
-    if close := difflib.get_close_matches(Path(text).name, names, n=1):
+    if close := difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {close[0]}?"
-    return "python -m jetbot_mjx runs lists those there are"
+    return "give a run folder or a checkpoint in it"
 
 
 def _age(seconds: float) -> str:

@@ -154,7 +154,8 @@ class Dashboard(Terminal):
         self.phase(None)
         with contextlib.suppress(OSError):
             # Rich holds back a line without an end, and would lose it.
-            print(end="", flush=True)
+            sys.stdout.write("")
+            sys.stdout.flush()
             self._live.stop()
 
     def _add(self, metrics: Sequence[MetricValues]) -> None:

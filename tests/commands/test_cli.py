@@ -66,14 +66,14 @@ def refused(here, capfd):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "one of the arguments --config --resume is required"),
-        ([SMOKE], "one of the arguments --config --resume is required"),
+        ([], "one of the arguments --config CONFIG --resume is required"),
+        ([SMOKE], "one of the arguments --config CONFIG --resume is required"),
         (["--config", SMOKE, "--resume", "run"], "--resume: not allowed with argument --config"),
         (["--resume", "run", "--run-dir", "run"], "--run-dir: --resume names the folder already"),
         (["--config", SMOKE, "--seeds", "x"], "argument --seeds: invalid int value: 'x'"),
         (["--config"], "argument --config: expected one argument"),
-        (["--config", SMOKE, "more"], "unrecognized arguments: more"),
-        (["--config", SMOKE, "--lr", "1"], "unrecognized arguments: --lr 1"),
+        (["--config", SMOKE, "more"], "argument CONFIG: not allowed with argument --config"),
+        (["--config", SMOKE, "--lr", "1"], "unrecognized arguments: --lr"),
         (["--config", SMOKE, "--set"], "argument --set: expected one argument"),
         (["--config", SMOKE, "--seed", "x"], "argument --seed: invalid int value: 'x'"),
     ],
@@ -107,7 +107,7 @@ def test_train_refuses_a_bad_file(refused, tmp_path, name):
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("nonsense.yaml", "config nonsense.yaml does not exist: give the path of a YAML file"),
+        ("nonsense.yaml", "config nonsense.yaml does not exist: give a file, or one of gpu, "),
         (".", "config . cannot be read: Is a directory"),
         ("", "config . cannot be read: Is a directory"),
     ],
@@ -248,7 +248,7 @@ both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "the following arguments are required: run"),
+        ([], "the following arguments are required: RUN"),
         (["run", "--more"], "unrecognized arguments: --more"),
         (["run", "--episodes", "0"], "argument --episodes: 0 is too small: give at least 1"),
         (["run", "--episodes", "-3"], "argument --episodes: -3 is too small: give at least 1"),
@@ -434,7 +434,7 @@ def asked(monkeypatch):
             calls.append((config, run_dir))
             raise UserError("no training here")
 
-        monkeypatch.setattr(session, "run", run)
+        monkeypatch.setattr(session, "train", run)
         with pytest.raises(UserError):
             train.main(arguments)
         return calls[0]
@@ -485,7 +485,7 @@ def test_train_names_its_run_folder_after_the_configuration(asked):
     [
         (
             ["train", "--config", "nonsense.yaml"],
-            "error: config nonsense.yaml does not exist: give the path of a YAML file\n",
+            "error: config nonsense.yaml does not exist: give a file, or one of gpu, isaac_sb3, jetbot, jetbot_egocentric, real_jetbot, smoke\n",
         ),
         (
             ["evaluate", "."],

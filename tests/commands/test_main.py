@@ -55,9 +55,7 @@ def test_a_command_runs_with_a_dot_or_without(words):
     command = [sys.executable, "-m", *words, "--config", "nonsense.yaml"]
     done = subprocess.run(command, capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (2, "")
-    assert (
-        done.stderr == "error: config nonsense.yaml does not exist: give the path of a YAML file\n"
-    )
+    assert done.stderr.startswith("error: config nonsense.yaml does not exist: give a file, or one")
 
 
 def test_the_version_is_told(capsys):

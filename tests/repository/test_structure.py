@@ -26,6 +26,7 @@ ROOMS = (
     "evaluation",
     "viewers",
     "training",
+    "tuning",
     "deployment",
     "adapters",
 )
