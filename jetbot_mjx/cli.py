@@ -48,7 +48,9 @@ class Parser(argparse.ArgumentParser):
                 close = difflib.get_close_matches(name, options, n=1)
                 hint = f": did you mean {close[0]}?" if close else ""
                 self.error(f"unrecognized arguments: {name}{hint}")
-        return super().parse_args(args, namespace)
+        parsed = super().parse_args(args, namespace)
+        assert parsed is not None
+        return parsed
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""

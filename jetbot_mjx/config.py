@@ -384,6 +384,9 @@ class Config(_Section):
     `brax.training.agents.ppo.train.train`, which cannot resume."""
     deterministic: bool = False
     """Whether a GPU computes bit-identical results for a seed, more slowly; a CPU always does."""
+    init_from: str | None = None
+    """A run whose networks and normaliser to begin with, instead of those of the seed: its folder,
+    or a name such as `pretrained:jetbot_egocentric`. The observation may differ."""
     checkpoint_interval: Steps = 100_000
     """Environment steps between two checkpoints, each with an evaluation and a log line."""
     checkpoints_to_keep: Count = 50
@@ -429,6 +432,8 @@ class Config(_Section):
                 raise ValueError(
                     "deterministic = true is not known to trainer = 'brax': take 'resumable'"
                 )
+            if self.init_from is not None:
+                raise ValueError("init_from is not known to trainer = 'brax': take 'resumable'")
             if self.seeds > 1:
                 raise ValueError(
                     f"seeds = {self.seeds} is not known to trainer = 'brax': take 'resumable'"

@@ -6,6 +6,7 @@ SIGTERM and Ctrl-C stop a training: it saves everything and exits with code 75. 
 """
 
 import argparse
+import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -27,6 +28,9 @@ def _parser() -> cli.Parser:
     )
     parser.add_argument("--seed", type=int, help="the same as --set seed=N")
     parser.add_argument("--seeds", type=int, help="the same as --set seeds=N: N policies at once")
+    parser.add_argument(
+        "--init-from", metavar="RUN", help="begin with the policy of another run, of any task"
+    )
     parser.add_argument("--run-dir", type=Path, help="default: runs/<config>-<date>-<time>")
     parser.add_argument(
         "--distributed",
@@ -46,6 +50,7 @@ def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
         options.config = options.resume / CONFIG
     overrides = [f"seed={options.seed}"] if options.seed is not None else []
     overrides += [f"seeds={options.seeds}"] if options.seeds is not None else []
+    overrides += [f"init_from={json.dumps(options.init_from)}"] if options.init_from else []
     config = cli.config_of(options, *overrides)
     return config, options.resume or options.run_dir or default_run_dir(options.config)
 

@@ -54,7 +54,7 @@ def open_program_cache(config: Config) -> ProgramCache:
     }
     cache_key = [
         # Leave out the seed, which is an argument of the programs.
-        config.model_copy(update={"seed": 0}).model_dump(mode="json"),
+        config.model_copy(update={"seed": 0, "init_from": None}).model_dump(mode="json"),
         _own_source(),
         _model(config),
         sys.version,

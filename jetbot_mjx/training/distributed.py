@@ -40,6 +40,8 @@ def check(config: Config) -> None:
     """
     if config.trainer == "brax":
         raise UserError("--distributed is not known to trainer = 'brax': take 'resumable'")
+    if config.init_from is not None:
+        raise UserError("--distributed cannot begin with another run's policy: leave init_from out")
     if config.seeds > 1:
         raise UserError(
             f"--distributed trains one policy, not seeds = {config.seeds}: leave one of them out"

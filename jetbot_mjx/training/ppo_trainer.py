@@ -211,17 +211,14 @@ def train(
       recorder: the callback that receives every report.
       preemption: the signal listener, which is checked while compiling and before every call.
       checkpoint_interval: environment steps from one report to the next, at least.
-      states: the state of each seed to resume from, on the host; None: start from the beginning.
+      states: the state of each seed to continue from, on the host; None: that of its seed.
     """
     # Compile in the background while the initial policy is evaluated.
     compiling = _Background(trainer.compile)
-    if states is None:
-        state, done = trainer.init(), 0
-        if not _report(trainer, recorder, state, 0.0):
-            return
-    else:
-        state = trainer.put(states)
-        done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step
+    state = trainer.init() if states is None else trainer.put(states)
+    done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step if states else 0
+    if done == 0 and not _report(trainer, recorder, state, 0.0):
+        return
     # Wait until every process has compiled; leave if one of them was asked to stop.
     running = True
     while running:

@@ -6,7 +6,7 @@ modules receive what they need as required arguments.
 """
 
 import contextlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,7 +21,7 @@ from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
-from jetbot_mjx.runs.checkpoint import about_policy
+from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
 from jetbot_mjx.runs.metrics import CompileClock, read_history
 from jetbot_mjx.runs.resume import Resumption, resume
@@ -46,6 +46,7 @@ from jetbot_mjx.training.run_recorder import (
     Standing,
     open_sinks,
 )
+from jetbot_mjx.training.warm_start import WarmStart, make_warm_start
 from jetbot_mjx.viewers.video import EvaluationVideo
 
 _COMPLETE, _BEGINS, _RESUMES = range(3)
@@ -92,6 +93,8 @@ class Training(NamedTuple):
     ppo: PPO
     """PPO over all devices; its networks are also those of the evaluations and videos."""
     programs: ProgramCache
+    warm_start: WarmStart | None
+    """The parameters to begin with; None: those of the seed, or the run is resumed."""
 
 
 def run(config: Config, run_dir: Path) -> Result:
@@ -138,7 +141,9 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
     # Build every object once.
     env = make_env(config)
     ppo = ppo_trainer.build_ppo(config, env)
-    training = Training(config, run_dir, seed_dirs(run_dir, config), env, ppo, programs)
+    run_dirs = seed_dirs(run_dir, config)
+    warm_start = _warm_start(config, env, run_dirs)
+    training = Training(config, run_dir, run_dirs, env, ppo, programs, warm_start)
     try:
         return _train_with_brax(training) if config.trainer == "brax" else _train(training)
     except jax.errors.JaxRuntimeError as error:
@@ -146,6 +151,13 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
             raise
         smaller = advice(config, sizes(ppo, env), jax.device_count(), device_memory())
     raise UserError(smaller)
+
+
+def _warm_start(config: Config, env: JetBotEnv, run_dirs: Sequence[Path]) -> WarmStart | None:
+    """Load the parameters to begin with, unless the run has checkpoints of its own."""
+    if config.init_from is None or any(map(checkpoint_steps, run_dirs)):
+        return None
+    return make_warm_start(load_checkpoint(config.init_from), config, env)
 
 
 def _train_with_brax(training: Training) -> Result:
@@ -178,6 +190,8 @@ def _train(training: Training) -> Result:
             if recorder.complete:
                 recorder.say(*messages)
                 return _COMPLETE
+            if training.warm_start:
+                messages.append(training.warm_start.describe())
             recorder.begin("\n".join([*messages, _headline(config, training.run_dir)]))
             return _RESUMES if resumption else _BEGINS
 
@@ -187,6 +201,8 @@ def _train(training: Training) -> Result:
         states = None
         if found == _RESUMES:
             states = distributed.broadcast_from_primary(stored, trainer.template(), len(seeds))
+        elif found == _BEGINS and training.warm_start:
+            states = [training.warm_start.apply(one) for one in trainer.get(trainer.init())]
         if found != _COMPLETE:
             callback = recorder or TrainerCallback()
             ppo_trainer.train(trainer, callback, preemption, config.checkpoint_interval, states)

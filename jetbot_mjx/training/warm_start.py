@@ -12,6 +12,7 @@ All later layers are taken over as they are. The optimizer begins anew.
 """
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -20,6 +21,7 @@ from brax.training.types import UInt64
 from jaxtyping import Array, Float, Int, PyTree
 
 from jetbot_mjx.agents.networks import PolicyParams, make_networks, make_policy
+from jetbot_mjx.agents.ppo import TrainState
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.task import layout_data
@@ -42,13 +44,31 @@ class WarmStart(NamedTuple):
 
     params: PolicyParams
     """On the host."""
-    kept: list[str]
+    source: Path
+    """The checkpoint."""
+    env_steps: int
+    """Environment steps that it was trained for."""
+    taken: list[str]
     """Names of the fields in both layouts."""
     new: list[str]
     dropped: list[str]
 
+    def apply(self, state: TrainState) -> TrainState:
+        """Return a training state before the first step with these parameters."""
+        networks = state.params.replace(policy=self.params.policy, value=self.params.value)
+        return state.replace(params=networks, normalizer=self.params.normalizer)
 
-def warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmStart:
+    def describe(self) -> str:
+        """Return one line that says what was taken over."""
+        parts = [f"begins with the policy of {self.source} after {self.env_steps:,} steps"]
+        if self.new:
+            parts.append(f"new in its observation: {', '.join(self.new)}")
+        if self.dropped:
+            parts.append(f"dropped: {', '.join(self.dropped)}")
+        return "; ".join(parts)
+
+
+def make_warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmStart:
     """Fit another run's policy to a new task.
 
     Args:
@@ -85,7 +105,9 @@ def warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmStart:
     taken = _taken(new, rows)
     return WarmStart(
         params=jax.device_get(params),
-        kept=[name for name in taken if taken[name]],
+        source=source.path,
+        env_steps=source.env_steps,
+        taken=[name for name in taken if taken[name]],
         new=[name for name in taken if not taken[name]],
         dropped=sorted(names[0] - {name for name in taken if taken[name]}),
     )

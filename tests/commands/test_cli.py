@@ -25,6 +25,9 @@ from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint import FORMAT
 from jetbot_mjx.training import session
 
+FILE_OR_NAME = (
+    "give a file, or one of gpu, isaac_sb3, jetbot, jetbot_egocentric, real_jetbot, smoke"
+)
 SMOKE = str(Path(__file__).parents[2] / "configs" / "smoke.yaml")
 COMMANDS = {
     "plan": plan,
@@ -67,7 +70,6 @@ def refused(here, capfd):
     ("arguments", "said"),
     [
         ([], "one of the arguments --config CONFIG --resume is required"),
-        ([SMOKE], "one of the arguments --config CONFIG --resume is required"),
         (["--config", SMOKE, "--resume", "run"], "--resume: not allowed with argument --config"),
         (["--resume", "run", "--run-dir", "run"], "--run-dir: --resume names the folder already"),
         (["--config", SMOKE, "--seeds", "x"], "argument --seeds: invalid int value: 'x'"),
@@ -107,7 +109,7 @@ def test_train_refuses_a_bad_file(refused, tmp_path, name):
 @pytest.mark.parametrize(
     ("path", "said"),
     [
-        ("nonsense.yaml", "config nonsense.yaml does not exist: give a file, or one of gpu, "),
+        ("nonsense.yaml", f"config nonsense.yaml does not exist: {FILE_OR_NAME}"),
         (".", "config . cannot be read: Is a directory"),
         ("", "config . cannot be read: Is a directory"),
     ],
@@ -485,7 +487,7 @@ def test_train_names_its_run_folder_after_the_configuration(asked):
     [
         (
             ["train", "--config", "nonsense.yaml"],
-            "error: config nonsense.yaml does not exist: give a file, or one of gpu, isaac_sb3, jetbot, jetbot_egocentric, real_jetbot, smoke\n",
+            f"error: config nonsense.yaml does not exist: {FILE_OR_NAME}\n",
         ),
         (
             ["evaluate", "."],
