@@ -91,7 +91,7 @@ def stored_config(run_dir: Path) -> Config | None:
         raise UserError(f"--run-dir {run_dir} cannot be used: {error.strerror}") from None
     if in_use:
         raise UserError(
-            f"--run-dir {run_dir} exists and is not a run (no {CONFIG}): name a new folder"
+            f"--run-dir {run_dir} exists and holds no run (no {CONFIG}): name a new folder"
         )
     return None
 

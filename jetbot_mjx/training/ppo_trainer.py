@@ -203,6 +203,8 @@ def train(
     preemption: Preemption,
     checkpoint_interval: int,
     states: Sequence[TrainState] | None = None,
+    *,
+    resumes: bool = False,
 ) -> None:
     """Train until the end, until the callback asks to stop, or until a signal arrives.
 
@@ -211,13 +213,14 @@ def train(
       recorder: the callback that receives every report.
       preemption: the signal listener, which is checked while compiling and before every call.
       checkpoint_interval: environment steps from one report to the next, at least.
-      states: the state of each seed to continue from, on the host; None: that of its seed.
+      states: the state of each seed to start from, on the host; None: that of its seed.
+      resumes: whether these states were reported before.
     """
     # Compile in the background while the initial policy is evaluated.
     compiling = _Background(trainer.compile)
     state = trainer.init() if states is None else trainer.put(states)
     done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step if states else 0
-    if done == 0 and not _report(trainer, recorder, state, 0.0):
+    if not resumes and not _report(trainer, recorder, state, 0.0):
         return
     # Wait until every process has compiled; leave if one of them was asked to stop.
     running = True

@@ -205,7 +205,14 @@ def _train(training: Training) -> Result:
             states = [training.warm_start.apply(one) for one in trainer.get(trainer.init())]
         if found != _COMPLETE:
             callback = recorder or TrainerCallback()
-            ppo_trainer.train(trainer, callback, preemption, config.checkpoint_interval, states)
+            ppo_trainer.train(
+                trainer,
+                callback,
+                preemption,
+                config.checkpoint_interval,
+                states,
+                resumes=found == _RESUMES,
+            )
     # Tell the other processes whether the training came to its end.
     complete = distributed.run_on_primary(lambda: recorder is not None and recorder.complete)
     return _result(training, recorder, finished=bool(complete))

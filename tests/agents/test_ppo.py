@@ -20,7 +20,7 @@ from brax.training.types import Transition
 from gliding import Gliding
 
 from jetbot_mjx import evaluate
-from jetbot_mjx.agents.ppo import LOSSES, make_optimizer
+from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import EGOCENTRIC, LAYOUTS, Field, GoalTask

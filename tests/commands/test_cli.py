@@ -187,14 +187,14 @@ def test_train_refuses_a_run_folder_in_use(refused, here):
     (here / "run").mkdir()
     (here / "run" / "metrics.jsonl").write_text("precious")
     line = refused(train, "--config", SMOKE, "--run-dir", "run")
-    assert "run exists and is not a run (no config.yaml): name a new folder" in line
+    assert "run exists and holds no run (no config.yaml): name a new folder" in line
     assert (here / "run" / "metrics.jsonl").read_text() == "precious"
 
 
 @pytest.mark.parametrize(
     ("run_dir", "said"),
     [
-        ("file", "--run-dir file exists and is not a run (no config.yaml): name a new folder"),
+        ("file", "--run-dir file exists and holds no run (no config.yaml): name a new folder"),
         ("file/run", "--run-dir file/run cannot be written: Not a directory"),
     ],
 )

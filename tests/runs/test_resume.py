@@ -444,7 +444,7 @@ DAMAGES = {
     ),
     "another format": (
         rewrite(lambda about: about.update(format="jetbot_mjx/1")),
-        "in the format 'jetbot_mjx/1', and only 'jetbot_mjx/3' can be read",
+        "has the format 'jetbot_mjx/1', and only 'jetbot_mjx/3' can be read",
     ),
     "another seed": (
         rewrite(lambda about: about["config"].update(seed=1)),
@@ -768,7 +768,9 @@ def test_a_run_that_another_training_holds_is_refused_and_left_alone(config, run
         fcntl.flock(file, fcntl.LOCK_EX)
         print(12345, file=file, flush=True)
         before = contents(run_copy)
-        assert "held by another training (process 12345)" in refused(session.run, config, run_copy)
+        assert "locked by another training (process 12345)" in refused(
+            session.run, config, run_copy
+        )
         assert contents(run_copy) == before
     assert session.run(config, run_copy).finished
 

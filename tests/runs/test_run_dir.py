@@ -115,13 +115,13 @@ def test_a_folder_with_anything_else_in_it_is_refused(tmp_path, occupant):
         (tmp_path / occupant).mkdir(parents=True)
     else:
         (tmp_path / occupant).write_text("")
-    assert "exists and is not a run (no config.yaml)" in refused(stored_config, tmp_path)
+    assert "exists and holds no run (no config.yaml)" in refused(stored_config, tmp_path)
 
 
 def test_a_file_is_no_run_folder(tmp_path):
     path = tmp_path / "file"
     path.write_text("")
-    assert "exists and is not a run" in refused(stored_config, path)
+    assert "exists and holds no run" in refused(stored_config, path)
 
 
 @pytest.mark.parametrize("text", ["ppo: [", "- 1", "sede: 3", "\udcff"])
