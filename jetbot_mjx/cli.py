@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.imports import install_lazy_imports
-from jetbot_mjx.interrupts import repeat_lost_interrupts
+from jetbot_mjx.interrupts import exit_on_interrupt, repeat_lost_interrupts
 
 if TYPE_CHECKING:
     from jetbot_mjx.config import Config
@@ -224,7 +224,8 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
 
 def run_path(text: str) -> Path:
     """Parse an argument that names a run or a checkpoint."""
-    from jetbot_mjx.runs.find_run import find_run
+    with exit_on_interrupt():
+        from jetbot_mjx.runs.find_run import find_run
 
     return find_run(text)
 

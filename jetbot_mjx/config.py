@@ -557,16 +557,18 @@ def find_config(name: str | Path) -> Path:
       name: the path of a file, or the name of a configuration that comes with the package, such
         as `jetbot_egocentric`.
 
+    Returns:
+      The path, which need not exist if it names a folder.
+
     Raises:
-      ConfigError: there is no such file.
+      ConfigError: a plain name is neither a file nor a configuration of the package.
     """
     path = Path(name)
-    if os.path.lexists(path):
+    # A reader of the documentation may name `configs/gpu.yaml` in another folder.
+    if os.path.lexists(path) or path.parent not in (Path(), Path("configs")):
         return path
     shipped = shipped_configs()
-    # A reader of the documentation may name `configs/gpu.yaml` in another folder.
-    plain = path.name if path.parent in (Path(), Path("configs")) else str(path)
-    if (found := shipped.get(plain.removesuffix(".yaml"))) is not None:
+    if (found := shipped.get(path.name.removesuffix(".yaml"))) is not None:
         return found
     close = difflib.get_close_matches(path.stem, shipped, n=1)
     hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"

@@ -169,7 +169,7 @@ BAD_VALUES = {
         "is unknown: known are preset",
     ),
     "unknown section": ("zzz: {a: 1}", "zzz = {'a': 1}", "known are seed, seeds, trainer,"),
-    "key in the wrong section": ("num_envs: 3", "num_envs = 3", "is unknown: known are seed"),
+    "key in the wrong section": ("num_envs: 3", "num_envs = 3", "did you mean ppo.num_envs?"),
     "key that is a number": ("ppo: {1: 2}", "ppo.1 = 1", "should be strings"),
     # Types.
     "string for a count": ("ppo: {num_envs: many}", "ppo.num_envs = 'many'", "integer"),

@@ -100,7 +100,7 @@ def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):
     assert given == [(PRETRAINED / "jetbot_egocentric", "best")]
     assert "no run is named" in capsys.readouterr().out
     assert play.main(["runs/mine"]) == 0
-    assert given[1] == ("runs/mine", "best")
+    assert given[1] == (Path("runs/mine"), "best")
     assert "no run is named" not in capsys.readouterr().out
 
 
