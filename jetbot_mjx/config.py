@@ -539,15 +539,22 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def shipped_configs() -> dict[str, Path]:
-    """Return the configurations that come with the package, by name.
+def shipped_folder(name: Literal["configs", "examples"]) -> Path:
+    """Return a folder at the top level of the repository, which a wheel holds inside the package.
 
-    They are in `configs/` at the top level of the repository, which a wheel holds as a folder of
-    the package.
+    Args:
+      name: the name of the folder.
     """
     package = Path(__file__).parent
-    folders = package / "configs", package.parent / "configs"
-    return {path.stem: path for folder in folders for path in sorted(folder.glob("*.yaml"))}
+    return next(
+        (folder / name for folder in (package, package.parent) if (folder / name).is_dir()),
+        package / name,
+    )
+
+
+def shipped_configs() -> dict[str, Path]:
+    """Return the configurations that come with the package, by name."""
+    return {path.stem: path for path in sorted(shipped_folder("configs").glob("*.yaml"))}
 
 
 def find_config(name: str | Path) -> Path:

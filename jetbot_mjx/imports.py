@@ -34,7 +34,9 @@ def load_lazily(
     def find(name: str) -> Any:
         if name not in homes:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        return getattr(importlib.import_module(f"{package}.{homes[name]}"), name)
+        with without_warp_lines():
+            module = importlib.import_module(f"{package}.{homes[name]}")
+        return getattr(module, name)
 
     return find, lambda: sorted(homes)
 
@@ -127,9 +129,21 @@ def _mjx() -> Iterator[None]:
     with (
         standing_in("trimesh", _Trimesh("trimesh")),
         standing_in("scipy.spatial", LazyModule("scipy.spatial")),
-        contextlib.redirect_stdout(io.StringIO()),
+        without_warp_lines(),
     ):
         yield
+
+
+@contextlib.contextmanager
+def without_warp_lines() -> Iterator[None]:
+    """Print what is printed inside the context, except for MJX's lines about its part Warp."""
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed):
+            yield
+    finally:
+        lines = printed.getvalue().splitlines(keepends=True)
+        sys.stdout.writelines(line for line in lines if not line.startswith("Failed to import "))
 
 
 @contextlib.contextmanager

@@ -48,9 +48,8 @@ def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
         if stored_config(options.resume) is None:
             raise UserError(f"--resume {options.resume}: there is no run in this folder")
         options.config = options.resume / CONFIG
-    overrides = [f"seed={options.seed}"] if options.seed is not None else []
-    overrides += [f"seeds={options.seeds}"] if options.seeds is not None else []
-    overrides += [f"init_from={json.dumps(options.init_from)}"] if options.init_from else []
+    given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
+    overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
     config = cli.config_of(options, *overrides)
     return config, options.resume or options.run_dir or default_run_dir(options.config)
 
@@ -64,9 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0, or 75 if the training was asked to stop and can be resumed.
     """
-    # Parse.
-    parser = _parser()
-    options = parser.parse_args(arguments)
+    options = (parser := _parser()).parse_args(arguments)
     if options.resume and options.run_dir:
         parser.error("--run-dir: --resume names the folder already")
     config, run_dir = _config_and_folder(options)

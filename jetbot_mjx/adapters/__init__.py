@@ -5,5 +5,8 @@ before the colon, and that registers the environment. Stable-Baselines3's batch 
 `jetbot_mjx.adapters.stable_baselines3.JetBotVecEnv`.
 """
 
-from jetbot_mjx.adapters.gymnasium import JetBotGymEnv as JetBotGymEnv
-from jetbot_mjx.adapters.vector import JetBotVectorEnv as JetBotVectorEnv
+from jetbot_mjx.imports import without_warp_lines
+
+with without_warp_lines():
+    from jetbot_mjx.adapters.gymnasium import JetBotGymEnv as JetBotGymEnv
+    from jetbot_mjx.adapters.vector import JetBotVectorEnv as JetBotVectorEnv

@@ -2,14 +2,14 @@
 
 import importlib.util
 import keyword
-from importlib import resources
 from pathlib import Path
 from typing import NamedTuple
 
+from jetbot_mjx.config import shipped_folder
 from jetbot_mjx.errors import UserError
 
 _EXAMPLE = ("obstacle_task.py", "obstacle.yaml")
-"""The files that are copied; in a checkout they are links to the examples."""
+"""The files that are copied."""
 
 
 class TaskFiles(NamedTuple):
@@ -52,7 +52,7 @@ def write_task_template(path: Path) -> TaskFiles:
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         for file, example in zip(files, _EXAMPLE, strict=True):
-            text = resources.files("jetbot_mjx").joinpath(f"assets/{example}").read_text("utf-8")
+            text = (shipped_folder("examples") / example).read_text("utf-8")
             for old, new in renamed.items():
                 text = text.replace(old, new)
             # Mode "x" does not overwrite a file that was created in the meantime.

@@ -7,7 +7,7 @@ import os
 import re
 import subprocess
 import sys
-import tomllib
+import zipfile
 from pathlib import Path
 
 import pytest
@@ -155,26 +155,18 @@ def test_no_two_modules_need_each_other():
     graphlib.TopologicalSorter(needs).prepare()
 
 
-def test_every_package_is_shipped():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
-    assert project["tool"]["setuptools"]["packages"] == {
-        "find": {"include": [f"{PACKAGE}*"], "namespaces": False}
-    }
-    # That finds folders with an `__init__` alone.
-    for path in (ROOT / PACKAGE).rglob("*.py"):
-        if "assets" not in path.parts:
-            assert (path.parent / "__init__.py").is_file(), path
-
-
-def test_every_asset_is_shipped():
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))
-    shipped = {
-        path
-        for pattern in project["tool"]["setuptools"]["package-data"][PACKAGE]
-        for path in (ROOT / PACKAGE).glob(pattern)
-    }
-    files = {path for path in (ROOT / PACKAGE / "assets").rglob("*") if path.is_file()}
-    assert files <= shipped
+def test_all_that_is_needed_is_shipped(tmp_path):
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", str(tmp_path)]
+    subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
+    (wheel,) = tmp_path.glob("*.whl")
+    shipped = set(zipfile.ZipFile(wheel).namelist())
+    tracked = subprocess.run(
+        ["git", "ls-files", PACKAGE, "configs"], cwd=ROOT, capture_output=True, text=True
+    ).stdout.split()
+    for path in tracked:
+        name = path if path.startswith(PACKAGE) else f"{PACKAGE}/{path}"
+        assert name in shipped
+    assert f"{PACKAGE}/examples/obstacle_task.py" in shipped
 
 
 @pytest.mark.parametrize("name", [name for name in MODULES if name != "__init__"])

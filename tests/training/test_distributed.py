@@ -90,7 +90,7 @@ class Ended:
         self.code = process.returncode
         self.told = [json.loads(line) for line in re.findall(r"^told: (.*)$", self.out, re.M)]
         # The collectives of a CPU tell of themselves.
-        self.said = re.sub(r"^(told: |\[Gloo\]).*\n", "", self.out, flags=re.M)
+        self.said = re.sub(r"^(told: |\[Gloo\]|Failed to import ).*\n", "", self.out, flags=re.M)
         self.complained = re.sub(r"^\[Gloo\].*\n", "", self.err, flags=re.M)
 
 

@@ -1,1 +1,0 @@
-../../examples/obstacle_task.py
