@@ -8,7 +8,10 @@ observation's layout names those numbers, so that the rows can be matched betwee
                            deviation are measured while that policy drives in the new task
   field of the old one     its rows are dropped, and it is named
 
-All later layers are taken over as they are. The optimizer begins anew.
+All later layers are taken over but for the policy's last one. A trained policy commands full speed
+almost everywhere, and there its noise changes nothing that it could learn from. Therefore the last
+layer's means are scaled by `MEAN_SCALE`, which changes how hard the policy steers and not where to,
+and the part that gives the width of its noise is that of a new policy. The optimizer begins anew.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,6 +34,9 @@ from jetbot_mjx.runs.checkpoint import Checkpoint
 
 # Pyright does not follow flax's dataclasses.
 _UInt64: Any = UInt64
+
+MEAN_SCALE = 0.25
+"""Factor on the means of the actions, before they are limited to -1 .. 1."""
 
 _MEASURED_ENVS = 256
 """Environments in which the statistics of new fields are measured, for one episode each."""
@@ -55,7 +61,8 @@ class WarmStart(NamedTuple):
 
     def apply(self, state: TrainState) -> TrainState:
         """Return a training state before the first step with these parameters."""
-        networks = state.params.replace(policy=self.params.policy, value=self.params.value)
+        policy = _with_new_noise(self.params.policy, jax.device_get(state.params.policy))
+        networks = state.params.replace(policy=policy, value=self.params.value)
         return state.replace(params=networks, normalizer=self.params.normalizer)
 
     def describe(self) -> str:
@@ -77,8 +84,8 @@ def make_warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmS
       env: its environment, unwrapped.
 
     Returns:
-      The parameters to begin with, which make the same actions as the other run's policy wherever
-      both tasks observe the same.
+      The parameters to begin with. Before `apply`, they make the same actions as the other run's
+      policy wherever both tasks observe the same.
 
     Raises:
       UserError: the networks differ in more than the observation, or no field is in both layouts.
@@ -172,6 +179,22 @@ def _match_first_layer(params: PyTree, rows: Int[np.ndarray, " new"]) -> PyTree:
     kernel = np.asarray(first["kernel"])
     first["kernel"] = np.where((rows >= 0)[:, None], kernel[rows], np.float32(0.0))
     return {**params, "params": {**layers, "hidden_0": first}}
+
+
+def _with_new_noise(trained: PyTree, fresh: PyTree) -> PyTree:
+    """Return a policy with smaller means and the noise of a fresh one.
+
+    The last layer's outputs are the means of the actions, then the parameters of their deviations.
+    """
+    layers = dict(trained["params"])
+    name = max(layers, key=lambda layer: int(layer.removeprefix("hidden_")))
+
+    def mix(x: Float[np.ndarray, "*in out"], new: Float[np.ndarray, "*in out"]) -> np.ndarray:
+        means = x.shape[-1] // 2
+        return np.concatenate([MEAN_SCALE * x[..., :means], new[..., means:]], axis=-1)
+
+    layers[name] = jax.tree.map(mix, layers[name], fresh["params"][name])
+    return {**trained, "params": layers}
 
 
 def _match_statistics(normalizer: Any, rows: Int[np.ndarray, " new"]) -> Any:
