@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup sb3 train test test-gpu test-slow check format benchmark docs clean
+.PHONY: setup sb3 train test test-gpu test-slow check format benchmark docs wheel clean
 
 setup: $(STAMP)
 
@@ -67,6 +67,17 @@ docs: $(DOCS_STAMP)
 $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	@touch $@
+
+# Builds the wheel, and uses it where there is no checkout: in a new environment and an empty folder.
+wheel: $(STAMP)
+	rm -rf .cache/wheel && mkdir -p .cache/wheel/elsewhere
+	$(BIN)/python -m hatchling build -t wheel -d .cache/wheel
+	$(PYTHON) -m venv .cache/wheel/venv
+	.cache/wheel/venv/bin/python -m pip install --quiet --constraint constraints.txt .cache/wheel/*.whl
+	cd .cache/wheel/elsewhere && ../venv/bin/jetbot-mjx configs && ../venv/bin/jetbot-mjx train smoke \
+		&& ../venv/bin/jetbot-mjx evaluate latest --episodes 64 \
+		&& ../venv/bin/jetbot-mjx evaluate pretrained:jetbot_egocentric --episodes 64 --output report \
+		&& ../venv/bin/jetbot-mjx runs && ../venv/bin/jetbot-mjx new_task my_task.py
 
 clean:
 	rm -rf $(VENV) .cache site
