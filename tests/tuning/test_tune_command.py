@@ -34,6 +34,6 @@ def test_a_search_ends_in_a_configuration(tmp_path, capsys):
 def test_a_mistake_writes_nothing(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "space.yaml").write_text("ppo.learning_rate: 3\n")
-    with pytest.raises(UserError, match="write {low: A, high: B}"):
+    with pytest.raises(UserError, match=r"write \{low: A, high: B\}"):
         command.main(["smoke", "--space", "space.yaml"])
     assert [path.name for path in tmp_path.iterdir()] == ["space.yaml"]
