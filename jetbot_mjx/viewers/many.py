@@ -46,10 +46,11 @@ MAX_GIF_BYTES = 3_000_000
 """Largest size of a GIF, which a README still shows quickly."""
 
 _SIZE = (960, 540)  # [pixels] width and height of the video
-_GIF_SCALES = (0.75, 0.6, 0.5, 0.4, 0.33, 0.25)  # relative to the video, tried in this order
-_WAVE_SECONDS = 4.5  # from the start of the first robot to that of the farthest
+_GIF_SCALES = (0.75, 0.6, 0.55, 0.5, 0.4, 0.33, 0.25)  # relative to the video, tried in this order
+_WAVE_SECONDS = 5.0  # from the start of the first robot to that of the farthest
 _PULL_BACK_SECONDS = 6.0  # duration of the camera's move
 _TEXT = 22  # [pixels] height of the font
+_FRONT = 0.5  # [m] first radius around the first robot within which others start
 _HOLD_SECONDS = 1.0  # pause after the end
 
 _SPACING = (1.5, 2.5)  # [m] smallest and largest distance between neighbouring cells
@@ -276,16 +277,23 @@ def place_on_grid(
     off_middle = np.linalg.norm(cell / width - [-0.15 * rows, 0.0], axis=-1)
     first = (np.linalg.norm(goal - _FIRST_GOAL, axis=-1) + 0.05 * off_middle).argmin()
     away = np.linalg.norm(cell - cell[first], axis=-1)
+    # The front of starting robots grows like the camera's view.
+    share = np.log(np.maximum(away, _FRONT) / _FRONT) / math.log(max(away.max(), width) / _FRONT)
     half = np.array([[x, y, 0.0] for x in (-0.5, 0.5) for y in (-0.5, 0.5)])
     return RobotGrid(
         qpos=qpos,
         steps=np.asarray(host.steps, int),
         markers=places,
         reached=np.asarray(host.success) > 0,
-        start_seconds=_WAVE_SECONDS * away / max(away.max(), width),
+        start_seconds=_WAVE_SECONDS * _smoothstep_inverse(share),
         corners_w=half * [rows * width, columns * width, 0.0],
         dt=env.dt,
     )
+
+
+def _smoothstep_inverse(y: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+    """Return x in [0, 1] with 3 x² - 2 x³ = y."""
+    return 0.5 - np.sin(np.arcsin(1 - 2 * y) / 3)
 
 
 class GridRenderer:
