@@ -293,7 +293,7 @@ def place_on_grid(
 
 def _smoothstep_inverse(y: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
     """Return x in [0, 1] with 3 x² - 2 x³ = y."""
-    return 0.5 - np.sin(np.arcsin(1 - 2 * y) / 3)
+    return np.clip(0.5 - np.sin(np.arcsin(1 - 2 * y) / 3), 0.0, 1.0)
 
 
 class GridRenderer:
