@@ -8,6 +8,8 @@ if TYPE_CHECKING:
     from jetbot_mjx.viewers.gallery import render_gallery as render_gallery
     from jetbot_mjx.viewers.gallery import render_run as render_run
     from jetbot_mjx.viewers.live import play_live as play_live
+    from jetbot_mjx.viewers.many import render_many as render_many
+    from jetbot_mjx.viewers.many import render_training_strip as render_training_strip
     from jetbot_mjx.viewers.player import Player as Player
 
 __getattr__, __dir__ = load_lazily(
@@ -16,6 +18,8 @@ __getattr__, __dir__ = load_lazily(
         "Player": "player",
         "play_live": "live",
         "render_gallery": "gallery",
+        "render_many": "many",
         "render_run": "gallery",
+        "render_training_strip": "many",
     },
 )

@@ -82,17 +82,8 @@ class Renderer:
         Raises:
           UserError: this machine has no OpenGL that works without a display.
         """
-        self._model = copy.copy(mj_model)
+        self._model, self._renderer = open_renderer(mj_model, width, height)
         self._data = mujoco.MjData(self._model)
-        drawn_width, drawn_height = _OVERSAMPLING * width, _OVERSAMPLING * height
-        self._model.vis.map.znear = _NEAR / self._model.stat.extent
-        self._model.vis.quality.offsamples = 0
-        self._model.vis.global_.offwidth = drawn_width
-        self._model.vis.global_.offheight = drawn_height
-        backend = importlib.import_module(f"mujoco.{find_backend()}")
-        # MuJoCo's renderer has no other way to set a back end after import.
-        with mock.patch.object(gl_context, "GLContext", backend.GLContext, create=True):
-            self._renderer = mujoco.Renderer(self._model, height=drawn_height, width=drawn_width)
 
     def frame(
         self,
@@ -122,7 +113,7 @@ class Renderer:
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         if trail_w is not None:
             self._add_trail(np.asarray(trail_w, float))
-        return np.asarray(Image.fromarray(self._renderer.render()).reduce(_OVERSAMPLING))
+        return reduce_image(self._renderer.render())
 
     def _add_trail(self, points_w: Float[np.ndarray, "n 3"]) -> None:
         """Add lines between consecutive points to the scene, as far as it has room."""
@@ -149,6 +140,40 @@ class Renderer:
     ) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
+
+
+def open_renderer(
+    mj_model: mujoco.MjModel, width: int, height: int, max_geoms: int = 10_000
+) -> tuple[mujoco.MjModel, mujoco.Renderer]:
+    """Open an OpenGL context for images that are rendered larger and then reduced.
+
+    Args:
+      mj_model: the model with all visual elements, which is not modified.
+      width: the width of an image after `reduce_image` [pixels].
+      height: the height of an image after `reduce_image` [pixels].
+      max_geoms: the largest number of geoms in a scene.
+
+    Returns:
+      A copy of the model with the image's size and near clipping plane, and its renderer.
+
+    Raises:
+      UserError: this machine has no OpenGL that works without a display.
+    """
+    model = copy.copy(mj_model)
+    width, height = _OVERSAMPLING * width, _OVERSAMPLING * height
+    model.vis.map.znear = _NEAR / model.stat.extent
+    model.vis.quality.offsamples = 0
+    model.vis.global_.offwidth = width
+    model.vis.global_.offheight = height
+    backend = importlib.import_module(f"mujoco.{find_backend()}")
+    # MuJoCo's renderer has no other way to set a back end after import.
+    with mock.patch.object(gl_context, "GLContext", backend.GLContext, create=True):
+        return model, mujoco.Renderer(model, height, width, max_geoms)
+
+
+def reduce_image(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:
+    """Return a rendered image in its final size, each pixel the mean of those rendered for it."""
+    return np.asarray(Image.fromarray(image).reduce(_OVERSAMPLING))
 
 
 def overview(
