@@ -62,17 +62,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     # Render several checkpoints, or one.
     if options.gallery:
-        gallery = render_gallery(options.run, episodes=options.episodes or 4)
+        with cli.show_progress():
+            gallery = render_gallery(options.run, episodes=options.episodes or 4)
         for step, successes in gallery.successes.items():
             print(f"{step:>12,} steps  {successes} of {gallery.episodes} goals reached")
         print(f"video: {gallery.mp4}\ngif:   {gallery.gif}\nplots: {gallery.plots}")
         return 0
-    rendered = render_run(
-        options.run,
-        episodes=options.episodes or 20,
-        goals=options.goals,
-        which=options.checkpoint,
-    )
+    with cli.show_progress():
+        rendered = render_run(
+            options.run,
+            episodes=options.episodes or 20,
+            goals=options.goals,
+            which=options.checkpoint,
+        )
     print(
         f"{rendered.successes} of {rendered.episodes} goals reached\n"
         f"video: {rendered.mp4}\ngif:   {rendered.gif}\nplot:  {rendered.trajectories}"

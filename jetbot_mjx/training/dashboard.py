@@ -8,14 +8,13 @@ is in order however the process ends, even by SIGKILL.
 
 import contextlib
 import io
-import os
 import statistics
 import sys
 import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO, Any, TextIO
+from typing import Any, TextIO
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -25,6 +24,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jetbot_mjx.runs.metrics import History, MetricValues
+from jetbot_mjx.runs.progress import in_foreground, is_watched
 from jetbot_mjx.training.console import COMPILING, Terminal
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
@@ -54,8 +54,7 @@ def open_terminal(
     """
     # With its own file: `sys.stdout` is replaced while the dashboard is drawn.
     console = Console(file=sys.stdout, highlight=False)
-    watched = sys.stdout.isatty() and console.is_interactive and _in_foreground(sys.stdout)
-    if not watched or not console.encoding.startswith("utf"):
+    if not is_watched(console):
         return Terminal(total_steps)
     seeds = [folder.name.removeprefix("seed-") for folder in run_dirs]
     title = (run_dirs[0] if len(run_dirs) == 1 else run_dirs[0].parent).name
@@ -205,7 +204,7 @@ class Dashboard(Terminal):
                 live.start()
                 self._console.show_cursor(True)
                 while not self._closing:
-                    if _in_foreground(self._console.file):
+                    if in_foreground(self._console.file):
                         self._draw(live)
                     self._wake.wait(_SECONDS_BETWEEN_DRAWINGS)
                     self._wake.clear()
@@ -330,14 +329,6 @@ class _LineQueue(io.TextIOBase):
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
-
-
-def _in_foreground(stream: IO[str]) -> bool:
-    """Return whether the terminal belongs to this process group, or to no shell at all."""
-    try:
-        return os.tcgetpgrp(stream.fileno()) == os.getpgrp()
-    except (OSError, ValueError):
-        return True
 
 
 def _clock(seconds: float) -> str:

@@ -116,7 +116,7 @@ def test_there_is_a_dashboard_where_people_watch_and_lines_elsewhere(
             patch.setenv(name, value)
             assert chosen() is Terminal
     with monkeypatch.context() as patch:
-        patch.setattr(dashboard_module.os, "tcgetpgrp", lambda file: os.getpgrp() + 1)
+        patch.setattr(os, "tcgetpgrp", lambda file: os.getpgrp() + 1)
         assert chosen() is Terminal
     with (
         monkeypatch.context() as patch,
@@ -258,7 +258,7 @@ def test_a_drawing_that_fails_ends_and_lines_come_instead(screen, opened, monkey
 def test_in_the_background_it_does_not_draw(screen, opened, monkeypatch):
     opened().begin()
     screen.until("╭")
-    monkeypatch.setattr(dashboard_module, "_in_foreground", lambda stream: False)
+    monkeypatch.setattr(dashboard_module, "in_foreground", lambda stream: False)
     time.sleep(0.6)
     length = len(screen.text)
     time.sleep(1.2)
