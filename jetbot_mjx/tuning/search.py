@@ -22,7 +22,7 @@ import jax
 import numpy as np
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError, UserError
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, report_keys
 from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import make_folder
@@ -32,7 +32,7 @@ from jetbot_mjx.tuning.trials import Outcome, Trials
 try:
     import optuna
 except ModuleNotFoundError:
-    raise UserError("tune needs Optuna: pip install 'jetbot_mjx[tune]'") from None
+    raise MissingPackageError("tune needs Optuna: pip install 'jetbot_mjx[tune]'") from None
 
 _BEAT_SECONDS = 5
 """How often a worker renews its heartbeat [s]."""

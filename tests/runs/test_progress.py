@@ -1,4 +1,4 @@
-"""Progress: a bar where people watch, a line a stage elsewhere, and nothing unless a command asks."""
+"""A bar where people watch, a line a stage elsewhere, and nothing unless a command asks."""
 
 import io
 import re
