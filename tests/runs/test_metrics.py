@@ -185,6 +185,7 @@ def read_events(folder):
         (event.step, value.tag, value.simple_value)
         for event in events(folder)
         for value in event.summary.value
+        if value.WhichOneof("value") == "simple_value"
     ]
 
 
