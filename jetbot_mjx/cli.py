@@ -15,7 +15,7 @@ import io
 import os
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -117,6 +117,18 @@ def prepare_device() -> None:
 
     require_device()
     use_compilation_cache()
+
+
+@contextlib.contextmanager
+def show_progress() -> Iterator[None]:
+    """Show the progress inside the context on standard error, where it does not mix with results.
+
+    The commands that take more than two seconds use it.
+    """
+    from jetbot_mjx.runs import progress
+
+    with progress.show_progress(sys.stderr):
+        yield
 
 
 def require_device() -> None:

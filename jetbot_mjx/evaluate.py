@@ -78,10 +78,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "simulator": options.simulator,
     }
     if len(options.run) > 1 or seed_folders(Path(options.run[0])):
-        result = evaluate_runs.compare_runs(options.run, **settings)
+        with cli.show_progress():
+            result = evaluate_runs.compare_runs(options.run, **settings)
         print(terminal_summary.summarize_comparison(result))
     else:
-        result = evaluate_runs.evaluate_run(options.run[0], **settings)
+        with cli.show_progress():
+            result = evaluate_runs.evaluate_run(options.run[0], **settings)
         print(terminal_summary.summarize_report(result))
     below = terminal_summary.below_target(result, options.min_success)
     print("".join(f"{line}\n" for line in below), end="")

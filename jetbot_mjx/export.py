@@ -50,9 +50,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     # Export.
     cli.prepare_device()
-    exported = export_policy(
-        options.run, formats=options.format, which=options.checkpoint, output=options.out
-    )
+    with cli.show_progress():
+        exported = export_policy(
+            options.run, formats=options.format, which=options.checkpoint, output=options.out
+        )
     print(summarize_export(exported))
     return 0
 

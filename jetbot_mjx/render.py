@@ -7,7 +7,7 @@ image of an untrained, an early and a trained policy.
 """
 
 import argparse
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
@@ -50,9 +50,19 @@ def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
     return parser
 
 
-def _print_successes(successes: Mapping[int, int], episodes: int) -> None:
-    for step, count in successes.items():
-        print(f"{step:>12,} steps  {count} of {episodes} goals reached")
+def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
+    """Refuse options that do not go together."""
+    chosen = options.checkpoint != "best"
+    for wrong, message in (
+        (options.gallery and options.goals, "--goals: a gallery shows the first goals"),
+        (options.gallery and chosen, "--checkpoint: a gallery shows the first, middle and last"),
+        (options.gallery and options.many, "--many: a gallery shows one robot at a time"),
+        (options.strip and chosen, "--checkpoint: a strip chooses three by itself"),
+        (options.strip and options.gallery, "--strip: it is no gallery"),
+        (options.strip and (options.goals or options.episodes), "--strip: only --many fits it"),
+    ):
+        if wrong:
+            parser.error(message)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -66,48 +76,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     with exit_on_interrupt():
         from jetbot_mjx.evaluation.evaluator import REPORT_GOALS
-        from jetbot_mjx.viewers.gallery import parse_goals, render_gallery, render_run
-        from jetbot_mjx.viewers.many import render_many, render_training_strip
-    # Parse.
-    parser = _parser(REPORT_GOALS, parse_goals)
+        from jetbot_mjx.viewers import gallery, many
+    parser = _parser(REPORT_GOALS, gallery.parse_goals)
     options = parser.parse_args(arguments)
-    if options.gallery and options.goals:
-        parser.error("--goals: a gallery shows the first goals, chosen before anyone saw them")
-    if options.gallery and options.checkpoint != "best":
-        parser.error("--checkpoint: a gallery shows the first, the middle and the last")
-    if options.gallery and options.many:
-        parser.error("--many: a gallery shows one robot at a time")
-    if options.strip and (options.goals or options.episodes or options.gallery):
-        parser.error("--strip: only --many goes with it")
-    if options.strip and options.checkpoint != "best":
-        parser.error("--checkpoint: a strip shows an untrained, an early and a trained policy")
+    _check(parser, options)
+    run, which, episodes = options.run, options.checkpoint, options.episodes
     cli.prepare_device()
-    # Render several checkpoints, or one.
-    if options.gallery:
-        gallery = render_gallery(options.run, episodes=options.episodes or 4)
-        _print_successes(gallery.successes, gallery.episodes)
-        print(f"video: {gallery.mp4}\ngif:   {gallery.gif}\nplots: {gallery.plots}")
-        return 0
-    if options.strip:
-        strip = render_training_strip(options.run, robots=options.many or 16)
-        _print_successes(strip.successes, strip.robots)
-        print(f"image: {strip.png}")
-        return 0
-    if options.many:
-        many = render_many(options.run, robots=options.many, which=options.checkpoint)
-        print(f"{many.successes:,} of {many.robots:,} goals reached")
-        print(f"video: {many.mp4}\ngif:   {many.gif}")
-        return 0
-    rendered = render_run(
-        options.run,
-        episodes=options.episodes or 20,
-        goals=options.goals,
-        which=options.checkpoint,
-    )
-    print(
-        f"{rendered.successes} of {rendered.episodes} goals reached\n"
-        f"video: {rendered.mp4}\ngif:   {rendered.gif}\nplot:  {rendered.trajectories}"
-    )
+    with cli.show_progress():
+        if options.gallery:
+            rendered = gallery.render_gallery(run, episodes=episodes or 4)
+        elif options.strip:
+            rendered = many.render_training_strip(run, robots=options.many or 16)
+        elif options.many:
+            rendered = many.render_many(run, robots=options.many, which=which)
+        else:
+            rendered = gallery.render_run(
+                run, episodes=episodes or 20, goals=options.goals, which=which
+            )
+    print(rendered.describe())
     return 0
 
 

@@ -40,9 +40,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with exit_on_interrupt():
         from jetbot_mjx.deployment.drive_comparison import compare_drive, summarize_drive
 
-    comparison = compare_drive(
-        options.log, delay=options.delay, lag=options.lag, output=options.output
-    )
+    with cli.show_progress():
+        comparison = compare_drive(
+            options.log, delay=options.delay, lag=options.lag, output=options.output
+        )
     print(summarize_drive(comparison))
     return 0
 

@@ -12,7 +12,7 @@ from jaxtyping import Float, UInt32
 
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.config import Config, load_config, parse_config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError, UserError
 
 Seed = int | Sequence[int | None] | None
 Source = Config | Mapping[str, Any] | str | Path | None
@@ -32,7 +32,7 @@ def requires_extra(extra: str) -> Iterator[None]:
     try:
         yield
     except ModuleNotFoundError as error:
-        raise UserError(
+        raise MissingPackageError(
             f"{error.name} is missing: pip install 'jetbot_mjx[{extra}]', from a checkout"
             f" '.[{extra}]'"
         ) from None

@@ -5,6 +5,7 @@ from typing import Any, NamedTuple
 
 from jetbot_mjx.deployment.drive_log import metrics, plot, read_log, replay
 from jetbot_mjx.evaluation.plots import theme, to_png
+from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, writing_to
 
 
@@ -40,7 +41,9 @@ def compare_drive(
       UserError: the file is not a log, or the files cannot be written.
     """
     path = Path(log)
-    compared = replay(read_log(path), delay=delay, lag=lag)
+    recorded = read_log(path)
+    with stage("simulating the drive"):
+        compared = replay(recorded, delay=delay, lag=lag)
     folder = path.parent if output is None else Path(output)
     make_folder(folder)
     files = DriveComparison(
@@ -48,7 +51,7 @@ def compare_drive(
         json=folder / f"{path.stem}.sim2real.json",
         metrics=metrics(compared),
     )
-    with theme("light"):
+    with stage("plotting"), theme("light"):
         image = to_png(plot(compared))
     with writing_to(folder):
         write_bytes(files.image, image)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jetbot_mjx.deployment.numpy_policy import Outputs, PortablePolicy
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError
 
 _TEXT_WIDTH = 96
 
@@ -65,7 +65,7 @@ def require(name: str) -> None:
         try:
             importlib.import_module(package)
         except ImportError:
-            raise UserError(
+            raise MissingPackageError(
                 f"--format {name} needs {package}, which is not installed:"
                 " pip install 'jetbot_mjx[export]'"
             ) from None

@@ -19,6 +19,7 @@ from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import Checkpoint
+from jetbot_mjx.runs.progress import stage
 
 RECORDED = 10_000
 """Number of observations on which an export is checked."""
@@ -161,15 +162,18 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Rec
     act = jax.jit(as_jax(checkpoint, env))
     keys = iter(np.asarray(report_keys(count)))
     seen: list[np.ndarray] = []
-    while len(seen) < count:
-        obs, _ = robot.reset(next(keys))
-        for _ in range(min(checkpoint.config.task.episode_length, count - len(seen))):
-            seen.append(obs)
-            (action,), _ = jax.device_get(act(obs[None]))
-            step = robot.step(action)
-            obs = step.obs
-            if step.terminated or not step.finite:
-                break
+    with stage("observations of a drive", count) as advance:
+        while len(seen) < count:
+            before = len(seen)
+            obs, _ = robot.reset(next(keys))
+            for _ in range(min(checkpoint.config.task.episode_length, count - before)):
+                seen.append(obs)
+                (action,), _ = jax.device_get(act(obs[None]))
+                step = robot.step(action)
+                obs = step.obs
+                if step.terminated or not step.finite:
+                    break
+            advance(len(seen) - before)
     obs = np.stack(seen)
     action, wheel_speeds = jax.device_get(act(obs))
     return Recording(obs, action, wheel_speeds)

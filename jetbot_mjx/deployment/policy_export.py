@@ -20,6 +20,7 @@ from jetbot_mjx.deployment.numpy_policy import (
 from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
+from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import write_json, writing_to
 
 FOLDER = "policy"
@@ -76,10 +77,10 @@ def export_policy(
         differences = {}
         for name in formats:
             path = unfinished / FORMATS[name].file
-            FORMATS[name].write(source, path)
-            found = difference(
-                recording, FORMATS[name].read(path)(recording.obs), policy.controller
-            )
+            with stage(f"writing and checking {path.name}"):
+                FORMATS[name].write(source, path)
+                outputs = FORMATS[name].read(path)(recording.obs)
+                found = difference(recording, outputs, policy.controller)
             if not found < TOLERANCE:
                 raise UserError(
                     f"nothing was written to {folder}: {path.name} differs from JAX by {found:.1e}"

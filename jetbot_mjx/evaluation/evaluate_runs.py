@@ -33,6 +33,7 @@ from jetbot_mjx.evaluation.robustness import (
 )
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.runs.metrics import read_history
+from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import seed_folders, versions
 
 Simulator = Literal["mujoco"]
@@ -156,15 +157,18 @@ def compare_runs(
         in_mujoco=robustness or simulator is not None,
         ranges_file=_RangesFile.read(ranges),
     )
-    by_run = {
-        name: {seed: _without_trajectories(next(reports)) for seed in entry.seeds}
-        for name, entry in entries.items()
-    }
+    by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
+    with stage("policies", len(checkpoints)) as advance:
+        for name, entry in entries.items():
+            for seed in entry.seeds:
+                by_run[name][seed] = _without_trajectories(next(reports))
+                advance(1)
     # Compare the reports and write the comparison.
     first = next(iter(entries.values())).folder
     folder = first / "evaluations" / "comparison" if output is None else Path(output)
     comparison = compare(folder.absolute(), by_run)
-    write_comparison(comparison)
+    with stage("writing the comparison"):
+        write_comparison(comparison)
     return comparison
 
 
@@ -336,7 +340,8 @@ def _write_reports(
             report = report._replace(randomized=on_others)
         if evaluators.mujoco:
             report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
-        write_report(report)
+        with stage("writing the report"):
+            write_report(report)
         yield report
 
 

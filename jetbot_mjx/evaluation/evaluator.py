@@ -21,6 +21,7 @@ from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
+from jetbot_mjx.runs.progress import stage
 
 GOAL_SET_VERSION = 1
 """Version number that increases whenever the goals or the rules of the report change."""
@@ -194,6 +195,7 @@ class Evaluator:
         self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
         drawn = ", drawn" if isinstance(env, DomainRandomizationWrapper) else ""
         self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
+        self._robots = " on drawn robots" if drawn else ""
         self._programs = programs
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
@@ -233,10 +235,12 @@ class Evaluator:
         arguments = np.int32(index), jax.device_get(params), np.asarray(keys)
         count = len(keys)
         if count not in self._compiled:
-            self._compiled[count] = self._programs.compile(
-                f"{count} {self._name}", lambda: self._run.trace(*arguments)
-            )
-        return self._compiled[count](*arguments)
+            with stage("compiling the episodes"):
+                self._compiled[count] = self._programs.compile(
+                    f"{count} {self._name}", lambda: self._run.trace(*arguments)
+                )
+        with stage(f"episodes, {self._names[index]}{self._robots}", count):
+            return jax.block_until_ready(self._compiled[count](*arguments))
 
 
 def _random(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:

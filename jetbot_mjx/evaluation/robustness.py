@@ -39,6 +39,7 @@ from jetbot_mjx.evaluation.evaluator import (
     summarize,
 )
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
+from jetbot_mjx.runs.progress import stage
 
 SWEEP_GOALS = 128
 """Number of the report's fixed goals that a sweep uses for each robot."""
@@ -245,7 +246,7 @@ class Sweeper:
         # Run robots one after the other on a CPU: the solver iterates until the last robot of a
         # batch has converged, so those that slide would slow down the rest. A GPU needs the whole
         # batch to be busy.
-        at_once = 1 if jax.default_backend() == "cpu" else len(self._robots)
+        self._at_once = 1 if jax.default_backend() == "cpu" else len(self._robots)
         controllers = [policy_controller(networks), BASELINES["scripted"](env)]
         length = env.config.task.episode_length
 
@@ -259,7 +260,7 @@ class Sweeper:
                 randomized_env = DomainRandomizationWrapper(env, RobotParams(*robot_params))
                 return rollout_fn(randomized_env, controllers, length)(index, params, keys)
 
-            return jax.lax.map(one, robot_params, batch_size=at_once)
+            return jax.vmap(one)(robot_params)
 
         self._run_episodes = jax.jit(run_episodes, compiler_options=compiler_options(env.config))
         self._scripted: dict[RobotParams, Summary] = {}
@@ -287,9 +288,16 @@ class Sweeper:
 
     def _evaluate(self, controller: int, params: PolicyParams) -> dict[RobotParams, Summary]:
         robot_params = jnp.asarray(self._robots, jnp.float32)
-        episodes = jax.device_get(self._run_episodes(controller, params, self._keys, robot_params))
-        each = (jax.tree.map(lambda x, i=i: x[i], episodes) for i in range(len(self._robots)))
-        summaries = (summarize(one, self._env.dt) for one in each)
+        summaries: list[Summary] = []
+        name = ("policy", "scripted")[controller]
+        with stage(f"robustness values, {name}", len(self._robots)) as advance:
+            for first in range(0, len(robot_params), self._at_once):
+                some = robot_params[first : first + self._at_once]
+                episodes = jax.device_get(self._run_episodes(controller, params, self._keys, some))
+                for i in range(len(some)):
+                    one = jax.tree.map(lambda x, i=i: x[i], episodes)
+                    summaries.append(summarize(one, self._env.dt))
+                advance(len(some))
         return dict(zip(self._robots, summaries, strict=True))
 
 
@@ -373,7 +381,7 @@ class MujocoEvaluator:
           params: parameters of the policy.
           keys: one reset key for each episode, such as `report_keys(1024)`.
         """
-        with default_device_cpu():
+        with default_device_cpu(), stage("in C MuJoCo"):
             return MujocoResult(
                 self._numerics,
                 summarize(self._preset.run(params, keys), self._dt),

@@ -8,11 +8,13 @@ import jax
 import numpy as np
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
+from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx.agents.networks import Policy, PolicyParams, make_networks, make_policy
 from jetbot_mjx.config import Config, ConfigError, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import layout_data
+from jetbot_mjx.errors import InvalidError
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
@@ -150,13 +152,28 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
       which: the checkpoint of a run folder.
 
     Returns:
-      `policy(obs, key=None) -> action`, which is deterministic without a key.
+      `policy(obs, key=None) -> action`, which is deterministic without a key. It raises an
+      `InvalidError` if the observation has another length than that of the training.
 
     Raises:
       CheckpointError: as for `load_checkpoint`.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    return make_policy(checkpoint.networks, checkpoint.params)
+    policy = make_policy(checkpoint.networks, checkpoint.params)
+    size, layout = checkpoint.about["observation_size"], checkpoint.about["layout"]
+
+    def checked_policy(
+        obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
+    ) -> Float[Array, "*batch action"]:
+        shape = np.shape(obs)
+        if shape[-1:] != (size,):
+            given = shape[-1] if shape else "one number without an axis"
+            raise InvalidError(
+                f"observation: expected {size} numbers, {_names(layout)}; got {given}"
+            )
+        return policy(obs, key)
+
+    return checked_policy
 
 
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:

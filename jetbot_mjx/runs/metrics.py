@@ -38,6 +38,7 @@ from typing import Any, NamedTuple, Protocol, Self
 
 import jax
 
+from jetbot_mjx.config import Config
 from jetbot_mjx.imports import standing_in
 from jetbot_mjx.runs.run_dir import write_text
 from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
@@ -45,6 +46,7 @@ from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
 # Where PyTorch is installed, tensorboardX would load it to draw network graphs, which takes seconds
 # and is not needed here.
 with standing_in("torch", None):
+    from tensorboardX import summary as tensorboard_summary
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto import event_pb2, summary_pb2
 
@@ -173,14 +175,35 @@ _SUMMARY: Any = vars(summary_pb2)["Summary"]
 _EVENT: Any = vars(event_pb2)["Event"]
 
 
+_LAYOUT = {
+    "success": {
+        "success rate, 95 % interval": [
+            "Margin",
+            ["eval/success_rate", "eval/success_low", "eval/success_high"],
+        ],
+        "success rate, and that of the exploring policy": [
+            "Multiline",
+            ["eval/success_rate", "rollout/success_rate"],
+        ],
+        "time to goal [s]": ["Multiline", ["eval/time_to_goal_median", "eval/time_to_goal_p95"]],
+    }
+}
+"""Charts of TensorBoard's tab of custom scalars, so that success comes first."""
+
+
 class TensorBoardSink:
-    """A sink that writes TensorBoard event files without TensorFlow."""
+    """A sink that writes TensorBoard event files without TensorFlow.
+
+    With a configuration, the file also holds its YAML as text, its settings as hyperparameters
+    beside the last success rate, and charts with success first.
+    """
 
     def __init__(
         self,
         folder: Path,
         history: Sequence[History] = (),
         names: Mapping[str, Alias] | None = None,
+        config: Config | None = None,
     ) -> None:
         """Open an event file.
 
@@ -188,6 +211,7 @@ class TensorBoardSink:
           folder: folder for `tensorboard --logdir`; event files of an earlier training are removed.
           history: metrics that are written first, in place of the removed ones.
           names: metrics that are also written under another tag, from `sb3_tags.aliases`.
+          config: the configuration of the run, or None to write metrics only.
         """
         self._names = names or {}
         folder.mkdir(exist_ok=True)
@@ -195,6 +219,9 @@ class TensorBoardSink:
             events.unlink()
         # tensorboardX's SummaryWriter writes from a thread, whose errors would not be reported.
         self._writer = EventsWriter(str(folder / "events"))
+        self._at_end: Any = None
+        if config is not None:
+            self._describe(config)
         for entry in history:
             self._add(*entry)
         self._writer.flush()
@@ -203,6 +230,24 @@ class TensorBoardSink:
         """Write one scalar for each metric that has a value."""
         self._add(env_steps, time.time(), metrics)
         self._writer.flush()
+
+    def _describe(self, config: Config) -> None:
+        """Write the charts, the configuration and the hyperparameters."""
+        # The plugin knows no lists and no None.
+        settings = {
+            key: value if isinstance(value, (bool, int, float)) else str(value)
+            for key, value in config.flat().items()
+        }
+        # The table of hyperparameters shows the last value of this metric.
+        *begin, self._at_end = tensorboard_summary.hparams(settings, {"eval/success_rate": 0.0})
+        # Markdown shows lines that are indented as they are.
+        indented = "".join(f"    {line}\n" for line in config.to_yaml().splitlines())
+        begin += [
+            tensorboard_summary.custom_scalars(_LAYOUT),
+            tensorboard_summary.text("config", indented),
+        ]
+        for summary in begin:
+            self._writer.write_event(_EVENT(wall_time=time.time(), summary=summary))
 
     def _add(self, env_steps: int, timestamp: float, metrics: MetricValues) -> None:
         values = [
@@ -214,6 +259,8 @@ class TensorBoardSink:
 
     def close(self) -> None:
         """Close the event file."""
+        if self._at_end is not None:
+            self._writer.write_event(_EVENT(wall_time=time.time(), summary=self._at_end))
         self._writer.close()
 
 

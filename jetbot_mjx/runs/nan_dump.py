@@ -12,7 +12,7 @@ from jetbot_mjx.config import Config, ConfigError, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, NotFoundError, UserError
 from jetbot_mjx.runs.checkpoint_store import flatten
 
 FOLDER = "nan_dumps"
@@ -70,32 +70,36 @@ def load_nan_dump(path: Path) -> StoredNanDump:
       The dump with its configuration and environment steps.
 
     Raises:
-      UserError: there is no such file, or `save_nan_dump` did not write it.
+      NotFoundError: there is no such file.
+      InvalidError: `save_nan_dump` did not write it.
     """
     try:
         with np.load(path, allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != _FORMAT:
-            raise ValueError(f"its format is {about['format']}, not {_FORMAT}")
+            raise InvalidError(f"{path} has the format {about['format']!r}, not {_FORMAT!r}")
         config = parse_config(about["config"], source="stored config")
         template = _template(config)
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():
             odd = sorted(wanted.keys() ^ arrays.keys())[0]
-            raise ValueError(f"{odd} is missing or unexpected")
+            raise InvalidError(f"{path} does not fit its task: {odd} is missing or unexpected")
         nan_dump = jax.tree.unflatten(
             jax.tree.structure(template), [arrays[name] for name in wanted]
         )
         return StoredNanDump(config, about["env_steps"], nan_dump)
     except FileNotFoundError:
-        raise UserError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
+        raise NotFoundError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
     except ConfigError as error:
-        raise UserError(f"{path} cannot be used: {error}") from None
-    # NumPy reports a damaged archive by many kinds of exception.
-    except Exception as error:
-        reason = str(error).strip().splitlines()[:1] or [type(error).__name__]
-        raise UserError(f"{path} is not a NaN dump of a training: {reason[0]}") from None
+        raise InvalidError(f"{path} cannot be used: {error}") from None
+    except UserError:
+        raise
+    # NumPy reports a foreign file by many kinds of exception, and with advice that does not apply.
+    except Exception:
+        raise InvalidError(
+            f"{path} is not a NaN dump of a training: give a file of a run's {FOLDER}/"
+        ) from None
 
 
 def _template(config: Config) -> NanDump:

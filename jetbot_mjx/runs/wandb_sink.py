@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError
 from jetbot_mjx.runs.metrics import History, MetricValues
 from jetbot_mjx.runs.run_dir import write_json
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
@@ -29,14 +29,14 @@ def check_tracking(config: Config) -> None:
     """Raise an error if a run needs Weights & Biases and the package is not installed.
 
     Raises:
-      UserError: the package is missing.
+      MissingPackageError: the package is missing.
     """
     if config.wandb is None:
         return
     spec = importlib.util.find_spec("wandb")
     # The folder `wandb/` of earlier runs looks like a package without a file.
     if spec is None or spec.origin is None:
-        raise UserError(
+        raise MissingPackageError(
             f"wandb = {config.wandb!r} needs a package that is not installed:"
             " pip install 'jetbot_mjx[wandb]'"
         )

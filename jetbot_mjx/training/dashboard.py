@@ -1,17 +1,20 @@
 """Show the progress of a training in place, on a terminal that a user watches, with rich.
 
-A thread of rich's `Live` draws twice a second. The cursor stays visible and rests on an empty line
-below the dashboard, so the terminal is in order however the process ends, even by SIGKILL.
+A thread draws twice a second, and only this thread writes to the terminal. The training updates
+plain data and queues lines, so that a terminal that stops reading (Ctrl-S, a lost connection) never
+blocks it. The cursor stays visible and rests on an empty line below the dashboard, so the terminal
+is in order however the process ends, even by SIGKILL.
 """
 
 import contextlib
-import os
+import io
 import statistics
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import IO
+from typing import Any, TextIO
 
 from rich.console import Console, Group
 from rich.live import Live
@@ -21,12 +24,15 @@ from rich.table import Table
 from rich.text import Text
 
 from jetbot_mjx.runs.metrics import History, MetricValues
+from jetbot_mjx.runs.progress import in_foreground, is_watched
 from jetbot_mjx.training.console import COMPILING, Terminal
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _MAX_ROWS = 8
 _MAX_WIDTH = 100
-_DRAWINGS_PER_SECOND = 2
+_SECONDS_BETWEEN_DRAWINGS = 0.5
+_PATIENCE_SECONDS = 1.0
+"""How long a caller waits for the terminal at most, at a flush and at the end [s]."""
 _SPEED_SECONDS = 3600.0
 """Time over which the speed for the remaining time is averaged [s]."""
 
@@ -46,9 +52,9 @@ def open_terminal(
     Returns:
       The terminal.
     """
-    console = Console(highlight=False)
-    watched = sys.stdout.isatty() and console.is_interactive and _in_foreground(sys.stdout)
-    if not watched or not console.encoding.startswith("utf"):
+    # With its own file: `sys.stdout` is replaced while the dashboard is drawn.
+    console = Console(file=sys.stdout, highlight=False)
+    if not is_watched(console):
         return Terminal(total_steps)
     seeds = [folder.name.removeprefix("seed-") for folder in run_dirs]
     title = (run_dirs[0] if len(run_dirs) == 1 else run_dirs[0].parent).name
@@ -108,55 +114,123 @@ class Dashboard(Terminal):
             get_time=time.monotonic,
         )
         self._task = self._progress.add_task("", total=total_steps, completed=steps)
-        self._live = _Live(
-            get_renderable=self.render,
-            console=console,
-            refresh_per_second=_DRAWINGS_PER_SECOND,
-            # Standard error may go to a file.
-            redirect_stderr=sys.stderr.isatty(),
-        )
+        # Protects the data above and the lines, and is never held while the terminal is written.
+        self._lock = threading.Lock()
+        self._lines: list[str] = []
+        self._wake, self._idle = threading.Event(), threading.Event()
+        self._drawing = self._closing = False
+        self._thread = threading.Thread(target=self._draw_until_closed, daemon=True)
+        self._replaced: dict[str, tuple[TextIO, _LineQueue]] = {}
 
     def begin(self) -> None:
-        """Begin to draw."""
+        """Begin to draw, and to print above the dashboard what others print on this terminal."""
         self.phase(COMPILING)
-        with contextlib.suppress(OSError):
-            self._live.start()
-            self._console.show_cursor(True)
+        self._drawing = True
+        for name in ("stdout", "stderr"):
+            stream = getattr(sys, name)
+            # Standard error may go to a file.
+            if stream.isatty():
+                self._replaced[name] = stream, _LineQueue(self, stream)
+                setattr(sys, name, self._replaced[name][1])
+        self._thread.start()
 
     def phase(self, name: str | None) -> None:
         """Show that a phase begins; None: the training has ended."""
         now = time.monotonic()
-        if self._phase is not None:
-            self._spent[self._phase] = self._seconds_in(self._phase)
-        self._phase, self._phase_began = name, now
-        if name is not None:
-            self._spent.setdefault(name, 0.0)
+        with self._lock:
+            if self._phase is not None:
+                self._spent[self._phase] = self._seconds_in(self._phase)
+            self._phase, self._phase_began = name, now
+            if name is not None:
+                self._spent.setdefault(name, 0.0)
 
     def write(self, env_steps: int, metrics: Sequence[MetricValues]) -> None:
         """Show the metrics of every seed at the end of an interval."""
-        self._add(metrics)
-        speed = metrics[0].get("time/env_steps_per_second")
-        self._advance(env_steps, speed)
+        with self._lock:
+            self._add(metrics)
+            self._advance(env_steps, metrics[0].get("time/env_steps_per_second"))
 
     def update(self, env_steps: int, metrics: MetricValues, env_steps_per_second: float) -> None:
         """Show progress within an interval; the metrics are means, so only one seed shows them."""
-        if len(self._seeds) == 1:
-            self._metrics = [{**self._metrics[0], **metrics}]
-        self._advance(env_steps, env_steps_per_second)
+        with self._lock:
+            if len(self._seeds) == 1:
+                self._metrics = [{**self._metrics[0], **metrics}]
+            self._advance(env_steps, env_steps_per_second)
 
     def say(self, text: str) -> None:
         """Print a message above the dashboard; do not fail if the terminal is gone."""
+        with self._lock:
+            if self._drawing:
+                self._lines.append(text)
+                self._idle.clear()
+                self._wake.set()
+                return
         with contextlib.suppress(OSError):
-            self._console.print(Text.from_ansi(text), soft_wrap=True)
+            print(text, file=self._console.file, flush=True)
+
+    def wait(self) -> None:
+        """Wait until all messages are printed, but not for long."""
+        if self._drawing and threading.current_thread() is not self._thread:
+            self._idle.wait(_PATIENCE_SECONDS)
 
     def close(self) -> None:
         """Draw for the last time."""
         self.phase(None)
-        with contextlib.suppress(OSError):
-            # Rich holds back a line without an end, and would lose it.
-            sys.stdout.write("")
-            sys.stdout.flush()
-            self._live.stop()
+        if self._thread.ident is None:
+            return
+        for _, queue in self._replaced.values():
+            queue.end_line()
+        self._closing = True
+        self._wake.set()
+        self._thread.join(_PATIENCE_SECONDS)
+        self._restore_streams()
+
+    def _restore_streams(self) -> None:
+        for name, (stream, queue) in self._replaced.items():
+            if getattr(sys, name) is queue:
+                setattr(sys, name, stream)
+
+    def _draw_until_closed(self) -> None:
+        """Draw until the training ends or the terminal is gone; then messages are printed again."""
+        live = Live(
+            get_renderable=self._render_locked,
+            console=self._console,
+            auto_refresh=False,
+            redirect_stdout=False,
+            redirect_stderr=False,
+        )
+        try:
+            with contextlib.suppress(OSError):
+                live.start()
+                self._console.show_cursor(True)
+                while not self._closing:
+                    if in_foreground(self._console.file):
+                        self._draw(live)
+                    self._wake.wait(_SECONDS_BETWEEN_DRAWINGS)
+                    self._wake.clear()
+                self._draw(live)
+                live.stop()
+        finally:
+            with self._lock:
+                self._drawing = False
+            self._idle.set()
+            self._restore_streams()
+
+    def _draw(self, live: Live) -> None:
+        with self._lock:
+            lines, self._lines = self._lines, []
+        # Printing draws the dashboard below the lines.
+        if lines:
+            self._console.print(Text.from_ansi("\n".join(lines)), soft_wrap=True)
+        else:
+            live.refresh()
+        with self._lock:
+            if not self._lines:
+                self._idle.set()
+
+    def _render_locked(self) -> Group:
+        with self._lock:
+            return self.render()
 
     def _add(self, metrics: Sequence[MetricValues]) -> None:
         self._metrics = [dict(one) for one in metrics]
@@ -224,21 +298,37 @@ class Dashboard(Terminal):
         return rows
 
 
-class _Live(Live):
-    """A live display that pauses in the background and ignores a terminal that is gone."""
+class _LineQueue(io.TextIOBase):
+    """A `_LineQueue` replaces a stream of the terminal; whole lines go above the dashboard."""
 
-    def refresh(self) -> None:
-        if _in_foreground(self.console.file):
-            with contextlib.suppress(OSError):
-                super().refresh()
+    def __init__(self, dashboard: Dashboard, stream: TextIO) -> None:
+        self._dashboard, self._stream = dashboard, stream
+        self._lock = threading.Lock()
+        self._unfinished = ""
 
+    def write(self, text: str) -> int:
+        with self._lock:
+            *lines, self._unfinished = (self._unfinished + text).split("\n")
+        if lines:
+            self._dashboard.say("\n".join(lines))
+        return len(text)
 
-def _in_foreground(stream: IO[str]) -> bool:
-    """Return whether the terminal belongs to this process group, or to no shell at all."""
-    try:
-        return os.tcgetpgrp(stream.fileno()) == os.getpgrp()
-    except (OSError, ValueError):
-        return True
+    def flush(self) -> None:
+        self._dashboard.wait()
+
+    def end_line(self) -> None:
+        """Print the text that no end of a line has followed."""
+        if self._unfinished:
+            self.write("\n")
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+    def fileno(self) -> int:
+        return self._stream.fileno()
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
 
 
 def _clock(seconds: float) -> str:

@@ -100,7 +100,8 @@ def open_sinks(
     with writing_to(run_dir):
         sinks: list[Sink] = [JsonlSink(run_dir / METRICS, history)]
         if config.tensorboard:
-            sinks.append(TensorBoardSink(run_dir / "tensorboard", history, aliases(config.ppo)))
+            folder = run_dir / "tensorboard"
+            sinks.append(TensorBoardSink(folder, history, aliases(config.ppo), config))
         if config.wandb is not None:
             sinks.append(WandbSink(config, run_dir, history, say, seeds))
     return Sinks(sinks)

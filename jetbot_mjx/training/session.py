@@ -6,6 +6,7 @@ modules receive what they need as required arguments.
 """
 
 import contextlib
+import importlib.util
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.agents.ppo import PPO, TrainState
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError, ran_out
@@ -188,7 +189,8 @@ def _train(training: Training) -> Result:
             recorder = stack.enter_context(open_recorder(training, clock, resumption))
             opened.append((recorder, resumption.states if resumption else []))
             if recorder.complete:
-                recorder.say(*messages)
+                # Of the messages, the last one would say that the training resumes.
+                recorder.say(*messages[:-1], _complete_message(config, recorder.standings))
                 return _COMPLETE
             if training.warm_start:
                 messages.append(training.warm_start.describe())
@@ -291,7 +293,12 @@ def _check_folder(config: Config, run_dir: Path) -> None:
         # A run that ended before its first checkpoint, for example because memory was too small,
         # may start again with another configuration.
         if stored.seeds != config.seeds or any(map(checkpoint_steps, seed_dirs(run_dir, stored))):
-            stored.check_resume(config)
+            try:
+                stored.check_resume(config)
+            except ConfigError as error:
+                raise ConfigError(
+                    f"{run_dir} holds another run: choose a new --run-dir, or --resume it: {error}"
+                ) from None
 
 
 def _open_folders(
@@ -314,7 +321,7 @@ def _open_folders(
         stack.enter_context(occupied(folder))
     resumption = resume(run_dirs, configs, template)
     # Compare the versions before those of this process replace the stored ones.
-    messages = [_resume_message(run_dir, resumption)] if resumption else []
+    messages = _resume_messages(run_dir, resumption) if resumption else []
     write_run(run_dir, config)
     if config.seeds > 1:
         for seed_dir, seed_config in zip(run_dirs, configs, strict=True):
@@ -333,12 +340,20 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
     )
 
 
-def _resume_message(run_dir: Path, resumption: Resumption) -> str:
+def _resume_messages(run_dir: Path, resumption: Resumption) -> list[str]:
     lines = [f"skipped: {reason}" for reason in resumption.skipped]
     if changes := changed_versions(run_dir):
         lines.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
     lines.append(f"resuming after {resumption.env_steps:,} steps")
-    return "\n".join(lines)
+    return lines
+
+
+def _complete_message(config: Config, standings: Sequence[Standing]) -> str:
+    """Return the line about a run that has nothing left to train, and how to train it further."""
+    steps = min(standing.env_steps for standing in standings)
+    planned = config.ppo.training_steps * config.ppo.steps_per_training_step
+    setting = "ppo.num_timesteps" if steps >= planned else "stop_at_success"
+    return f"complete after {steps:,} steps; raise {setting} to train further"
 
 
 def _headline(config: Config, run_dir: Path) -> str:
@@ -379,6 +394,9 @@ def summary(result: Result) -> str:
         f"{result.wall_seconds:.1f} s in all",
         f"next: python -m jetbot_mjx.evaluate {result.run_dir}",
         f"      python -m jetbot_mjx.render {result.run_dirs[0]}",
-        f"      tensorboard --logdir {result.run_dir}",
+        f"      python -m jetbot_mjx.play {result.run_dirs[0]}",
     ]
+    if importlib.util.find_spec("tensorboard") is not None:
+        # TensorBoard names runs by their folder below this one.
+        lines.append(f"      tensorboard --logdir {result.run_dir.parent}")
     return "\n".join(lines)

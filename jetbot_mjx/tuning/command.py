@@ -4,7 +4,6 @@ The study lies in the output folder. The same command with the same `--output` c
 that was stopped, and several workers may share one study through `--storage`.
 """
 
-import time
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -61,6 +60,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = cli.config_of(options)
     cli.wake_device()
     with exit_on_interrupt():
+        from jetbot_mjx.runs.metrics import process_seconds
         from jetbot_mjx.runs.run_dir import default_run_dir
         from jetbot_mjx.tuning import results, search
         from jetbot_mjx.tuning.space import read_space
@@ -68,16 +68,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     folder = options.output or default_run_dir(Path(f"tune-{options.config.stem}"))
     # Search.
-    began = time.perf_counter()
-    study = search.Search(config, space, folder, storage=options.storage, say=_say)
-    study.run(options.trials, options.round)
-    _say(f"search: {time.perf_counter() - began:.1f} s")
-    # Train the best anew, and write the results.
-    entrants = study.confirm(options.confirm, CONFIRM_SEEDS)
+    with cli.show_progress():
+        study = search.Search(config, space, folder, storage=options.storage, say=_say)
+        study.run(options.trials, options.round)
+        _say(f"search done {process_seconds():.1f} s after the start")
+        # Train the best anew, and write the results.
+        entrants = study.confirm(options.confirm, CONFIRM_SEEDS)
     path = results.write_results(folder, config, study.study, entrants)
     _say(
         f"\ntrained anew with {CONFIRM_SEEDS} new seeds, evaluated on the report's goals:\n\n"
-        f"{results.entrants_table(entrants)}\n\n{time.perf_counter() - began:.1f} s in all\n"
+        f"{results.entrants_table(entrants)}\n\n{process_seconds():.1f} s in all\n"
         f"results: {folder}\nnext: python -m jetbot_mjx.train --config {path}"
     )
     return 0

@@ -22,8 +22,9 @@ import jax
 import numpy as np
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError, UserError
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, report_keys
+from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import make_folder
 from jetbot_mjx.tuning.space import TRACED, Parameter, with_values
 from jetbot_mjx.tuning.trials import Outcome, Trials
@@ -31,7 +32,7 @@ from jetbot_mjx.tuning.trials import Outcome, Trials
 try:
     import optuna
 except ModuleNotFoundError:
-    raise UserError("tune needs Optuna: pip install 'jetbot_mjx[tune]'") from None
+    raise MissingPackageError("tune needs Optuna: pip install 'jetbot_mjx[tune]'") from None
 
 _BEAT_SECONDS = 5
 """How often a worker renews its heartbeat [s]."""
@@ -127,21 +128,27 @@ class Search:
         Raises:
           UserError: the values of no trial of a round fit together.
         """
-        while (count := self._next_round(trials, round_size)) > 0:
-            began = time.perf_counter()
-            asked = [self.study.ask() for _ in range(count)]
-            with self._heartbeat(asked):
-                self._train(asked)
-            errors = [one.user_attrs.get("error") for one in self._stored(asked)]
-            if all(errors):
-                raise UserError(
-                    f"none of the last {count} trials could be trained, such as: {errors[0]}"
-                )
-            best = max((one.value for one in self._completed()), default=float("nan"))
-            self._say(
-                f"{len(self._completed())} of {trials} trials, best mean success {best:.2%};"
-                f" this round of {count} took {time.perf_counter() - began:.1f} s"
+        with stage("trials", max(0, trials - len(self._completed()))) as advance:
+            while (count := self._next_round(trials, round_size)) > 0:
+                self._run_round(count, trials)
+                advance(count)
+
+    def _run_round(self, count: int, trials: int) -> None:
+        """Run `count` trials at once, and tell how many of `trials` the study has."""
+        began = time.perf_counter()
+        asked = [self.study.ask() for _ in range(count)]
+        with self._heartbeat(asked):
+            self._train(asked)
+        errors = [one.user_attrs.get("error") for one in self._stored(asked)]
+        if all(errors):
+            raise UserError(
+                f"none of the last {count} trials could be trained, such as: {errors[0]}"
             )
+        best = max((one.value for one in self._completed()), default=float("nan"))
+        self._say(
+            f"{len(self._completed())} of {trials} trials, best mean success {best:.2%};"
+            f" this round of {count} took {time.perf_counter() - began:.1f} s"
+        )
 
     def confirm(self, count: int, seeds: int) -> list[Entrant]:
         """Train the best trials and the given configuration anew, with new seeds.
@@ -170,7 +177,8 @@ class Search:
                 [self._traced(work[i][1]) for i in members], [work[i][2] for i in members]
             )
             stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
-            episodes = batch.evaluate(stacked, report_keys(REPORT_GOALS))
+            with stage("episodes of the report's goals", len(members) * REPORT_GOALS):
+                episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
             success = np.asarray(episodes.success)
             limit = self._config.task.episode_length
             steps = np.where(success > 0, np.asarray(episodes.steps), limit)

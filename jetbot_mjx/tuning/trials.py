@@ -23,6 +23,7 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.evaluation.evaluator import policy_controller, training_keys
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
+from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.tuning.space import TRACED
 
 SECTION = "ppo."
@@ -107,10 +108,12 @@ class Trials:
         state = self._init(traced, keys)
         goals = training_keys(self._config.evaluation.episodes)
         rates, episodes = [], None
-        for steps in self._steps:
-            state = self._advance(traced, state, np.int32(steps))
-            episodes = self.evaluate(state.policy_params, goals)
-            rates.append(np.asarray(episodes.success).mean(axis=1))
+        with stage(f"intervals of training {count} policies", len(self._steps)) as advance:
+            for steps in self._steps:
+                state = self._advance(traced, state, np.int32(steps))
+                episodes = self.evaluate(state.policy_params, goals)
+                rates.append(np.asarray(episodes.success).mean(axis=1))
+                advance(1)
         assert episodes is not None
         # A failed episode counts with the full time limit.
         limit = self._config.task.episode_length

@@ -2,7 +2,7 @@
 
 import io
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from jetbot_mjx.evaluation.plots import plot_trajectories
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
+from jetbot_mjx.runs.progress import Advance, stage
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
 from jetbot_mjx.viewers.video import (
     GIF_STRIDE,
@@ -44,6 +45,13 @@ class RenderedRun(NamedTuple):
     successes: int
     episodes: int
 
+    def describe(self) -> str:
+        """Return what to print about it."""
+        return (
+            f"{self.successes} of {self.episodes} goals reached\n"
+            f"video: {self.mp4}\ngif:   {self.gif}\nplot:  {self.trajectories}"
+        )
+
 
 class Gallery(NamedTuple):
     """A `Gallery` holds the files rendered for several policies of one run."""
@@ -56,6 +64,26 @@ class Gallery(NamedTuple):
     """Number of goals reached, by the checkpoint's environment steps."""
     episodes: int
     """Number of goals that each policy drove to."""
+
+    def describe(self) -> str:
+        """Return what to print about it."""
+        return (
+            f"{successes_table(self.successes, self.episodes)}\n"
+            f"video: {self.mp4}\ngif:   {self.gif}\nplots: {self.plots}"
+        )
+
+
+def successes_table(successes: Mapping[int, int], episodes: int) -> str:
+    """Return one line for each checkpoint, with the number of goals reached.
+
+    Args:
+      successes: the number of goals reached, by the checkpoint's environment steps.
+      episodes: the number of goals.
+    """
+    return "\n".join(
+        f"{step:>12,} steps  {count} of {episodes} goals reached"
+        for step, count in successes.items()
+    )
 
 
 def render_run(
@@ -104,10 +132,10 @@ def render_run(
     with writing_to(rendered.trajectories):
         _trajectory_plot(checkpoint, env, rolled_out, goals).save(rendered.trajectories)
     with VideoRenderer(env) as renderer:
-        videos = [
-            renderer.render_episode(drive) for drive in split_trajectories(env, rolled_out, goals)
-        ]
-        _write_videos(rendered.mp4, rendered.gif, videos, _GIF_SIZE)
+        drives = split_trajectories(env, rolled_out, goals)
+        total = sum(renderer.frame_count([drive]) for drive in drives)
+        videos = [renderer.render_episode(drive) for drive in drives]
+        _write_videos(rendered.mp4, rendered.gif, videos, total, _GIF_SIZE)
     return rendered
 
 
@@ -154,13 +182,14 @@ def render_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
         Image.fromarray(np.hstack(plots)).save(gallery.plots)
     # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
-    by_goal = zip(*(split_trajectories(env, each, goals) for each in rolled_out), strict=True)
+    by_goal = list(zip(*(split_trajectories(env, each, goals) for each in rolled_out), strict=True))
     with VideoRenderer(env) as renderer:
         videos = [
             renderer.render_side_by_side(list(zip(headings, same_goal, strict=True)))
             for same_goal in by_goal
         ]
-        _write_videos(gallery.mp4, gallery.gif, videos, _GALLERY_GIF_SIZE)
+        total = sum(renderer.frame_count(same_goal) for same_goal in by_goal)
+        _write_videos(gallery.mp4, gallery.gif, videos, total, _GALLERY_GIF_SIZE)
     return gallery
 
 
@@ -203,20 +232,31 @@ def _trajectory_plot(
     return Image.open(file).convert("RGB")
 
 
-def _write_videos(mp4: Path, gif: Path, videos: Sequence[Iterable[Frame]], size: float) -> None:
-    """Write all videos to one mp4 file, and the first ones to a gif of relative size `size`."""
+def _write_videos(
+    mp4: Path, gif: Path, videos: Sequence[Iterable[Frame]], total: int, size: float
+) -> None:
+    """Write all videos to one mp4 file, and the first ones to a gif of relative size `size`.
+
+    Args:
+      mp4: The path of the mp4 file.
+      gif: The path of the gif.
+      videos: The frames of each video.
+      total: The number of frames of all videos.
+      size: The size of the gif relative to the video.
+    """
     gif_frames: list[Frame] = []
 
-    def frames() -> Iterator[Frame]:
+    def frames(advance: Advance) -> Iterator[Frame]:
         for place, video in enumerate(videos):
             for index, frame in enumerate(video):
                 if place < _GIF_EPISODES and index % GIF_STRIDE == 0:
                     gif_frames.append(resize_frame(frame, size))
                 yield frame
+                advance(1)
 
-    with writing_to(mp4):
-        write_mp4(mp4, frames())
-    with writing_to(gif):
+    with stage("frames", total) as advance, writing_to(mp4):
+        write_mp4(mp4, frames(advance))
+    with stage("writing the gif"), writing_to(gif):
         write_gif(gif, gif_frames)
 
 

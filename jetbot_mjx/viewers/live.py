@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError
 from jetbot_mjx.runs.checkpoint import Which
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
@@ -104,7 +104,7 @@ def _server() -> types.ModuleType:
     try:
         from jetbot_mjx.viewers import viser_server
     except ModuleNotFoundError as error:
-        raise UserError(
+        raise MissingPackageError(
             f"the browser viewer is an extra ({error.name} is missing): pip install"
             " 'jetbot_mjx[play]'"
         ) from None

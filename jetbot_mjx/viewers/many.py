@@ -35,6 +35,7 @@ from jetbot_mjx.runs.checkpoint import (
 )
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
+from jetbot_mjx.viewers.gallery import successes_table
 from jetbot_mjx.viewers.offscreen import open_renderer, overview, reduce_image
 from jetbot_mjx.viewers.pose import set_pose
 from jetbot_mjx.viewers.video import FPS, GIF_STRIDE, Frame, resize_frame, write_gif, write_mp4
@@ -85,6 +86,13 @@ class ManyRobotsVideo(NamedTuple):
     successes: int
     robots: int
 
+    def describe(self) -> str:
+        """Return what to print about it."""
+        return (
+            f"{self.successes:,} of {self.robots:,} goals reached\n"
+            f"video: {self.mp4}\ngif:   {self.gif}"
+        )
+
 
 class TrainingStrip(NamedTuple):
     """A `TrainingStrip` holds the image of an untrained, an early and a trained policy."""
@@ -94,6 +102,10 @@ class TrainingStrip(NamedTuple):
     """Number of goals reached, by the checkpoint's environment steps."""
     robots: int
     """Number of goals that each policy drove to."""
+
+    def describe(self) -> str:
+        """Return what to print about it."""
+        return f"{successes_table(self.successes, self.robots)}\nimage: {self.png}"
 
 
 class RobotGrid(NamedTuple):

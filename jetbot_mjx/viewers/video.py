@@ -184,11 +184,14 @@ class VideoRenderer:
         chase = self._with_inset(chase, trajectory, step, top=False)
         return np.hstack([self._with_text(chase, trajectory, step), top])
 
+    def frame_count(self, trajectories: Sequence[Trajectory]) -> int:
+        """Return the number of frames of a video of one trajectory, or of several side by side."""
+        longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
+        return math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps) + 1
+
     def _frame_times(self, trajectories: Sequence[Trajectory]) -> Iterator[float]:
         """Return the times of the frames [s], up to a pause after the longest episode."""
-        longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
-        count = math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps)
-        return (frame / self._fps for frame in range(count + 1))
+        return (frame / self._fps for frame in range(self.frame_count(trajectories)))
 
     def _episode_view(
         self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera

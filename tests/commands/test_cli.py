@@ -470,7 +470,8 @@ def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
         "empty.npz": lambda path: path.touch(),
     }.items():
         write(tmp_path / name)
-        assert "is not a NaN dump of a training" in refused(replay, tmp_path / name)
+        said = refused(replay, tmp_path / name)
+        assert f"{name} is not a NaN dump of a training: give a file of a run's nan_dumps/" in said
 
 
 def test_train_names_its_run_folder_after_the_configuration(asked):

@@ -32,7 +32,7 @@ from jetbot_mjx.deployment.numpy_policy import (
 from jetbot_mjx.deployment.policy_spec import policy_spec
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import MissingPackageError, UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import Checkpoint, about_policy, load_checkpoint
 from jetbot_mjx.runs.run_dir import write_json
@@ -381,7 +381,7 @@ def test_a_difference_is_seen(action, wheel_speeds, run_dir):
 def test_a_missing_package_is_told_with_its_remedy(run_dir, monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "onnx", None)
     with pytest.raises(
-        UserError, match=r"--format onnx needs onnx.*pip install 'jetbot_mjx\[export"
+        MissingPackageError, match=r"--format onnx needs onnx.*pip install 'jetbot_mjx\[export"
     ):
         export.main([str(run_dir), "--format", "all", "--out", str(tmp_path / "p")])
     assert os.listdir(tmp_path) == []

@@ -83,6 +83,9 @@ def filmed(monkeypatch):
         def __exit__(self, *exception):
             pass
 
+        def frame_count(self, drives):
+            return 1
+
         def render_episode(self, drive):
             shots.append([("", drive)])
             yield np.zeros((2, 2, 3), np.uint8)
@@ -206,7 +209,10 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys):
         # Three policies, not one thrice.
         ends = {tuple(drive.qpos[min(drive.steps, 20)]) for drive in shown}
         assert len(ends) == 3
-    shown = capsys.readouterr().out
+    shown, progress = capsys.readouterr()
+    stages = [line.split(" s  ")[1] for line in progress.splitlines()]
+    assert stages[-2:] == ["frames: 2", "writing the gif"]
+    assert stages.count("episodes, policy: 2") == 3
     assert "           0 steps  0 of 2 goals reached" in shown
     for suffix in ("mp4", "gif", "png"):
         assert str(run_copy / "videos" / f"gallery.{suffix}") in shown

@@ -9,6 +9,7 @@ import orbax.checkpoint as ocp
 import pytest
 
 from jetbot_mjx import load_policy
+from jetbot_mjx.errors import InvalidError
 from jetbot_mjx.runs.checkpoint import (
     FORMAT,
     POLICY,
@@ -116,6 +117,23 @@ def test_a_policy_is_deterministic_without_a_key_and_samples_with_one(smoke_run)
     with jax.default_matmul_precision("highest"):
         np.testing.assert_allclose(policy(batched)[0], policy(obs), rtol=1e-5)
     assert np.all(np.abs(policy(100.0 * batched)) <= 1.0)
+
+
+@pytest.mark.parametrize(
+    ("obs", "got"),
+    [
+        (np.zeros(16), "got 16"),
+        (np.zeros((7, 3)), "got 3"),
+        ([0.0] * 6, "got 6"),
+        (1.0, "got one number without an axis"),
+    ],
+)
+def test_an_observation_of_another_size_is_refused_with_what_is_expected(smoke_run, obs, got):
+    policy = load_policy(smoke_run)
+    with pytest.raises(ValueError, match=r"^observation: expected 7 numbers, goal_") as caught:
+        policy(obs)
+    assert isinstance(caught.value, InvalidError)
+    assert str(caught.value).endswith(f"; {got}")
 
 
 def test_one_checkpoint_folder_stands_for_itself(smoke_run):

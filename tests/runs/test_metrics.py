@@ -14,8 +14,10 @@ import jax
 import jax.numpy as jnp
 import pytest
 from tensorboardX.proto.event_pb2 import Event
+from tensorboardX.proto.layout_pb2 import Layout
+from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
 
-from jetbot_mjx.config import PPOConfig
+from jetbot_mjx.config import PPOConfig, parse_config
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.metrics import (
     CompileClock,
@@ -183,6 +185,7 @@ def read_events(folder):
         (event.step, value.tag, value.simple_value)
         for event in events(folder)
         for value in event.summary.value
+        if value.WhichOneof("value") == "simple_value"
     ]
 
 
@@ -216,6 +219,45 @@ def test_tensorboard_holds_the_history_once_and_goes_on(tmp_path):
 def test_tensorboard_keeps_the_time_at_which_something_was_reported(tmp_path):
     TensorBoardSink(tmp_path / "tensorboard", HISTORY).close()
     assert [event.wall_time for event in events(tmp_path / "tensorboard")][-3:] == [1.5, 2.5, 3.5]
+
+
+def test_tensorboard_tells_the_configuration_and_shows_success_first(tmp_path):
+    config = parse_config({"seed": 7, "ppo": {"learning_rate": 0.5}})
+    folder = tmp_path / "tensorboard"
+    sink = TensorBoardSink(folder, HISTORY, aliases(config.ppo), config)
+    sink.write(2_048, {"eval/success_rate": 0.75})
+    sink.close()
+    values = {value.tag: value for event in events(folder) for value in event.summary.value}
+    # The configuration as it is in the run folder.
+    text = values["config/text_summary"].tensor.string_val[0].decode()
+    assert [line[4:] for line in text.splitlines()] == config.to_yaml().splitlines()
+    # Charts that name metrics there are, success first.
+    layout = Layout.FromString(values["custom_scalars__config__"].tensor.string_val[0])
+    charts = [chart for category in layout.category for chart in category.chart]
+    assert charts[0].margin.series[0].value == "eval/success_rate"
+    shown = {tag for chart in charts for tag in chart.multiline.tag}
+    assert shown <= set(re.findall(r"  (\w+/\w+) ", metrics.__doc__)) | {"eval/time_to_goal_p95"}
+    # Every setting, beside the success rate.
+    content = {
+        name: HParamsPluginData.FromString(values[f"_hparams_/{name}"].metadata.plugin_data.content)
+        for name in ("experiment", "session_start_info", "session_end_info")
+    }
+    settings = content["session_start_info"].session_start_info.hparams
+    assert settings.keys() == config.flat().keys()
+    assert settings["ppo.learning_rate"].number_value == 0.5
+    assert settings["seed"].number_value == 7
+    assert settings["ppo.network.policy_hidden_layer_sizes"].string_value.startswith("[")
+    (metric,) = content["experiment"].experiment.metric_infos
+    assert metric.name.tag == "eval/success_rate"
+    # The scalars are each there once.
+    scalars = [
+        (event.step, value.tag)
+        for event in events(folder)
+        for value in event.summary.value
+        if value.WhichOneof("value") == "simple_value"
+    ]
+    assert (2_048, "eval/success_rate") in scalars
+    assert len(scalars) == len(set(scalars))
 
 
 def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):

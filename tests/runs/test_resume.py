@@ -695,7 +695,18 @@ def test_what_may_not_change_on_resume_is_refused_by_name(run_copy, setting, sai
 
 def test_the_same_command_with_another_configuration_is_refused(run_copy, smoke):
     arguments = ["--config", smoke, "--run-dir", str(run_copy), "--seed", "3"]
-    assert "seed = 3 is not what the run began with, 0" in refused(train.main, arguments)
+    said = refused(train.main, arguments)
+    assert f"{run_copy} holds another run: choose a new --run-dir, or --resume it" in said
+    assert "seed = 3 is not what the run began with, 0" in said
+
+
+def test_what_is_complete_says_so_and_how_to_go_on(run_copy, config, capsys):
+    assert train.main(["--resume", str(run_copy)]) == 0
+    out = capsys.readouterr().out
+    assert f"complete after {LAST:,} steps; raise ppo.num_timesteps to train further\n" in out
+    assert "resuming" not in out
+    early = session._complete_message(config, [session.Standing(env_steps=16_384)])
+    assert early == "complete after 16,384 steps; raise stop_at_success to train further"
 
 
 def test_a_run_that_ended_before_its_first_checkpoint_begins_as_another(config, tmp_path):

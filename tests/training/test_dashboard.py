@@ -116,7 +116,7 @@ def test_there_is_a_dashboard_where_people_watch_and_lines_elsewhere(
             patch.setenv(name, value)
             assert chosen() is Terminal
     with monkeypatch.context() as patch:
-        patch.setattr(dashboard_module.os, "tcgetpgrp", lambda file: os.getpgrp() + 1)
+        patch.setattr(os, "tcgetpgrp", lambda file: os.getpgrp() + 1)
         assert chosen() is Terminal
     with (
         monkeypatch.context() as patch,
@@ -200,10 +200,65 @@ def test_a_terminal_that_goes_away_does_not_stop_the_training(screen, opened, mo
     assert sys.stdout is screen.stream
 
 
+def test_a_terminal_that_nobody_reads_does_not_block_the_training(tmp_path, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm-256color")
+    master, slave = os.openpty()
+    with os.fdopen(slave, "w", encoding="utf-8", newline="") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        dashboard = open_terminal([tmp_path / "mine"], 10_000, [[]])
+        assert type(dashboard) is Dashboard
+        dashboard.begin()
+        # More than a pseudo-terminal stores: whoever writes now waits until it is read.
+        dashboard.say("filler " * 100_000)
+        time.sleep(1.2)
+        began = time.monotonic()
+        for step in range(1_000):
+            dashboard.write(step, [REPORT])
+            dashboard.update(step, {}, 1.0)
+            dashboard.phase(TRAINING)
+            dashboard.say("line")
+            print("printed")
+        assert time.monotonic() - began < 1.0
+        print("one more", flush=True)
+        dashboard.close()
+        assert time.monotonic() - began < 5.0
+        assert sys.stdout is stream
+        # The thread that draws ends when the terminal is gone.
+        os.close(master)
+        dashboard._thread.join(PATIENCE)
+        assert not dashboard._thread.is_alive()
+        monkeypatch.undo()
+
+
+OF_A_THREAD = "ignore::pytest.PytestUnhandledThreadExceptionWarning"
+
+
+@pytest.mark.parametrize(
+    "error",
+    # A terminal that has gone away is nobody's mistake; anything else is, and shows.
+    [OSError, pytest.param(ZeroDivisionError, marks=pytest.mark.filterwarnings(OF_A_THREAD))],
+)
+def test_a_drawing_that_fails_ends_and_lines_come_instead(screen, opened, monkeypatch, error):
+    def fail(*arguments):
+        raise error
+
+    dashboard = opened()
+    dashboard.begin()
+    screen.until("╭")
+    monkeypatch.setattr(Dashboard, "render", fail)
+    deadline = time.monotonic() + PATIENCE
+    while sys.stdout is not screen.stream:
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+    dashboard.write(1, [REPORT])
+    dashboard.say("still there")
+    screen.until("still there")
+
+
 def test_in_the_background_it_does_not_draw(screen, opened, monkeypatch):
     opened().begin()
     screen.until("╭")
-    monkeypatch.setattr(dashboard_module, "_in_foreground", lambda stream: False)
+    monkeypatch.setattr(dashboard_module, "in_foreground", lambda stream: False)
     time.sleep(0.6)
     length = len(screen.text)
     time.sleep(1.2)
@@ -245,7 +300,7 @@ def test_a_training_on_a_terminal_has_the_dashboard(screen, watch, root, tmp_pat
         arguments += ["--set", setting]
     assert train.main(arguments) == 0
     assert sys.stdout is screen.stream
-    screen.until("tensorboard --logdir")
+    screen.until("python -m jetbot_mjx.play")
     text = screen.text
     for part in ("training jetbot_mjx:GoalTask", "run folder: ", "first training step done"):
         assert part in text

@@ -148,7 +148,7 @@ def test_many_robots_and_a_strip_are_rendered(
         (["--many", "4", "--goals", "3"], "not allowed with argument"),
         (["--many", "4", "--gallery"], "--many: a gallery shows one robot at a time"),
         (["--strip", "--goals", "3"], "--strip: only --many goes with it"),
-        (["--strip", "--checkpoint", "last"], "--checkpoint: a strip shows"),
+        (["--strip", "--checkpoint", "last"], "--checkpoint: a strip chooses"),
     ],
 )
 def test_options_that_contradict_are_refused_in_one_line(arguments, said, capsys):

@@ -1,0 +1,27 @@
+"""What the end of a training says comes next."""
+
+import importlib.util
+from pathlib import Path
+
+import pytest
+
+from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.training import session
+
+
+@pytest.mark.parametrize("installed", [True, False])
+def test_the_end_names_the_next_commands_and_tensorboard_where_it_is_installed(
+    installed, monkeypatch
+):
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: object() if installed else None)
+    mine = Path("runs/mine")
+    best = Summary(4, 4, 1.0, 0.5, 1.0, 1.5, 2.0, 0.9, 0.8, 0.1, 0)
+    standing = session.Standing(env_steps=8, best_steps=8, best=best)
+    result = session.Result(mine, [mine], [standing], ["abc"], finished=True, wall_seconds=1.0)
+    lines = session.summary(result).splitlines()
+    assert lines[2:5] == [
+        "next: python -m jetbot_mjx.evaluate runs/mine",
+        "      python -m jetbot_mjx.render runs/mine",
+        "      python -m jetbot_mjx.play runs/mine",
+    ]
+    assert lines[5:] == (["      tensorboard --logdir runs"] if installed else [])
