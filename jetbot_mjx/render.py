@@ -51,7 +51,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     with exit_on_interrupt():
         from jetbot_mjx.evaluation.evaluator import REPORT_GOALS
-        from jetbot_mjx.viewers.gallery import parse_goals, render_gallery, render_run
+        from jetbot_mjx.viewers.gallery import (
+            EPISODES,
+            GALLERY_EPISODES,
+            parse_goals,
+            render_gallery,
+            render_run,
+        )
     # Parse.
     parser = _parser(REPORT_GOALS, parse_goals)
     options = parser.parse_args(arguments)
@@ -62,14 +68,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     # Render several checkpoints, or one.
     if options.gallery:
-        gallery = render_gallery(options.run, episodes=options.episodes or 4)
+        gallery = render_gallery(options.run, episodes=options.episodes or GALLERY_EPISODES)
         for step, successes in gallery.successes.items():
             print(f"{step:>12,} steps  {successes} of {gallery.episodes} goals reached")
         print(f"video: {gallery.mp4}\ngif:   {gallery.gif}\nplots: {gallery.plots}")
         return 0
     rendered = render_run(
         options.run,
-        episodes=options.episodes or 20,
+        episodes=options.episodes or EPISODES,
         goals=options.goals,
         which=options.checkpoint,
     )

@@ -10,7 +10,6 @@ installed packages are not stored, because their versions are.
 import ast
 import builtins
 import contextlib
-import functools
 import hashlib
 import importlib
 import importlib.abc
@@ -164,7 +163,8 @@ def stored_task_class(run_dir: Path, name: str) -> type[Any] | None:
     """
     module, _, class_name = name.partition(":")
     code = read_task_code(run_dir)
-    if code is None or code.module != module:
+    # Never replace this package, whose compiled programs are cached by its own source.
+    if code is None or code.module != module or module.partition(".")[0] == _PACKAGE:
         return None
     # Prefer the module itself if nothing changed, so that its classes are the user's own.
     root = _import_root(module)
@@ -358,7 +358,9 @@ class _StoredLoader(importlib.abc.SourceLoader):
         super().exec_module(module)
 
 
-@functools.cache
+_importers: dict[TaskCode, _StoredModules] = {}
+
+
 def _stored_modules(folder: Path, code: TaskCode) -> _StoredModules:
     """Return the importer of a source; runs that stored the same source share it."""
-    return _StoredModules(folder, code)
+    return _importers.setdefault(code, _StoredModules(folder, code))
