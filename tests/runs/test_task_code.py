@@ -5,17 +5,23 @@ import json
 import sys
 import textwrap
 
+import gliding
 import pytest
 
+from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import task_code
+from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.task_code import (
     collect_task_code,
     read_task_code,
     stored_task_class,
     write_task_code,
 )
+from jetbot_mjx.training import session
 
 NAME = "kicking_task"
 
@@ -269,3 +275,44 @@ def test_dataclasses_with_annotations_as_text_work(tmp_path):
     )
     write_task_code(tmp_path, task_code.TaskCode(NAME, ((f"{NAME}.py", source.encode()),)))
     assert stored_task_class(tmp_path, f"{NAME}:Task")(3).at == 3
+
+
+def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
+    tmp_path, root, monkeypatch, capsys
+):
+    source = write_task(tmp_path / "src", 3)
+    config = load_config(
+        root / "configs" / "smoke.yaml", [f"task.name={NAME}:Task", "ppo.num_timesteps=16384"]
+    )
+    run_dir = tmp_path / "run"
+    with gliding.everywhere(), monkeypatch.context() as patch:
+        patch.syspath_prepend(source)
+        session.run(config, run_dir)
+    assert (run_dir / "task" / "kicking_tools.py").is_file()
+    for name in own_modules():
+        del sys.modules[name]
+    # Without the module.
+    checkpoint = load_checkpoint(run_dir)
+    env = checkpoint.make_env()
+    assert env.task.factor == 3
+    assert MujocoJetBot(checkpoint.config, type(env.task)).env.task.factor == 3
+    # With one that has changed.
+    write_task(source, 4)
+    monkeypatch.syspath_prepend(source)
+    assert make_env(config).task.factor == 4
+    assert load_checkpoint(run_dir).make_env().task.factor == 3
+    monkeypatch.setattr(task_code, "_said", set())
+    capsys.readouterr()
+    env, code = session._make_env(config, [run_dir])
+    assert (env.task.factor, code) == (3, None)
+    assert f"{NAME} on disk differs from the code this run was" in capsys.readouterr().err
+    # A new run has the new one, in the folders of all of its seeds.
+    two = parse_config({**config.model_dump(), "seeds": 2})
+    run_dirs = [tmp_path / "two" / f"seed-{n}" for n in (0, 1)]
+    env, code = session._make_env(two, run_dirs)
+    assert env.task.factor == 4
+    for folder in run_dirs:
+        folder.mkdir(parents=True)
+    session._store_run(session.Training(two, tmp_path / "two", run_dirs, *[None] * 4, code))
+    for folder in (tmp_path / "two", *run_dirs):
+        assert read_task_code(folder) == code
