@@ -360,7 +360,7 @@ def several(smoke_run, still, tmp_path_factory):
 
 def test_runs_are_compared_beside_their_own_reports(several):
     folder, code, said = several
-    home = folder / "five" / "evaluations" / "comparison"
+    home = folder / "five" / "evaluations" / f"comparison-{EPISODES}-goals"
     assert set(files(home)) == {
         *("comparison.html", "comparison.md", "comparison.json"),
         *("runs.png", "learning_curves.png"),
@@ -386,7 +386,7 @@ def test_runs_are_compared_beside_their_own_reports(several):
 
 
 def test_the_comparison_tells_the_numbers_of_its_json_file(several):
-    home = several[0] / "five" / "evaluations" / "comparison"
+    home = several[0] / "five" / "evaluations" / f"comparison-{EPISODES}-goals"
     values = json.loads((home / "comparison.json").read_text())
     places = check_numbers(home / "comparison.html", values)
     assert {
