@@ -176,7 +176,7 @@ def compare_runs(
     }
     # Compare the reports and write the comparison.
     first = next(iter(entries.values())).folder
-    name = name_with_count("comparison", episodes, REPORT_GOALS)
+    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
     folder = first / _FOLDER / name if output is None else Path(output)
     comparison = compare(folder.absolute(), by_run)
     write_comparison(comparison)

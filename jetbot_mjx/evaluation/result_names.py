@@ -9,15 +9,16 @@ PARTS = ("robustness", "randomized", "mujoco")
 """Parts of a report that are written on request or if the run has ranges; keys of its JSON file."""
 
 
-def name_with_count(name: str, count: int, default: int) -> str:
+def name_with_count(name: str, count: int, default: int, unit: str = "") -> str:
     """Return the name of a result, with the count after it unless that is the default.
 
     Args:
       name: the name, such as `episodes`.
       count: the number of episodes that the result is about.
       default: the number of episodes without an option.
+      unit: what follows the count.
     """
-    return name if count == default else f"{name}-{count}"
+    return name if count == default else f"{name}-{count}{unit}"
 
 
 def report_folder(evaluations: Path, name: str, goals: int, parts: frozenset[str]) -> Path:
@@ -36,12 +37,12 @@ def report_folder(evaluations: Path, name: str, goals: int, parts: frozenset[str
     Returns:
       The folder, which may not exist yet.
     """
-    count = "" if goals == REPORT_GOALS else f"-{goals}-goals"
-    folder = evaluations / (name if goals >= REPORT_GOALS else name + count)
+    own_name = name_with_count(name, goals, REPORT_GOALS, "-goals")
+    folder = evaluations / (name if goals >= REPORT_GOALS else own_name)
     found = _goals_and_parts(folder)
     if found is None or (found[0] <= goals and found[1] <= parts):
         return folder
-    return evaluations / f"{name}{count}-{'-'.join(sorted(parts)) or 'nominal'}"
+    return evaluations / f"{own_name}-{'-'.join(sorted(parts)) or 'nominal'}"
 
 
 def find_report(evaluations: Path, name: str, goals: int, parts: frozenset[str]) -> Path | None:

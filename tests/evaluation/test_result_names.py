@@ -28,6 +28,7 @@ def test_names_say_a_number_that_is_not_the_default():
     assert name_with_count("episodes", 20, 20) == "episodes"
     assert name_with_count("episodes", 3, 20) == "episodes-3"
     assert name_with_count("episodes", 100, 20) == "episodes-100"
+    assert name_with_count("comparison", 16, 1024, "-goals") == "comparison-16-goals"
 
 
 @pytest.mark.parametrize(
@@ -97,6 +98,7 @@ def test_a_report_that_is_as_full_is_found(tmp_path):
     assert find_report(tmp_path, STEPS, 16, NONE) == full
     assert find_report(tmp_path, STEPS, REPORT_GOALS, frozenset({"mujoco"})) == full
     assert find_report(tmp_path, STEPS, REPORT_GOALS, ALL) is None
+    assert find_report(tmp_path, STEPS, 4096, NONE) is None
 
 
 def test_the_report_that_stays_is_named(tmp_path):
