@@ -54,7 +54,9 @@ def find_report(evaluations: Path, name: str, goals: int, parts: frozenset[str])
       goals: the number of goals of the new report.
       parts: those of `PARTS` that the new report has.
     """
-    for folder in (evaluations / name, report_folder(evaluations, name, goals, parts)):
+    own_name = name_with_count(name, goals, REPORT_GOALS, "-goals")
+    own_folder = report_folder(evaluations, name, goals, parts)
+    for folder in (evaluations / name, evaluations / own_name, own_folder):
         found = _goals_and_parts(folder)
         if found is not None and found[0] >= goals and found[1] >= parts:
             return folder

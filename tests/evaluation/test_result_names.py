@@ -94,6 +94,8 @@ def test_a_report_that_is_as_full_is_found(tmp_path):
     assert find_report(tmp_path, STEPS, 16, NONE) == few
     assert find_report(tmp_path, STEPS, 16, ALL) is None
     assert find_report(tmp_path, STEPS, 17, NONE) is None
+    write(few, 16, ALL)
+    assert find_report(tmp_path, STEPS, 16, NONE) == few
     write(full, REPORT_GOALS, frozenset({"mujoco"}))
     assert find_report(tmp_path, STEPS, 16, NONE) == full
     assert find_report(tmp_path, STEPS, REPORT_GOALS, frozenset({"mujoco"})) == full
