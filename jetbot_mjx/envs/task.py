@@ -344,8 +344,8 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     return task
 
 
-def _import_class(name: str) -> type[Any]:
-    """Import a class by its name, `package.module:Class`."""
+def _import_class(name: str) -> Any:
+    """Import what a name `package.module:Class` stands for, which may be no class."""
     module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
         raise UserError(f"task.name = {name!r} is wrong: write package.module:Class")
