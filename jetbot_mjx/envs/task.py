@@ -334,12 +334,11 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     Raises:
       UserError: the name is malformed, cannot be imported, or does not name a task.
     """
-    if task_class is None:
-        task_class = _import_class(config.name)
-    _check_members(config.name, task_class, METHODS)
-    if task_class is Task:
+    found: Any = task_class or _import_class(config.name)
+    _check_members(config.name, found, METHODS)
+    if found is Task:
         raise UserError(f"task.name = {config.name!r} is the contract, not a task: derive from it")
-    task = task_class(config)
+    task = found(config)
     _check_members(config.name, task, ("layout",))
     return task
 
