@@ -33,11 +33,9 @@ def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
     group.add_argument(
         "--goals", type=goals, metavar="I,J-K", help="these of the fixed goals, as in 3,17 or 0-7"
     )
+    number = cli.whole_number(1, most)
     group.add_argument(
-        "--many",
-        type=cli.whole_number(1, most),
-        metavar="N",
-        help="N robots in one scene, each of which drives to its own goal",
+        "--many", type=number, metavar="N", help="N robots in one scene, each with its own goal"
     )
     parser.add_argument(
         "--gallery",
@@ -84,15 +82,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     with cli.show_progress():
         if options.gallery:
-            rendered = gallery.render_gallery(run, episodes=episodes or 4)
+            rendered = gallery.render_gallery(run, episodes=episodes or gallery.GALLERY_EPISODES)
         elif options.strip:
             rendered = many.render_training_strip(run, robots=options.many or 16)
         elif options.many:
             rendered = many.render_many(run, robots=options.many, which=which)
         else:
-            rendered = gallery.render_run(
-                run, episodes=episodes or 20, goals=options.goals, which=which
-            )
+            count = episodes or gallery.EPISODES
+            rendered = gallery.render_run(run, episodes=count, goals=options.goals, which=which)
     print(rendered.describe())
     return 0
 

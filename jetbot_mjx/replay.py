@@ -33,7 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f" up to there:\n{HEADER}"
     )
     nonfinite: list[str] = []
-    env = make_env(stored.config.for_any_device())
+    env = make_env(stored.config.for_any_device(), stored.task_class)
     for index, step in enumerate(replay_nan_dump(stored, env)):
         print(format_step(index, step))
         nonfinite = step.nonfinite

@@ -158,7 +158,7 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Rec
     Returns:
       The recording, the same for the same checkpoint on the same machine.
     """
-    robot = MujocoJetBot(checkpoint.config)
+    robot = MujocoJetBot(checkpoint.config, type(env.task))
     act = jax.jit(as_jax(checkpoint, env))
     keys = iter(np.asarray(report_keys(count)))
     seen: list[np.ndarray] = []

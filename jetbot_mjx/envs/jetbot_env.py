@@ -7,7 +7,7 @@ rebuilt inside `step`.
 
 import copy
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import brax.envs
 import jax
@@ -70,17 +70,18 @@ class JetBotEnv(brax.envs.Env):
     `done` means termination only; `EpisodeWrapper` adds the time limit.
     """
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, task_class: type[Any] | None = None) -> None:
         """Build the task and its models.
 
         Args:
           config: the configuration; the sections robot, task and physics are used.
+          task_class: the class of the task; None: the one that `task.name` imports.
 
         Raises:
           UserError: the task or its scene cannot be built.
         """
         self.config = config
-        self.task: Task = make_task(config.task)
+        self.task: Task = make_task(config.task, task_class)
         self.robot = ROBOTS[config.robot.preset]
         try:
             self.mj_model: mujoco.MjModel = make_mj_model(
@@ -314,11 +315,12 @@ class JetBotEnv(brax.envs.Env):
         return self.config.physics.ctrl_dt
 
 
-def make_env(config: Config) -> JetBotEnv:
+def make_env(config: Config, task_class: type[Any] | None = None) -> JetBotEnv:
     """Build the environment that a configuration describes.
 
     Args:
       config: the configuration; the sections robot, task and physics are used.
+      task_class: the class of the task; None: the one that `task.name` imports.
 
     Returns:
       The environment, unbatched and unwrapped.
@@ -326,4 +328,4 @@ def make_env(config: Config) -> JetBotEnv:
     Raises:
       UserError: the task or its scene cannot be built.
     """
-    return JetBotEnv(config)
+    return JetBotEnv(config, task_class)

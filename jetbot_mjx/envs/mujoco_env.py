@@ -64,16 +64,18 @@ class _Programs(NamedTuple):
 class MujocoJetBot:
     """A `MujocoJetBot` simulates one robot and its goal."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, config: Config, task_class: type[Any] | None = None) -> None:
         """Build the model, and compile the programs of the task.
 
         Args:
           config: the configuration; `randomization` is ignored.
+          task_class: the class of the task; None: the one that `task.name` imports.
 
         Raises:
           UserError: the task or its scene cannot be built.
         """
-        self.env, self.model, self._reset, self._task_step = _programs(config.model_dump_json())
+        programs = _programs(config.model_dump_json(), task_class)
+        self.env, self.model, self._reset, self._task_step = programs
         self.data = mujoco.MjData(self.model)
         self.goal: Goal = None
         """Goal of this episode, as it stands now."""
@@ -167,14 +169,15 @@ class MujocoJetBot:
 
 
 @functools.lru_cache(maxsize=8)
-def _programs(settings: str) -> _Programs:
+def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
     """Build the environment, model and programs of a configuration.
 
     Args:
       settings: the configuration as JSON, since a `Config` is not hashable.
+      task_class: as for `MujocoJetBot`.
     """
     config = Config.model_validate_json(settings)
-    env = make_env(config)
+    env = make_env(config, task_class)
     model = make_mj_model(
         ROBOTS[config.robot.preset],
         config.physics,

@@ -324,34 +324,41 @@ class GoalTask:
         return jnp.linalg.norm(self.goal_position(goal) - robot.position_w)
 
 
-def make_task(config: TaskConfig) -> Task:
+def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     """Import and build the task that a configuration names.
 
     Args:
       config: the task section; its `name` is `package.module:Class`.
+      task_class: the class, if it was already imported from the source that a run stored.
 
     Raises:
       UserError: the name is malformed, cannot be imported, or does not name a task.
     """
-    module_name, separator, class_name = config.name.partition(":")
+    found: Any = task_class or _import_class(config.name)
+    _check_members(config.name, found, METHODS)
+    if found is Task:
+        raise UserError(f"task.name = {config.name!r} is the contract, not a task: derive from it")
+    task = found(config)
+    _check_members(config.name, task, ("layout",))
+    return task
+
+
+def _import_class(name: str) -> Any:
+    """Import what a name `package.module:Class` stands for, which may be no class."""
+    module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
-        raise UserError(f"task.name = {config.name!r} is wrong: write package.module:Class")
+        raise UserError(f"task.name = {name!r} is wrong: write package.module:Class")
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
         raise UserError(
-            f"task.name = {config.name!r}: no module named {error.name!r} can be imported;"
+            f"task.name = {name!r}: no module named {error.name!r} can be imported;"
             " install it, or name its folder in PYTHONPATH"
         ) from None
     task_class: Any = getattr(module, class_name, None)
     if task_class is None:
-        raise UserError(f"task.name = {config.name!r}: {module_name} has no {class_name!r}")
-    _check_members(config.name, task_class, METHODS)
-    if task_class is Task:
-        raise UserError(f"task.name = {config.name!r} is the contract, not a task: derive from it")
-    task = task_class(config)
-    _check_members(config.name, task, ("layout",))
-    return task
+        raise UserError(f"task.name = {name!r}: {module_name} has no {class_name!r}")
+    return task_class
 
 
 def _check_members(name: str, task: object, members: Sequence[str]) -> None:

@@ -25,6 +25,7 @@ from jetbot_mjx.evaluation.report import (
     find_failures,
     learning_curve,
 )
+from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
 from jetbot_mjx.evaluation.robustness import (
     SWEEP_GOALS,
     MujocoEvaluator,
@@ -38,6 +39,8 @@ from jetbot_mjx.runs.run_dir import seed_folders, versions
 
 Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
+
+_FOLDER = "evaluations"
 
 SIMULATORS: tuple[Simulator, ...] = get_args(Simulator)
 
@@ -58,7 +61,8 @@ def evaluate_run(
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
       episodes: The number of fixed goals, from the first on.
       which: The checkpoint of a run folder.
-      output: The folder to write, or None for `evaluations/<env_steps>/` of the run folder.
+      output: The folder to write, or None for the one in `evaluations/` of the run folder that
+        `report_folder` chooses, so that no fuller report is replaced.
       robustness: Whether to evaluate the policy also on robots that differ from the preset, and in
         C MuJoCo.
       ranges: A configuration file with ranges below `randomization`. The policy is evaluated also
@@ -72,15 +76,17 @@ def evaluate_run(
       UserError: there is no usable checkpoint, or the folder cannot be written.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    folder = _report_folder(checkpoint) if output is None else Path(output)
-    reports = _write_reports(
-        [(checkpoint, folder)],
+    options = _Options(
         episodes,
         robustness=robustness,
         in_mujoco=robustness or simulator is not None,
         ranges_file=_RangesFile.read(ranges),
     )
-    return next(reports)
+    if output is not None:
+        target = _Target(Path(output))
+    else:
+        target = _Target(report_folder(*options.describe_report(checkpoint)))
+    return next(_write_reports([(checkpoint, target)], options))
 
 
 def evaluate_in_mujoco(
@@ -129,11 +135,14 @@ def compare_runs(
 ) -> Comparison:
     """Evaluate the policies of several runs or seeds, write a report on each, and compare them.
 
+    The report on a policy is not written again if there is one that is at least as full.
+
     Args:
       runs: Run folders, of one seed or several, or checkpoint folders.
       episodes: The number of fixed goals, from the first on.
       which: The checkpoint of a run folder, of each seed.
-      output: The folder for the comparison, or None for `evaluations/comparison/` of the first run.
+      output: The folder for the comparison, or None for `evaluations/comparison/` of the first run,
+        whose name ends with the number of goals if they are not as many as by default.
       robustness: Whether each policy is also evaluated on other robots and in C MuJoCo.
       ranges: As for `evaluate_run`.
       simulator: As for `evaluate_run`.
@@ -150,13 +159,18 @@ def compare_runs(
     check_comparable({name: entry.config for name, entry in entries.items()})
     # Evaluate each policy and write its report.
     checkpoints = [one for entry in entries.values() for one in entry.seeds.values()]
-    reports = _write_reports(
-        [(one, _report_folder(one)) for one in checkpoints],
+    options = _Options(
         episodes,
         robustness=robustness,
         in_mujoco=robustness or simulator is not None,
         ranges_file=_RangesFile.read(ranges),
     )
+    targets = []
+    for one in checkpoints:
+        wanted = options.describe_report(one)
+        found = find_report(*wanted)
+        targets.append(_Target(found or report_folder(*wanted), write=found is None))
+    reports = _write_reports(list(zip(checkpoints, targets, strict=True)), options)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(checkpoints)) as advance:
         for name, entry in entries.items():
@@ -165,7 +179,8 @@ def compare_runs(
                 advance(1)
     # Compare the reports and write the comparison.
     first = next(iter(entries.values())).folder
-    folder = first / "evaluations" / "comparison" if output is None else Path(output)
+    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
+    folder = first / _FOLDER / name if output is None else Path(output)
     comparison = compare(folder.absolute(), by_run)
     with stage("writing the comparison"):
         write_comparison(comparison)
@@ -189,6 +204,36 @@ class _RangesFile(NamedTuple):
                 " `randomization`, such as configs/real_jetbot.yaml"
             )
         return cls(Path(path), ranges)
+
+
+class _Options(NamedTuple):
+    """An `_Options` holds what every policy of one command is evaluated on."""
+
+    episodes: int
+    robustness: bool
+    in_mujoco: bool
+    ranges_file: _RangesFile | None
+
+    def ranges_of(self, config: Config) -> RandomizationConfig:
+        """Return the ranges of `--ranges`, or those of the run."""
+        return self.ranges_file.ranges if self.ranges_file else config.randomization
+
+    def describe_report(self, checkpoint: Checkpoint) -> tuple[Path, str, int, frozenset[str]]:
+        """Return the arguments of `report_folder` for the report of a policy."""
+        parts = {
+            "robustness": self.robustness,
+            "mujoco": self.in_mujoco,
+            "randomized": bool(self.ranges_of(checkpoint.config).drawn),
+        }
+        has = frozenset(name for name, wanted in parts.items() if wanted)
+        return checkpoint.run_dir / _FOLDER, checkpoint.path.name, self.episodes, has
+
+
+class _Target(NamedTuple):
+    """A `_Target` holds the folder of a report, and whether the report is to be written there."""
+
+    folder: Path
+    write: bool = True
 
 
 class RunEntry(NamedTuple):
@@ -269,7 +314,7 @@ class _Evaluators(NamedTuple):
             varied = DomainRandomizationWrapper(env, ranges=ranges)
             randomized = Evaluator(varied, networks, programs)
         return cls(
-            key=_program_key(checkpoint.config, ranges),
+            key=_program_key(checkpoint.config, env, ranges),
             nominal=nominal,
             randomized=randomized,
             mujoco=MujocoEvaluator(env, networks, ranges) if in_mujoco else None,
@@ -277,10 +322,11 @@ class _Evaluators(NamedTuple):
         )
 
 
-def _program_key(config: Config, ranges: RandomizationConfig) -> tuple[Any, ...]:
+def _program_key(config: Config, env: JetBotEnv, ranges: RandomizationConfig) -> tuple[Any, ...]:
     """Return the parts of a configuration that the compiled episodes depend on."""
     return (
         config.task,
+        type(env.task),
         config.robot,
         config.physics,
         config.deterministic,
@@ -291,29 +337,25 @@ def _program_key(config: Config, ranges: RandomizationConfig) -> tuple[Any, ...]
 
 
 def _write_reports(
-    checkpoints: Sequence[tuple[Checkpoint, Path]],
-    episodes: int,
-    *,
-    robustness: bool,
-    in_mujoco: bool,
-    ranges_file: _RangesFile | None,
+    checkpoints: Sequence[tuple[Checkpoint, _Target]], options: _Options
 ) -> Iterator[Report]:
     """Evaluate policies and write their reports, reusing compiled programs where they fit."""
+    episodes, robustness, in_mujoco, ranges_file = options
     keys, used_versions = report_keys(episodes), versions()
     # Build all environments first, so that an unsuitable policy is rejected before any writing.
     envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
     evaluators = None
-    for (checkpoint, folder), env in zip(checkpoints, envs, strict=True):
+    for (checkpoint, target), env in zip(checkpoints, envs, strict=True):
         config, params = checkpoint.config, checkpoint.params
-        ranges = ranges_file.ranges if ranges_file else config.randomization
-        if evaluators is None or evaluators.key != _program_key(config, ranges):
+        ranges = options.ranges_of(config)
+        if evaluators is None or evaluators.key != _program_key(config, env, ranges):
             evaluators = _Evaluators.build(checkpoint, env, keys, ranges, in_mujoco=in_mujoco)
         # Run the fixed goals, which most parts of the report are computed from.
         finished = jax.device_get(evaluators.nominal.run(params, keys))
         best_known, missing = compare_with_best_known(config, finished)
         run_dir = _relative(checkpoint.run_dir)
         report = Report(
-            folder=folder,
+            folder=target.folder,
             run=run_dir,
             checkpoint=checkpoint.path,
             env_steps=checkpoint.env_steps,
@@ -340,13 +382,10 @@ def _write_reports(
             report = report._replace(randomized=on_others)
         if evaluators.mujoco:
             report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
-        with stage("writing the report"):
-            write_report(report)
+        if target.write:
+            with stage("writing the report"):
+                write_report(report)
         yield report
-
-
-def _report_folder(checkpoint: Checkpoint) -> Path:
-    return checkpoint.run_dir / "evaluations" / checkpoint.path.name
 
 
 def _without_trajectories(report: Report) -> Report:

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.result_names import fuller_report
 from jetbot_mjx.evaluation.tables import (
     best_known_lines,
     pairs_table,
@@ -22,6 +23,8 @@ def summarize_report(report: Report) -> str:
         f"{best_known_lines(report)}{robustness_table(report)}"
         f"report: {report.folder / 'report.html'}"
     )
+    if fuller := fuller_report(report.folder, report.checkpoint.name):
+        text += f" (the one in {fuller} stays as it is)"
     if report.policy.nonfinite_envs:
         text += f"\n{report.policy.nonfinite_envs} episodes ended in a non-finite state"
     return text

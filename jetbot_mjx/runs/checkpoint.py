@@ -26,6 +26,7 @@ from jetbot_mjx.runs.checkpoint_store import (
 )
 from jetbot_mjx.runs.find_run import PRETRAINED as PRETRAINED
 from jetbot_mjx.runs.find_run import find_run, list_runs, suggest_run
+from jetbot_mjx.runs.task_code import stored_task_class
 
 Which = Literal["best", "last"] | int
 """Selects a checkpoint of a run: the best, the last, or one by its environment steps."""
@@ -54,11 +55,15 @@ class Checkpoint(NamedTuple):
     def make_env(self) -> JetBotEnv:
         """Build the environment that the policy was trained in, for the available devices.
 
+        The code of a task of one's own is what the run stored, if that cannot be imported by name
+        or has changed.
+
         Raises:
-          UserError: the task cannot be built.
+          UserError: the task cannot be built, or its stored code is damaged.
           CheckpointError: its observation differs from the one that the policy was trained on.
         """
-        env = make_env(self.config.for_any_device())
+        task_class = stored_task_class(self.run_dir, self.config.task.name)
+        env = make_env(self.config.for_any_device(), task_class)
         layout = layout_data(env.task.layout)
         if layout != self.about["layout"]:
             raise CheckpointError(

@@ -14,6 +14,7 @@ from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError
 from jetbot_mjx.runs.checkpoint_store import flatten
+from jetbot_mjx.runs.task_code import stored_task_class
 
 FOLDER = "nan_dumps"
 """Name of the folder of dumps in a run folder."""
@@ -31,6 +32,8 @@ class StoredNanDump(NamedTuple):
     env_steps: int
     """Environment steps of the training at the end of the call that found the non-finite state."""
     nan_dump: NanDump
+    task_class: type[Any] | None = None
+    """The class of the task, if its code is stored in the run; None: it is imported by name."""
 
 
 def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDump) -> Path | None:
@@ -80,7 +83,9 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         if about["format"] != _FORMAT:
             raise InvalidError(f"{path} has the format {about['format']!r}, not {_FORMAT!r}")
         config = parse_config(about["config"], source="stored config")
-        template = _template(config)
+        run_dir = Path(path).absolute().parent.parent
+        task_class = stored_task_class(run_dir, config.task.name)
+        template = _template(config, task_class)
         wanted = flatten(template)
         if wanted.keys() != arrays.keys():
             odd = sorted(wanted.keys() ^ arrays.keys())[0]
@@ -88,7 +93,7 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         nan_dump = jax.tree.unflatten(
             jax.tree.structure(template), [arrays[name] for name in wanted]
         )
-        return StoredNanDump(config, about["env_steps"], nan_dump)
+        return StoredNanDump(config, about["env_steps"], nan_dump, task_class)
     except FileNotFoundError:
         raise NotFoundError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
     except ConfigError as error:
@@ -102,9 +107,9 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         ) from None
 
 
-def _template(config: Config) -> NanDump:
+def _template(config: Config, task_class: type[Any] | None) -> NanDump:
     """Return the shapes and dtypes of a dump of this configuration."""
-    env = wrap_for_training(JetBotEnv(config), config.task.episode_length)
+    env = wrap_for_training(JetBotEnv(config, task_class), config.task.episode_length)
     batched: Any = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
     return NanDump(

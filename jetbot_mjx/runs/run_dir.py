@@ -1,8 +1,9 @@
 """Create, lock and read run folders, which hold everything that is needed after training.
 
-A run folder holds config.yaml (resolved), versions.json, metrics.jsonl, tensorboard/,
-checkpoints/<env_steps>/, evaluations/<env_steps>/, videos/, policy/ and nan_dumps/. If several
-seeds are trained at once, it holds one folder seed-<n>/ for each of them, with all of that inside.
+A run folder holds config.yaml (resolved), versions.json, task/ (the source of a task that is not of
+this package), metrics.jsonl, tensorboard/, checkpoints/<env_steps>/, evaluations/<env_steps>/,
+videos/, policy/ and nan_dumps/. If several seeds are trained at once, it holds one folder seed-<n>/
+for each of them, with all of that inside.
 """
 
 import contextlib

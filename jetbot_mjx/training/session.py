@@ -34,6 +34,12 @@ from jetbot_mjx.runs.run_dir import (
     versions,
     write_run,
 )
+from jetbot_mjx.runs.task_code import (
+    TaskCode,
+    collect_task_code,
+    stored_task_class,
+    write_task_code,
+)
 from jetbot_mjx.runs.wandb_sink import check_tracking
 from jetbot_mjx.training import distributed, ppo_trainer
 from jetbot_mjx.training.callbacks import TrainerCallback
@@ -96,6 +102,8 @@ class Training(NamedTuple):
     programs: ProgramCache
     warm_start: WarmStart | None
     """The parameters to begin with; None: those of the seed, or the run is resumed."""
+    task_code: TaskCode | None = None
+    """The source of the task that the run stores; None: it has none, or it is stored already."""
 
 
 def run(config: Config, run_dir: Path) -> Result:
@@ -140,11 +148,11 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
     config.check_devices(jax.device_count())
     check_tracking(config)
     # Build every object once.
-    env = make_env(config)
-    ppo = ppo_trainer.build_ppo(config, env)
     run_dirs = seed_dirs(run_dir, config)
+    env, task_code = _make_env(config, run_dirs)
+    ppo = ppo_trainer.build_ppo(config, env)
     warm_start = _warm_start(config, env, run_dirs)
-    training = Training(config, run_dir, run_dirs, env, ppo, programs, warm_start)
+    training = Training(config, run_dir, run_dirs, env, ppo, programs, warm_start, task_code)
     try:
         return _train_with_brax(training) if config.trainer == "brax" else _train(training)
     except jax.errors.JaxRuntimeError as error:
@@ -152,6 +160,29 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
             raise
         smaller = advice(config, sizes(ppo, env), jax.device_count(), device_memory())
     raise UserError(smaller)
+
+
+def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, TaskCode | None]:
+    """Build the environment, and return it with the source of its task if that is to be stored.
+
+    A run that has checkpoints continues with the task that it was begun with.
+    """
+    task_class = None
+    if any(map(checkpoint_steps, run_dirs)):
+        task_class = stored_task_class(run_dirs[0], config.task.name)
+    env = make_env(config, task_class)
+    return env, None if task_class else collect_task_code(config.task.name)
+
+
+def _store_run(training: Training) -> None:
+    """Write what is known before training: configuration, versions and the source of the task."""
+    folders = {training.run_dir: training.config}
+    if training.config.seeds > 1:
+        folders |= dict(zip(training.run_dirs, training.config.of_each_seed(), strict=True))
+    for folder, config in folders.items():
+        write_run(folder, config)
+        if training.task_code:
+            write_task_code(folder, training.task_code)
 
 
 def _warm_start(config: Config, env: JetBotEnv, run_dirs: Sequence[Path]) -> WarmStart | None:
@@ -168,7 +199,7 @@ def _train_with_brax(training: Training) -> Result:
     config, run_dir = training.config, training.run_dir
     _check_folder(config, run_dir)
     with occupied(run_dir), CompileClock() as clock:
-        write_run(run_dir, config)
+        _store_run(training)
         with open_recorder(training, clock, None) as recorder:
             recorder.begin(_headline(config, run_dir))
             brax_trainer.train(config, training.env, recorder)
@@ -322,10 +353,7 @@ def _open_folders(
     resumption = resume(run_dirs, configs, template)
     # Compare the versions before those of this process replace the stored ones.
     messages = _resume_messages(run_dir, resumption) if resumption else []
-    write_run(run_dir, config)
-    if config.seeds > 1:
-        for seed_dir, seed_config in zip(run_dirs, configs, strict=True):
-            write_run(seed_dir, seed_config)
+    _store_run(training)
     return resumption, messages
 
 

@@ -17,6 +17,7 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
 from jetbot_mjx.evaluation.plots import plot_trajectories
+from jetbot_mjx.evaluation.result_names import name_with_count
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
@@ -31,6 +32,9 @@ from jetbot_mjx.viewers.video import (
     write_gif,
     write_mp4,
 )
+
+EPISODES, GALLERY_EPISODES = 20, 4
+"""Default number of goals of the videos of one policy, and of a gallery."""
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # relative to the video
@@ -89,7 +93,7 @@ def successes_table(successes: Mapping[int, int], episodes: int) -> str:
 def render_run(
     run_or_checkpoint: str | Path,
     *,
-    episodes: int = 20,
+    episodes: int = EPISODES,
     goals: Sequence[int] | None = None,
     which: Which = "best",
 ) -> RenderedRun:
@@ -103,15 +107,15 @@ def render_run(
 
     Returns:
       The files, in `videos/<env_steps>/` of the run folder. With `goals`, their names contain the
-      indices.
+      indices; with another number of episodes than by default, that number.
 
     Raises:
       UserError: there is no usable checkpoint, no such goal, no OpenGL, or no space on the disk.
     """
     # Choose the goals and the names of the files.
-    names = ("episodes", "trajectories")
     if goals is None:
         goals = range(episodes)
+        names = [name_with_count(name, episodes, EPISODES) for name in ("episodes", "trajectories")]
     else:
         check_goals(goals)
         names = (f"goals-{_ranges(goals)}",) * 2
@@ -139,7 +143,7 @@ def render_run(
     return rendered
 
 
-def render_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
+def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> Gallery:
     """Render the first, the middle and the last checkpoint of a run driving to the same goals.
 
     The goals are the report's, from the first on, so that none is chosen by its outcome.
@@ -149,7 +153,8 @@ def render_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
       episodes: The number of goals.
 
     Returns:
-      The files, in `videos/` of the run folder.
+      The files, in `videos/` of the run folder. Their names contain the number of goals if it is
+      not the default.
 
     Raises:
       UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
@@ -166,10 +171,11 @@ def render_gallery(run_dir: str | Path, *, episodes: int = 4) -> Gallery:
     folder = path / "videos"
     make_folder(folder)
     successes = [int(each.success.sum()) for each in rolled_out]
+    name = name_with_count("gallery", episodes, GALLERY_EPISODES)
     gallery = Gallery(
-        mp4=folder / "gallery.mp4",
-        gif=folder / "gallery.gif",
-        plots=folder / "gallery.png",
+        mp4=folder / f"{name}.mp4",
+        gif=folder / f"{name}.gif",
+        plots=folder / f"{name}.png",
         successes=dict(zip(chosen, successes, strict=True)),
         episodes=episodes,
     )

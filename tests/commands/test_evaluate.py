@@ -360,7 +360,7 @@ def several(smoke_run, still, tmp_path_factory):
 
 def test_runs_are_compared_beside_their_own_reports(several):
     folder, code, said = several
-    home = folder / "five" / "evaluations" / "comparison"
+    home = folder / "five" / "evaluations" / f"comparison-{EPISODES}-goals"
     assert set(files(home)) == {
         *("comparison.html", "comparison.md", "comparison.json"),
         *("runs.png", "learning_curves.png"),
@@ -386,7 +386,7 @@ def test_runs_are_compared_beside_their_own_reports(several):
 
 
 def test_the_comparison_tells_the_numbers_of_its_json_file(several):
-    home = several[0] / "five" / "evaluations" / "comparison"
+    home = several[0] / "five" / "evaluations" / f"comparison-{EPISODES}-goals"
     values = json.loads((home / "comparison.json").read_text())
     places = check_numbers(home / "comparison.html", values)
     assert {
@@ -406,7 +406,12 @@ def test_the_comparison_tells_the_numbers_of_its_json_file(several):
 
 def test_seeds_of_one_run_are_a_comparison_without_a_pair(several, tmp_path, monkeypatch):
     run = several[0] / "five"
+    written = {path: path.stat().st_mtime_ns for path in run.rglob("evaluations/*/report.json")}
     comparison = compare_runs([run], episodes=EPISODES, output=tmp_path)
+    # The reports that are there have the other simulator too, so they stay.
+    reports = run.rglob("evaluations/*/report.json")
+    assert {path: path.stat().st_mtime_ns for path in reports} == written
+    assert len(written) == 2
     values = json.loads((tmp_path / "comparison.json").read_text())
     assert values["pairs"] == []
     check_numbers(tmp_path / "comparison.html", values)

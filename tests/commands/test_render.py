@@ -110,14 +110,14 @@ def names(folder):
 def test_rendering_writes_a_film_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
     assert render.main([str(run_copy), "--episodes", "2"]) == 0
     (folder,) = (run_copy / "videos").iterdir()
-    film = iio.imread(folder / "episodes.mp4", plugin="pyav")
+    film = iio.imread(folder / "episodes-2.mp4", plugin="pyav")
     assert film.shape[1:] == (80, 160, 3)
     assert film.shape[0] > 8
     assert np.abs(film[0].astype(int) - film[5]).mean() > 1  # it moves
-    assert iio.imread(folder / "episodes.gif").shape[1:] == (48, 96, 3)
-    assert iio.imread(folder / "trajectories.png").shape[0] > 400
+    assert iio.imread(folder / "episodes-2.gif").shape[1:] == (48, 96, 3)
+    assert iio.imread(folder / "trajectories-2.png").shape[0] > 400
     shown = capsys.readouterr().out
-    for name in ("episodes.mp4", "episodes.gif", "trajectories.png"):
+    for name in ("episodes-2.mp4", "episodes-2.gif", "trajectories-2.png"):
         assert str(folder / name) in shown
 
 
@@ -215,14 +215,14 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys):
     assert stages.count("episodes, policy: 2") == 3
     assert "           0 steps  0 of 2 goals reached" in shown
     for suffix in ("mp4", "gif", "png"):
-        assert str(run_copy / "videos" / f"gallery.{suffix}") in shown
+        assert str(run_copy / "videos" / f"gallery-2.{suffix}") in shown
 
 
 def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
     rendered = render_gallery(run_copy, episodes=2)
     film = iio.imread(rendered.mp4, plugin="pyav")
     assert film.shape[1:] == (80, 240, 3)
-    assert names(run_copy / "videos") == ["gallery.gif", "gallery.mp4", "gallery.png"]
+    assert names(run_copy / "videos") == ["gallery-2.gif", "gallery-2.mp4", "gallery-2.png"]
     assert iio.imread(rendered.gif).shape[1:] == (60, 180, 3)
     height, width, _ = iio.imread(rendered.plots).shape
     assert width == 3 * height
@@ -247,7 +247,7 @@ def test_without_opengl_one_line_names_the_remedy(monkeypatch, run_copy):
         offscreen.find_backend.cache_clear()
     assert "\n" not in str(caught.value)
     # What needs no OpenGL is there all the same.
-    assert list(run_copy.glob("videos/*/trajectories.png"))
+    assert list(run_copy.glob("videos/*/trajectories-2.png"))
 
 
 def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):

@@ -147,7 +147,7 @@ def test_many_robots_and_a_strip_are_rendered(
         (["--many", "0"], "--many"),
         (["--many", "4", "--goals", "3"], "not allowed with argument"),
         (["--many", "4", "--gallery"], "--many: a gallery shows one robot at a time"),
-        (["--strip", "--goals", "3"], "--strip: only --many goes with it"),
+        (["--strip", "--goals", "3"], "--strip: only --many fits it"),
         (["--strip", "--checkpoint", "last"], "--checkpoint: a strip chooses"),
     ],
 )
