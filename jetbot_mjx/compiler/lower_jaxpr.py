@@ -29,6 +29,7 @@ of robots.
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -255,7 +256,7 @@ class _JaxprLowering:
         def condition(state: list[ScalarArray]) -> Scalar:
             # A loop under `jax.vmap` has a condition for each row, and runs while any is true.
             rows = row_conditions(state)
-            return self._reduce("or", np.bool_(False), {"axes": range(rows.ndim)}, rows).item()
+            return self._reduce_or(None, {"axes": range(rows.ndim)}, rows).item()
 
         def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
             rows = row_conditions(state)
@@ -431,11 +432,8 @@ class _JaxprLowering:
                 result[place] = update if op is None else self._graph.apply(op, old, update)
         return result.reshape(x.shape)
 
-    def _scatter_add(self, equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
-        return self._scatter(equation, params, *operands, op="add")
-
-    def _scatter_mul(self, equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
-        return self._scatter(equation, params, *operands, op="mul")
+    _scatter_add = functools.partialmethod(_scatter, op="add")
+    _scatter_mul = functools.partialmethod(_scatter, op="mul")
 
     # Rules of primitives with arithmetic on more than single elements.
 
@@ -479,7 +477,9 @@ class _JaxprLowering:
     def _rsqrt(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
-    def _reduce(self, op: str, initial: Scalar, params: Any, x: ScalarArray) -> ScalarArray:
+    def _reduce(
+        self, op: str, initial: Scalar, equation: Any, params: Any, x: ScalarArray
+    ) -> ScalarArray:
         axes = tuple(params["axes"])
         free = [axis for axis in range(x.ndim) if axis not in axes]
         shape = [x.shape[axis] for axis in free]
@@ -491,19 +491,16 @@ class _JaxprLowering:
         return results
 
     def _reduce_sum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), params, x)
+        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, params, x)
 
-    def _reduce_and(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("and", np.bool_(True), params, x)
-
-    def _reduce_or(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("or", np.bool_(False), params, x)
+    _reduce_and = functools.partialmethod(_reduce, "and", np.bool_(True))
+    _reduce_or = functools.partialmethod(_reduce, "or", np.bool_(False))
 
     def _reduce_max(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("max", _lowest(equation), params, x)
+        return self._reduce("max", _lowest(equation), equation, params, x)
 
     def _reduce_min(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("min", -_lowest(equation), params, x)
+        return self._reduce("min", -_lowest(equation), equation, params, x)
 
     def _cumsum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         result = np.moveaxis(x.copy(), params["axis"], 0)
@@ -513,12 +510,6 @@ class _JaxprLowering:
             # Assign to a slice: assigned to an element, the array would become a nested object.
             result[i : i + 1] = self._elementwise("add", previous, _at(result, i))[None]
         return np.moveaxis(result, 0, params["axis"])
-
-    def _argmin(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._arg_extreme("lt", equation, params, x)
-
-    def _argmax(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._arg_extreme("gt", equation, params, x)
 
     def _arg_extreme(self, better: str, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         (axis,) = params["axes"]
@@ -532,6 +523,9 @@ class _JaxprLowering:
                 best = self._graph.select(wins, best, scalar)
                 places[row] = self._graph.select(wins, places[row], kind(i))
         return places
+
+    _argmin = functools.partialmethod(_arg_extreme, "lt")
+    _argmax = functools.partialmethod(_arg_extreme, "gt")
 
     def _dot_general(
         self, equation: Any, params: Any, a: ScalarArray, b: ScalarArray

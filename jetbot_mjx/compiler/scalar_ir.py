@@ -9,6 +9,7 @@ Two simplifications hold for finite numbers only: 0·x is 0, and x - x is 0.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -330,30 +331,23 @@ def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
     return None
 
 
-def _simplify_neg(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
-    return x.operands[0] if x.op == "neg" else None
+def _simplify_inverse(op: str) -> Callable[..., Scalar | None]:
+    """Return the simplification of an operation that is its own inverse."""
+    return lambda graph, dtype, x: x.operands[0] if x.op == op else None
 
 
-def _simplify_not(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
-    return x.operands[0] if x.op == "not" else None
+def _simplify_logic(absorbing: bool) -> Callable[..., Scalar | None]:
+    """Return the simplification of `and` or `or`, whose result is `absorbing` if an operand is."""
 
+    def simplify(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+        if x is y:
+            return x
+        for one, other in ((x, y), (y, x)):
+            if dtype == _BOOL and is_constant(one):
+                return np.bool_(absorbing) if one == absorbing else other
+        return None
 
-def _simplify_and(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if x is y:
-        return x
-    for one, other in ((x, y), (y, x)):
-        if dtype == _BOOL and is_constant(one):
-            return other if one else np.bool_(False)
-    return None
-
-
-def _simplify_or(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if x is y:
-        return x
-    for one, other in ((x, y), (y, x)):
-        if dtype == _BOOL and is_constant(one):
-            return np.bool_(True) if one else other
-    return None
+    return simplify
 
 
 def _simplify_xor(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -430,21 +424,17 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
     return graph.select(do("ge", quarter, np.float32(2)), value, do("neg", value))
 
 
-def _simplify_cosine(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
-    return _simplify_sine(graph, dtype, x, ahead=1)
-
-
 _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
     "add": _simplify_add,
-    "and": _simplify_and,
-    "cos": _simplify_cosine,
+    "and": _simplify_logic(absorbing=False),
+    "cos": functools.partial(_simplify_sine, ahead=1),
     "div": _simplify_div,
     "max": _simplify_extreme,
     "min": _simplify_extreme,
     "mul": _simplify_mul,
-    "neg": _simplify_neg,
-    "not": _simplify_not,
-    "or": _simplify_or,
+    "neg": _simplify_inverse("neg"),
+    "not": _simplify_inverse("not"),
+    "or": _simplify_logic(absorbing=True),
     "pow": _simplify_pow,
     "sign": _simplify_sign,
     "sin": _simplify_sine,
