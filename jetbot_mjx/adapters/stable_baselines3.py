@@ -57,15 +57,9 @@ class JetBotVecEnv(AdapterBase, VecEnv):
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         self._attributes: dict[str, list[Any]] = {}
+        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
         self.batch, *spaces = self._construct(
-            lambda config: BatchedEnv(config, num_envs, seed),
-            config,
-            skip_frame,
-            physics_dt,
-            rendering_dt,
-            max_episode_length,
-            headless,
-            render_mode,
+            lambda config: BatchedEnv(config, num_envs, seed), config, *given
         )
         metadata = self.metadata
         super().__init__(self.batch.num_envs, *spaces)

@@ -58,15 +58,9 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
         Raises:
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
+        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
         self.batch, self.single_observation_space, self.single_action_space = self._construct(
-            lambda config: BatchedEnv(config, num_envs, seed),
-            config,
-            skip_frame,
-            physics_dt,
-            rendering_dt,
-            max_episode_length,
-            headless,
-            render_mode,
+            lambda config: BatchedEnv(config, num_envs, seed), config, *given
         )
         self.num_envs = self.batch.num_envs
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
