@@ -68,10 +68,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"video: {gallery.mp4}\ngif:   {gallery.gif}\nplots: {gallery.plots}")
         return 0
     rendered = render_run(
-        options.run,
-        episodes=options.episodes or 20,
-        goals=options.goals,
-        which=options.checkpoint,
+        options.run, episodes=options.episodes or 20, goals=options.goals, which=options.checkpoint
     )
     print(
         f"{rendered.successes} of {rendered.episodes} goals reached\n"

@@ -31,10 +31,7 @@ _INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
 }
-_CONES = {
-    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
-}
+_CONES = {"pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL, "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC}
 _WHOLE_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 _INPUTS = mujoco.mjtState.mjSTATE_CTRL.value | mujoco.mjtState.mjSTATE_MOCAP_POS.value
 
@@ -72,11 +69,7 @@ def training_numerics(physics: PhysicsConfig) -> Numerics:
       physics: the physics section of the run's configuration.
     """
     return Numerics(
-        substeps=physics.n_substeps,
-        integrator="Euler",
-        cone="pyramidal",
-        solref=None,
-        solimp=None,
+        substeps=physics.n_substeps, integrator="Euler", cone="pyramidal", solref=None, solimp=None
     )
 
 

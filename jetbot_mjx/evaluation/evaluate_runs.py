@@ -25,12 +25,7 @@ from jetbot_mjx.evaluation.report import (
     find_failures,
     learning_curve,
 )
-from jetbot_mjx.evaluation.robustness import (
-    SWEEP_GOALS,
-    MujocoEvaluator,
-    MujocoResult,
-    sweep,
-)
+from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, sweep
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.runs.metrics import read_history
 from jetbot_mjx.runs.run_dir import seed_folders, versions

@@ -200,9 +200,7 @@ class Report(NamedTuple):
         }
 
 
-def goal_positions(
-    episodes: Episodes,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def goal_positions(episodes: Episodes) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Compute the distance and bearing of each goal relative to the robot at the start.
 
     Args:
@@ -302,9 +300,7 @@ def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
 
 
 def _goal_bin(
-    limits: tuple[float, float, float, float],
-    won: np.ndarray,
-    seconds: Float[np.ndarray, " n"],
+    limits: tuple[float, float, float, float], won: np.ndarray, seconds: Float[np.ndarray, " n"]
 ) -> GoalBin:
     count, wins = won.size, int(won.sum())
     low, high = wilson_interval(wins, count) if count else (None, None)

@@ -136,8 +136,7 @@ class CheckpointStore:
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
             started = self._manager.save(
-                env_steps,
-                args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)}),
+                env_steps, args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)})
             )
             if not started:
                 raise ValueError(f"there is one after {env_steps} steps or more")

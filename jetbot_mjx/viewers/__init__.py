@@ -12,10 +12,5 @@ if TYPE_CHECKING:
 
 __getattr__, __dir__ = load_lazily(
     __name__,
-    {
-        "Player": "player",
-        "play_live": "live",
-        "render_gallery": "gallery",
-        "render_run": "gallery",
-    },
+    {"Player": "player", "play_live": "live", "render_gallery": "gallery", "render_run": "gallery"},
 )
