@@ -37,6 +37,7 @@ from jetbot_mjx.evaluation.evaluator import (
     GOAL_SET_VERSION,
     Evaluator,
     Summary,
+    json_values,
     policy_controller,
     summarize,
 )
@@ -193,12 +194,7 @@ class MujocoResult(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return the numerics and metrics as JSON values."""
-        numerics = self.numerics._asdict().items()
-        return {
-            "numerics": {k: list(v) if isinstance(v, tuple) else v for k, v in numerics},
-            "policy": self.policy._asdict(),
-            "randomized": self.randomized._asdict() if self.randomized else None,
-        }
+        return json_values(self)
 
 
 class MujocoEvaluator:
@@ -281,7 +277,7 @@ def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
     Returns:
       The parameters with their values, metrics and the range over which the policy is robust.
     """
-    return {
+    values = {
         "goal_set_version": GOAL_SET_VERSION,
         "carries_at": ROBUST_SUCCESS_RATE,
         "goals": results[0].policy[0].episodes,
@@ -289,15 +285,12 @@ def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
             {
                 **result.sweep._asdict(),
                 "nominal": result.sweep.nominal,
-                "carries": _as_list(robust_range(result)),
+                "carries": robust_range(result),
                 "lowest": min(summary.success_rate for summary in result.policy),
-                "policy": [summary._asdict() for summary in result.policy],
-                "scripted": [summary._asdict() for summary in result.scripted],
+                "policy": result.policy,
+                "scripted": result.scripted,
             }
             for result in results
         ],
     }
-
-
-def _as_list(span: tuple[float, float] | None) -> list[float] | None:
-    return None if span is None else list(span)
+    return json_values(values)
