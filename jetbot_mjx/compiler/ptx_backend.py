@@ -19,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jetbot_mjx.compiler.kernel import Kernel
+from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
-from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 
 IMPL = "ptx"
 PLATFORM = "cuda"
@@ -57,19 +57,7 @@ def is_available() -> bool:
         _binding()
     except (ImportError, OSError, RuntimeError, IndexError):
         return False
-    probe = Kernel(
-        scalarize(lambda x: x + 1.0, jax.ShapeDtypeStruct((1,), jnp.float32)),
-        carried=1,
-        steps=1,
-        fallback=lambda x: [x + 1.0],
-    )
-    # Run the probe at once, because the caller may be tracing another function.
-    with jax.ensure_compile_time_eval(), jax.default_device(device):
-        try:
-            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.zeros((2, 1)))
-            return bool((np.asarray(result) == 1.0).all())
-        except jax.errors.JaxRuntimeError:
-            return False
+    return runs_correctly(launch, device, robots=2)
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:

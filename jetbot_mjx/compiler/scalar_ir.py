@@ -24,37 +24,22 @@ Scalar = Any
 """An `Expr`, or a NumPy scalar if the value is a constant."""
 
 
+@dataclasses.dataclass(eq=False, slots=True)
 class Expr:
     """An `Expr` is a scalar whose value is known only when the program runs."""
 
-    __slots__ = ("dtype", "index", "op", "operands", "owner", "place")
-
-    def __init__(
-        self,
-        op: str,
-        operands: tuple[Scalar, ...],
-        dtype: np.dtype,
-        index: int,
-        owner: "Loop | Branch | None" = None,
-        place: int = 0,
-    ) -> None:
-        """Describe one operation.
-
-        Args:
-          op: the operation's name, as in `jax.lax`; `input` is an input of the program, `carry` a
-            value that a loop carries between iterations, `result` a result of a loop or branch.
-          operands: the operation's operands.
-          dtype: the dtype of the result: float32, int32 or bool.
-          index: the position in the order of recording; operands have smaller indices.
-          owner: the loop or branch that a `carry` or `result` belongs to.
-          place: the position of a `carry` or `result` among those of its owner.
-        """
-        self.op = op
-        self.operands = operands
-        self.dtype = dtype
-        self.index = index
-        self.owner = owner
-        self.place = place
+    op: str
+    """Name of the operation, as in `jax.lax`; `input` is an input of the program, `carry` a value
+    that a loop carries between iterations, `result` a result of a loop or branch."""
+    operands: tuple[Scalar, ...]
+    dtype: np.dtype
+    """dtype of the result: float32, int32 or bool."""
+    index: int
+    """Position in the order of recording; operands have smaller indices."""
+    owner: "Loop | Branch | None" = None
+    """The loop or branch that a `carry` or `result` belongs to."""
+    place: int = 0
+    """Position of a `carry` or `result` among those of its owner."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -185,9 +170,10 @@ class ExprGraph:
         operand_dtype = next(x.dtype for x in operands if not is_constant(x))
         if operand_dtype not in (_FLOAT, _INT, _BOOL):
             raise UnsupportedError(f"{op} of {operand_dtype}")
-        simplified = _SIMPLIFY.get(op, _no_simplification)(self, operand_dtype, *operands)
-        if simplified is not None:
-            return simplified
+        if simplify := _SIMPLIFY.get(op):
+            simplified = simplify(self, operand_dtype, *operands)
+            if simplified is not None:
+                return simplified
         dtype = _BOOL if op in COMPARISONS or op == "is_finite" else operand_dtype
         return self._record(op, operands, dtype)
 
@@ -290,10 +276,6 @@ def _are_constant(x: Scalar, *others: Scalar) -> bool:
 
 def _equals(x: Scalar, number: float) -> bool:
     return is_constant(x) and x == number
-
-
-def _no_simplification(graph: ExprGraph, dtype: np.dtype, *operands: Scalar) -> None:
-    return None
 
 
 def _simplify_add(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:

@@ -32,6 +32,7 @@ _COLOURS = {
     "light": ("#ffffff", "#22272e", "#d5dae1", "#1f6fd0 #d9480f #2b8a3e #862e9c #b08900 #0b7285"),
     "dark": ("#161b22", "#d5dbe3", "#363e49", "#5aa2f5 #ff8a4c #5bbd6e #c98be0 #e0b73c #4dbfd0"),
 }
+_FACES = ("figure", "savefig", "axes", "legend")
 _REACHED, _MISSED = "C0", "C1"
 
 _DPI = 160
@@ -45,20 +46,11 @@ def theme(name: Theme) -> Iterator[None]:
     """Set the colours of figures that are drawn inside the context to a light or dark theme."""
     paper, ink, faint, cycle = _COLOURS[name]
     style: Any = {
-        "figure.facecolor": paper,
-        "savefig.facecolor": paper,
-        "axes.facecolor": paper,
-        "legend.facecolor": paper,
-        "legend.edgecolor": faint,
+        **dict.fromkeys((f"{part}.facecolor" for part in _FACES), paper),
+        **dict.fromkeys(("legend.edgecolor", "axes.edgecolor", "grid.color", "hatch.color"), faint),
+        **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), ink),
         "legend.framealpha": 0.85,
-        "text.color": ink,
-        "axes.labelcolor": ink,
-        "axes.edgecolor": faint,
-        "xtick.color": ink,
-        "ytick.color": ink,
-        "grid.color": faint,
         "grid.linewidth": 0.7,
-        "hatch.color": faint,
         "axes.prop_cycle": cycler(color=cycle.split()),
         "axes.spines.top": False,
         "axes.spines.right": False,

@@ -89,7 +89,9 @@ class CheckpointStore:
         options = ocp.CheckpointManagerOptions(
             create=False,
             multiprocessing_options=_single_process_options(),
-            step_name_format=_step_names(),
+            step_name_format=ocp.path.step.standard_name_format(
+                step_format_fixed_length=_STEP_DIGITS
+            ),
             preservation_policy=_PreserveBestAndLatest(keep, self._success),
             cleanup_tmp_directories=True,
             # Orbax moves a checkpoint here before it deletes it.
@@ -398,7 +400,3 @@ def _single_process_options() -> Any:
     return ocp.options.MultiprocessingOptions(
         primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
     )
-
-
-def _step_names() -> ocp.path.step.NameFormat[Any]:
-    return ocp.path.step.standard_name_format(step_format_fixed_length=_STEP_DIGITS)

@@ -27,20 +27,8 @@ from jetbot_mjx.viewers.pose import set_pose
 
 _BACKENDS = ("egl", "osmesa", "glfw")
 
-_UNDECIDED = (
-    "",
-    "0",
-    "1",
-    "disable",
-    "disabled",
-    "enable",
-    "enabled",
-    "false",
-    "off",
-    "on",
-    "true",
-)
-_UNDECIDED += ("cgl", "glx", "wgl")
+_UNDECIDED = ("", "0", "1", "disable", "disabled", "enable", "enabled", "false", "off", "on")
+_UNDECIDED += ("true", "cgl", "glx", "wgl")
 """Other values of `MUJOCO_GL` that MuJoCo accepts; with these, this module chooses."""
 
 _OVERSAMPLING = 2
