@@ -15,24 +15,28 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.wrappers import wrap_for_training
 
+Observations = Float[np.ndarray, "n obs"]
+Rewards = Float[np.ndarray, " n"]
+Flags = Bool[np.ndarray, " n"]
+
 _MOST_ENVS = 2**24
 
 
 class Steps(NamedTuple):
     """One step of every environment. Where an episode ended, `obs` is the next one's first."""
 
-    obs: Float[np.ndarray, "n obs"]
-    reward: Float[np.ndarray, " n"]
-    terminated: Bool[np.ndarray, " n"]
-    truncated: Bool[np.ndarray, " n"]
-    success: Bool[np.ndarray, " n"]
-    nonfinite: Bool[np.ndarray, " n"]
+    obs: Observations
+    reward: Rewards
+    terminated: Flags
+    truncated: Flags
+    success: Flags
+    nonfinite: Flags
     """Where the state was not finite, and the episode was truncated for it."""
-    final_obs: Float[np.ndarray, "n obs"]
+    final_obs: Observations
     """The observation after the step, before any reset; without a reset it equals `obs`."""
 
     @property
-    def done(self) -> Bool[np.ndarray, " n"]:
+    def done(self) -> Flags:
         """Return where an episode ended."""
         return self.terminated | self.truncated
 
@@ -71,7 +75,7 @@ class BatchedEnv:
         self._state: State | None = None
         self._results: tuple[jax.Array, ...] | None = None
 
-    def reset(self, seed: Seed = None) -> Float[np.ndarray, "n obs"]:
+    def reset(self, seed: Seed = None) -> Observations:
         """Begin an episode in every environment.
 
         Args:

@@ -63,15 +63,9 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
           UserError: An argument or setting is wrong, the configuration randomizes the robot, or
             there is no display for a window.
         """
+        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
         self.robot, self.observation_space, self.action_space = self._construct(
-            _single_robot,
-            config,
-            skip_frame,
-            physics_dt,
-            rendering_dt,
-            max_episode_length,
-            headless,
-            render_mode,
+            _single_robot, config, *given
         )
         self._reset_keys = ResetKeys(seed, 1)
         self._next_key = None

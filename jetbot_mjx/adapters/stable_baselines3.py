@@ -4,11 +4,11 @@ from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Source, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
-from jetbot_mjx.adapters.batched_env import BatchedEnv
+from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards
 from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.errors import UserError
 
@@ -57,22 +57,16 @@ class JetBotVecEnv(AdapterBase, VecEnv):
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         self._attributes: dict[str, list[Any]] = {}
+        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
         self.batch, *spaces = self._construct(
-            lambda config: BatchedEnv(config, num_envs, seed),
-            config,
-            skip_frame,
-            physics_dt,
-            rendering_dt,
-            max_episode_length,
-            headless,
-            render_mode,
+            lambda config: BatchedEnv(config, num_envs, seed), config, *given
         )
         metadata = self.metadata
         super().__init__(self.batch.num_envs, *spaces)
         # `VecEnv` leaves nothing but the render mode in it.
         self.metadata = metadata
 
-    def reset(self) -> Float[np.ndarray, "n obs"]:
+    def reset(self) -> Observations:
         """Begin an episode in every environment, with the seeds that `seed` was called with.
 
         Returns:
@@ -98,14 +92,7 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         self._require_reset("step")
         self.batch.start(actions)
 
-    def step_wait(
-        self,
-    ) -> tuple[
-        Float[np.ndarray, "n obs"],
-        Float[np.ndarray, " n"],
-        Bool[np.ndarray, " n"],
-        list[dict[str, Any]],
-    ]:
+    def step_wait(self) -> tuple[Observations, Rewards, Flags, list[dict[str, Any]]]:
         """Wait for the step that `step_async` began.
 
         Returns:

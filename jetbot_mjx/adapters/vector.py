@@ -3,11 +3,11 @@
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Seed, Source, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
-from jetbot_mjx.adapters.batched_env import BatchedEnv
+from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
 
 with requires_extra("gymnasium"):
@@ -58,15 +58,9 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
         Raises:
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
+        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
         self.batch, self.single_observation_space, self.single_action_space = self._construct(
-            lambda config: BatchedEnv(config, num_envs, seed),
-            config,
-            skip_frame,
-            physics_dt,
-            rendering_dt,
-            max_episode_length,
-            headless,
-            render_mode,
+            lambda config: BatchedEnv(config, num_envs, seed), config, *given
         )
         self.num_envs = self.batch.num_envs
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
@@ -74,7 +68,7 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
 
     def reset(
         self, *, seed: Seed = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float[np.ndarray, "n obs"], dict[str, Any]]:
+    ) -> tuple[Observations, dict[str, Any]]:
         """Begin an episode in every environment.
 
         Args:
@@ -94,13 +88,7 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
 
     def step(
         self, actions: Float[np.ndarray, "n 2"]
-    ) -> tuple[
-        Float[np.ndarray, "n obs"],
-        Float[np.ndarray, " n"],
-        Bool[np.ndarray, " n"],
-        Bool[np.ndarray, " n"],
-        dict[str, Any],
-    ]:
+    ) -> tuple[Observations, Rewards, Flags, Flags, dict[str, Any]]:
         """Step every environment.
 
         Args:

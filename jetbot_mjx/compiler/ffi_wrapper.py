@@ -27,58 +27,12 @@ _BLOCKS_PER_THREAD = 4
 _PATIENCE = 1000
 """Number of polls for the other threads, about 20 µs, before a thread yields its core."""
 
-# Flush subnormal numbers to zero on every thread: XLA's threads do so, and others may not.
-_PROCESSORS = {
-    "x86_64": """
-declare void @llvm.x86.sse.stmxcsr(ptr)
-declare void @llvm.x86.sse.ldmxcsr(ptr)
-define internal i64 @begin() {
-  %place = alloca i32
-  call void @llvm.x86.sse.stmxcsr(ptr %place)
-  %before = load i32, ptr %place
-  %flushing = or i32 %before, 32832
-  store i32 %flushing, ptr %place
-  call void @llvm.x86.sse.ldmxcsr(ptr %place)
-  %wide = zext i32 %before to i64
-  ret i64 %wide
-}
-define internal void @end(i64 %before) {
-  %place = alloca i32
-  %narrow = trunc i64 %before to i32
-  store i32 %narrow, ptr %place
-  call void @llvm.x86.sse.ldmxcsr(ptr %place)
-  ret void
-}
-declare void @llvm.x86.sse2.pause()
-define internal void @relax() {
-  call void @llvm.x86.sse2.pause()
-  ret void
-}
-""",
-    "aarch64": """
-declare i64 @llvm.aarch64.get.fpcr()
-declare void @llvm.aarch64.set.fpcr(i64)
-define internal i64 @begin() {
-  %before = call i64 @llvm.aarch64.get.fpcr()
-  %flushing = or i64 %before, 16777216
-  call void @llvm.aarch64.set.fpcr(i64 %flushing)
-  ret i64 %before
-}
-define internal void @end(i64 %before) {
-  call void @llvm.aarch64.set.fpcr(i64 %before)
-  ret void
-}
-declare void @llvm.aarch64.hint(i32)
-define internal void @relax() {
-  call void @llvm.aarch64.hint(i32 1)
-  ret void
-}
-""",
-}
-MACHINES = tuple(_PROCESSORS)
+_ASSETS = resources.files("jetbot_mjx").joinpath("assets")
+
+MACHINES = ("x86_64", "aarch64")
 """Processors that a kernel can be written for."""
 
-TEXT = resources.files("jetbot_mjx").joinpath("assets/xla_call.ll").read_text("utf-8")
+TEXT = _ASSETS.joinpath("xla_call.ll").read_text("utf-8")
 """Template of all kernels."""
 
 
@@ -127,7 +81,8 @@ def kernel_text(
         "steps": steps,
         "writes": "\n  ".join(_writes(sizes[:carried], len(sizes), lanes)),
     }
-    return _PROCESSORS[machine] + step + Template(TEXT).substitute(values)
+    processor = _ASSETS.joinpath(f"xla_call.{machine}.ll").read_text("utf-8")
+    return processor + step + Template(TEXT).substitute(values)
 
 
 def _address(i: int) -> str:

@@ -119,10 +119,6 @@ def _fill_value(equation: Any) -> float:
     return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
 
 
-def _copy(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-    return x
-
-
 def _reshape(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
     return x.reshape(shape_of(equation.outvars[0]))
 
@@ -140,33 +136,9 @@ def _broadcast_in_dim(equation: Any, params: Any, x: ScalarArray) -> ScalarArray
     return np.broadcast_to(x.reshape(shape), params["shape"])
 
 
-def _transpose(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-    return x.transpose(params["permutation"])
-
-
-def _rev(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-    return np.flip(x, params["dimensions"])
-
-
-def _tile(equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-    return np.tile(x, params["reps"])
-
-
-def _concatenate(equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
-    return np.concatenate(operands, params["dimension"])
-
-
-def _stack(equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
-    return np.stack(operands, params["axis"])
-
-
 def _unstack(equation: Any, params: Any, x: ScalarArray) -> list[ScalarArray]:
     parts = np.split(x, x.shape[params["axis"]], params["axis"])
     return [part.reshape(shape_of(equation.outvars[0])) for part in parts]
-
-
-def _split(equation: Any, params: Any, x: ScalarArray) -> list[ScalarArray]:
-    return np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"])
 
 
 def _pad(equation: Any, params: Any, x: ScalarArray, padding: ScalarArray) -> ScalarArray:
@@ -220,23 +192,25 @@ def _sort(equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArra
 
 RULES: dict[str, Callable[..., Any]] = {
     "broadcast_in_dim": _broadcast_in_dim,
-    "concatenate": _concatenate,
-    "copy": _copy,
+    "concatenate": lambda equation, params, *xs: np.concatenate(xs, params["dimension"]),
+    "copy": lambda equation, params, x: x,
     "empty": _empty,
     "expand_dims": _reshape,
     "gather": _gather,
     "iota": _iota,
     "pad": _pad,
     "reshape": _reshape,
-    "rev": _rev,
+    "rev": lambda equation, params, x: np.flip(x, params["dimensions"]),
     "slice": _slice,
     "sort": _sort,
-    "split": _split,
+    "split": lambda equation, params, x: np.split(
+        x, np.cumsum(params["sizes"])[:-1], params["axis"]
+    ),
     "squeeze": _reshape,
-    "stack": _stack,
-    "stop_gradient": _copy,
-    "tile": _tile,
-    "transpose": _transpose,
+    "stack": lambda equation, params, *xs: np.stack(xs, params["axis"]),
+    "stop_gradient": lambda equation, params, x: x,
+    "tile": lambda equation, params, x: np.tile(x, params["reps"]),
+    "transpose": lambda equation, params, x: x.transpose(params["permutation"]),
     "unstack": _unstack,
 }
 """Lowering rules of operations that only rearrange scalars, by the name of the JAX primitive.

@@ -17,6 +17,7 @@ Protocol: JAX sees the kernel as a primitive.
 """
 
 import contextlib
+import dataclasses
 import functools
 import hashlib
 import math
@@ -33,7 +34,7 @@ from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, PyTree
 
-from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
 from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
 from jetbot_mjx.errors import UserError
 
@@ -41,40 +42,28 @@ Step = Callable[[PyTree, PyTree], PyTree]
 """A function of (carry, consts) that returns the carry some steps later."""
 
 
+@dataclasses.dataclass(eq=False)
 class Kernel:
     """A `Kernel` holds a step of one robot that a back end can run for many robots.
 
-    Kernels are compared by identity.
+    Its results replace its first arguments. Kernels are compared by identity.
     """
 
-    def __init__(
-        self,
-        program: ScalarProgram,
-        *,
-        carried: int,
-        steps: int,
-        fallback: Callable[..., list[Array]],
-        impl: str = "auto",
-    ) -> None:
-        """Describe a kernel that repeats a step; its results replace its first arguments.
-
-        Args:
-          program: the step; its results have the shapes of its first `carried` arguments.
-          carried: the number of argument leaves that are carried from step to step.
-          steps: the number of steps.
-          fallback: the same computation in JAX, as a function of all leaves of one robot, for
-            platforms without a back end.
-          impl: the name of the back end that must run the kernel; `auto` takes the back end of the
-            platform, or the fallback if there is none.
-        """
-        self.program = program
-        self.carried = carried
-        self.steps = steps
-        self.fallback = fallback
-        self.impl = impl
-        self._texts: dict[str, str] = {}
-        # Programs are lowered in several threads.
-        self._lock = threading.Lock()
+    program: ScalarProgram
+    """The step; its results have the shapes of its first `carried` arguments."""
+    carried: int
+    """Number of argument leaves that are carried from step to step."""
+    steps: int
+    """Number of steps."""
+    fallback: Callable[..., list[Array]]
+    """The same computation in JAX, as a function of all leaves of one robot, for platforms without
+    a back end."""
+    impl: str = "auto"
+    """Name of the back end that must run the kernel; `auto` takes the back end of the platform, or
+    the fallback if there is none."""
+    _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
+    # Programs are lowered in several threads.
+    _lock: Any = dataclasses.field(default_factory=threading.Lock, init=False)
 
     def text(self, name: str, write: Callable[[], str]) -> str:
         """Return the text that is cached under a name; call `write` for it on first use."""
@@ -202,6 +191,32 @@ def _differentiate(primals: Any, tangents: Any, *, kernel: Kernel) -> Any:
 
 
 ad.primitive_jvps[_kernel_p] = _differentiate
+
+
+def runs_correctly(
+    launch: Callable[[Kernel, Sequence[Array]], list[Array]], device: Any, robots: int
+) -> bool:
+    """Return whether a back end runs a small kernel correctly.
+
+    Args:
+      launch: the back end's function.
+      device: the device to run on.
+      robots: the number of robots.
+    """
+    probe = Kernel(
+        scalarize(lambda x: 2.0 * x + 1.0, jax.ShapeDtypeStruct((2,), jnp.float32)),
+        carried=1,
+        steps=2,
+        fallback=lambda x: [4.0 * x + 3.0],
+    )
+    values = np.arange(2 * robots, dtype=np.float32).reshape(-1, 2)
+    # Run the probe at once, because the caller may be tracing another function.
+    with jax.ensure_compile_time_eval(), jax.default_device(device):
+        try:
+            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(values))
+        except jax.errors.JaxRuntimeError:
+            return False
+        return bool((np.asarray(result) == 4 * values + 3).all())
 
 
 def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:

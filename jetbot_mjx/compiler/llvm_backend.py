@@ -16,12 +16,10 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.compiler import ffi_wrapper, llvm_codegen
-from jetbot_mjx.compiler.kernel import Kernel, cached_bytes
-from jetbot_mjx.compiler.lower_jaxpr import scalarize
+from jetbot_mjx.compiler.kernel import Kernel, cached_bytes, runs_correctly
 
 IMPL = "llvm"
 PLATFORM = "cpu"
@@ -68,22 +66,8 @@ def is_available() -> bool:
         # llvmlite is missing or does not know this processor, the C library lacks a function, or
         # JAX_PLATFORMS leaves out the CPU.
         return False
-    if host.machine not in ffi_wrapper.MACHINES:
-        return False
-    probe = Kernel(
-        scalarize(lambda x: 2.0 * x + 1.0, jax.ShapeDtypeStruct((2,), jnp.float32)),
-        carried=1,
-        steps=2,
-        fallback=lambda x: [4.0 * x + 3.0],
-    )
-    values = np.arange(4 * host.lanes + 2, dtype=np.float32).reshape(-1, 2)
-    # Run the probe at once, because the caller may be tracing another function.
-    with jax.ensure_compile_time_eval(), jax.default_device(device):
-        try:
-            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(values))
-        except jax.errors.JaxRuntimeError:
-            return False
-        return bool((np.asarray(result) == 4 * values + 3).all())
+    known = host.machine in ffi_wrapper.MACHINES
+    return known and runs_correctly(launch, device, robots=2 * host.lanes + 1)
 
 
 def kernel_text(kernel: Kernel) -> str:

@@ -24,11 +24,12 @@ Protocol, in the order in which a function passes through the package:
 
 Arguments for this protocol: the operations and their order are those of the function, so results
 differ from JAX's by round-off only, as long as all numbers are finite. The lowering knows nothing
-of robots, and `ScalarProgram.evaluate` runs any program in NumPy as a reference for the back ends.
+of robots.
 """
 
 import contextlib
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -48,16 +49,14 @@ from jetbot_mjx.compiler.indexing import (
 )
 from jetbot_mjx.compiler.scalar_ir import (
     EVALUATE,
-    Expr,
     ExprGraph,
     Loop,
     Scalar,
     UnsupportedError,
-    convert_constant,
     is_constant,
     is_same,
 )
-from jetbot_mjx.compiler.schedule import Block, PlacedBranch, PlacedLoop, schedule
+from jetbot_mjx.compiler.schedule import Block, schedule
 
 MAX_UNROLLED_TRIPS = 64
 """Largest number of iterations of a loop that is unrolled."""
@@ -87,88 +86,6 @@ class ScalarProgram:
     def size(self) -> int:
         """Return the number of recorded operations."""
         return sum(1 for _ in self.block.values())
-
-    def evaluate(self, leaves: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Run the program in NumPy.
-
-        Args:
-          leaves: the leaves of the arguments, each with the same leading batch axes.
-
-        Returns:
-          The leaves of the result, with the same batch axes.
-        """
-        batch = leaves[0].shape[: leaves[0].ndim - self.inputs[0].ndim]
-        run = _Evaluation(batch)
-        for array, leaf in zip(self.inputs, leaves, strict=True):
-            columns = leaf.reshape(*batch, array.size)
-            run.values |= {x.index: columns[..., i] for i, x in enumerate(array.ravel())}
-        with np.errstate(all="ignore"):
-            run.block(self.block)
-        return [
-            np.stack([run.look_up(x) for x in array.ravel()], -1).reshape(*batch, *array.shape)
-            for array in self.outputs
-        ]
-
-
-class _Evaluation:
-    """An `_Evaluation` holds the values of a program that runs in NumPy for a batch of robots."""
-
-    def __init__(self, batch: tuple[int, ...]) -> None:
-        self._batch = batch
-        # The robots that execute the current block; the values of the others are arbitrary.
-        self._mask = np.ones(batch, bool)
-        self.values: dict[int, np.ndarray] = {}
-
-    def look_up(self, x: Scalar) -> np.ndarray:
-        return np.broadcast_to(x, self._batch) if is_constant(x) else self.values[x.index]
-
-    def block(self, block: Block) -> None:
-        for item in block.items:
-            if isinstance(item, PlacedLoop):
-                self._loop(item)
-            elif isinstance(item, PlacedBranch):
-                self._branch(item)
-            else:
-                self.values[item.index] = self._operation(item)
-
-    def _masked_block(self, block: Block, mask: np.ndarray) -> None:
-        enclosing, self._mask = self._mask, mask
-        self.block(block)
-        self._mask = enclosing
-
-    def _operation(self, value: Expr) -> np.ndarray:
-        operands = [self.look_up(x) for x in value.operands]
-        if value.op == "select":
-            return np.where(operands[0], operands[2], operands[1])
-        if value.op == "convert":
-            return convert_constant(operands[0], value.dtype)
-        return EVALUATE[value.op](*operands)
-
-    def _loop(self, item: PlacedLoop) -> None:
-        loop = item.loop
-        state = [self.look_up(loop.initial[place]) for place in item.places]
-        active = self._mask
-        while True:
-            for place, value in zip(item.places, state, strict=True):
-                self.values[loop.carries[place].index] = value
-            self.block(item.head)
-            active = active & self.look_up(loop.condition)
-            if not active.any():
-                break
-            self._masked_block(item.body, active)
-            updated = [self.look_up(loop.updated[place]) for place in item.places]
-            state = [np.where(active, b, a) for a, b in zip(state, updated, strict=True)]
-        for result in item.results:
-            self.values[result.index] = self.look_up(loop.results[result.place])
-
-    def _branch(self, item: PlacedBranch) -> None:
-        branch = item.branch
-        condition = self.look_up(branch.condition)
-        self._masked_block(item.if_false, ~condition & self._mask)
-        self._masked_block(item.if_true, condition & self._mask)
-        for result in item.results:
-            sides = [self.look_up(side[result.place]) for side in (branch.if_true, branch.if_false)]
-            self.values[result.index] = np.where(condition, *sides)
 
 
 def scalarize(function: Callable[..., Any], *arguments: Any) -> ScalarProgram:
@@ -339,7 +256,7 @@ class _JaxprLowering:
         def condition(state: list[ScalarArray]) -> Scalar:
             # A loop under `jax.vmap` has a condition for each row, and runs while any is true.
             rows = row_conditions(state)
-            return self._reduce("or", np.bool_(False), {"axes": range(rows.ndim)}, rows).item()
+            return self._reduce_or(None, {"axes": range(rows.ndim)}, rows).item()
 
         def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
             rows = row_conditions(state)
@@ -515,11 +432,8 @@ class _JaxprLowering:
                 result[place] = update if op is None else self._graph.apply(op, old, update)
         return result.reshape(x.shape)
 
-    def _scatter_add(self, equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
-        return self._scatter(equation, params, *operands, op="add")
-
-    def _scatter_mul(self, equation: Any, params: Any, *operands: ScalarArray) -> ScalarArray:
-        return self._scatter(equation, params, *operands, op="mul")
+    _scatter_add = functools.partialmethod(_scatter, op="add")
+    _scatter_mul = functools.partialmethod(_scatter, op="mul")
 
     # Rules of primitives with arithmetic on more than single elements.
 
@@ -563,7 +477,9 @@ class _JaxprLowering:
     def _rsqrt(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
-    def _reduce(self, op: str, initial: Scalar, params: Any, x: ScalarArray) -> ScalarArray:
+    def _reduce(
+        self, op: str, initial: Scalar, equation: Any, params: Any, x: ScalarArray
+    ) -> ScalarArray:
         axes = tuple(params["axes"])
         free = [axis for axis in range(x.ndim) if axis not in axes]
         shape = [x.shape[axis] for axis in free]
@@ -575,19 +491,16 @@ class _JaxprLowering:
         return results
 
     def _reduce_sum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), params, x)
+        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, params, x)
 
-    def _reduce_and(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("and", np.bool_(True), params, x)
-
-    def _reduce_or(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("or", np.bool_(False), params, x)
+    _reduce_and = functools.partialmethod(_reduce, "and", np.bool_(True))
+    _reduce_or = functools.partialmethod(_reduce, "or", np.bool_(False))
 
     def _reduce_max(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("max", _lowest(equation), params, x)
+        return self._reduce("max", _lowest(equation), equation, params, x)
 
     def _reduce_min(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("min", -_lowest(equation), params, x)
+        return self._reduce("min", -_lowest(equation), equation, params, x)
 
     def _cumsum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         result = np.moveaxis(x.copy(), params["axis"], 0)
@@ -597,12 +510,6 @@ class _JaxprLowering:
             # Assign to a slice: assigned to an element, the array would become a nested object.
             result[i : i + 1] = self._elementwise("add", previous, _at(result, i))[None]
         return np.moveaxis(result, 0, params["axis"])
-
-    def _argmin(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._arg_extreme("lt", equation, params, x)
-
-    def _argmax(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._arg_extreme("gt", equation, params, x)
 
     def _arg_extreme(self, better: str, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
         (axis,) = params["axes"]
@@ -616,6 +523,9 @@ class _JaxprLowering:
                 best = self._graph.select(wins, best, scalar)
                 places[row] = self._graph.select(wins, places[row], kind(i))
         return places
+
+    _argmin = functools.partialmethod(_arg_extreme, "lt")
+    _argmax = functools.partialmethod(_arg_extreme, "gt")
 
     def _dot_general(
         self, equation: Any, params: Any, a: ScalarArray, b: ScalarArray

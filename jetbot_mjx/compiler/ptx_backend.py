@@ -10,6 +10,8 @@ import functools
 import importlib
 import math
 from collections.abc import Sequence
+from importlib import resources
+from string import Template
 from typing import Any
 
 import jax
@@ -17,9 +19,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jetbot_mjx.compiler.kernel import Kernel
+from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
-from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 
 IMPL = "ptx"
 PLATFORM = "cuda"
@@ -32,6 +34,9 @@ _MIN_THREADS = 32
 
 _BLOCKS = 128
 """Number of blocks above which blocks grow: a GPU has about as many multiprocessors."""
+
+_TEXT = resources.files("jetbot_mjx").joinpath("assets/ptx_kernel.ll").read_text("utf-8")
+"""Template of all kernels."""
 
 _NAME = "physics"
 _TARGET = "__gpu$xla.gpu.ptx"
@@ -52,19 +57,7 @@ def is_available() -> bool:
         _binding()
     except (ImportError, OSError, RuntimeError, IndexError):
         return False
-    probe = Kernel(
-        scalarize(lambda x: x + 1.0, jax.ShapeDtypeStruct((1,), jnp.float32)),
-        carried=1,
-        steps=1,
-        fallback=lambda x: [x + 1.0],
-    )
-    # Run the probe at once, because the caller may be tracing another function.
-    with jax.ensure_compile_time_eval(), jax.default_device(device):
-        try:
-            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.zeros((2, 1)))
-            return bool((np.asarray(result) == 1.0).all())
-        except jax.errors.JaxRuntimeError:
-            return False
+    return runs_correctly(launch, device, robots=2)
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
@@ -146,72 +139,26 @@ def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
     carried_scalars = sum(sizes[:carried])
     now = [f"%now{i}" for i in range(carried_scalars)]
     results = emitter.step([*now, *arguments[carried_scalars:]])[:carried_scalars]
-    # Write the loop over the steps around it, whose carries begin with the arguments.
+    # Insert it into the loop over the steps, whose carries begin with the arguments.
     end = emitter.label
     carries = [
         f"{name} = phi float [{before}, %load], [{after}, %{end}]"
         for name, before, after in zip(now, arguments, results, strict=False)
     ]
-    parameters = ", ".join(f"ptr addrspace(1) %a{i}" for i in range(len(sizes) + carried))
-    lines = [
-        *emitter.declarations(),
-        *_PTX_DECLARATIONS,
-        f"define ptx_kernel void @{_NAME}({parameters}) {{",
-        *_SELECT_ROBOT,
-        *_transfers(sizes, "load"),
-        "br label %steps",
-        "steps:",
-        f"%count = phi i32 [0, %load], [%count.next, %{end}]",
-        *carries,
-        # Without this barrier, threads whose loops make different numbers of iterations drift apart
-        # until their instructions no longer fit into the cache: 540 instead of 760 M steps/s.
-        "call void @llvm.nvvm.barrier0()",
-        *emitter.lines,
-        "%count.next = add i32 %count, 1",
-        f"%again = icmp ult i32 %count.next, {steps}",
-        "br i1 %again, label %steps, label %end",
-        "end:",
-        "br i1 %is.there, label %store, label %done",
-        "store:",
-        *_transfers(sizes[:carried], "store", len(sizes), results),
-        *_RETURN,
-    ]
-    return "\n".join(lines) + "\n"
-
-
-_PTX_DECLARATIONS = (
-    "declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
-    "declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
-    "declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()",
-    "declare void @llvm.nvvm.barrier0()",
-)
-
-# Threads beyond the last robot step the last robot too, without storing it: so no thread of a warp
-# leaves early.
-_SELECT_ROBOT = (
-    "entry:",
-    "%thread = call i32 @llvm.nvvm.read.ptx.sreg.tid.x()",
-    "%block = call i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()",
-    "%threads = call i32 @llvm.nvvm.read.ptx.sreg.ntid.x()",
-    "%before = mul i32 %block, %threads",
-    "%wanted = add i32 %before, %thread",
-    f'%robots = call i32 asm "mov.u32 $0, {_ROBOTS};", "=r"()',
-    "%is.there = icmp ult i32 %wanted, %robots",
-    "%last = sub i32 %robots, 1",
-    "%robot = select i1 %is.there, i32 %wanted, i32 %last",
-    "br label %load",
-    "load:",
-    "%wide = zext i32 %robot to i64",
-)
-
-_RETURN = (
-    "br label %done",
-    "done:",
-    "ret void",
-    "}",
-    "!nvvm.annotations = !{!0}",
-    f'!0 = !{{ptr @{_NAME}, !"maxntidx", i32 {_MAX_THREADS}}}',
-)
+    values = {
+        "carries": "\n  ".join(carries),
+        "declarations": "\n".join(emitter.declarations()),
+        "end": end,
+        "loads": "\n  ".join(_transfers(sizes, "load")),
+        "max_threads": _MAX_THREADS,
+        "name": _NAME,
+        "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(len(sizes) + carried)),
+        "robots": _ROBOTS,
+        "step": "\n  ".join(emitter.lines),
+        "steps": steps,
+        "stores": "\n  ".join(_transfers(sizes[:carried], "store", len(sizes), results)),
+    }
+    return Template(_TEXT).substitute(values)
 
 
 def _transfers(

@@ -9,6 +9,7 @@ Two simplifications hold for finite numbers only: 0·x is 0, and x - x is 0.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,37 +24,22 @@ Scalar = Any
 """An `Expr`, or a NumPy scalar if the value is a constant."""
 
 
+@dataclasses.dataclass(eq=False, slots=True)
 class Expr:
     """An `Expr` is a scalar whose value is known only when the program runs."""
 
-    __slots__ = ("dtype", "index", "op", "operands", "owner", "place")
-
-    def __init__(
-        self,
-        op: str,
-        operands: tuple[Scalar, ...],
-        dtype: np.dtype,
-        index: int,
-        owner: "Loop | Branch | None" = None,
-        place: int = 0,
-    ) -> None:
-        """Describe one operation.
-
-        Args:
-          op: the operation's name, as in `jax.lax`; `input` is an input of the program, `carry` a
-            value that a loop carries between iterations, `result` a result of a loop or branch.
-          operands: the operation's operands.
-          dtype: the dtype of the result: float32, int32 or bool.
-          index: the position in the order of recording; operands have smaller indices.
-          owner: the loop or branch that a `carry` or `result` belongs to.
-          place: the position of a `carry` or `result` among those of its owner.
-        """
-        self.op = op
-        self.operands = operands
-        self.dtype = dtype
-        self.index = index
-        self.owner = owner
-        self.place = place
+    op: str
+    """Name of the operation, as in `jax.lax`; `input` is an input of the program, `carry` a value
+    that a loop carries between iterations, `result` a result of a loop or branch."""
+    operands: tuple[Scalar, ...]
+    dtype: np.dtype
+    """dtype of the result: float32, int32 or bool."""
+    index: int
+    """Position in the order of recording; operands have smaller indices."""
+    owner: "Loop | Branch | None" = None
+    """The loop or branch that a `carry` or `result` belongs to."""
+    place: int = 0
+    """Position of a `carry` or `result` among those of its owner."""
 
 
 @dataclasses.dataclass(eq=False)
@@ -184,9 +170,10 @@ class ExprGraph:
         operand_dtype = next(x.dtype for x in operands if not is_constant(x))
         if operand_dtype not in (_FLOAT, _INT, _BOOL):
             raise UnsupportedError(f"{op} of {operand_dtype}")
-        simplified = _SIMPLIFY.get(op, _no_simplification)(self, operand_dtype, *operands)
-        if simplified is not None:
-            return simplified
+        if simplify := _SIMPLIFY.get(op):
+            simplified = simplify(self, operand_dtype, *operands)
+            if simplified is not None:
+                return simplified
         dtype = _BOOL if op in COMPARISONS or op == "is_finite" else operand_dtype
         return self._record(op, operands, dtype)
 
@@ -291,10 +278,6 @@ def _equals(x: Scalar, number: float) -> bool:
     return is_constant(x) and x == number
 
 
-def _no_simplification(graph: ExprGraph, dtype: np.dtype, *operands: Scalar) -> None:
-    return None
-
-
 def _simplify_add(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     if _equals(x, 0):
         return y
@@ -330,30 +313,23 @@ def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
     return None
 
 
-def _simplify_neg(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
-    return x.operands[0] if x.op == "neg" else None
+def _simplify_inverse(op: str) -> Callable[..., Scalar | None]:
+    """Return the simplification of an operation that is its own inverse."""
+    return lambda graph, dtype, x: x.operands[0] if x.op == op else None
 
 
-def _simplify_not(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
-    return x.operands[0] if x.op == "not" else None
+def _simplify_logic(absorbing: bool) -> Callable[..., Scalar | None]:
+    """Return the simplification of `and` or `or`, whose result is `absorbing` if an operand is."""
 
+    def simplify(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+        if x is y:
+            return x
+        for one, other in ((x, y), (y, x)):
+            if dtype == _BOOL and is_constant(one):
+                return np.bool_(absorbing) if one == absorbing else other
+        return None
 
-def _simplify_and(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if x is y:
-        return x
-    for one, other in ((x, y), (y, x)):
-        if dtype == _BOOL and is_constant(one):
-            return other if one else np.bool_(False)
-    return None
-
-
-def _simplify_or(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if x is y:
-        return x
-    for one, other in ((x, y), (y, x)):
-        if dtype == _BOOL and is_constant(one):
-            return np.bool_(True) if one else other
-    return None
+    return simplify
 
 
 def _simplify_xor(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -430,21 +406,17 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
     return graph.select(do("ge", quarter, np.float32(2)), value, do("neg", value))
 
 
-def _simplify_cosine(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
-    return _simplify_sine(graph, dtype, x, ahead=1)
-
-
 _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
     "add": _simplify_add,
-    "and": _simplify_and,
-    "cos": _simplify_cosine,
+    "and": _simplify_logic(absorbing=False),
+    "cos": functools.partial(_simplify_sine, ahead=1),
     "div": _simplify_div,
     "max": _simplify_extreme,
     "min": _simplify_extreme,
     "mul": _simplify_mul,
-    "neg": _simplify_neg,
-    "not": _simplify_not,
-    "or": _simplify_or,
+    "neg": _simplify_inverse("neg"),
+    "not": _simplify_inverse("not"),
+    "or": _simplify_logic(absorbing=True),
     "pow": _simplify_pow,
     "sign": _simplify_sign,
     "sin": _simplify_sine,

@@ -59,10 +59,14 @@ def default_device_cpu() -> Iterator[Any]:
     Yields:
       JAX's device of the host CPU.
     """
-    try:
-        device = jax.local_devices(backend="cpu")[0]
-    except RuntimeError:
-        # JAX_PLATFORMS leaves out the CPU: use the default device instead.
-        device = jax.local_devices()[0]
+    device = host_cpu()
     with jax.default_device(device):
         yield device
+
+
+def host_cpu() -> Any:
+    """Return JAX's device of the host CPU, or the default device if `JAX_PLATFORMS` excludes it."""
+    try:
+        return jax.local_devices(backend="cpu")[0]
+    except RuntimeError:
+        return jax.local_devices()[0]

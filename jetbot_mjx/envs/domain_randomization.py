@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.envs import Wrapper
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx.config import RandomizationConfig
 from jetbot_mjx.envs import kinematics
@@ -159,9 +159,9 @@ class DomainRandomizationWrapper(Wrapper):
             motors, command, robot_params, full_speed=self._full_speed, ctrl_dt=self.env.dt
         )
         state = self._env_of(robot_params).step_with_ctrl(state, action, ctrl)
-        sensors, measured = step_sensors(
-            sensors, robot_state(state.pipeline_state), robot_params, self._step_count(state)
-        )
+        robot = robot_state(state.pipeline_state)
+        count = jnp.round(state.pipeline_state.time / self.env.dt).astype(jnp.int32)
+        sensors, measured = step_sensors(sensors, robot, robot_params, count)
         return state.replace(
             obs=self.env.task.observe(measured, state.goal),
             episode_params=EpisodeParams(drawn, motors, sensors),
@@ -177,9 +177,6 @@ class DomainRandomizationWrapper(Wrapper):
         if robot_params.differs(*_MODEL):
             model = vary_model(model, self.env.mj_model, robot_params)
         return self.env if model is self.env.mjx_model else self.env.with_model(model)
-
-    def _step_count(self, state: State) -> Int[Array, ""]:
-        return jnp.round(state.pipeline_state.time / self.env.dt).astype(jnp.int32)
 
 
 def _at_start_pose(physics: PhysicsState, robot_params: RobotParams) -> PhysicsState:

@@ -254,9 +254,7 @@ class JetBotEnv(brax.envs.Env):
           Wheel speed targets (left, right) [rad/s].
         """
         twist_b = kinematics.twist_from_action(
-            action,
-            max_speed=self.config.task.max_speed,
-            max_yaw_rate=self.config.task.max_yaw_rate,
+            action, max_speed=self.config.task.max_speed, max_yaw_rate=self.config.task.max_yaw_rate
         )
         return kinematics.wheel_speeds(
             twist_b,

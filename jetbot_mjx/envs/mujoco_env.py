@@ -85,7 +85,7 @@ class MujocoJetBot:
         # Views of MuJoCo's arrays.
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._mocap_pos: Float[np.ndarray, "nmocap 3"] = self.data.mocap_pos.copy()
-        self._before = self._pose()
+        self._before = np.concatenate((self._qpos, self._qvel), dtype=np.float32)
         self._obs = np.zeros(self.env.observation_size, np.float32)
 
     def reset(
@@ -163,9 +163,6 @@ class MujocoJetBot:
         self.data.mocap_pos[:] = self._mocap_pos
         self.data.time = time
         self.data.warning.number[_NONFINITE_WARNINGS] = 1
-
-    def _pose(self) -> Float[np.ndarray, " nq+nv"]:
-        return np.concatenate((self._qpos, self._qvel), dtype=np.float32)
 
 
 @functools.lru_cache(maxsize=8)

@@ -27,14 +27,6 @@ from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
 
-_INTEGRATORS = {
-    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
-    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
-}
-_CONES = {
-    "pyramidal": mujoco.mjtCone.mjCONE_PYRAMIDAL,
-    "elliptic": mujoco.mjtCone.mjCONE_ELLIPTIC,
-}
 _WHOLE_STATE = mujoco.mjtState.mjSTATE_FULLPHYSICS.value
 _INPUTS = mujoco.mjtState.mjSTATE_CTRL.value | mujoco.mjtState.mjSTATE_MOCAP_POS.value
 
@@ -72,11 +64,7 @@ def training_numerics(physics: PhysicsConfig) -> Numerics:
       physics: the physics section of the run's configuration.
     """
     return Numerics(
-        substeps=physics.n_substeps,
-        integrator="Euler",
-        cone="pyramidal",
-        solref=None,
-        solimp=None,
+        substeps=physics.n_substeps, integrator="Euler", cone="pyramidal", solref=None, solimp=None
     )
 
 
@@ -130,8 +118,8 @@ def make_model(env: JetBotEnv, numerics: Numerics) -> mujoco.MjModel:
     )
     option = model.opt
     option.timestep = env.dt / numerics.substeps
-    option.integrator = _INTEGRATORS[numerics.integrator]
-    option.cone = _CONES[numerics.cone]
+    option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{numerics.integrator.upper()}")
+    option.cone = getattr(mujoco.mjtCone, f"mjCONE_{numerics.cone.upper()}")
     option.iterations, option.ls_iterations = numerics.iterations, numerics.ls_iterations
     option.tolerance = numerics.tolerance
     if numerics.solref is not None:

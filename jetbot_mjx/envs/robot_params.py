@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jetbot_mjx.envs import mjx
 
@@ -195,11 +195,8 @@ def _invweights(
     shift = _com_shift(robot_params)
     varied = model.body_invweight0.at[np.asarray(bodies)].set(weights(robot_params.mass, shift))
     # Bit-identical to the preset where mass and centre of mass are those of the preset.
-    return jnp.where(_is_preset(robot_params, shift), model.body_invweight0, varied)
-
-
-def _is_preset(robot_params: RobotParams, shift: Float[Array, "3"]) -> Bool[Array, ""]:
-    return (jnp.asarray(robot_params.mass) == 1.0) & (shift == 0.0).all()
+    is_preset = (jnp.asarray(robot_params.mass) == 1.0) & (shift == 0.0).all()
+    return jnp.where(is_preset, model.body_invweight0, varied)
 
 
 def _inverse(a: Float[Array, "3 3"]) -> Float[Array, "3 3"]:

@@ -136,11 +136,7 @@ class EpisodeWrapper(Wrapper):
             "steps": zero,
             "truncation": zero,
             "episode_done": zero,
-            "episode_metrics": {
-                "sum_reward": zero,
-                "length": zero,
-                **dict.fromkeys(metrics, zero),
-            },
+            "episode_metrics": {"sum_reward": zero, "length": zero, **dict.fromkeys(metrics, zero)},
             "final_obs": state.obs,
         }
         return state.replace(metrics=metrics, info=info)

@@ -28,7 +28,7 @@ from jetbot_mjx.evaluation.bootstrap import (
     median_estimate,
     probability_of_improvement,
 )
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary
+from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary, json_values
 from jetbot_mjx.evaluation.report import Report
 
 
@@ -117,16 +117,9 @@ class Comparison(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return everything except the episodes as JSON values."""
-        return {
-            "goal_set_version": GOAL_SET_VERSION,
-            "episodes": self.episodes,
-            "settings": dict(self.settings),
-            "runs": [_run_json(run) for run in self.runs],
-            "pairs": [_nested(pair) for pair in self.pairs],
-            "differences": {key: list(values) for key, values in self.differences.items()},
-            "baselines": {name: one._asdict() for name, one in self.baselines.items()},
-            "versions": dict(self.versions),
-        }
+        values = {name: value for name, value in self._asdict().items() if name != "folder"}
+        values["runs"] = [_run_json(run) for run in self.runs]
+        return json_values({"goal_set_version": GOAL_SET_VERSION, **values})
 
 
 def _run_json(run: Run) -> dict[str, Any]:
@@ -135,19 +128,12 @@ def _run_json(run: Run) -> dict[str, Any]:
             "name": name,
             "checkpoint": report.checkpoint.name,
             "env_steps": report.env_steps,
-            "policy": report.policy._asdict(),
-            "mujoco": report.mujoco.to_json() if report.mujoco else None,
+            "policy": report.policy,
+            "mujoco": report.mujoco,
         }
         for name, report in run.seeds.items()
     ]
-    return _nested(run._replace(seeds={})) | {"seeds": seeds}
-
-
-def _nested(value: Any) -> Any:
-    """Convert nested named tuples to nested dictionaries."""
-    if hasattr(value, "_asdict"):
-        return {name: _nested(one) for name, one in value._asdict().items()}
-    return [_nested(one) for one in value] if isinstance(value, tuple) else value
+    return {**run._asdict(), "seeds": seeds}
 
 
 def check_comparable(configs: Mapping[str, Config]) -> None:

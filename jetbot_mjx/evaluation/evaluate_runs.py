@@ -26,12 +26,7 @@ from jetbot_mjx.evaluation.report import (
     learning_curve,
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
-from jetbot_mjx.evaluation.robustness import (
-    SWEEP_GOALS,
-    MujocoEvaluator,
-    MujocoResult,
-    sweep,
-)
+from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, sweep
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.runs.metrics import read_history
 from jetbot_mjx.runs.progress import stage

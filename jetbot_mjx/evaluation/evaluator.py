@@ -6,6 +6,7 @@ for the evaluations during training, by which the best checkpoint is chosen, and
 """
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -105,6 +106,15 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
         final_distance_median=float(np.median(final_distances(host))),
         nonfinite_envs=int(host.nonfinite.sum()),
     )
+
+
+def json_values(value: Any) -> Any:
+    """Return named tuples as dictionaries and tuples as lists, at any depth."""
+    if hasattr(value, "_asdict"):
+        value = value._asdict()
+    if isinstance(value, Mapping):
+        return {name: json_values(one) for name, one in value.items()}
+    return [json_values(one) for one in value] if isinstance(value, tuple | list) else value
 
 
 def path_efficiencies(episodes: Episodes) -> Float[np.ndarray, " n"]:

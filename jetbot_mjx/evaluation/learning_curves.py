@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
 from jetbot_mjx.evaluation.comparison import Aggregate, BandPoint, Comparison
+from jetbot_mjx.evaluation.plots import plot_rates
 from jetbot_mjx.evaluation.report import Report
 
 
@@ -72,16 +73,7 @@ def plot_learning_curves(comparison: Comparison) -> Figure:
 
 def _curve(axes: Axes, points: Sequence[Any], colour: str, label: str) -> None:
     steps = [point.env_steps for point in points]
-    axes.fill_between(
-        steps,
-        [point.success_low for point in points],
-        [point.success_high for point in points],
-        color=colour,
-        alpha=0.2,
-        lw=0,
-    )
-    rates = [point.success_rate for point in points]
-    axes.plot(steps, rates, color=colour, marker="o", markersize=3, lw=1.5, label=label)
+    plot_rates(axes, steps, points, color=colour, label=label, alpha=0.2, markersize=3)
 
 
 def _label_curves(axes: Axes) -> None:

@@ -18,7 +18,7 @@ from matplotlib.patches import Rectangle
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from jetbot_mjx.evaluation.evaluator import Summary, final_distances, path_efficiencies
+from jetbot_mjx.evaluation.evaluator import final_distances, path_efficiencies
 from jetbot_mjx.evaluation.report import SECTORS, GoalBin, Report
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, SweepResult
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -32,6 +32,7 @@ _COLOURS = {
     "light": ("#ffffff", "#22272e", "#d5dae1", "#1f6fd0 #d9480f #2b8a3e #862e9c #b08900 #0b7285"),
     "dark": ("#161b22", "#d5dbe3", "#363e49", "#5aa2f5 #ff8a4c #5bbd6e #c98be0 #e0b73c #4dbfd0"),
 }
+_FACES = ("figure", "savefig", "axes", "legend")
 _REACHED, _MISSED = "C0", "C1"
 
 _DPI = 160
@@ -45,20 +46,11 @@ def theme(name: Theme) -> Iterator[None]:
     """Set the colours of figures that are drawn inside the context to a light or dark theme."""
     paper, ink, faint, cycle = _COLOURS[name]
     style: Any = {
-        "figure.facecolor": paper,
-        "savefig.facecolor": paper,
-        "axes.facecolor": paper,
-        "legend.facecolor": paper,
-        "legend.edgecolor": faint,
+        **dict.fromkeys((f"{part}.facecolor" for part in _FACES), paper),
+        **dict.fromkeys(("legend.edgecolor", "axes.edgecolor", "grid.color", "hatch.color"), faint),
+        **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), ink),
         "legend.framealpha": 0.85,
-        "text.color": ink,
-        "axes.labelcolor": ink,
-        "axes.edgecolor": faint,
-        "xtick.color": ink,
-        "ytick.color": ink,
-        "grid.color": faint,
         "grid.linewidth": 0.7,
-        "hatch.color": faint,
         "axes.prop_cycle": cycler(color=cycle.split()),
         "axes.spines.top": False,
         "axes.spines.right": False,
@@ -150,13 +142,11 @@ def plot_by_goal(goal_bins: Sequence[GoalBin]) -> Figure:
     """
     figure = Figure(figsize=(10.4, 5.4), layout="constrained")
     success, seconds = figure.subplots(1, 2, subplot_kw={"projection": "polar"})
-    middle, cycle = matplotlib.rcParams["grid.color"], _cycle()
+    middle = matplotlib.rcParams["grid.color"]
+    cycle = matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
     ramp = LinearSegmentedColormap.from_list
-    times = [
-        goal_bin.time_to_goal_median
-        for goal_bin in goal_bins
-        if goal_bin.time_to_goal_median is not None
-    ]
+    medians = [goal_bin.time_to_goal_median for goal_bin in goal_bins]
+    times = [median for median in medians if median is not None]
     slowest, fastest = max(times, default=1.0), min(times, default=0.0)
     _polar(
         success,
@@ -169,18 +159,14 @@ def plot_by_goal(goal_bins: Sequence[GoalBin]) -> Figure:
     _polar(
         seconds,
         goal_bins,
-        [goal_bin.time_to_goal_median for goal_bin in goal_bins],
-        [f"{goal_bin.time_to_goal_median or 0:.2f}" for goal_bin in goal_bins],
+        medians,
+        [f"{median or 0:.2f}" for median in medians],
         ramp("", [middle, cycle[3]]),
         Normalize(fastest - 0.15 * (slowest - fastest) - 1e-6, slowest),
     )
     success.set_title("Goals reached", pad=22)
     seconds.set_title("Median time to goal [s]", pad=22)
     return figure
-
-
-def _cycle() -> list[str]:
-    return matplotlib.rcParams["axes.prop_cycle"].by_key()["color"]
 
 
 def _polar(
@@ -306,7 +292,10 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
             ("scripted", result.scripted, "tab:gray"),
             ("policy", result.policy, "C0"),
         ):
-            _plot_over(success, time, result.sweep.values, summaries, label=name, color=colour)
+            values = result.sweep.values
+            plot_rates(success, values, summaries, color=colour, label=name)
+            seconds = [summary.time_to_goal_median for summary in summaries]
+            time.plot(values, np.array(seconds, float), marker="o", markersize=4, color=colour)
         for axes in (success, time):
             axes.axvline(result.sweep.nominal, color=ink, linestyle="--", linewidth=0.8)
             axes.grid(alpha=0.3)
@@ -323,22 +312,29 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
     return figure
 
 
-def _plot_over(
-    success: Axes,
-    time: Axes,
-    values: Sequence[float],
-    summaries: Sequence[Summary],
+def plot_rates(
+    axes: Axes,
+    x: Sequence[float],
+    points: Sequence[Any],
     *,
-    label: str,
     color: str,
+    label: str,
+    alpha: float = 0.25,
+    markersize: float = 4,
 ) -> None:
-    rates = [summary.success_rate for summary in summaries]
-    low = [summary.success_low for summary in summaries]
-    high = [summary.success_high for summary in summaries]
-    medians = [
-        np.nan if summary.time_to_goal_median is None else summary.time_to_goal_median
-        for summary in summaries
-    ]
-    success.fill_between(values, low, high, color=color, alpha=0.25, linewidth=0)
-    success.plot(values, rates, marker="o", markersize=4, color=color, label=label)
-    time.plot(values, medians, marker="o", markersize=4, color=color)
+    """Plot success rates over x, with their intervals as a band.
+
+    Args:
+      axes: the axes to draw on.
+      x: the place of each point.
+      points: objects with a success rate and the ends of its interval.
+      color: the colour of line and band.
+      label: the label of the line.
+      alpha: the opacity of the band.
+      markersize: the size of the points.
+    """
+    low = [point.success_low for point in points]
+    high = [point.success_high for point in points]
+    axes.fill_between(x, low, high, color=color, alpha=alpha, lw=0)
+    rates = [point.success_rate for point in points]
+    axes.plot(x, rates, color=color, marker="o", markersize=markersize, label=label)

@@ -20,6 +20,7 @@ from jetbot_mjx.evaluation.evaluator import (
     REPORT_GOALS,
     Summary,
     final_distances,
+    json_values,
     wilson_interval,
 )
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
@@ -175,7 +176,7 @@ class Report(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return everything except the episodes as JSON values."""
-        return {
+        values = {
             "goal_set_version": GOAL_SET_VERSION,
             "run": self.name,
             "checkpoint": self.checkpoint.name,
@@ -185,24 +186,23 @@ class Report(NamedTuple):
                 for key, value in self.config.flat().items()
                 if key in _SETTINGS or key.startswith("task.")
             },
-            "policy": self.policy._asdict(),
-            "baselines": {name: one._asdict() for name, one in self.baselines.items()},
-            "best_known": _best_known_to_json(self.best_known),
+            "policy": self.policy,
+            "baselines": self.baselines,
+            "best_known": self.best_known,
             "best_known_missing": self.best_known_missing,
-            "cells": [one._asdict() for one in self.goal_bins],
-            "failures": [failure._asdict() for failure in self.failures],
-            "learning_curve": [point._asdict() for point in self.learning_curve],
+            "cells": self.goal_bins,
+            "failures": self.failures,
+            "learning_curve": self.learning_curve,
             "robustness": as_json(self.robustness) if self.robustness else None,
-            "randomized": self.randomized._asdict() if self.randomized else None,
+            "randomized": self.randomized,
             "ranges": self.ranges.drawn if self.ranges else None,
-            "mujoco": self.mujoco.to_json() if self.mujoco else None,
-            "versions": dict(self.versions),
+            "mujoco": self.mujoco,
+            "versions": self.versions,
         }
+        return json_values(values)
 
 
-def goal_positions(
-    episodes: Episodes,
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+def goal_positions(episodes: Episodes) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """Compute the distance and bearing of each goal relative to the robot at the start.
 
     Args:
@@ -283,13 +283,6 @@ def compare_with_best_known(
     return BestKnown(median, p95, gap(-180.0, 180.0, won), by_direction), None
 
 
-def _best_known_to_json(found: BestKnown | None) -> dict[str, Any] | None:
-    if found is None:
-        return None
-    by_direction = [one._asdict() for one in found.by_direction]
-    return {**found._asdict(), "total": found.total._asdict(), "by_direction": by_direction}
-
-
 def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
     # A goal that rounding moved across an edge still belongs to the adjacent ring.
     low = math.floor(distance.min() / _EDGE_STEP + 1e-4) * _EDGE_STEP
@@ -302,9 +295,7 @@ def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
 
 
 def _goal_bin(
-    limits: tuple[float, float, float, float],
-    won: np.ndarray,
-    seconds: Float[np.ndarray, " n"],
+    limits: tuple[float, float, float, float], won: np.ndarray, seconds: Float[np.ndarray, " n"]
 ) -> GoalBin:
     count, wins = won.size, int(won.sum())
     low, high = wilson_interval(wins, count) if count else (None, None)

@@ -4,7 +4,8 @@ A sweep changes one parameter at a time from the preset's value. Goals, rules an
 of the report. One compiled program evaluates all robots, with the policy and with the scripted
 controller. The evaluation in C MuJoCo uses the same robot with numerics that no training uses.
 
-Sources of the ranges, by tag; BOM, EST and SIM are those of `envs/robot_model.py`:
+Sources of the ranges in `assets/robustness.yaml`, by tag; BOM, EST and SIM are those of
+`envs/robot_model.py`:
   CAD         the space for the battery and the clearance of the casters in the CAD model
   CSE276A     gassajor000/cse276a_jetbot: calibration of a JetBot's motors
   DUCKIETOWN  gym-duckietown: simulator of a robot with the same motors
@@ -15,6 +16,7 @@ Sources of the ranges, by tag; BOM, EST and SIM are those of `envs/robot_model.p
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +27,7 @@ from jaxtyping import Array, Float, Int, UInt32
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
-from jetbot_mjx.config import RandomizationConfig
+from jetbot_mjx.config import RandomizationConfig, read_yaml
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
@@ -35,6 +37,7 @@ from jetbot_mjx.evaluation.evaluator import (
     GOAL_SET_VERSION,
     Evaluator,
     Summary,
+    json_values,
     policy_controller,
     summarize,
 )
@@ -71,146 +74,11 @@ class Sweep(NamedTuple):
         return [RobotParams()._replace(**{self.name: value}) for value in self.values]
 
 
-SWEEPS = (
-    Sweep(
-        "friction",
-        "wheel-floor friction",
-        "× preset",
-        (0.3, 0.4, 0.6, 0.8, 1.0, 1.2),
-        "ISAACRL 0.4 to 1.2; WHEELEDLAB from 0.3",
-    ),
-    Sweep(
-        "mass",
-        "chassis mass and inertia",
-        "× preset",
-        (0.85, 0.92, 1.0, 1.12, 1.25),
-        "EST 0.60 to 0.85 kg in all, from the BOM's parts; ISAACRL ±15 %",
-    ),
-    Sweep(
-        "com_x",
-        "centre of mass, forward",
-        "m",
-        (-0.03, -0.015, 0.0, 0.015),
-        "CAD ±15 mm; further forward the robot tips over its wheels",
-    ),
-    Sweep("com_y", "centre of mass, left", "m", (-0.01, -0.005, 0.0, 0.005, 0.01), "CAD ±5 mm"),
-    Sweep("com_z", "centre of mass, up", "m", (-0.01, 0.0, 0.01, 0.02), "EST ±10 mm"),
-    Sweep(
-        "wheel_radius",
-        "radius of the wheels",
-        "× preset",
-        (0.92, 0.96, 1.0, 1.04, 1.08),
-        "BOM wheels of 60 and 65 mm, worn or new; measured to 68 mm",
-    ),
-    Sweep(
-        "wheel_radius_mismatch",
-        "unequal wheels",
-        "(left - right) / mean",
-        (-0.1, -0.05, -0.02, 0.0, 0.02, 0.05, 0.1),
-        "EST radius ±2 %",
-    ),
-    Sweep(
-        "wheel_separation",
-        "wheel separation",
-        "× preset",
-        (0.9, 0.95, 1.0, 1.05, 1.25, 1.6),
-        "CAD ±5 %; CSE276A turns as if 1.4 to 1.8 times as wide",
-    ),
-    Sweep(
-        "motor_gain",
-        "motor gain",
-        "× preset",
-        (0.85, 0.9, 0.95, 1.0, 1.05, 1.1, 1.15),
-        "ISAACRL ±10 %",
-    ),
-    Sweep(
-        "motor_gain_mismatch",
-        "unequal motors",
-        "(left - right) / mean",
-        (-0.2, -0.1, 0.0, 0.1, 0.2),
-        "CSE276A 3 % apart; DUCKIETOWN deviation 2 %, to 5 % EST",
-    ),
-    Sweep(
-        "supply_voltage",
-        "supply voltage",
-        "× nominal",
-        (0.8, 0.9, 1.0, 1.05, 1.15),
-        "BOM 5 V bank 0.9 to 1.05; three cells 9.6 to 12.6 V",
-    ),
-    Sweep(
-        "dead_band",
-        "dead-band of the motors",
-        "of full voltage",
-        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25, 0.3),
-        "CSE276A 1 %, PICOBOT 11 %, TT 11 to 25 %",
-    ),
-    Sweep(
-        "motor_lag",
-        "further lag of the motors",
-        "s",
-        (0.0, 0.05, 0.1, 0.15, 0.2, 0.25),
-        "PICOBOT 0.085 s, DUCKIETOWN 0.20 to 0.25 s, motors and all",
-    ),
-    Sweep(
-        "action_delay",
-        "delay of actions",
-        "control steps",
-        (0.0, 1.0, 2.0, 3.0, 6.0, 9.0),
-        "ISAACRL 0 to 3 steps; DUCKIETOWN 0.15 s",
-    ),
-    Sweep(
-        "position_noise",
-        "noise of the position",
-        "m",
-        (0.0, 0.01, 0.02, 0.03, 0.06),
-        "ISAACRL 0.01 to 0.03 m",
-    ),
-    Sweep(
-        "yaw_noise",
-        "noise of the heading",
-        "rad",
-        (0.0, 0.01, 0.03, 0.1),
-        "ISAACRL 0.01 to 0.03 rad",
-    ),
-    Sweep("speed_noise", "noise of the velocity", "m/s", (0.0, 0.01, 0.03), "ISAACRL 0.01 m/s"),
-    Sweep(
-        "yaw_rate_noise",
-        "noise of the yaw rate",
-        "rad/s",
-        (0.0, 0.03, 0.1),
-        "ISAACRL 0.03 rad/s",
-    ),
-    Sweep(
-        "observation_delay",
-        "delay of observations",
-        "control steps",
-        (0.0, 1.0, 2.0, 3.0, 6.0),
-        "EST 30 to 60 ms of a camera with 30 frames per second",
-    ),
-    Sweep(
-        "height_offset",
-        "observed height, offset",
-        "m",
-        (-0.003, -0.001, 0.0, 0.001, 0.003),
-        "SIM MuJoCo's default contact carries the robot 0.4 mm higher; EST 3 mm, a carpet",
-    ),
-    Sweep(
-        "pitch_offset",
-        "observed pitch, offset",
-        "rad",
-        (-0.0175, 0.0, 0.0175),
-        "EST 1°, how straight a sensor is mounted",
-    ),
-    Sweep("start_x", "start, forward", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
-    Sweep("start_y", "start, left", "m", (-0.05, 0.0, 0.05), "EST set down by hand"),
-    Sweep(
-        "start_yaw",
-        "heading at the start",
-        "rad",
-        (-3.14, -1.57, 0.0, 1.57, 3.14),
-        "EST any heading",
-    ),
+SWEEPS = tuple(
+    Sweep(name, **{**one, "values": tuple(one["values"])})
+    for name, one in read_yaml(Path(__file__).parents[1] / "assets" / "robustness.yaml").items()
 )
+"""All parameters."""
 
 
 class SweepResult(NamedTuple):
@@ -334,12 +202,7 @@ class MujocoResult(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return the numerics and metrics as JSON values."""
-        numerics = self.numerics._asdict().items()
-        return {
-            "numerics": {k: list(v) if isinstance(v, tuple) else v for k, v in numerics},
-            "policy": self.policy._asdict(),
-            "randomized": self.randomized._asdict() if self.randomized else None,
-        }
+        return json_values(self)
 
 
 class MujocoEvaluator:
@@ -422,7 +285,7 @@ def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
     Returns:
       The parameters with their values, metrics and the range over which the policy is robust.
     """
-    return {
+    values = {
         "goal_set_version": GOAL_SET_VERSION,
         "carries_at": ROBUST_SUCCESS_RATE,
         "goals": results[0].policy[0].episodes,
@@ -430,15 +293,12 @@ def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
             {
                 **result.sweep._asdict(),
                 "nominal": result.sweep.nominal,
-                "carries": _as_list(robust_range(result)),
+                "carries": robust_range(result),
                 "lowest": min(summary.success_rate for summary in result.policy),
-                "policy": [summary._asdict() for summary in result.policy],
-                "scripted": [summary._asdict() for summary in result.scripted],
+                "policy": result.policy,
+                "scripted": result.scripted,
             }
             for result in results
         ],
     }
-
-
-def _as_list(span: tuple[float, float] | None) -> list[float] | None:
-    return None if span is None else list(span)
+    return json_values(values)

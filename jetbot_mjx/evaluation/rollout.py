@@ -172,13 +172,10 @@ def _to_episodes(env: JetBotEnv | Wrapper, first: State, end: _Carry) -> Episode
         # Repeat the final state in the rows that were not reached.
         ended = jnp.arange(qpos.shape[1]) > end.time
         qpos = jnp.where(ended[:, None], last.pipeline_state.qpos[:, None], qpos)
+    # All episodes have ended: the other statistics are those of whole episodes.
+    statistics = {name: x for name, x in tally._asdict().items() if name != "alive"}
     return Episodes(
-        success=tally.success,
-        steps=tally.steps,
-        episode_return=tally.episode_return,
-        terminated=tally.terminated,
-        nonfinite=tally.nonfinite,
-        path_length=tally.path_length,
+        **statistics,
         start_w=start[:, QPOS_XYZ][:, :2],
         start_yaw=jax.vmap(kinematics.yaw)(start[:, QPOS_QUAT]),
         end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],

@@ -89,7 +89,9 @@ class CheckpointStore:
         options = ocp.CheckpointManagerOptions(
             create=False,
             multiprocessing_options=_single_process_options(),
-            step_name_format=_step_names(),
+            step_name_format=ocp.path.step.standard_name_format(
+                step_format_fixed_length=_STEP_DIGITS
+            ),
             preservation_policy=_PreserveBestAndLatest(keep, self._success),
             cleanup_tmp_directories=True,
             # Orbax moves a checkpoint here before it deletes it.
@@ -136,8 +138,7 @@ class CheckpointStore:
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
             started = self._manager.save(
-                env_steps,
-                args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)}),
+                env_steps, args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)})
             )
             if not started:
                 raise ValueError(f"there is one after {env_steps} steps or more")
@@ -399,7 +400,3 @@ def _single_process_options() -> Any:
     return ocp.options.MultiprocessingOptions(
         primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
     )
-
-
-def _step_names() -> ocp.path.step.NameFormat[Any]:
-    return ocp.path.step.standard_name_format(step_format_fixed_length=_STEP_DIGITS)

@@ -41,10 +41,7 @@ class Resumption(NamedTuple):
 
 def to_trees(state: TrainState) -> dict[str, Any]:
     """Return a training state as the trees of a checkpoint."""
-    return {
-        POLICY: state.policy_params,
-        TRAINING: {name: getattr(state, name) for name in _REST},
-    }
+    return {POLICY: state.policy_params, TRAINING: {name: getattr(state, name) for name in _REST}}
 
 
 def resume(

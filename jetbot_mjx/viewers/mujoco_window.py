@@ -6,7 +6,6 @@ import time
 import types
 import warnings
 from collections.abc import Callable, Mapping
-from types import TracebackType
 from typing import Any, Self
 
 import mujoco
@@ -111,12 +110,7 @@ class Window:
         """Return the window."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Close the window."""
         self.close()
 

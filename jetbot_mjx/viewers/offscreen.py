@@ -13,7 +13,6 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
-from types import TracebackType
 from typing import Any, Self
 from unittest import mock
 
@@ -28,20 +27,8 @@ from jetbot_mjx.viewers.pose import set_pose
 
 _BACKENDS = ("egl", "osmesa", "glfw")
 
-_UNDECIDED = (
-    "",
-    "0",
-    "1",
-    "cgl",
-    "disable",
-    "disabled",
-    "enable",
-    "enabled",
-    "false",
-    "glx",
-    "off",
-)
-_UNDECIDED += ("on", "true", "wgl")
+_UNDECIDED = ("", "0", "1", "disable", "disabled", "enable", "enabled", "false", "off", "on")
+_UNDECIDED += ("true", "cgl", "glx", "wgl")
 """Other values of `MUJOCO_GL` that MuJoCo accepts; with these, this module chooses."""
 
 _OVERSAMPLING = 2
@@ -132,12 +119,7 @@ class Renderer:
         """Return the renderer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
 

@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, UInt32
 
+from jetbot_mjx.compiler.xla_options import host_cpu
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
@@ -63,7 +64,7 @@ class Player:
         self.frames = Rate()
         """Frame counter of the viewer, which counts every frame that it shows."""
         # A single robot is faster on a CPU than on a GPU.
-        self._device = _cpu()
+        self._device = host_cpu()
         self._fns = make_viewer_fns(self.env, checkpoint.networks)
         self._key, key = self._put(tuple(jax.random.split(jax.random.PRNGKey(seed))))
         self._count = 0
@@ -261,11 +262,3 @@ def _outcome(snapshot: Snapshot) -> str:
     if snapshot.nonfinite > 0:
         return "non-finite state"
     return "failed" if snapshot.terminated > 0 else "out of time"
-
-
-def _cpu() -> Any:
-    """Return the CPU as a JAX device, or the default device where `JAX_PLATFORMS` excludes it."""
-    try:
-        return jax.devices("cpu")[0]
-    except RuntimeError:
-        return jax.devices()[0]

@@ -86,10 +86,7 @@ def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Viewe
     """
     episode_env = EpisodeWrapper(env, env.config.task.episode_length)
     controllers = [policy_controller(networks), *(make(env) for make in BASELINES.values())]
-    limits = {
-        "max_speed": env.config.task.max_speed,
-        "max_yaw_rate": env.config.task.max_yaw_rate,
-    }
+    limits = {"max_speed": env.config.task.max_speed, "max_yaw_rate": env.config.task.max_yaw_rate}
 
     def snapshot(state: State) -> Snapshot:
         return Snapshot(

@@ -26,6 +26,7 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
 from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs.run_dir import write_bytes
 from jetbot_mjx.viewers.offscreen import Renderer, overview
 
 VIEW = 400
@@ -173,13 +174,7 @@ class VideoRenderer:
 
     def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
         chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
-        top = self._view.frame(
-            trajectory.qpos[step],
-            trajectory.markers,
-            "top",
-            shadows=False,
-            trail_w=trajectory.trail_w(step),
-        )
+        top = self._frame_with_trail(trajectory, step, "top")
         # In the lower corner the inset hides a goal only while the robot drives away from it.
         chase = self._with_inset(chase, trajectory, step, top=False)
         return np.hstack([self._with_text(chase, trajectory, step), top])
@@ -189,6 +184,12 @@ class VideoRenderer:
         longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
         return math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps) + 1
 
+    def _frame_with_trail(
+        self, trajectory: Trajectory, step: int, camera: str | mujoco.MjvCamera
+    ) -> Frame:
+        qpos, trail_w = trajectory.qpos[step], trajectory.trail_w(step)
+        return self._view.frame(qpos, trajectory.markers, camera, shadows=False, trail_w=trail_w)
+
     def _frame_times(self, trajectories: Sequence[Trajectory]) -> Iterator[float]:
         """Return the times of the frames [s], up to a pause after the longest episode."""
         return (frame / self._fps for frame in range(self.frame_count(trajectories)))
@@ -196,13 +197,7 @@ class VideoRenderer:
     def _episode_view(
         self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
     ) -> Frame:
-        view = self._view.frame(
-            trajectory.qpos[step],
-            trajectory.markers,
-            camera,
-            shadows=False,
-            trail_w=trajectory.trail_w(step),
-        )
+        view = self._frame_with_trail(trajectory, step, camera)
         # A white line between neighbouring views.
         view = np.pad(view[:, :-1], ((0, 0), (0, 1), (0, 0)), constant_values=255)
         return self._with_text(
@@ -339,7 +334,7 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
         video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
         for frame in frames:
             video.write_frame(frame)
-    _write_atomically(path, file.getvalue())
+    write_bytes(path, file.getvalue())
 
 
 def write_gif(path: Path, frames: Sequence[Frame]) -> None:
@@ -365,14 +360,4 @@ def write_gif(path: Path, frames: Sequence[Frame]) -> None:
         loop=0,
         optimize=True,
     )
-    _write_atomically(path, file.getvalue())
-
-
-def _write_atomically(path: Path, content: bytes) -> None:
-    """Write a file under another name and rename it, so that no partial file is visible."""
-    unfinished = path.with_name(f".{path.name}.unfinished")
-    try:
-        unfinished.write_bytes(content)
-        unfinished.replace(path)
-    finally:
-        unfinished.unlink(missing_ok=True)
+    write_bytes(path, file.getvalue())

@@ -20,7 +20,6 @@ import socket
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
-from types import TracebackType
 from typing import Any, Self
 
 import rich
@@ -118,12 +117,7 @@ class ViserViewer:
         """Return the viewer."""
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         """Stop the server."""
         self.close()
 

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import random_functions
+from run_program import evaluate
 
 from jetbot_mjx.compiler import ffi_wrapper, llvm_backend, llvm_codegen, lower_jaxpr, ptx_backend
 from jetbot_mjx.compiler.kernel import Kernel, as_step
@@ -65,7 +66,7 @@ def check(seed, monkeypatch):
     program = lower_jaxpr.scalarize(lambda result, x: function(x), RESULT, ARGUMENT)
     monkeypatch.undo()
     arguments = [np.zeros_like(theirs), x]
-    agree(program.evaluate(arguments)[0], theirs, function.errors, "in NumPy")
+    agree(evaluate(program, arguments)[0], theirs, function.errors, "in NumPy")
     for count in (lanes, 1):
         ours = by_llvm(program, count, arguments)
         agree(ours, theirs, function.errors, f"{count} lanes")

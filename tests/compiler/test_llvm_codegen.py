@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from call_frame import Pool
 from kernel_cases import FUNCTIONS, LOOPS, VECTOR, robots
+from run_program import evaluate
 
 from jetbot_mjx.compiler import ffi_wrapper, llvm_backend
 from jetbot_mjx.compiler.kernel import Kernel
@@ -53,7 +54,7 @@ def test_a_kernel_does_what_the_function_does(name, lanes):
     function, x = FUNCTIONS[name], robots(2 * LANES + 3)
     program = scalarize(function, VECTOR)
     theirs = jax.vmap(function)(x)
-    np.testing.assert_allclose(program.evaluate([x])[0], theirs, rtol=2e-5, atol=2e-6)
+    np.testing.assert_allclose(evaluate(program, [x])[0], theirs, rtol=2e-5, atol=2e-6)
     (ours,) = run(program, [x])
     np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import run_program
 
 from jetbot_mjx.compiler import scalar_ir
 from jetbot_mjx.compiler.indexing import scalar_array
@@ -89,9 +90,8 @@ def evaluate(result, *inputs):
     """A number for each robot; `inputs` are what it depends on, with an array of numbers each."""
     values, columns = zip(*inputs, strict=True)
     leaves = [scalar_array([value], ()) for value in values]
-    (ends,) = ScalarProgram(leaves, [scalar_array([result], ())], schedule([result])).evaluate(
-        columns
-    )
+    program = ScalarProgram(leaves, [scalar_array([result], ())], schedule([result]))
+    (ends,) = run_program.evaluate(program, columns)
     return ends
 
 
