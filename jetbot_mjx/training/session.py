@@ -162,13 +162,21 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
     raise UserError(smaller)
 
 
+def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
+    """Return whether there is a run to continue; a folder that cannot be read is refused later."""
+    try:
+        return any(map(checkpoint_steps, run_dirs))
+    except OSError:
+        return False
+
+
 def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, TaskCode | None]:
     """Build the environment, and return it with the source of its task if that is to be stored.
 
     A run that has checkpoints continues with the task that it was begun with.
     """
     task_class = None
-    if any(map(checkpoint_steps, run_dirs)):
+    if _has_checkpoints(run_dirs):
         task_class = stored_task_class(run_dirs[0], config.task.name)
     env = make_env(config, task_class)
     return env, None if task_class else collect_task_code(config.task.name)
@@ -187,7 +195,7 @@ def _store_run(training: Training) -> None:
 
 def _warm_start(config: Config, env: JetBotEnv, run_dirs: Sequence[Path]) -> WarmStart | None:
     """Load the parameters to begin with, unless the run has checkpoints of its own."""
-    if config.init_from is None or any(map(checkpoint_steps, run_dirs)):
+    if config.init_from is None or _has_checkpoints(run_dirs):
         return None
     return make_warm_start(load_checkpoint(config.init_from), config, env)
 

@@ -55,8 +55,18 @@ TRAININGS = (
 )
 """Of which the others speak."""
 
+
+def in_full(words):
+    """`jetbot-mjx train` as the `python -m jetbot_mjx.train` that it is short for."""
+    return (
+        ["python", "-m", f"jetbot_mjx.{words[1]}", *words[2:]]
+        if words[0] == "jetbot-mjx"
+        else words
+    )
+
+
 DOCUMENTED = {
-    " ".join(words): (page, words)
+    " ".join(words): (page, in_full(words))
     for page, text in TEXTS.items()
     for block in blocks(text, "sh")
     for words in commands(block)
@@ -359,6 +369,8 @@ def test_no_kind_of_command_is_left_out():
     elsewhere |= {("scp",), ("git", "clone"), ("cd",)}
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
     covered |= {"new_task", "check_env", "pretrained", "jetbot_mjx"}
+    # Listed and searched by tests of their own: test_find_run.py, test_tune_command.py.
+    covered |= {"configs", "runs", "tune"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]
         if bare[:2] == ["python", "-m"] and bare[2] != "pytest":

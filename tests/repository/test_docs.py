@@ -35,8 +35,11 @@ from jetbot_mjx.agents.ppo import LOSSES
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.runs import command as runs_command
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.sb3_tags import aliases
+from jetbot_mjx.training import configs
+from jetbot_mjx.tuning import command as tune_command
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -381,6 +384,9 @@ COMMANDS = {
     "export": export,
     "sim2real": sim2real,
     "pretrained": pretrained,
+    "configs": configs,
+    "runs": runs_command,
+    "tune": tune_command,
 }
 
 
@@ -466,6 +472,8 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
         words = words[1:]
     if words[0] == "srun":
         words = words[words.index("python") :]
+    if words[0] == "jetbot-mjx":
+        words = ["python", "-m", *words[1:]]
     match words:
         case ["python", "-m", "pytest", *arguments]:
             assert all(Path(one).is_file() for one in arguments if one[0] != "-")
