@@ -125,7 +125,7 @@ def test_a_cpu_has_the_memory_of_its_machine():
 
 
 def test_out_of_memory_the_next_size_that_fits_is_named(config, tmp_path, monkeypatch):
-    def train_too_large(*arguments):
+    def train_too_large(*arguments, **options):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory\nallocating")
 
     monkeypatch.setattr(session.ppo_trainer, "train", train_too_large)
@@ -139,7 +139,7 @@ def test_out_of_memory_the_next_size_that_fits_is_named(config, tmp_path, monkey
 
 
 def test_other_failures_of_jax_pass_through(config, tmp_path, monkeypatch):
-    def fail(*arguments):
+    def fail(*arguments, **options):
         raise jax.errors.JaxRuntimeError("INTERNAL: no")
 
     monkeypatch.setattr(session.ppo_trainer, "train", fail)
