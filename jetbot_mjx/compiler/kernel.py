@@ -42,7 +42,7 @@ Step = Callable[[PyTree, PyTree], PyTree]
 """A function of (carry, consts) that returns the carry some steps later."""
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(eq=False, repr=False)
 class Kernel:
     """A `Kernel` holds a step of one robot that a back end can run for many robots.
 

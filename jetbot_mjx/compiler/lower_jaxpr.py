@@ -71,7 +71,7 @@ MIN_BRANCH_OPERATIONS = 24
 """Smallest number of operations for which a branch is faster than computing both sides."""
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, repr=False)
 class ScalarProgram:
     """A `ScalarProgram` holds a function's operations on scalars."""
 

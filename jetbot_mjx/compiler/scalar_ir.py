@@ -24,7 +24,7 @@ Scalar = Any
 """An `Expr`, or a NumPy scalar if the value is a constant."""
 
 
-@dataclasses.dataclass(eq=False, slots=True)
+@dataclasses.dataclass(eq=False, repr=False, slots=True)
 class Expr:
     """An `Expr` is a scalar whose value is known only when the program runs."""
 
@@ -42,7 +42,7 @@ class Expr:
     """Position of a `carry` or `result` among those of its owner."""
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(eq=False, repr=False)
 class Loop:
     """A `Loop` is a while loop that carries scalars."""
 
@@ -60,7 +60,7 @@ class Loop:
     """The results of the loop, as functions of the `carries` for which `condition` is false."""
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(eq=False, repr=False)
 class Branch:
     """A `Branch` selects between two lists of scalars and computes only the selected side."""
 

@@ -18,7 +18,7 @@ Item: TypeAlias = "Expr | PlacedLoop | PlacedBranch"
 _Node: TypeAlias = Expr | Loop | Branch
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(eq=False, repr=False)
 class Block:
     """A `Block` holds operations that are executed one after the other."""
 
@@ -45,7 +45,7 @@ class Block:
                     yield from block.values()
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(eq=False, repr=False)
 class PlacedLoop:
     """A `PlacedLoop` is a loop whose `head` computes the condition and `body` the iteration."""
 
@@ -63,7 +63,7 @@ class PlacedLoop:
         return self.head, self.body
 
 
-@dataclasses.dataclass(eq=False)
+@dataclasses.dataclass(eq=False, repr=False)
 class PlacedBranch:
     """A `PlacedBranch` is a branch with a block for each side."""
 

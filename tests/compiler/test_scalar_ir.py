@@ -164,3 +164,12 @@ def test_what_is_not_known_here_is_named(graph, x):
         graph.apply("erf_inv", x)
     with pytest.raises(UnsupportedError, match="float16"):
         graph.convert(x, np.dtype(np.float16))
+
+
+def test_an_expression_is_named_and_not_written_out():
+    """Written out, shared operands would double at every level, and a jaxpr prints its kernel."""
+    graph = ExprGraph()
+    value = graph.input(np.float32)
+    for _ in range(64):
+        value = graph.apply("mul", value, value)
+    assert len(repr(value)) < 200
