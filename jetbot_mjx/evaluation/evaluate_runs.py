@@ -221,7 +221,7 @@ class _Options(NamedTuple):
             "randomized": bool(self.ranges_of(checkpoint.config).drawn),
         }
         has = frozenset(name for name, wanted in parts.items() if wanted)
-        return checkpoint.run_dir / _FOLDER, checkpoint.path.name, self.episodes, has
+        return checkpoint.results_dir / _FOLDER, checkpoint.path.name, self.episodes, has
 
 
 class _Target(NamedTuple):

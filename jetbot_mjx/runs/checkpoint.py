@@ -25,7 +25,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     read_tree,
 )
 from jetbot_mjx.runs.find_run import PRETRAINED as PRETRAINED
-from jetbot_mjx.runs.find_run import find_run, list_runs, suggest_run
+from jetbot_mjx.runs.find_run import ROOT, find_run, list_runs, suggest_run
 from jetbot_mjx.runs.task_code import stored_task_class
 
 Which = Literal["best", "last"] | int
@@ -51,6 +51,13 @@ class Checkpoint(NamedTuple):
     params: PolicyParams
     networks: ppo_networks.PPONetworks
     about: Mapping[str, Any]
+
+    @property
+    def results_dir(self) -> Path:
+        """Return the folder for results: of a run of the package, one in the current folder."""
+        if self.run_dir.parent == PRETRAINED:
+            return ROOT / "pretrained" / self.run_dir.name
+        return self.run_dir
 
     def make_env(self) -> JetBotEnv:
         """Build the environment that the policy was trained in, for the available devices.

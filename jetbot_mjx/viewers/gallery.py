@@ -123,7 +123,7 @@ def render_run(
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
     rolled_out = _run_episodes([checkpoint], env, goals)[0]
-    folder = checkpoint.run_dir / "videos" / checkpoint.path.name
+    folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     make_folder(folder)
     rendered = RenderedRun(
         mp4=folder / f"{names[0]}.mp4",

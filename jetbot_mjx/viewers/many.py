@@ -169,7 +169,7 @@ def render_many(
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
     grid = place_on_grid(env, _run_episodes([checkpoint], env, robots)[0])
-    folder = checkpoint.run_dir / "videos" / checkpoint.path.name
+    folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     make_folder(folder)
     name = f"many-{robots}"
     video = ManyRobotsVideo(
