@@ -160,12 +160,7 @@ def compare_runs(
         in_mujoco=robustness or simulator is not None,
         ranges_file=_RangesFile.read(ranges),
     )
-    targets = []
-    for one in checkpoints:
-        wanted = options.describe_report(one)
-        found = find_report(*wanted)
-        targets.append(_Target(found or report_folder(*wanted), write=found is None))
-    reports = _write_reports(list(zip(checkpoints, targets, strict=True)), options)
+    reports = _write_reports([(one, _target(one, options)) for one in checkpoints], options)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(checkpoints)) as advance:
         for name, entry in entries.items():
@@ -180,6 +175,13 @@ def compare_runs(
     with stage("writing the comparison"):
         write_comparison(comparison)
     return comparison
+
+
+def _target(checkpoint: Checkpoint, options: "_Options") -> "_Target":
+    """Return where the report on a policy goes, unless there is one that is at least as full."""
+    wanted = options.describe_report(checkpoint)
+    found = find_report(*wanted)
+    return _Target(found or report_folder(*wanted), write=found is None)
 
 
 class _RangesFile(NamedTuple):
@@ -259,7 +261,7 @@ def _load_runs(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
                 )
             owners[place] = path
         first = next(iter(seeds.values()))
-        entries.append(RunEntry(first.run_dir.parent if folders else first.run_dir, seeds))
+        entries.append(RunEntry(first.run_dir.parent if folders else first.results_dir, seeds))
     return dict(zip(_names(entries), entries, strict=True))
 
 

@@ -1,13 +1,14 @@
 """Runs by name: which are found, how they are listed, and what a mistaken name is told."""
 
 import json
+from pathlib import Path
 
 import pytest
 
 from jetbot_mjx.config import ConfigError, find_config, load_config, parse_config, shipped_configs
 from jetbot_mjx.errors import NotFoundError
 from jetbot_mjx.runs import command
-from jetbot_mjx.runs.checkpoint import find_checkpoint, load_policy
+from jetbot_mjx.runs.checkpoint import find_checkpoint, load_checkpoint, load_policy
 from jetbot_mjx.runs.checkpoint_store import CheckpointError
 from jetbot_mjx.runs.find_run import PRETRAINED, find_run, list_runs, read_info, runs_table
 
@@ -66,6 +67,13 @@ def test_without_runs_there_is_no_latest(tmp_path, monkeypatch):
 
 def test_python_takes_names_too():
     assert load_policy("pretrained:jetbot_egocentric") is not None
+
+
+def test_results_of_the_package_s_runs_go_to_the_current_folder():
+    checkpoint = load_checkpoint("pretrained:jetbot_egocentric")
+    assert str(checkpoint.results_dir) == "runs/pretrained/jetbot_egocentric"
+    own = checkpoint._replace(run_dir=Path("runs/mine"))
+    assert own.results_dir == Path("runs/mine")
 
 
 def test_runs_are_listed_the_latest_first(runs):
