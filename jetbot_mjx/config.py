@@ -113,8 +113,11 @@ class TaskConfig(_Section):
     name: str = "jetbot_mjx:GoalTask"
     """The task class, as `package.module:Class`, built as `Class(task_config)`; this package's own
     is named by the package alone."""
-    observation: Literal["world", "egocentric"] = "world"
-    """`world`: the tutorial's 16-number observation; `egocentric`: the goal in robot frame."""
+    observation: Literal["world", "egocentric", "camera", "camera+world", "camera+egocentric"] = (
+        "world"
+    )
+    """`world`: the tutorial's 16-number observation; `egocentric`: the goal in robot frame;
+    `camera`: the image of the robot's camera, alone or beside numbers."""
     episode_length: Count = 256
     """Control steps after which an episode is truncated."""
     max_speed: Positive = 1.0
@@ -130,6 +133,65 @@ class TaskConfig(_Section):
     centre lies 18 mm above the axle: no smaller radius can be reached."""
     options: dict[Text, _Scalar] = Field(default_factory=dict)
     """Free settings for a task of your own."""
+
+    @property
+    def sees(self) -> bool:
+        """Return whether the policy sees through the robot's camera."""
+        return self.observation.startswith("camera")
+
+    @property
+    def numbers(self) -> str:
+        """Return the name of the numbers that the policy observes; empty if it observes none."""
+        return self.observation.removeprefix("camera").removeprefix("+")
+
+
+class CameraConfig(_Section):
+    """The robot's camera, for `task.observation: camera`."""
+
+    width: Annotated[int, BeforeValidator(_integral), Field(ge=8, le=512)] = 32
+    """[pixels] width of the image."""
+    height: Annotated[int, BeforeValidator(_integral), Field(ge=8, le=512)] = 32
+    """[pixels] height of the image."""
+    colour: Literal["rgb", "grey"] = "rgb"
+    """`rgb`: three channels; `grey`: one."""
+    frames: Annotated[int, BeforeValidator(_integral), Field(ge=1, le=8)] = 1
+    """Images that the policy sees, stacked along the channels, the newest last."""
+    samples: Annotated[int, BeforeValidator(_integral), Field(ge=1, le=8)] = 2
+    """Rays per side of a pixel."""
+    position: tuple[float, float, float] = (0.018, 0.0, 0.059)
+    """[m] optical centre ahead of, left of and above the axle midpoint. The JetBot's CAD has the
+    lens 15 to 19 mm ahead of the axle and 92 mm above the floor."""
+    pitch: Annotated[float, Field(ge=-90, le=90, allow_inf_nan=False)] = 20.0
+    """[deg] angle by which the camera looks down; 20 in the JetBot's CAD."""
+    lens: Literal["pinhole", "opencv", "fisheye"] = "pinhole"
+    """`opencv` and `fisheye`: OpenCV's two models of a lens with distortion."""
+    fovy: Annotated[float, Field(ge=1, le=178, allow_inf_nan=False)] = 115.0
+    """[deg] vertical field of view, without `matrix`. The JetBot's wide lens has 160 degrees from
+    corner to corner, 113 from side to side of a square image; NVIDIA's own simulation uses 115."""
+    matrix: tuple[Positive, Positive, float, float] | None = None
+    """[pixels] fx, fy, cx, cy of a calibrated camera; null: `fovy`, the axis in the middle."""
+    calibration_size: tuple[Count, Count] | None = None
+    """[pixels] width and height of the images of the calibration; null: those above."""
+    distortion: tuple[float, ...] = ()
+    """Coefficients in OpenCV's order: k1, k2, p1, p2, k3 to k6, or of a fisheye k1 to k4."""
+
+    @field_validator("position", "matrix", "calibration_size", "distortion", mode="before")
+    @classmethod
+    def _as_tuple(cls, value: Any) -> object:
+        return tuple(value) if isinstance(value, list) else value
+
+    @model_validator(mode="after")
+    def _known_lens(self) -> Self:
+        most = {"pinhole": 0, "opencv": 8, "fisheye": 4}[self.lens]
+        if len(self.distortion) > most:
+            raise ValueError(
+                f"distortion has {len(self.distortion)} coefficients: lens = {self.lens} takes at"
+                f" most {most}"
+            )
+        values = [*self.position, *self.distortion, *(self.matrix or ())]
+        if not all(map(math.isfinite, values)):
+            raise ValueError("position, matrix and distortion should be finite numbers")
+        return self
 
 
 class PhysicsConfig(_Section):
@@ -278,6 +340,14 @@ class NetworkConfig(_Section):
     """Activation between the layers."""
     distribution_type: Literal["normal", "tanh_normal"] = "tanh_normal"
     """Action distribution; `normal` leaves clipping to the environment, as SB3 does."""
+    cnn: Literal["nature", "small", "tiny"] = "small"
+    """Convolutions in front of the hidden layers, for `task.observation: camera`. `nature`: those
+    of SB3's `CnnPolicy`, 603 k parameters at 64×64; `small` and `tiny`: for 32×32."""
+    shared_cnn: bool = True
+    """Whether policy and value function share the convolutions; Brax's networks do not."""
+    cnn_dtype: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Numbers that the convolutions compute with; parameters and sums are float32. `auto`:
+    bfloat16 on GPUs, float32 on CPUs."""
 
 
 class PPOConfig(_Section):
@@ -401,6 +471,7 @@ class Config(_Section):
     """Project of Weights & Biases that the run is also logged to; null: none."""
     robot: RobotConfig = RobotConfig()
     task: TaskConfig = TaskConfig()
+    camera: CameraConfig = CameraConfig()
     physics: PhysicsConfig = PhysicsConfig()
     randomization: RandomizationConfig = RandomizationConfig()
     ppo: PPOConfig = PPOConfig()
@@ -416,6 +487,15 @@ class Config(_Section):
         return self
 
     @model_validator(mode="after")
+    def _camera_begins_anew(self) -> Self:
+        if self.task.sees and self.init_from is not None:
+            raise ValueError(
+                f"init_from = {self.init_from!r}: a policy with task.observation ="
+                f" {self.task.observation!r} cannot begin with another's: leave it out"
+            )
+        return self
+
+    @model_validator(mode="after")
     def _trainer_can(self) -> Self:
         if self.trainer == "brax":
             if self.ppo.learning_rate_schedule == "LINEAR":
@@ -427,6 +507,11 @@ class Config(_Section):
                 raise ValueError(
                     "ppo.normalizer = 'physical' is not known to trainer = 'brax':"
                     " take trainer = 'resumable', or ppo.normalizer = 'brax'"
+                )
+            if self.task.sees:
+                raise ValueError(
+                    f"task.observation = {self.task.observation!r} is not known to trainer = 'brax':"
+                    " take 'resumable'"
                 )
             if self.deterministic:
                 raise ValueError(

@@ -11,6 +11,7 @@ from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_a
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.errors import UserError
 
 with requires_extra("gymnasium"):
     import gymnasium
@@ -52,6 +53,11 @@ class AdapterBase:
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         self.config, mode, rendering_dt = resolve(config, *given)
+        if self.config.task.sees:
+            raise UserError(
+                f"task.observation = {self.config.task.observation!r}: the adapters observe numbers"
+                " only, world or egocentric; make_env and wrap_for_training render images"
+            )
         self.render_mode = mode
         # A script that imports an adapter has no other reason to set up JAX's cache.
         use_compilation_cache()

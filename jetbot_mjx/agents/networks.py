@@ -1,17 +1,19 @@
 """Build Brax's policy and value networks, name their parameters, and run inference."""
 
-from collections.abc import Callable
+import functools
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.acme import running_statistics
+from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import identity_observation_preprocessor
 from jaxtyping import Array, Float, UInt32
 
+from jetbot_mjx.agents.vision import is_image, make_vision_networks
 from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import NetworkConfig
 
@@ -21,6 +23,10 @@ _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "elu": nn.elu,
     "swish": nn.swish,
 }
+
+
+Observation = Float[Array | np.ndarray, "*batch obs"] | Mapping[str, Array | np.ndarray]
+"""One observation or any batch of them: a vector of numbers, or a dictionary with images."""
 
 
 class PolicyParams(NamedTuple):
@@ -39,7 +45,7 @@ class Policy(Protocol):
     """A `Policy` maps observations to actions."""
 
     def __call__(
-        self, obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
+        self, obs: Observation, key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
         """Return actions: the mode of the distribution without a key, a sample with one."""
         ...
@@ -52,47 +58,79 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
       config: the layer sizes, the activation and the action distribution.
 
     Returns:
-      A function of (observation_size, action_size, preprocess_observations_fn=...).
+      A function of (observation_size, action_size, preprocess_observations_fn=...) and of further
+      arguments of `brax.training.agents.ppo.networks.make_ppo_networks`.
     """
-
-    def factory(
-        observation_size: Any,
-        action_size: int,
-        preprocess_observations_fn: Any = identity_observation_preprocessor,
-    ) -> ppo_networks.PPONetworks:
-        return ppo_networks.make_ppo_networks(
-            observation_size,
-            action_size,
-            preprocess_observations_fn=preprocess_observations_fn,
-            policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
-            value_hidden_layer_sizes=config.value_hidden_layer_sizes,
-            activation=_ACTIVATIONS[config.activation],
-            distribution_type=config.distribution_type,
-        )
-
-    return factory
+    return functools.partial(
+        ppo_networks.make_ppo_networks,
+        policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
+        value_hidden_layer_sizes=config.value_hidden_layer_sizes,
+        activation=_ACTIVATIONS[config.activation],
+        distribution_type=config.distribution_type,
+    )
 
 
 def make_networks(
-    config: NetworkConfig, observation_size: int, action_size: int, *, normalize: bool
-) -> ppo_networks.PPONetworks:
-    """Build Brax's policy and value networks.
+    config: NetworkConfig,
+    observation_size: int | Mapping[str, Sequence[int]],
+    action_size: int,
+    *,
+    normalize: bool,
+) -> Any:
+    """Build the policy and value networks: Brax's, behind an encoder if there are images.
 
     Args:
       config: the layer sizes, the activation and the action distribution.
-      observation_size: the length of the observation.
+      observation_size: the length of the observation, or the shapes of its parts.
       action_size: the length of the action.
-      normalize: whether the networks normalise observations by running statistics.
+      normalize: whether the networks normalise numbers by running statistics.
 
     Returns:
-      Brax's networks.
+      Brax's `PPONetworks`, or `VisionNetworks`.
     """
     preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
     # Brax's networks hold an observation of zeros, which need not be on the GPU.
     with jax.ensure_compile_time_eval(), default_device_cpu():
-        return network_factory(config)(
-            observation_size, action_size, preprocess_observations_fn=preprocess
+        make_heads = network_factory(config)
+        if isinstance(observation_size, int):
+            return make_heads(observation_size, action_size, preprocess_observations_fn=preprocess)
+        shapes = {name: tuple(shape) for name, shape in observation_size.items()}
+        return make_vision_networks(
+            config, shapes, action_size, make_heads=make_heads, normalize=preprocess
         )
+
+
+def init_normalizer(observation_size: int | Mapping[str, Sequence[int]]) -> Any:
+    """Return the statistics of an observation before the first is known; images have none.
+
+    Args:
+      observation_size: the length of the observation, or the shapes of its parts.
+    """
+    dtype = jnp.dtype("float32")
+    if isinstance(observation_size, int):
+        return running_statistics.init_state(specs.Array((observation_size,), dtype))
+    return running_statistics.init_state(
+        {
+            name: specs.Array(tuple(shape), dtype)
+            for name, shape in observation_size.items()
+            if not is_image(name)
+        }
+    )
+
+
+def update_normalizer(normalizer: Any, obs: Observation, axis_name: str | None = None) -> Any:
+    """Return the statistics with a batch of observations taken in; those of images are not kept.
+
+    Args:
+      normalizer: the statistics before.
+      obs: the observations, with any batch axes.
+      axis_name: the mesh axis over which the observations are sharded; None: none.
+    """
+    if isinstance(obs, Mapping):
+        obs = {name: value for name, value in obs.items() if not is_image(name)}
+    if not jax.tree.leaves(obs):
+        return normalizer
+    return running_statistics.update(normalizer, obs, pmap_axis_name=axis_name)
 
 
 def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Policy:
@@ -109,11 +147,11 @@ def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Pol
     greedy, exploring = inference(params, deterministic=True), inference(params)
 
     def policy(
-        obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
+        obs: Observation, key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
         if key is None:
             # Brax requires a key, although the mode does not use it.
-            return greedy(jnp.asarray(obs), jax.random.PRNGKey(0))[0]
-        return exploring(jnp.asarray(obs), key)[0]
+            return greedy(jax.tree.map(jnp.asarray, obs), jax.random.PRNGKey(0))[0]
+        return exploring(jax.tree.map(jnp.asarray, obs), key)[0]
 
     return policy

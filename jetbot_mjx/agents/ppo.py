@@ -50,7 +50,7 @@ import jax.numpy as jnp
 import optax
 from brax.envs import Env
 from brax.training import acting, gradients
-from brax.training.acme import running_statistics, specs
+from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, optimizer
 from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import Transition, UInt64
@@ -58,7 +58,8 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from jetbot_mjx.agents import gae
-from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, update_normalizer
+from jetbot_mjx.agents.vision import VisionNetworks
 from jetbot_mjx.config import PPOConfig
 
 # Pyright does not follow flax's dataclasses.
@@ -200,11 +201,7 @@ class PPO:
         state = TrainState(
             params=params,
             optimizer_state=self._optimizer.init(params),
-            normalizer=self._with_floor(
-                running_statistics.init_state(
-                    specs.Array((self._env.observation_size,), jnp.dtype("float32"))
-                )
-            ),
+            normalizer=self._with_floor(init_normalizer(self._env.observation_size)),
             env_state=self._env.reset(jax.random.split(env_key, self.num_envs)),
             key=jax.random.split(epoch_key, 1)[0],
             env_steps=_UInt64(hi=0, lo=0),
@@ -262,7 +259,7 @@ class PPO:
         # Collect experience, and update the normaliser with all of its observations.
         env_state, data, nan_dump = self.collect(state, rollout_key)
         updated_normalizer = self._with_floor(
-            running_statistics.update(state.normalizer, data.observation, pmap_axis_name=self._axis)
+            update_normalizer(state.normalizer, data.observation, self._axis)
         )
         # Update the networks. As in Brax, ADAPTIVE_KL uses the old normaliser, because it compares
         # the new action distributions with those of the collection.
@@ -294,7 +291,7 @@ class PPO:
         if self._min_std is None:
             return normalizer
         raised: Any = normalizer
-        return raised.replace(std=jnp.maximum(raised.std, self._min_std))
+        return raised.replace(std=jax.tree.map(jnp.maximum, raised.std, self._min_std))
 
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]
@@ -323,8 +320,9 @@ class PPO:
                 extra_fields=("truncation", "episode_metrics", "episode_done"),
             )
             nan_dump = _find_nan_dump(env_state, data)
-            # The loss needs the next observation only at the end of an unroll.
-            data = data._replace(next_observation=data.next_observation[-1:])
+            # The loss needs the next observation only at the end of an unroll, where it is in the
+            # state: the others, possibly images, are not even stored.
+            data = data._replace(next_observation=jax.tree.map(lambda x: x[None], after.obs))
             return (after, next_key), (data, nan_dump)
 
         # Run the unrolls one after the other, and return the first non-finite state of all.
@@ -443,13 +441,17 @@ class PPO:
         key: UInt32[Array, "2"],
     ) -> tuple[Array, Mapping[str, Array]]:
         """Compute Brax's PPO loss L = L_policy + L_value + L_entropy, as the module states it."""
+        networks = self.networks
+        if isinstance(networks, VisionNetworks):
+            batch = _encoded(networks, normalizer, params, batch)
+            networks = networks.heads
         with gae.unrolled():
             return losses.compute_ppo_loss(
                 params,
                 normalizer,
                 batch,
                 key,
-                ppo_network=self.networks,
+                ppo_network=networks,
                 entropy_cost=self.config.entropy_cost,
                 discounting=self.config.discounting,
                 reward_scaling=self.config.reward_scaling,
@@ -499,6 +501,23 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     if config.max_grad_norm is None:
         return optax.chain(adam)
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
+
+
+def _encoded(
+    networks: VisionNetworks, normalizer: Any, params: PyTree, batch: Transition
+) -> Transition:
+    """Replace the observations of a minibatch, of shape (unrolls, time, ...), by their features."""
+    # Encode the last next observations along with the others: one product is faster than two.
+    joined = jax.tree.map(
+        lambda x, last: jnp.concatenate([x, last[:, -1:]], axis=1),
+        batch.observation,
+        batch.next_observation,
+    )
+    encoded = networks.encode(normalizer, params, joined)
+    return batch._replace(
+        observation=jax.tree.map(lambda x: x[:, :-1], encoded),
+        next_observation=jax.tree.map(lambda x: x[:, -1:], encoded),
+    )
 
 
 def _find_nan_dump(start: PyTree, data: Transition) -> NanDump:

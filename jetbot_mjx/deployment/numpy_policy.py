@@ -17,6 +17,7 @@ from jetbot_mjx.agents.networks import make_policy
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import Checkpoint
 from jetbot_mjx.runs.progress import stage
@@ -90,8 +91,16 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
 
     Returns:
       The policy as arrays. Compare its outputs with `as_jax`, which uses Brax's own code.
+
+    Raises:
+      UserError: the policy sees images.
     """
     config = checkpoint.config
+    if config.task.sees:
+        raise UserError(
+            f"{checkpoint.run_dir} has task.observation = {config.task.observation!r}: only policies"
+            " that observe numbers can be exported"
+        )
     network = config.ppo.network
     params: Any = jax.device_get(checkpoint.params)
     size = checkpoint.about["observation_size"]

@@ -71,8 +71,9 @@ def draw(ranges: RandomizationConfig, key: UInt32[Array, "2"]) -> Float[Array, "
 class DomainRandomizationWrapper(Wrapper):
     """A wrapper that varies the robot: its physics model, actuators, sensors and start pose.
 
-    Like the environment inside, it sees one robot without a batch axis. A step is: wheel speed
-    targets of the action, actuator model, physics with the varied model, sensor model, observation.
+    Like the environment inside, it sees one robot without a batch axis. It observes numbers only:
+    `with_camera` renders outside of it. A step is: wheel speed targets of the action, actuator
+    model, physics with the varied model, sensor model, observation.
     """
 
     env: JetBotEnv
@@ -92,7 +93,8 @@ class DomainRandomizationWrapper(Wrapper):
           ranges: ranges of the parameters that are drawn anew in every episode, which replace
             those of `robot_params`; None: no parameter is drawn.
         """
-        super().__init__(env)
+        super().__init__(env.blind())
+        self.camera = env.camera
         self._constant = robot_params or RobotParams()
         self._ranges = ranges or RandomizationConfig()
         self._max_action_delay = self._max_delay("action_delay", MAX_ACTION_DELAY)
@@ -140,7 +142,7 @@ class DomainRandomizationWrapper(Wrapper):
         motors = initial_actuator_state(robot_params, self._max_action_delay)
         return state.replace(
             pipeline_state=physics,
-            obs=self.env.task.observe(add_offsets(robot, robot_params), state.goal),
+            obs=self.env.observe(add_offsets(robot, robot_params), state.goal),
             episode_params=EpisodeParams(drawn, motors, sensors),
         )
 
@@ -163,7 +165,7 @@ class DomainRandomizationWrapper(Wrapper):
         count = jnp.round(state.pipeline_state.time / self.env.dt).astype(jnp.int32)
         sensors, measured = step_sensors(sensors, robot, robot_params, count)
         return state.replace(
-            obs=self.env.task.observe(measured, state.goal),
+            obs=self.env.observe(measured, state.goal),
             episode_params=EpisodeParams(drawn, motors, sensors),
         )
 

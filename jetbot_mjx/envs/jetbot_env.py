@@ -18,6 +18,8 @@ from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import kinematics, mjx
+from jetbot_mjx.envs.camera.render import Camera
+from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
 from jetbot_mjx.envs.physics import Physics
 from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
@@ -45,8 +47,8 @@ class TaskStep(NamedTuple):
     It does not depend on which simulator moved the robot.
     """
 
-    obs: Float[Array, " obs"]
-    """Observation after the step."""
+    obs: Any
+    """Observation after the step, as of `JetBotEnv.observe`."""
     reward: Float[Array, ""]
     """Reward of the step."""
     terms: Mapping[str, Float[Array, ""]]
@@ -65,7 +67,8 @@ class JetBotEnv(brax.envs.Env):
     Action: two numbers, clipped to [-1, 1]. They command the speed v = (a₀ + 1)/2 · `max_speed`
     [m/s] and the yaw rate ω = a₁ · `max_yaw_rate` [rad/s]. The tutorial's differential controller
     turns both into wheel speed targets, which are held for one environment step.
-    Observation: described by the task's `layout`.
+    Observation: described by the task's `layout`; with `task.observation: camera` a dictionary, as
+    described by `CameraWrapper`.
     State: `metrics` holds `success` and `reward/<term>` of the step; `info` holds `terminated`.
     `done` means termination only; `EpisodeWrapper` adds the time limit.
     """
@@ -91,6 +94,7 @@ class JetBotEnv(brax.envs.Env):
                 self.robot, config.physics, build_scene=self.task.build_scene, visual=False
             )
             self.physics = Physics(physics_model, config.physics)
+            self.camera = Camera(config.camera, self.mj_model) if config.task.sees else None
             # MJX may not support a custom scene: build its model now, to fail before a run begins.
             # The model of a built-in task is built later, when a program is compiled.
             if type(self.task).build_scene is not GoalTask.build_scene:
@@ -103,6 +107,15 @@ class JetBotEnv(brax.envs.Env):
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
                 f" (python -m jetbot_mjx.check_env {config.task.name} says more)"
             ) from None
+
+    def blind(self) -> "JetBotEnv":
+        """Return a copy of this environment that observes numbers only.
+
+        Wrappers of a single robot take it, and `with_camera` renders outside of them.
+        """
+        env = copy.copy(self)
+        env.camera = None
+        return env
 
     @property
     def mjx_model(self) -> mjx.Model:
@@ -148,9 +161,9 @@ class JetBotEnv(brax.envs.Env):
         # Only the names of the reward terms are needed here: a first state has no reward.
         _, terms = jax.eval_shape(self.task.reward, robot, robot, goal, jnp.zeros(self.action_size))
         zero = jnp.zeros(())
-        return State(
+        state = State(
             pipeline_state=physics,
-            obs=self.task.observe(robot, goal),
+            obs=self.observe(robot, goal),
             reward=zero,
             done=zero,
             metrics={"success": zero, **{f"reward/{name}": zero for name in terms}},
@@ -158,6 +171,7 @@ class JetBotEnv(brax.envs.Env):
             goal=goal,
             key=key,
         )
+        return state if self.camera is None else see(self.camera, self.task, state)
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
         """Make one environment step.
@@ -169,15 +183,20 @@ class JetBotEnv(brax.envs.Env):
         Returns:
           The next state, with the same tree structure, shapes and dtypes.
         """
-        return self.step_with_ctrl(state, action, self.wheel_targets(action))
+        targets = self.wheel_targets(action)
+        if self.camera is None:
+            return self.step_with_ctrl(state, action, targets)
+        before = state.replace(obs=numbers_of(state.obs))
+        nstate = self.step_with_ctrl(before, action, targets)
+        return see(self.camera, self.task, nstate, state.obs[PIXELS], begins=False)
 
     def step_with_ctrl(
         self, state: State, action: Float[Array, "2"], ctrl: Float[Array, "2"]
     ) -> State:
-        """Make one environment step with given wheel speed targets.
+        """Make one environment step with given wheel speed targets, without the camera.
 
         Args:
-          state: a state of this environment.
+          state: a state of this environment, whose observation has no images.
           action: the action, in [-1, 1]²; only the task's reward uses it.
           ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
 
@@ -217,8 +236,17 @@ class JetBotEnv(brax.envs.Env):
             goal = self.task.advance(before, after, goal)
         terminated = self.task.terminated(after, goal).astype(jnp.float32)
         success = self.task.success(after, goal).astype(jnp.float32)
-        obs = self.task.observe(after, goal)
+        obs = self.observe(after, goal)
         return TaskStep(obs, reward, terms, terminated, success, goal)
+
+    def observe(self, robot: RobotState, goal: Goal) -> Any:
+        """Return the task's observation: a vector, or an empty dictionary if its layout is empty.
+
+        Args:
+          robot: the robot as its sensors measure it.
+          goal: the goal of the episode.
+        """
+        return self.task.observe(robot, goal) if self.task.layout else {}
 
     def mocap_positions(self, goal: Goal) -> Float[Array, "nmocap 3"] | None:
         """Return the positions of the task's solid mocap bodies during a step.
@@ -282,20 +310,24 @@ class JetBotEnv(brax.envs.Env):
         return self.physics.step(physics, ctrl, mocap_pos)
 
     @property
-    def observation_size(self) -> int:
-        """Length of the observation vector."""
-        return layout_size(self.task.layout)
+    def observation_size(self) -> int | dict[str, tuple[int, ...]]:
+        """Length of the observation vector; with a camera, the shapes of the parts by name."""
+        length = layout_size(self.task.layout)
+        if self.camera is None:
+            return length
+        return observation_shapes(self.camera, length)
 
     @property
-    def observation_min_std(self) -> Float[np.ndarray, " obs"]:
-        """Smallest standard deviation by which training normalises each entry of the observation.
+    def observation_min_std(self) -> Any:
+        """Smallest standard deviation by which training normalises each number of the observation.
 
         Raises:
           UserError: the task's layout does not define it.
         """
         layout = self.task.layout
         by_field = [min_std(field) for field in layout]
-        return np.repeat(np.array(by_field, np.float32), [field.size for field in layout])
+        smallest = np.repeat(np.array(by_field, np.float32), [field.size for field in layout])
+        return smallest if self.camera is None else {NUMBERS: smallest} if layout else {}
 
     @property
     def action_size(self) -> int:

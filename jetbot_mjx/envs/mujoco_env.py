@@ -24,7 +24,7 @@ from jetbot_mjx.envs.robot_model import (
     make_mj_model,
 )
 from jetbot_mjx.envs.state import PhysicsState, robot_state
-from jetbot_mjx.envs.task import AdvancesGoal, Goal, RobotState
+from jetbot_mjx.envs.task import AdvancesGoal, Goal, RobotState, layout_size
 
 # MuJoCo prints each of these warnings once per episode and appends it to a file in the working
 # directory. They are suppressed, since `Step.finite` reports the same.
@@ -86,7 +86,7 @@ class MujocoJetBot:
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._mocap_pos: Float[np.ndarray, "nmocap 3"] = self.data.mocap_pos.copy()
         self._before = np.concatenate((self._qpos, self._qvel), dtype=np.float32)
-        self._obs = np.zeros(self.env.observation_size, np.float32)
+        self._obs = np.zeros(layout_size(self.env.task.layout), np.float32)
 
     def reset(
         self, key: UInt32[np.ndarray, "2"]

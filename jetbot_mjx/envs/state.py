@@ -36,8 +36,9 @@ class State(struct.PyTreeNode):
 
     pipeline_state: PhysicsState
     """The physics state; the name is Brax's."""
-    obs: Float[Array, " obs"]
-    """Observation of the policy."""
+    obs: Any
+    """Observation of the policy: a vector of numbers, or a dictionary with images, as of
+    `CameraWrapper`."""
     reward: Float[Array, ""]
     """Reward of the last step."""
     done: Float[Array, ""]

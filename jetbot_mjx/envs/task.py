@@ -78,7 +78,7 @@ EGOCENTRIC: Layout = (
     Field("yaw_rate", 1, "rad/s", "body"),
 )
 
-LAYOUTS: dict[str, Layout] = {"world": WORLD, "egocentric": EGOCENTRIC}
+LAYOUTS: dict[str, Layout] = {"world": WORLD, "egocentric": EGOCENTRIC, "": ()}
 
 
 def layout_size(layout: Layout) -> int:
@@ -140,7 +140,8 @@ class Task(Protocol):
     """
 
     layout: Layout
-    """Description of the observation: name, size, unit and frame of each part."""
+    """Description of the observation: name, size, unit and frame of each part; empty if the policy
+    sees images only."""
 
     def sample(self, key: UInt32[Array, "2"]) -> Goal:
         """Draw the goal of one episode, arrays in any pytree."""
@@ -244,7 +245,7 @@ class GoalTask:
           config: the range of goals, the success radius and the observation layout.
         """
         self.config = config
-        self.layout: Layout = LAYOUTS[config.observation]
+        self.layout: Layout = LAYOUTS[config.numbers]
 
     def sample(self, key: UInt32[Array, "2"]) -> Float[Array, "3"]:
         """Draw a goal position [m], world frame.
@@ -262,9 +263,11 @@ class GoalTask:
         )
 
     def observe(self, robot: RobotState, goal: Goal) -> Float[Array, " obs"]:
-        """Return the observation in the configured layout: `WORLD` or `EGOCENTRIC`."""
+        """Return the numbers in the configured layout: `WORLD`, `EGOCENTRIC` or none."""
+        if not self.config.numbers:
+            return jnp.zeros(0)
         position_w = self.goal_position(goal)
-        if self.config.observation == "world":
+        if self.config.numbers == "world":
             return jnp.concatenate([*robot, position_w])
         heading = kinematics.yaw(robot.quat)
         goal_b = kinematics.to_body(heading, position_w[:2] - robot.position_w[:2])

@@ -2,7 +2,8 @@
 
 `wrap_for_training` is the entry point. The order, from the inside out:
 
-    JetBotEnv > DomainRandomizationWrapper > EpisodeWrapper > NewEpisodeWrapper > jax.vmap
+    JetBotEnv > DomainRandomizationWrapper > EpisodeWrapper > NewEpisodeWrapper > CameraWrapper
+      > jax.vmap
 
 All wrappers but the last one see a single robot without a batch axis.
 """
@@ -17,6 +18,7 @@ from brax.envs.wrappers.training import VmapWrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx.envs import mjx
+from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
@@ -57,9 +59,10 @@ def wrap_for_training(
       (n, 2).
     """
 
-    def wrap_one(env: JetBotEnv) -> NewEpisodeWrapper:
-        randomized = maybe_randomize(env)
-        return NewEpisodeWrapper(EpisodeWrapper(randomized, episode_length, action_repeat))
+    def wrap_one(env: JetBotEnv) -> Any:
+        randomized = maybe_randomize(env.blind())
+        episodes = NewEpisodeWrapper(EpisodeWrapper(randomized, episode_length, action_repeat))
+        return with_camera(episodes, env.camera)
 
     if randomization_fn is None:
         return VmapWrapper(wrap_one(env))

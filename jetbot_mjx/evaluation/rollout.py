@@ -15,6 +15,7 @@ from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.state import State
@@ -103,7 +104,8 @@ def rollout_fn(
       environment), to be compiled by `jax.jit`. The reset key also seeds the controller's own
       randomness.
     """
-    episode_env = EpisodeWrapper(env, episode_length)
+    blind = env.blind() if isinstance(env, JetBotEnv) else env
+    episode_env = with_camera(EpisodeWrapper(blind, episode_length), env.camera)
     step = jax.vmap(functools.partial(_step_and_tally, episode_env))
     # Fold in twice: `fold_in(key, 1)` alone equals `split(key)[1]`, from which the goal is drawn.
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
@@ -143,7 +145,7 @@ def rollout_fn(
 
 
 def _step_and_tally(
-    env: EpisodeWrapper, state: State, tally: _Tally, action: Float[Array, "2"]
+    env: Any, state: State, tally: _Tally, action: Float[Array, "2"]
 ) -> tuple[State, _Tally]:
     """Step one environment and add to its episode statistics, unless its episode has ended."""
     nstate = env.step(state, action)

@@ -6,11 +6,16 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import numpy as np
-from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.agents.networks import Policy, PolicyParams, make_networks, make_policy
+from jetbot_mjx.agents.networks import (
+    Observation,
+    Policy,
+    PolicyParams,
+    init_normalizer,
+    make_networks,
+    make_policy,
+)
 from jetbot_mjx.config import Config, ConfigError, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import layout_data
@@ -49,7 +54,7 @@ class Checkpoint(NamedTuple):
     env_steps: int
     config: Config
     params: PolicyParams
-    networks: ppo_networks.PPONetworks
+    networks: Any
     about: Mapping[str, Any]
 
     @property
@@ -175,17 +180,47 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
     size, layout = checkpoint.about["observation_size"], checkpoint.about["layout"]
 
     def checked_policy(
-        obs: Float[Array | np.ndarray, "*batch obs"], key: UInt32[Array, "2"] | None = None
+        obs: Observation, key: UInt32[Array, "2"] | None = None
     ) -> Float[Array, "*batch action"]:
-        shape = np.shape(obs)
-        if shape[-1:] != (size,):
-            given = shape[-1] if shape else "one number without an axis"
-            raise InvalidError(
-                f"observation: expected {size} numbers, {_names(layout)}; got {given}"
-            )
+        if isinstance(size, int):
+            _check_numbers(obs, size, layout)
+        else:
+            _check_parts(obs, size)
         return policy(obs, key)
 
     return checked_policy
+
+
+def _check_numbers(obs: Any, size: int, layout: Sequence[Mapping[str, Any]]) -> None:
+    """Raise an error if an observation is no vector of a length, or a batch of such."""
+    if isinstance(obs, Mapping):
+        raise InvalidError(f"observation: expected {size} numbers; got {_parts(obs)}")
+    shape = np.shape(obs)
+    if shape[-1:] != (size,):
+        given = shape[-1] if shape else "one number without an axis"
+        raise InvalidError(f"observation: expected {size} numbers, {_names(layout)}; got {given}")
+
+
+def _check_parts(obs: Any, shapes: Mapping[str, Sequence[int]]) -> None:
+    """Raise an error if an observation lacks parts of the given shapes, or a batch of such."""
+    wanted = "{" + ", ".join(f"{name}: {list(shape)}" for name, shape in shapes.items()) + "}"
+    if not isinstance(obs, Mapping):
+        raise InvalidError(f"observation: expected {wanted}; got shape {list(np.shape(obs))}")
+    fits = set(obs) == set(shapes) and all(
+        np.shape(obs[name])[-len(shape) :] == tuple(shape) for name, shape in shapes.items()
+    )
+    if not fits:
+        raise InvalidError(f"observation: expected {wanted}; got {_parts(obs)}")
+    images = [name for name in shapes if len(shapes[name]) == 3]
+    if wrong := [name for name in images if np.asarray(obs[name]).dtype != np.uint8]:
+        raise InvalidError(
+            f"observation: {wrong[0]} has the dtype {np.asarray(obs[wrong[0]]).dtype}: it should be"
+            " uint8, 0 to 255"
+        )
+
+
+def _parts(obs: Mapping[str, Any]) -> str:
+    return "{" + ", ".join(f"{name}: {list(np.shape(x))}" for name, x in obs.items()) + "}"
 
 
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
@@ -258,15 +293,13 @@ def _success_rate(folder: Path) -> float:
         return -1.0
 
 
-def policy_template(networks: ppo_networks.PPONetworks, observation_size: int) -> PolicyParams:
+def policy_template(networks: Any, observation_size: int | dict[str, list[int]]) -> PolicyParams:
     """Return the shapes and dtypes of a policy's parameters, without any values."""
 
     def init() -> PolicyParams:
         key = jax.random.PRNGKey(0)
         return PolicyParams(
-            normalizer=running_statistics.init_state(
-                specs.Array((observation_size,), np.dtype("float32"))
-            ),
+            normalizer=init_normalizer(observation_size),
             policy=networks.policy_network.init(key),
             value=networks.value_network.init(key),
         )

@@ -90,6 +90,11 @@ def make_warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmS
     Raises:
       UserError: the networks differ in more than the observation, or no field is in both layouts.
     """
+    if source.config.task.sees:
+        raise UserError(
+            f"init_from {source.path}: its policy sees images (task.observation ="
+            f" {source.config.task.observation!r}), and only numbers can be matched"
+        )
     _check_networks(source, config, env)
     old, new = source.about["layout"], layout_data(env.task.layout)
     rows = match_rows(old, new)

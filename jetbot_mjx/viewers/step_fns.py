@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int, UInt32
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.camera.wrapper import see, with_camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.envs.task import MovesGoal
@@ -84,7 +85,8 @@ def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Viewe
     Returns:
       The functions; `move` may only be called if `move_goal_error` returns an empty string.
     """
-    episode_env = EpisodeWrapper(env, env.config.task.episode_length)
+    episodes = EpisodeWrapper(env.blind(), env.config.task.episode_length)
+    episode_env = with_camera(episodes, env.camera)
     controllers = [policy_controller(networks), *(make(env) for make in BASELINES.values())]
     limits = {"max_speed": env.config.task.max_speed, "max_yaw_rate": env.config.task.max_yaw_rate}
 
@@ -116,9 +118,11 @@ def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Viewe
     def move(state: State, position_w: Float[Array, "3"]) -> tuple[State, Snapshot]:
         assert isinstance(env.task, MovesGoal)
         goal = env.task.move_goal(state.goal, position_w)
-        obs = env.task.observe(robot_state(state.pipeline_state), goal)
+        obs = env.blind().observe(robot_state(state.pipeline_state), goal)
         info = {**state.info, "steps": jnp.zeros(())}
         state = state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
+        if env.camera is not None:
+            state = see(env.camera, env.task, state)
         return state, snapshot(state)
 
     compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))

@@ -1,0 +1,223 @@
+"""Build policy and value networks that see: convolutions in front of Brax's networks.
+
+Motivation: Brax's vision networks give the policy and the value function convolutions of their own,
+which doubles the most expensive part of an update, and XLA's gradients of convolutions are slow on
+CPUs. Here both share one encoder by default, and a convolution is a matrix product.
+
+Equations: the encoder maps an image to features φ, and Brax's networks see (φ, normalised numbers):
+
+    x₀ = pixels / 255,  x_i = relu(x_{i-1} * W_i + b_i),  φ = relu(W flatten(x) + b)
+
+The encoder's parameters are part of the policy's, because inference needs them. The loss encodes a
+minibatch once, and passes the features to Brax's loss as its observation, so that gradients flow
+from policy and value function into one encoder.
+
+Source: V. Mnih et al., Nature 518 (2015), 529-533, for `nature`; google/brax v0.14.2,
+brax/training/agents/ppo/networks_vision.py.
+"""
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from brax.training import networks as brax_networks
+from brax.training.agents.ppo import networks as ppo_networks
+from jaxtyping import Array, Float, UInt8
+
+from jetbot_mjx.config import NetworkConfig
+
+Shapes = Mapping[str, tuple[int, ...]]
+"""Shapes of the parts of an observation, by name."""
+
+_POLICY, _VALUE = "policy", "value"
+_ENCODER, _HEAD = "encoder", "head"
+
+
+class _Layers(NamedTuple):
+    """A `_Layers` holds the sizes of an encoder."""
+
+    convolutions: tuple[tuple[int, int, int], ...]
+    """Channels, side of the kernel and stride of each convolution [pixels]."""
+    features: int
+
+
+_CNNS = {
+    "nature": _Layers(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),
+    "small": _Layers(((16, 4, 2), (32, 4, 2), (32, 3, 1)), 128),
+    "tiny": _Layers(((16, 4, 4), (32, 4, 2)), 64),
+}
+
+
+class VisionNetworks(NamedTuple):
+    """A `VisionNetworks` has the attributes of Brax's `PPONetworks`, and its encoder."""
+
+    policy_network: brax_networks.FeedForwardNetwork
+    """The policy: parameters and observation to the parameters of the action distribution."""
+    value_network: brax_networks.FeedForwardNetwork
+    """The value function; it takes encoded observations."""
+    parametric_action_distribution: Any
+    heads: ppo_networks.PPONetworks
+    """The networks behind the encoder, which take encoded observations."""
+    encode: Callable[[Any, Any, Any], dict[str, Float[Array, "*batch features"]]]
+    """Encode observations: (normaliser, parameters of both networks, observation)."""
+
+
+def is_image(name: str) -> bool:
+    """Return whether a part of an observation holds images, as Brax's networks decide it."""
+    return name.startswith("pixels/")
+
+
+def make_vision_networks(
+    config: NetworkConfig,
+    shapes: Shapes,
+    action_size: int,
+    *,
+    make_heads: Callable[..., ppo_networks.PPONetworks],
+    normalize: Callable[[Any, Any], Any],
+) -> VisionNetworks:
+    """Build the networks for an observation with images.
+
+    Args:
+      config: the layers, the activation and the action distribution.
+      shapes: the shapes of the observation's parts.
+      action_size: the length of the action.
+      make_heads: builds Brax's networks from (observation_size, action_size, ...).
+      normalize: a function of (numbers, statistics) that normalises the numbers.
+
+    Returns:
+      The networks.
+    """
+    layers = _CNNS[config.cnn]
+    encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
+    images = [name for name in sorted(shapes) if is_image(name)]
+    numbers = {name: shape for name, shape in shapes.items() if not is_image(name)}
+    length = layers.features + sum(shape[0] for shape in numbers.values())
+    brax_heads = make_heads(length, action_size)
+
+    def init(head: brax_networks.FeedForwardNetwork, encodes: bool) -> Callable[[Any], Any]:
+        def init_network(key: Any) -> Any:
+            encoder_key, head_key = jax.random.split(key)
+            pixels = _joined({name: jnp.zeros((1, *shapes[name]), jnp.uint8) for name in images})
+            own = {_ENCODER: encoder.init(encoder_key, pixels)} if encodes else {}
+            return {_HEAD: head.init(head_key), **own}
+
+        return init_network
+
+    def encode_one(normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
+        features: Any = encoder.apply(
+            params[_ENCODER], _joined({name: obs[name] for name in images})
+        )
+        values = normalize({name: obs[name] for name in numbers}, normalizer)
+        return jnp.concatenate([features, *(values[name] for name in sorted(numbers))], axis=-1)
+
+    def encode(normalizer: Any, params: Any, obs: Any) -> dict[str, Any]:
+        for_policy = encode_one(normalizer, params.policy, obs)
+        if config.shared_cnn:
+            return {_POLICY: for_policy, _VALUE: for_policy}
+        return {_POLICY: for_policy, _VALUE: encode_one(normalizer, params.value, obs)}
+
+    def head_of(
+        name: str, head: brax_networks.FeedForwardNetwork, encodes: bool
+    ) -> brax_networks.FeedForwardNetwork:
+        return brax_networks.FeedForwardNetwork(
+            init=init(head, encodes),
+            apply=lambda _, params, encoded: head.apply(None, params[_HEAD], encoded[name]),
+        )
+
+    # Pyright does not follow flax's dataclasses.
+    networks: Any = ppo_networks.PPONetworks
+    heads = networks(
+        head_of(_POLICY, brax_heads.policy_network, True),
+        head_of(_VALUE, brax_heads.value_network, not config.shared_cnn),
+        brax_heads.parametric_action_distribution,
+    )
+
+    def apply_policy(normalizer: Any, params: Any, obs: Any) -> Array:
+        encoded = {_POLICY: encode_one(normalizer, params, obs)}
+        return heads.policy_network.apply(None, params, encoded)
+
+    return VisionNetworks(
+        policy_network=brax_networks.FeedForwardNetwork(
+            init=heads.policy_network.init, apply=apply_policy
+        ),
+        value_network=heads.value_network,
+        parametric_action_distribution=heads.parametric_action_distribution,
+        heads=heads,
+        encode=encode,
+    )
+
+
+def _joined(images: Mapping[str, UInt8[Array, "*batch h w c"]]) -> UInt8[Array, "*batch h w c"]:
+    """Return several images of one size as the channels of one."""
+    return jnp.concatenate(list(images.values()), axis=-1)
+
+
+class Encoder(nn.Module):
+    """An `Encoder` maps images to features."""
+
+    convolutions: tuple[tuple[int, int, int], ...]
+    """Channels, side of the kernel and stride of each convolution [pixels]."""
+    features: int
+    dtype: str
+    """`auto`, `float32` or `bfloat16`."""
+
+    @nn.compact
+    def __call__(self, pixels: UInt8[Array, "*batch h w c"]) -> Float[Array, "*batch features"]:
+        """Return the features of images, at any number of batch axes."""
+        dtype = _dtype(self.dtype)
+        batch = pixels.shape[:-3]
+        x = pixels.reshape(-1, *pixels.shape[-3:])
+        for i, (channels, side, stride) in enumerate(self.convolutions):
+            shape = (side, side, x.shape[-1], channels)
+            kernel = self.param(f"conv_{i}_kernel", nn.initializers.lecun_normal(), shape)
+            bias = self.param(f"conv_{i}_bias", nn.initializers.zeros_init(), (channels,))
+            if i == 0:
+                # Divide the few weights instead of the many pixels.
+                kernel = kernel / 255.0
+            x = nn.relu(convolve(x, kernel.astype(dtype), stride) + bias.astype(dtype))
+        x = x.reshape(x.shape[0], -1)
+        x = nn.relu(nn.Dense(self.features, dtype=dtype, name="dense")(x))
+        return x.astype(jnp.float32).reshape(*batch, self.features)
+
+
+def _dtype(name: str) -> Any:
+    if name == "auto":
+        return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16
+    return jnp.dtype(name)
+
+
+def convolve(
+    x: Array, kernel: Float[Array, "side side c_in c_out"], stride: int
+) -> Float[Array, "n h_out w_out c_out"]:
+    """Convolve images without padding, as one matrix product.
+
+    The image is cut into squares as large as the stride, whose pixels become channels; a kernel
+    covers m × m of them, side = m stride, and their shifted copies become channels again. XLA's own
+    gradients of convolutions take many times as long on CPUs.
+
+    Args:
+      x: images of shape (n, h, w, c_in), of any dtype.
+      kernel: the weights, of the dtype to compute with; its side is a multiple of the stride.
+      stride: the stride of the convolution [pixels].
+
+    Returns:
+      The images convolved, as `jax.lax.conv` does with padding VALID.
+    """
+    count, height, width, c_in = x.shape
+    side, _, _, c_out = kernel.shape
+    m = side // stride
+    rows, columns = ((size - side) // stride + 1 for size in (height, width))
+    # Cut into squares: (n, row, column, square).
+    down, right = rows + m - 1, columns + m - 1
+    x = x[:, : down * stride, : right * stride]
+    x = x.reshape(count, down, stride, right, stride, c_in).transpose(0, 1, 3, 2, 4, 5)
+    x = x.reshape(count, down, right, stride * stride * c_in)
+    # Join the squares that a kernel covers, and order its weights likewise.
+    parts = [x[:, i : i + rows, j : j + columns] for i in range(m) for j in range(m)]
+    patches = jnp.concatenate(parts, axis=-1).astype(kernel.dtype)
+    weights = kernel.reshape(m, stride, m, stride, c_in, c_out).transpose(0, 2, 1, 3, 4, 5)
+    weights = weights.reshape(math.prod(kernel.shape[:3]), c_out)
+    return patches @ weights

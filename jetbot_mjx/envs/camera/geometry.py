@@ -1,0 +1,217 @@
+"""Intersect rays with MuJoCo's primitives, in the frame of each geom.
+
+Motivation: thousands of small images a millisecond are a matter of few operations and of a layout
+without vectors. Every vector is therefore a tuple of three arrays, of the shape of an image or of
+scalars per frame, so that XLA makes one elementwise kernel of a whole image.
+
+A ray is o + t d with o the camera's position and d = M (x, y, 1) the direction of the pixel, both
+in the frame of the geom. Since d has the length 1 along the optical axis, t is the depth [m].
+An intersection is where the ray enters: a camera inside a geom does not see it, as in OpenGL with
+back faces culled.
+
+Source of the quadratic in its stable form: t = c / (-b + √(b² - ac)), the smaller root, since the
+product of both is c/a.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+Vector = tuple[Array, Array, Array]
+"""x, y and z of a vector, each a scalar or an image."""
+
+Size = tuple[float, float, float]
+"""Sizes of a geom [m], as in MuJoCo; a sphere has its radius three times."""
+
+_TINY = 1e-12
+
+
+class Hit(NamedTuple):
+    """A `Hit` holds where rays enter a geom."""
+
+    mask: Bool[Array, "h w"]
+    """Whether the ray enters the geom."""
+    depth: Float[Array, "h w"]
+    """Depth along the optical axis [m], where `mask`."""
+    faces: tuple[Bool[Array, "h w"], ...] = ()
+    """For a box, which axis the entered face is perpendicular to: the first two of three."""
+
+    @property
+    def masked_depth(self) -> Float[Array, "h w"]:
+        """Return the depth [m], infinite where the ray does not enter."""
+        return jnp.where(self.mask, self.depth, jnp.inf)
+
+
+def dot(a: Vector, b: Vector) -> Array:
+    """Return the scalar product."""
+    return a[0] * b[0] + (a[1] * b[1] + a[2] * b[2])
+
+
+def along(origin: Vector, direction: Vector, depth: Array) -> Vector:
+    """Return the points of rays at a depth [m]."""
+    x, y, z = (o + depth * d for o, d in zip(origin, direction, strict=True))
+    return x, y, z
+
+
+def hit_plane(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with a plane z = 0, seen from above.
+
+    Args:
+      origin: the camera in the plane's frame [m].
+      direction: the directions of the rays.
+      size: half lengths [m]; 0: infinite.
+    """
+    down = jnp.maximum(-direction[2], _TINY)
+    depth = origin[2] / down
+    mask = (direction[2] < -_TINY) & (origin[2] > 0)
+    for axis in (0, 1):
+        if size[axis] > 0:
+            mask &= jnp.abs(origin[axis] + depth * direction[axis]) <= size[axis]
+    return Hit(mask, depth)
+
+
+def hit_box(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with a box, one face per axis, since the camera sees at most three.
+
+    The face of axis a lies at the distance m = |o_a| - h_a in front of the camera, and is reached
+    at t = m/D, D = -sign(o_a) d_a. Multiplied by D > 0, the test |o_b + t d_b| ≤ h_b of the two
+    other axes needs no division.
+
+    Args:
+      origin: the camera in the box's frame [m].
+      direction: the directions of the rays.
+      size: half lengths [m].
+    """
+    faces, distances, speeds = [], [], []
+    for a in range(3):
+        b, c = (a + 1) % 3, (a + 2) % 3
+        distance = jnp.abs(origin[a]) - size[a]
+        speed = -jnp.sign(origin[a]) * direction[a]
+        # A camera between the planes of both faces sees neither: no width is small enough.
+        seen = jnp.where(distance > 0, 1.0, -1.0)
+        faces.append(
+            (jnp.abs(origin[b] * speed + distance * direction[b]) <= (seen * size[b]) * speed)
+            & (jnp.abs(origin[c] * speed + distance * direction[c]) <= (seen * size[c]) * speed)
+        )
+        distances.append(distance)
+        speeds.append(speed)
+    first, second, third = faces
+    distance = jnp.where(first, distances[0], jnp.where(second, distances[1], distances[2]))
+    speed = jnp.where(first, speeds[0], jnp.where(second, speeds[1], speeds[2]))
+    return Hit(first | second | third, distance / jnp.maximum(speed, _TINY), (first, second))
+
+
+def hit_ellipsoid(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with an ellipsoid: a unit sphere in scaled coordinates.
+
+    Args:
+      origin: the camera in the ellipsoid's frame [m].
+      direction: the directions of the rays.
+      size: radii [m].
+    """
+    o, d = (_scaled(vector, size) for vector in (origin, direction))
+    return _enter(dot(d, d), dot(o, d), dot(o, o) - 1.0)
+
+
+def hit_sphere(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with a sphere.
+
+    Args:
+      origin: the camera in the sphere's frame [m].
+      direction: the directions of the rays.
+      size: the radius [m], three times.
+    """
+    squared = dot(direction, direction)
+    return _enter(squared, dot(origin, direction), dot(origin, origin) - size[0] * size[0])
+
+
+def hit_cylinder(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with a cylinder along z: its side, and the cap that faces the camera.
+
+    Args:
+      origin: the camera in the cylinder's frame [m].
+      direction: the directions of the rays.
+      size: radius, half length [m], and a number that is not used.
+    """
+    side = _enter_side(origin, direction, size)
+    distance = jnp.abs(origin[2]) - size[1]
+    speed = -jnp.sign(origin[2]) * direction[2]
+    depth = distance / jnp.maximum(speed, _TINY)
+    x, y, _ = along(origin, direction, depth)
+    cap = (distance > 0) & (speed > _TINY) & (x * x + y * y <= size[0] * size[0])
+    return Hit(side.mask | cap, jnp.where(cap, depth, side.depth))
+
+
+def hit_capsule(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with a capsule along z: a cylinder's side and two spheres.
+
+    Args:
+      origin: the camera in the capsule's frame [m].
+      direction: the directions of the rays.
+      size: radius, half length of the cylinder [m], and a number that is not used.
+    """
+    hits = [_enter_side(origin, direction, size)]
+    for end in (-size[1], size[1]):
+        centre = (origin[0], origin[1], origin[2] - end)
+        hits.append(hit_sphere(centre, direction, size))
+    depths = [jnp.where(hit.mask, hit.depth, jnp.inf) for hit in hits]
+    depth = jnp.minimum(jnp.minimum(depths[0], depths[1]), depths[2])
+    # Inside of one of the three parts is inside of the capsule.
+    z = jnp.clip(origin[2], -size[1], size[1])
+    outside = origin[0] ** 2 + origin[1] ** 2 + (origin[2] - z) ** 2 > size[0] * size[0]
+    return Hit(outside & jnp.isfinite(depth), depth)
+
+
+def _enter_side(origin: Vector, direction: Vector, size: Size) -> Hit:
+    """Intersect rays with the side of a cylinder along z."""
+    (ox, oy, oz), (dx, dy, dz) = origin, direction
+    hit = _enter(dx * dx + dy * dy, ox * dx + oy * dy, ox * ox + oy * oy - size[0] * size[0])
+    return hit._replace(mask=hit.mask & (jnp.abs(oz + hit.depth * dz) <= size[1]))
+
+
+def _enter(a: Array, b: Array, c: Array) -> Hit:
+    """Return the smaller root of a t² + 2 b t + c, where it is positive and c too: from outside."""
+    inside_root = b * b - a * c
+    mask = (inside_root > 0) & (b < 0) & (c > 0)
+    root = jnp.sqrt(jnp.maximum(inside_root, 0.0))
+    return Hit(mask, c / jnp.maximum(root - b, _TINY))
+
+
+def _scaled(vector: Vector, size: Sequence[Any]) -> Vector:
+    x, y, z = (v / s for v, s in zip(vector, size, strict=True))
+    return x, y, z
+
+
+def normal_ellipsoid(point: Vector, size: Size) -> Vector:
+    """Return the outward unit normals at points of an ellipsoid, in its frame."""
+    return _unit(_scaled(_scaled(point, size), size))
+
+
+def normal_sphere(point: Vector, size: Size) -> Vector:
+    """Return the outward unit normals at points of a sphere, in its frame."""
+    return _scaled(point, (size[0], size[0], size[0]))
+
+
+def normal_cylinder(point: Vector, size: Size) -> Vector:
+    """Return the outward unit normals at points of a cylinder, in its frame."""
+    x, y, z = point
+    cap = jnp.abs(z) >= size[1] * (1 - 1e-5)
+    # A point of the cap may lie on its edge as well.
+    cap &= x * x + y * y < (size[0] * (1 - 1e-5)) ** 2
+    side = jnp.where(cap, 0.0, 1.0 / size[0])
+    return x * side, y * side, jnp.where(cap, jnp.sign(z), 0.0)
+
+
+def normal_capsule(point: Vector, size: Size) -> Vector:
+    """Return the outward unit normals at points of a capsule, in its frame."""
+    x, y, z = point
+    return _scaled((x, y, z - jnp.clip(z, -size[1], size[1])), (size[0], size[0], size[0]))
+
+
+def _unit(vector: Vector) -> Vector:
+    scale = jax.lax.rsqrt(jnp.maximum(dot(vector, vector), _TINY))
+    x, y, z = (v * scale for v in vector)
+    return x, y, z

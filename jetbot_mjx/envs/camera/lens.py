@@ -1,0 +1,166 @@
+"""Compute the direction in which every pixel of a camera looks.
+
+Frames: image coordinates as in OpenCV, x to the right, y down, z along the optical axis; pixel
+(0, 0) is the upper left one, and its centre lies at (0, 0). Directions are scaled to z = 1.
+
+Everything here is NumPy and runs once: a lens costs a compiled program nothing but the constants.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.errors import InvalidError
+
+_MAX_ANGLE = np.radians(89.0)
+
+
+class Rays(NamedTuple):
+    """A `Rays` holds the directions (x, y, 1) of points of the image, as arrays that broadcast."""
+
+    x: Float[np.ndarray, "h w"]
+    y: Float[np.ndarray, "h w"]
+
+
+class Footprint(NamedTuple):
+    """A `Footprint` holds the centres of the pixels and how directions change across one."""
+
+    centre: Rays
+    right: Rays
+    """Change of (x, y) to the next pixel on the right."""
+    down: Rays
+    """Change of (x, y) to the next pixel below."""
+
+
+class Intrinsics(NamedTuple):
+    """An `Intrinsics` holds a camera matrix in pixels, as OpenCV calibrates it."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+def intrinsics(config: CameraConfig) -> Intrinsics:
+    """Return the camera matrix for the size of the image.
+
+    Args:
+      config: the camera section; without a matrix, `fovy` and the middle of the image count.
+    """
+    width, height = config.width, config.height
+    if config.matrix is not None:
+        of_width, of_height = config.calibration_size or (width, height)
+        fx, fy, cx, cy = config.matrix
+        right, down = width / of_width, height / of_height
+        # The middle of the upper left pixel is the origin, and stays half a pixel from the corner.
+        return Intrinsics(fx * right, fy * down, (cx + 0.5) * right - 0.5, (cy + 0.5) * down - 0.5)
+    half = np.radians(config.fovy) / 2
+    focal = height / 2 / (half if config.lens == "fisheye" else np.tan(half))
+    return Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
+
+
+def sample_rays(config: CameraConfig, samples: int) -> list[Rays]:
+    """Return the directions of a regular grid of points within every pixel.
+
+    Args:
+      config: the camera section.
+      samples: points per side of a pixel.
+
+    Returns:
+      `samples`² grids of the image's size, row by row.
+    """
+    offsets = (np.arange(samples) + 0.5) / samples - 0.5
+    return [_rays(config, right, down) for down in offsets for right in offsets]
+
+
+def footprint(config: CameraConfig) -> Footprint:
+    """Return the directions of the pixels' centres, and their differences across a pixel."""
+    left, right = _rays(config, -0.5, 0.0), _rays(config, 0.5, 0.0)
+    upper, lower = _rays(config, 0.0, -0.5), _rays(config, 0.0, 0.5)
+    return Footprint(
+        centre=_rays(config, 0.0, 0.0),
+        right=Rays(right.x - left.x, right.y - left.y),
+        down=Rays(lower.x - upper.x, lower.y - upper.y),
+    )
+
+
+def _rays(config: CameraConfig, right: float, down: float) -> Rays:
+    """Return the directions of all pixels' points at an offset from their centres [pixels]."""
+    matrix = intrinsics(config)
+    x = (np.arange(config.width)[None, :] + right - matrix.cx) / matrix.fx
+    y = (np.arange(config.height)[:, None] + down - matrix.cy) / matrix.fy
+    if config.lens == "fisheye":
+        x, y = _undistort_fisheye(x, y, config.distortion)
+    elif config.distortion:
+        x, y = _undistort(x, y, config.distortion)
+    return Rays(np.asarray(x, np.float32), np.asarray(y, np.float32))
+
+
+def _undistort(
+    x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Invert OpenCV's radial and tangential distortion (k1, k2, p1, p2, k3, k4, k5, k6).
+
+    x" = x (1 + k1 r² + k2 r⁴ + k3 r⁶) / (1 + k4 r² + k5 r⁴ + k6 r⁶) + 2 p1 x y + p2 (r² + 2 x²),
+    and y" likewise with p1 and p2 exchanged; solved by Newton's method from x" itself.
+
+    Raises:
+      InvalidError: the coefficients do not describe a lens for the whole image.
+    """
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *[0.0] * (8 - len(coefficients)))
+
+    def distort(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        r2 = x * x + y * y
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / (1 + r2 * (k4 + r2 * (k5 + r2 * k6)))
+        return (
+            x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x),
+            y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
+        )
+
+    wanted_x, wanted_y = np.broadcast_arrays(x, y)
+    x, y = wanted_x, wanted_y
+    step = 1e-6
+    for _ in range(50):
+        at_x, at_y = distort(x, y)
+        (xx, yx), (xy, yy) = distort(x + step, y), distort(x, y + step)
+        xx, xy = (xx - at_x) / step, (xy - at_x) / step
+        yx, yy = (yx - at_y) / step, (yy - at_y) / step
+        error_x, error_y = wanted_x - at_x, wanted_y - at_y
+        determinant = xx * yy - xy * yx
+        x = x + (yy * error_x - xy * error_y) / determinant
+        y = y + (xx * error_y - yx * error_x) / determinant
+    at_x, at_y = distort(x, y)
+    error = np.maximum(np.abs(at_x - wanted_x), np.abs(at_y - wanted_y))
+    # Past the turning point of the polynomial the image would show a direction twice.
+    if not (np.all(error < 1e-5) and np.all(determinant > 0)):
+        raise _no_lens(coefficients)
+    return x, y
+
+
+def _undistort_fisheye(
+    x: np.ndarray, y: np.ndarray, coefficients: tuple[float, ...]
+) -> tuple[np.ndarray, np.ndarray]:
+    """Invert OpenCV's fisheye model: r = θ (1 + k1 θ² + k2 θ⁴ + k3 θ⁶ + k4 θ⁸).
+
+    Raises:
+      InvalidError: a corner would look 89 degrees aside or more, or the polynomial turns.
+    """
+    powers = np.array([1.0, *coefficients])
+    x, y = np.broadcast_arrays(x, y)
+    radius = np.hypot(x, y)
+    angles = np.linspace(0.0, _MAX_ANGLE, 20_001)
+    radii = angles * np.polynomial.polynomial.polyval(angles**2, powers)
+    if (np.diff(radii) <= 0).any() or radius.max() > radii[-1]:
+        raise _no_lens(coefficients)
+    angle = np.interp(radius, radii, angles)
+    scale = np.where(radius > 1e-9, np.tan(angle) / np.maximum(radius, 1e-9), 1.0)
+    return x * scale, y * scale
+
+
+def _no_lens(coefficients: tuple[float, ...]) -> InvalidError:
+    return InvalidError(
+        f"camera.distortion = {list(coefficients)} with this lens, matrix and field of view is no"
+        " lens: every pixel should look less than 89 degrees aside, in a direction of its own"
+    )

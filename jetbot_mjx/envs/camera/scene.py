@@ -1,0 +1,241 @@
+"""Read what a camera can see out of a MuJoCo model: geoms, colours, lights and the sky."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import mujoco
+import numpy as np
+from jaxtyping import Float
+
+from jetbot_mjx.errors import UserError
+
+Rgb = tuple[float, float, float]
+
+_KINDS = {
+    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
+    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
+    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
+    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
+    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
+    mujoco.mjtGeom.mjGEOM_BOX: "box",
+}
+_HIDDEN_GROUPS = 3
+"""Geoms of this group and above are hidden, as in MuJoCo's viewers."""
+
+_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)
+_SKY = (0.0, 0.0, 0.0)
+
+
+class Checker(NamedTuple):
+    """A `Checker` holds a checker texture on a plane."""
+
+    even: Rgb
+    """Colour of the square whose corner is the plane's origin, in the quadrant x, y > 0."""
+    odd: Rgb
+    size: tuple[float, float]
+    """Side lengths of a square [m]."""
+
+
+class SceneGeom(NamedTuple):
+    """A `SceneGeom` holds one geom, in the frame of the world or of a mocap body."""
+
+    geom_id: int
+    kind: str
+    size: tuple[float, float, float]
+    """Sizes [m] as in MuJoCo; a sphere has its radius three times."""
+    rgb: Rgb
+    emission: float
+    checker: Checker | None
+    mocap: str | None
+    """The mocap body whose position is added to `position`; None: it stands still."""
+    position: Float[np.ndarray, "3"]
+    """Position [m] in the axes of the world."""
+    rotation: Float[np.ndarray, "3 3"]
+    """Axes of the geom, as columns, in the axes of the world."""
+
+
+class Light(NamedTuple):
+    """A `Light` holds a directional light."""
+
+    direction: Float[np.ndarray, "3"]
+    """Direction of the light's rays, a unit vector in the world frame."""
+    diffuse: Rgb
+
+
+class Scene(NamedTuple):
+    """A `Scene` holds what a camera can see."""
+
+    geoms: tuple[SceneGeom, ...]
+    ambient: Rgb
+    headlight: Rgb
+    """Diffuse light along the optical axis."""
+    lights: tuple[Light, ...]
+    horizon: Rgb
+    zenith: Rgb
+    """Colours of the sky."""
+
+
+def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
+    """Return the visible geoms, lights and sky of a model.
+
+    The robot itself is left out: its camera looks past it. Specular light, shadows, reflections and
+    transparency are not rendered. A plane may have MuJoCo's checker texture; any other texture is
+    replaced by its mean colour.
+
+    Args:
+      model: the compiled model with its visual elements.
+      robot: the name of the robot's body.
+
+    Raises:
+      UserError: a visible geom is a mesh, a height field or an SDF, moves by joints, or a light has
+        a position.
+    """
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    robot_id = model.body(robot).id
+    geoms = []
+    for geom in range(model.ngeom):
+        chain = _ancestors(model, int(model.geom_bodyid[geom]))
+        hidden = model.geom_group[geom] >= _HIDDEN_GROUPS or _rgba(model, geom)[3] == 0
+        if not hidden and robot_id not in chain:
+            geoms.append(_read_geom(model, data, geom, chain))
+    headlight = model.vis.headlight
+    active = bool(headlight.active)
+    horizon, zenith = _read_sky(model)
+    return Scene(
+        tuple(geoms),
+        ambient=_rgb(headlight.ambient * active + model.light_ambient.sum(axis=0)),
+        headlight=_rgb(headlight.diffuse * active),
+        lights=tuple(_read_light(model, light) for light in range(model.nlight)),
+        horizon=horizon,
+        zenith=zenith,
+    )
+
+
+def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
+    """Return a body and the bodies that carry it, without the world."""
+    chain = []
+    while body:
+        chain.append(body)
+        body = int(model.body_parentid[body])
+    return chain
+
+
+def _rgb(values: Sequence[float] | np.ndarray) -> Rgb:
+    red, green, blue = (float(value) for value in values)
+    return red, green, blue
+
+
+def _rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
+    """Return a geom's colour: its own, unless that is the default and it has a material."""
+    own = tuple(float(value) for value in model.geom_rgba[geom])
+    material = model.geom_matid[geom]
+    if material < 0 or not np.allclose(own, _DEFAULT_RGBA):
+        return own
+    return tuple(float(value) for value in model.mat_rgba[material])
+
+
+def _read_geom(
+    model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]
+) -> SceneGeom:
+    kind = _KINDS.get(mujoco.mjtGeom(model.geom_type[geom]))
+    name = model.geom(geom).name or f"geom {geom}"
+    if kind is None:
+        raise UserError(
+            f"task.observation: the camera cannot draw {name!r}, a"
+            f" {mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix('mjGEOM_').lower()}: build"
+            f" it of {', '.join(_KINDS.values())}, or hide it (group={_HIDDEN_GROUPS})"
+        )
+    if any(model.body_jntnum[body] for body in chain):
+        raise UserError(
+            f"task.observation: the camera cannot draw {name!r}, which moves by joints: only bodies"
+            " that stand still and mocap bodies can be drawn"
+        )
+    mocap = next((body for body in chain if model.body_mocapid[body] >= 0), None)
+    start = data.xpos[mocap] if mocap else np.zeros(3)
+    size = model.geom_size[geom]
+    if kind == "sphere":
+        size = np.repeat(size[0], 3)
+    material = int(model.geom_matid[geom])
+    rgba = _rgba(model, geom)
+    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+    checker, tint = None, np.ones(3)
+    if material >= 0 and texture >= 0:
+        image = _texture(model, texture)
+        tint = image.reshape(-1, 3).mean(axis=0)
+        if kind == "plane":
+            checker = _read_checker(model, material, image, size, rgba)
+    return SceneGeom(
+        geom_id=geom,
+        kind=kind,
+        size=_rgb(size),
+        rgb=_rgb(np.asarray(rgba[:3]) * tint),
+        emission=float(model.mat_emission[material]) if material >= 0 else 0.0,
+        checker=checker,
+        mocap=model.body(mocap).name if mocap else None,
+        position=(data.geom_xpos[geom] - start).astype(np.float32),
+        rotation=data.geom_xmat[geom].reshape(3, 3).astype(np.float32),
+    )
+
+
+def _texture(model: mujoco.MjModel, texture: int) -> Float[np.ndarray, "h w 3"]:
+    """Return a texture's image, colours from 0 to 1; of a cube, its six sides one below another."""
+    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+    image = model.tex_data[start : start + height * width * channels]
+    image = image.reshape(height, width, channels) / 255.0
+    return image[..., :3] if channels >= 3 else np.repeat(image[..., :1], 3, axis=-1)
+
+
+def _read_checker(
+    model: mujoco.MjModel,
+    material: int,
+    image: Float[np.ndarray, "h w 3"],
+    size: np.ndarray,
+    rgba: Sequence[float],
+) -> Checker | None:
+    """Return the checker that a texture shows; None: it shows something else."""
+    height, width, _ = image.shape
+    upper, lower = np.array_split(image, 2)
+    quadrants = [half for part in (upper, lower) for half in np.array_split(part, 2, axis=1)]
+    colours = [quadrant[height // 4, width // 4] for quadrant in quadrants]
+    plain = all(np.allclose(q, c, atol=0.01) for q, c in zip(quadrants, colours, strict=True))
+    opposite = np.allclose(colours[0], colours[3]) and np.allclose(colours[1], colours[2])
+    if not (plain and opposite):
+        return None
+    repeat = model.mat_texrepeat[material]
+    # MuJoCo counts repetitions per metre if the texture is uniform or the plane infinite, else over
+    # half of the plane. They begin at the origin, and a square is as long as a repetition.
+    spans = [1.0 if model.mat_texuniform[material] or half == 0 else half for half in size[:2]]
+    tint = np.asarray(rgba[:3])
+    return Checker(
+        even=_rgb(colours[1] * tint),
+        odd=_rgb(colours[0] * tint),
+        size=(float(spans[0] / repeat[0]), float(spans[1] / repeat[1])),
+    )
+
+
+def _read_light(model: mujoco.MjModel, light: int) -> Light:
+    if model.light_type[light] != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
+        raise UserError(
+            f"task.observation: the camera knows directional lights only, and light"
+            f" {model.light(light).name or light!r} has a position: set its type to directional"
+        )
+    direction = model.light_dir[light] / np.linalg.norm(model.light_dir[light])
+    active = float(model.light_active[light])
+    return Light(direction.astype(np.float32), _rgb(model.light_diffuse[light] * active))
+
+
+def _read_sky(model: mujoco.MjModel) -> tuple[Rgb, Rgb]:
+    """Return the sky's colours at the horizon and at the zenith; black without a skybox."""
+    for texture in range(model.ntex):
+        if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
+            image = _texture(model, texture)
+            side = image.shape[1]
+            # The sides are right, left, up, down, front, back.
+            sides = [image[i * side : (i + 1) * side] for i in range(image.shape[0] // side)]
+            if len(sides) != 6:
+                mean = image.reshape(-1, 3).mean(axis=0)
+                return _rgb(mean), _rgb(mean)
+            return _rgb(sides[0][side // 2, side // 2]), _rgb(sides[2][side // 2, side // 2])
+    return _SKY, _SKY
