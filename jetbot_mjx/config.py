@@ -510,8 +510,8 @@ class Config(_Section):
                 )
             if self.task.sees:
                 raise ValueError(
-                    f"task.observation = {self.task.observation!r} is not known to trainer = 'brax':"
-                    " take 'resumable'"
+                    f"task.observation = {self.task.observation!r} is not known to trainer ="
+                    " 'brax': take 'resumable'"
                 )
             if self.deterministic:
                 raise ValueError(

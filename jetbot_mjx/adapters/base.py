@@ -11,6 +11,7 @@ from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_a
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.task import layout_size
 from jetbot_mjx.errors import UserError
 
 with requires_extra("gymnasium"):
@@ -69,7 +70,7 @@ class AdapterBase:
             "render_modes": [one for one in RENDER_MODES if one == mode or is_available(one)],
             "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
         }
-        observations = spaces.Box(-np.inf, np.inf, (env.observation_size,))
+        observations = spaces.Box(-np.inf, np.inf, (layout_size(env.task.layout),))
         return simulation, observations, spaces.Box(-1.0, 1.0, (env.action_size,))
 
     def _poses(self) -> list[Pose]:

@@ -98,8 +98,8 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
     config = checkpoint.config
     if config.task.sees:
         raise UserError(
-            f"{checkpoint.run_dir} has task.observation = {config.task.observation!r}: only policies"
-            " that observe numbers can be exported"
+            f"{checkpoint.run_dir} has task.observation = {config.task.observation!r}: only"
+            " policies that observe numbers can be exported"
         )
     network = config.ppo.network
     params: Any = jax.device_get(checkpoint.params)
