@@ -174,6 +174,8 @@ class CameraConfig(_Section):
     """[pixels] width and height of the images of the calibration; null: those above."""
     distortion: tuple[float, ...] = ()
     """Coefficients in OpenCV's order: k1, k2, p1, p2, k3 to k6, or of a fisheye k1 to k4."""
+    impl: Literal["auto", "llvm", "ptx", "xla"] = "auto"
+    """How an image is compiled, as in `physics.impl`."""
 
     @field_validator("position", "matrix", "calibration_size", "distortion", mode="before")
     @classmethod

@@ -1,4 +1,4 @@
-; What XLA calls on a CPU, around a `step` of as many robots as a vector register has lanes. A template of
+; What XLA calls on a CPU, around a `block` of robots. A template of
 ; `jetbot_mjx.compiler.ffi_wrapper`: names after a dollar are filled in. Offsets are those of XLA's xla/ffi/api/c_api.h.
 
 ; What threads share of one call: blocks that are begun, blocks that are ended, who holds the job, blocks in all,
@@ -8,46 +8,7 @@ declare ptr @malloc(i64)
 declare void @free(ptr)
 declare i32 @sched_yield()
 
-; Takes a block of robots through all steps: rows of a tile are numbers, columns are robots.
-define internal void @block(ptr %job, i64 %index) {
-entry:
-  %tile = alloca [$rows x <$lanes x float>], align $alignment
-  %robots.at = getelementptr %Job, ptr %job, i32 0, i32 4
-  %robots = load i64, ptr %robots.at
-  %last = sub i64 %robots, 1
-  %first = mul i64 %index, $lanes
-  $addresses
-  br label %read
-read:
-  %lane = phi i64 [0, %entry], [%lane.next, %read]
-  %wanted = add i64 %first, %lane
-  ; Lanes beyond the last robot do what it does.
-  %there = icmp ult i64 %wanted, %robots
-  %robot = select i1 %there, i64 %wanted, i64 %last
-  $reads
-  %lane.next = add i64 %lane, 1
-  %more = icmp ult i64 %lane.next, $lanes
-  br i1 %more, label %read, label %steps
-steps:
-  %count = phi i64 [0, %read], [%count.next, %steps]
-  call void @$step(ptr %tile)
-  %count.next = add i64 %count, 1
-  %again = icmp ult i64 %count.next, $steps
-  br i1 %again, label %steps, label %write
-write:
-  %out = phi i64 [0, %steps], [%out.next, %write]
-  %to = add i64 %first, %out
-  $writes
-  %out.next = add i64 %out, 1
-  %to.next = add i64 %to, 1
-  %inside = icmp ult i64 %out.next, $lanes
-  %exists = icmp ult i64 %to.next, %robots
-  %on = and i1 %inside, %exists
-  br i1 %on, label %write, label %done
-done:
-  ret void
-}
-
+$block
 ; Lets go of a job; the last one frees it.
 define internal void @release(ptr %job) {
   %holders = getelementptr %Job, ptr %job, i32 0, i32 2
@@ -211,7 +172,7 @@ prepare:
   %sizes = load ptr, ptr %sizes.at
   %robots = load i64, ptr %sizes
   %rounded = add i64 %robots, $fill
-  %blocks = udiv i64 %rounded, $lanes
+  %blocks = udiv i64 %rounded, $robots_per_block
   %end = getelementptr %Job, ptr null, i32 1
   %bytes = ptrtoint ptr %end to i64
   %job = call ptr @malloc(i64 %bytes)

@@ -62,27 +62,76 @@ def kernel_text(
     Returns:
       The text of an LLVM module.
     """
-    arrays = len(sizes) + carried
-    values = {
-        "addresses": "\n  ".join(_address(i) for i in range(arrays)),
+    block = {
+        "addresses": "\n  ".join(_address(i) for i in range(len(sizes) + carried)),
         "alignment": 4 * lanes,
-        "arrays": arrays,
-        "blocks_per_thread": _BLOCKS_PER_THREAD,
-        "fill": lanes - 1,
         "lanes": lanes,
-        "major": VERSION[0],
-        "minor": VERSION[1],
-        "name": name,
-        "patience": _PATIENCE,
-        "pointers": "\n  ".join(_pointer(i, len(sizes)) for i in range(arrays)),
         "reads": "\n  ".join(_reads(sizes, lanes)),
         "rows": max(1, sum(sizes)),
         "step": STEP,
         "steps": steps,
         "writes": "\n  ".join(_writes(sizes[:carried], len(sizes), lanes)),
     }
+    text = step + _template("xla_step.ll").substitute(block)
+    return _call(text, len(sizes), carried, name=name, machine=machine, robots=lanes)
+
+
+def map_kernel_text(
+    function: str, sizes: Sequence[int], *, items: int, results: int, name: str, machine: str
+) -> str:
+    """Write the LLVM module whose function XLA calls for a kernel with a table.
+
+    The function takes float32 arrays of shape (robots, ...) and the table, and returns arrays of
+    shape (robots, items).
+
+    Args:
+      function: the text of the function from `llvm_codegen.map_text`.
+      sizes: the number of scalars per robot in each argument.
+      items: the number of items of a robot.
+      results: the number of results.
+      name: the name of the function, a C identifier.
+      machine: the processor, one of `MACHINES`.
+
+    Returns:
+      The text of an LLVM module.
+    """
+    # The address of a robot's row is that of its array, plus the row; all share the table.
+    rows = [*sizes, 0, *[items] * results]
+    block = {
+        "addresses": "\n  ".join(
+            f"{_address(i)}\n"
+            f"  %row{i} = mul i64 %index, {size}\n"
+            f"  %p{i} = getelementptr float, ptr %a{i}, i64 %row{i}"
+            for i, size in enumerate(rows)
+        ),
+        "pointers": ", ".join(f"ptr %p{i}" for i in range(len(rows))),
+        "step": STEP,
+    }
+    text = function + _template("xla_map.ll").substitute(block)
+    return _call(text, len(sizes) + 1, results, name=name, machine=machine, robots=1)
+
+
+def _template(file: str) -> Template:
+    return Template(_ASSETS.joinpath(file).read_text("utf-8"))
+
+
+def _call(block: str, arguments: int, results: int, *, name: str, machine: str, robots: int) -> str:
+    """Write the function that XLA calls, around the `block` of so many robots."""
+    arrays = arguments + results
+    values = {
+        "arrays": arrays,
+        "block": block,
+        "blocks_per_thread": _BLOCKS_PER_THREAD,
+        "fill": robots - 1,
+        "major": VERSION[0],
+        "minor": VERSION[1],
+        "name": name,
+        "patience": _PATIENCE,
+        "pointers": "\n  ".join(_pointer(i, arguments) for i in range(arrays)),
+        "robots_per_block": robots,
+    }
     processor = _ASSETS.joinpath(f"xla_call.{machine}.ll").read_text("utf-8")
-    return processor + step + Template(TEXT).substitute(values)
+    return processor + Template(TEXT).substitute(values)
 
 
 def _address(i: int) -> str:

@@ -1,13 +1,18 @@
-"""Run a step of one robot as one kernel for all robots.
+"""Run a step of one robot as one kernel for all robots, or a function of every item of a robot.
 
 Motivation: `jax.vmap` and XLA compile MJX's step to hundreds of kernels, and every value that
 passes from one kernel to the next goes through memory. Lowered to scalars (`lower_jaxpr`), the
 same step is one kernel that reads a robot's state, runs all physics steps of an environment step,
 and writes the state back.
 
+An image is the other case: a function of what a robot's camera shares and of a pixel. With
+`Kernel.table` the program runs once for every column of a table, for every robot, and what depends
+on the robot only is computed once per robot (CPU) or thread (GPU).
+
 Protocol: JAX sees the kernel as a primitive.
 
-1. `as_step` binds the primitive to the leaves of (carry, consts) of one robot, all float32.
+1. `as_step` binds the primitive to the leaves of (carry, consts) of one robot, `as_map` to those
+   that all items of a robot share; all are float32.
 2. The batching rule of `jax.vmap` puts any number of batch axes into one launch.
 3. The primitive is lowered for the platform that a program is compiled for, whatever the
    process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
@@ -32,7 +37,7 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
 from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
@@ -44,13 +49,15 @@ Step = Callable[[PyTree, PyTree], PyTree]
 
 @dataclasses.dataclass(eq=False, repr=False)
 class Kernel:
-    """A `Kernel` holds a step of one robot that a back end can run for many robots.
+    """A `Kernel` holds a function of one robot that a back end can run for many robots.
 
-    Its results replace its first arguments. Kernels are compared by identity.
+    Without a table it is a step, whose results replace its first arguments. Kernels are compared by
+    identity.
     """
 
     program: ScalarProgram
-    """The step; its results have the shapes of its first `carried` arguments."""
+    """The function. A step's results have the shapes of its first `carried` arguments; with a
+    table, its last argument is a column of it, and its results are scalars."""
     carried: int
     """Number of argument leaves that are carried from step to step."""
     steps: int
@@ -61,6 +68,8 @@ class Kernel:
     impl: str = "auto"
     """Name of the back end that must run the kernel; `auto` takes the back end of the platform, or
     the fallback if there is none."""
+    table: Float[np.ndarray, "rows items"] | None = None
+    """What differs between the items of a robot; None: the kernel is a step."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
     # Programs are lowered in several threads.
     _lock: Any = dataclasses.field(default_factory=threading.Lock, init=False)
@@ -71,6 +80,19 @@ class Kernel:
             if name not in self._texts:
                 self._texts[name] = write()
             return self._texts[name]
+
+    @property
+    def argument_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the arguments of one robot."""
+        shapes = [array.shape for array in self.program.inputs]
+        return shapes if self.table is None else shapes[:-1]
+
+    @property
+    def result_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the results of one robot."""
+        if self.table is None:
+            return self.argument_shapes[: self.carried]
+        return [(self.table.shape[1],)] * len(self.program.outputs)
 
 
 class Backend(Protocol):
@@ -103,7 +125,7 @@ class Backend(Protocol):
           leaves: its arguments, float32 arrays of shape (robots, ...).
 
         Returns:
-          The new values of the carried arguments, in the same shapes.
+          The results, of shapes (robots, ...) as in `Kernel.result_shapes`.
         """
         ...
 
@@ -126,6 +148,19 @@ def as_step(kernel: Kernel) -> Step:
     return step
 
 
+def as_map(kernel: Kernel) -> Callable[[PyTree], list[Array]]:
+    """Return a kernel with a table as a JAX function of one robot, which `jax.vmap` can batch.
+
+    Args:
+      kernel: the kernel.
+
+    Returns:
+      A function of a pytree, whose leaves are the kernel's arguments and must be float32. It
+      returns an array with an entry for every item, for each result. It cannot be differentiated.
+    """
+    return lambda shared: _kernel_p.bind(*jax.tree.leaves(shared), kernel=kernel)
+
+
 _kernel_p = Primitive("robot_kernel")
 _kernel_p.multiple_results = True
 
@@ -137,7 +172,7 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
       UserError: an argument is not float32.
       ValueError: an argument does not have the shape that the kernel expects.
     """
-    shapes = [array.shape for array in kernel.program.inputs]
+    shapes = kernel.argument_shapes
     batch = leaves[0].shape[: leaves[0].ndim - len(shapes[0])]
     for leaf, shape in zip(leaves, shapes, strict=True):
         if leaf.dtype != np.float32:
@@ -152,8 +187,8 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
 
 @_kernel_p.def_abstract_eval
 def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
-    _batch_shape(kernel, leaves)
-    return [ShapedArray(leaf.shape, leaf.dtype) for leaf in leaves[: kernel.carried]]
+    batch = _batch_shape(kernel, leaves)
+    return [ShapedArray((*batch, *shape), np.float32) for shape in kernel.result_shapes]
 
 
 @_kernel_p.def_impl
@@ -226,8 +261,8 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
         batch = _batch_shape(kernel, leaves)
         robots = math.prod(batch)
         flat = [
-            x.reshape(robots, *array.shape)
-            for x, array in zip(leaves, kernel.program.inputs, strict=True)
+            x.reshape(robots, *shape)
+            for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
         ]
         if backend and kernel.impl in ("auto", backend.IMPL) and backend.is_available():
             results = backend.launch(kernel, flat)
@@ -238,7 +273,8 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
                 f"physics.impl = {kernel.impl}: this program is for"
                 f" {backend.PLATFORM if backend else 'another platform'}: choose xla or auto"
             )
-        return [x.reshape(leaf.shape) for x, leaf in zip(results, leaves, strict=False)]
+        shapes = kernel.result_shapes
+        return [x.reshape(*batch, *shape) for x, shape in zip(results, shapes, strict=True)]
 
     return lowered
 

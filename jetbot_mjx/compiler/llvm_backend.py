@@ -9,6 +9,7 @@ import ctypes
 import functools
 import hashlib
 import importlib
+import math
 import re
 import threading
 from collections.abc import Mapping, Sequence
@@ -83,9 +84,20 @@ def kernel_text(kernel: Kernel) -> str:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     host = _host()
+    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
+    if kernel.table is not None:
+        items = kernel.table.shape[1]
+        return ffi_wrapper.map_kernel_text(
+            llvm_codegen.map_text(kernel.program, lanes=host.lanes, items=items),
+            sizes,
+            items=items,
+            results=len(kernel.program.outputs),
+            name=_NAME,
+            machine=host.machine,
+        )
     return ffi_wrapper.kernel_text(
         llvm_codegen.step_text(kernel.program, carried=kernel.carried, lanes=host.lanes),
-        [array.size for array in kernel.program.inputs],
+        sizes,
         carried=kernel.carried,
         lanes=host.lanes,
         steps=kernel.steps,
@@ -97,9 +109,10 @@ def kernel_text(kernel: Kernel) -> str:
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     text = kernel.text(IMPL, lambda: kernel_text(kernel))
-    results = leaves[: kernel.carried]
-    shapes = [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
-    return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves))
+    robots = leaves[0].shape[0]
+    shapes = [jax.ShapeDtypeStruct((robots, *x), jnp.float32) for x in kernel.result_shapes]
+    table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
+    return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves, *table))
 
 
 def _registered(text: str) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 from jetbot_mjx.compiler.scalar_ir import COMPARISONS, Expr, Scalar, UnsupportedError, is_constant
-from jetbot_mjx.compiler.schedule import Block, PlacedBranch, PlacedLoop
+from jetbot_mjx.compiler.schedule import Block, Item, PlacedBranch, PlacedLoop
 
 STEP = "step"
 """Name of the function that runs one step."""
@@ -69,6 +69,70 @@ def step_text(program: ScalarProgram, *, carried: int, lanes: int) -> str:
     )
 
 
+def map_text(program: ScalarProgram, *, lanes: int, items: int) -> str:
+    """Write an LLVM function that runs a program for every item of a robot.
+
+    The parameters of the function are the addresses of a robot's arguments, one after the other, of
+    the table with a row of `items` values for each scalar of the program's last argument, and of
+    the results, a row of `items` values each. All are float32.
+
+    Args:
+      program: the function of (arguments of a robot ..., a column of the table), with scalar
+        results.
+      lanes: the number of items that are computed side by side.
+      items: the number of items, at least `lanes`.
+
+    Returns:
+      The text of the function and of the declarations that it needs.
+
+    Raises:
+      UnsupportedError: the program has an operation that has no LLVM instruction here.
+    """
+    emitter = LlvmEmitter(program, lanes, label="items")
+    vector = emitter.type("f")
+    *shared, row = [array.size for array in program.inputs]
+    # Load what the items share, and compute what follows from it alone.
+    arguments = []
+    for i, size in enumerate(shared):
+        for j in range(size):
+            address = emitter.do(f"getelementptr float, ptr %in{i}, i64 {j}")
+            arguments.append(emitter.splat(emitter.do(f"load float, ptr {address}")))
+    columns = [f"%column{j}" for j in range(row)]
+    rest = emitter.hoist([*arguments, *columns], row)
+    before, emitter.lines = emitter.lines, []
+    # Compute a group of items; the last group may overlap with the one before.
+    for j, column in enumerate(columns):
+        emitter.add(f"{column}.at = getelementptr float, ptr %table, i64 {j * items}")
+        emitter.add(f"{column}.of = getelementptr float, ptr {column}.at, i64 %item")
+        emitter.add(f"{column} = load {vector}, ptr {column}.of, align 4")
+    for i, result in enumerate(emitter.finish(rest)):
+        address = emitter.do(f"getelementptr float, ptr %out{i}, i64 %item")
+        emitter.add(f"store {vector} {result}, ptr {address}, align 4")
+    parameters = [f"ptr noalias %in{i}" for i in range(len(shared))]
+    parameters += ["ptr noalias %table"]
+    parameters += [f"ptr noalias %out{i}" for i in range(len(program.outputs))]
+    return "\n".join(
+        [
+            *emitter.declarations(),
+            f"define internal void @{STEP}({', '.join(parameters)}) noinline {{",
+            "entry:",
+            *before,
+            "br label %items",
+            "items:",
+            f"%group = phi i64 [0, %entry], [%next, %{emitter.label}]",
+            f"%is.last = icmp ugt i64 %group, {items - lanes}",
+            f"%item = select i1 %is.last, i64 {items - lanes}, i64 %group",
+            *emitter.lines,
+            f"%next = add i64 %group, {lanes}",
+            f"%more = icmp ult i64 %next, {items}",
+            "br i1 %more, label %items, label %done",
+            "done:",
+            "ret void",
+            "}\n",
+        ]
+    )
+
+
 def require(program: ScalarProgram) -> None:
     """Check that a program can be written as LLVM IR.
 
@@ -81,13 +145,17 @@ def require(program: ScalarProgram) -> None:
 class LlvmEmitter:
     """An `LlvmEmitter` collects the lines of an LLVM function and the names of its values."""
 
-    def __init__(self, program: ScalarProgram, lanes: int, label: str = "entry") -> None:
+    def __init__(
+        self, program: ScalarProgram, lanes: int, label: str = "entry", *, approximate: bool = False
+    ) -> None:
         """Begin with no lines.
 
         Args:
           program: the program, whose arguments must be float32.
           lanes: the number of robots side by side; with 1, values are scalars instead of vectors.
           label: the label of the basic block that the first lines belong to.
+          approximate: whether division and square root may be off by some units in the last place,
+            as a GPU's own instructions for them are.
 
         Raises:
           UnsupportedError: an argument is not float32.
@@ -98,6 +166,7 @@ class LlvmEmitter:
         self.label = label
         self._program = program
         self._lanes = lanes
+        self._fast = "afn " if approximate else ""
         self._count = 0
         self._names: dict[int, str] = {}
         # The value that is true in the lanes that execute the current block; empty: all lanes do.
@@ -116,6 +185,44 @@ class LlvmEmitter:
         self._names = {x.index: name for x, name in zip(inputs, arguments, strict=True)}
         self._block(self._program.block)
         return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
+
+    def hoist(self, arguments: Sequence[str], varying: int) -> list[Item]:
+        """Write the operations that do not depend on the last arguments.
+
+        Args:
+          arguments: the names of the scalars of the program's arguments.
+          varying: the number of scalars at the end of them that differ from item to item.
+
+        Returns:
+          The operations that depend on them, for `finish`.
+        """
+        inputs = [x for array in self._program.inputs for x in array.ravel()]
+        self._names = {x.index: name for x, name in zip(inputs, arguments, strict=True)}
+        known = {x.index for x in inputs[: len(inputs) - varying]}
+        rest: list[Item] = []
+        for item in self._program.block.items:
+            if isinstance(item, Expr) and all(
+                is_constant(x) or x.index in known for x in item.operands
+            ):
+                self._operation(item)
+                known.add(item.index)
+            else:
+                rest.append(item)
+        return rest
+
+    def finish(self, rest: Sequence[Item]) -> list[str]:
+        """Write the operations that `hoist` left, and return the names of the program's results."""
+        self._block(Block(items=list(rest)))
+        return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
+
+    def splat(self, name: str) -> str:
+        """Return a scalar in all lanes."""
+        if self._lanes == 1:
+            return name
+        vector = self.type("f")
+        first = self.do(f"insertelement {vector} poison, float {name}, i64 0")
+        mask = f"<{self._lanes} x i32> zeroinitializer"
+        return self.do(f"shufflevector {vector} {first}, {vector} poison, {mask}")
 
     def declarations(self) -> list[str]:
         """Return the declarations of the LLVM intrinsics that programs call."""
@@ -243,36 +350,65 @@ class LlvmEmitter:
     def _branch(self, item: PlacedBranch) -> None:
         branch = item.branch
         condition = self._operand(branch.condition)
-        if_true = self._side(
-            item.if_true, condition, [branch.if_true[x.place] for x in item.results]
-        )
-        inverse = self.do(f"xor {self.type('b')} {condition}, {self._splat('b', 'true')}")
-        if_false = self._side(
-            item.if_false, inverse, [branch.if_false[x.place] for x in item.results]
-        )
-        for result, a, b in zip(item.results, if_true, if_false, strict=True):
-            self._names[result.index] = self.do(
-                self._select_text(condition, result.dtype.kind, a, b)
-            )
+        if_true = [branch.if_true[x.place] for x in item.results]
+        if_false = [branch.if_false[x.place] for x in item.results]
+        if not item.if_false.items:
+            # One side computes nothing: its values remain, and are chosen where the other is taken.
+            names = self._side(item.if_true, condition, if_true, if_false)
+        elif not item.if_true.items:
+            inverse = self._inverse(condition)
+            names = self._side(item.if_false, inverse, if_false, if_true)
+        else:
+            there = self._side(item.if_true, condition, if_true, None)
+            names = self._side(item.if_false, self._inverse(condition), if_false, there)
+        for result, name in zip(item.results, names, strict=True):
+            self._names[result.index] = name
 
-    def _side(self, block: Block, condition: str, scalars: Sequence[Scalar]) -> list[str]:
-        """Write one side of a branch; its values are arbitrary where no lane takes that side."""
-        if not block.items:
-            return [self._operand(x) for x in scalars]
+    def _inverse(self, condition: str) -> str:
+        return self.do(f"xor {self.type('b')} {condition}, {self._splat('b', 'true')}")
+
+    def _side(
+        self,
+        block: Block,
+        condition: str,
+        scalars: Sequence[Scalar],
+        others: Sequence[Scalar] | Sequence[str] | None,
+    ) -> list[str]:
+        """Write one side of a branch.
+
+        Args:
+          block: the operations of this side.
+          condition: the name of the condition under which a lane takes this side.
+          scalars: the values of this side.
+          others: the values of lanes that do not take it, as scalars or as names; None: any.
+
+        Returns:
+          The names of the values after the branch.
+        """
+        taking = condition
         if self._mask:
-            condition = self.do(f"and {self.type('b')} {condition}, {self._mask}")
+            taking = self.do(f"and {self.type('b')} {condition}, {self._mask}")
+        kinds = [x.dtype.kind for x in scalars]
+        absent = ["zeroinitializer"] * len(scalars)
+        if others is not None:
+            absent = [x if isinstance(x, str) else self._operand(x) for x in others]
         before = self.label
         taken, end = self._labels("taken", "end")
-        self.add(f"br i1 {self._any(condition)}, label %{taken}, label %{end}")
+        self.add(f"br i1 {self._any(taking)}, label %{taken}, label %{end}")
         self.begin(taken)
-        self._masked_block(block, condition)
-        names, after = [self._operand(x) for x in scalars], self.label
+        self._masked_block(block, taking)
+        names = [self._operand(x) for x in scalars]
+        if others is not None and self._lanes > 1:
+            names = [
+                self.do(self._select_text(condition, kind, name, other))
+                for kind, name, other in zip(kinds, names, absent, strict=True)
+            ]
+        after = self.label
         self.add(f"br label %{end}")
         self.begin(end)
-        kinds = [self.type(x.dtype.kind) for x in scalars]
         return [
-            self.do(f"phi {kind} [{name}, %{after}], [zeroinitializer, %{before}]")
-            for kind, name in zip(kinds, names, strict=True)
+            self.do(f"phi {self.type(kind)} [{name}, %{after}], [{other}, %{before}]")
+            for kind, name, other in zip(kinds, names, absent, strict=True)
         ]
 
     def _operation(self, value: Expr) -> None:
@@ -287,9 +423,11 @@ class LlvmEmitter:
 
     def _call(self, value: Expr, operands: list[str]) -> str:
         (x,) = operands
-        return (
-            f"call {self.type('f')} {self._function(_INTRINSICS[value.op])}({self.type('f')} {x})"
-        )
+        number, function = self.type("f"), self._function(_INTRINSICS[value.op])
+        return f"call {self._fast}{number} {function}({number} {x})"
+
+    def _quotient(self, value: Expr, operands: list[str]) -> str:
+        return f"fdiv {self._fast}{_FUSED} {self.type('f')} {', '.join(operands)}"
 
     def _extreme(self, value: Expr, operands: list[str]) -> str:
         number = self.type("f")
@@ -375,7 +513,7 @@ def _float(x: float) -> str:
 _FUSED = "contract"
 
 _EMIT: dict[tuple[str, str], _Emit] = {
-    **{(op, "f"): _instruction(f"f{op} {_FUSED}", "f") for op in ("add", "div", "mul", "sub")},
+    **{(op, "f"): _instruction(f"f{op} {_FUSED}", "f") for op in ("add", "mul", "sub")},
     **{(op, "i"): _instruction(op, "i") for op in ("add", "mul", "sub")},
     **{(op, "b"): _instruction(op, "b") for op in ("and", "or", "xor")},
     **{(op, kind): LlvmEmitter._comparison for op in COMPARISONS for kind in "fi"},
@@ -386,6 +524,7 @@ _EMIT: dict[tuple[str, str], _Emit] = {
     **{("select", kind): LlvmEmitter._select for kind in "fi"},
     **{("convert", kind): LlvmEmitter._convert for kind in "fib"},
     ("abs", "i"): LlvmEmitter._magnitude,
+    ("div", "f"): LlvmEmitter._quotient,
     ("is_finite", "f"): LlvmEmitter._finite,
     ("neg", "f"): _instruction("fneg", "f"),
     ("neg", "i"): LlvmEmitter._negative,

@@ -32,11 +32,17 @@ _MAX_THREADS = 256
 
 _MIN_THREADS = 32
 
+_ITEM_THREADS = 128
+"""Number of threads that compute the items of a robot."""
+
 _BLOCKS = 128
 """Number of blocks above which blocks grow: a GPU has about as many multiprocessors."""
 
 _TEXT = resources.files("jetbot_mjx").joinpath("assets/ptx_kernel.ll").read_text("utf-8")
-"""Template of all kernels."""
+"""Template of the kernels that step."""
+
+_MAP_TEXT = resources.files("jetbot_mjx").joinpath("assets/ptx_map.ll").read_text("utf-8")
+"""Template of the kernels with a table."""
 
 _NAME = "physics"
 _TARGET = "__gpu$xla.gpu.ptx"
@@ -64,26 +70,30 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     robots = leaves[0].shape[0]
     threads = threads_in_block(robots)
+    blocks = math.ceil(robots / threads)
+    arguments = list(leaves)
+    if kernel.table is not None:
+        # A block computes all items of a robot.
+        arguments.append(jnp.asarray(kernel.table))
+        threads, blocks = _ITEM_THREADS, robots
     architecture = _architecture()
     text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
-    results = leaves[: kernel.carried]
-    call = jax.ffi.ffi_call(
-        _TARGET, [jax.ShapeDtypeStruct(leaf.shape, jnp.float32) for leaf in results]
-    )
+    results = [jax.ShapeDtypeStruct((robots, *x), jnp.float32) for x in kernel.result_shapes]
+    call = jax.ffi.ffi_call(_TARGET, results)
     return list(
         call(
-            *leaves,
+            *arguments,
             name=_NAME,
             kernel_type="ptx",
             kernel_data=text.replace(_ROBOTS, str(robots)),
-            grid_x=np.int64(math.ceil(robots / threads)),
+            grid_x=np.int64(blocks),
             grid_y=np.int64(1),
             grid_z=np.int64(1),
             block_x=np.int64(threads),
             block_y=np.int64(1),
             block_z=np.int64(1),
             shared_mem_bytes=np.int64(0),
-            output_indices=tuple(range(len(leaves), len(leaves) + len(results))),
+            output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
         )
     )
 
@@ -108,7 +118,10 @@ def compiled(kernel: Kernel, architecture: int) -> str:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     binding = _binding()
-    text = kernel_text(kernel.program, carried=kernel.carried, steps=kernel.steps)
+    if kernel.table is None:
+        text = kernel_text(kernel.program, carried=kernel.carried, steps=kernel.steps)
+    else:
+        text = map_kernel_text(kernel.program, items=kernel.table.shape[1])
     module = binding.parse_assembly(text, binding.create_context())
     module.triple = _TRIPLE
     target = binding.Target.from_triple(_TRIPLE)
@@ -159,6 +172,59 @@ def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
         "stores": "\n  ".join(_transfers(sizes[:carried], "store", len(sizes), results)),
     }
     return Template(_TEXT).substitute(values)
+
+
+def map_kernel_text(program: ScalarProgram, *, items: int) -> str:
+    """Write a kernel with a table as LLVM IR.
+
+    Its parameters are the addresses of all arguments, float32 arrays of shape (robots, ...), of the
+    table, of shape (scalars of the program's last argument, items), and of all results, of shape
+    (robots, items). A block of threads computes one robot: each thread loads what the items share,
+    computes what follows from it, and goes through the items in strides of a block.
+
+    Args:
+      program: the function of (arguments of a robot ..., a column of the table), with scalar
+        results.
+      items: the number of items.
+
+    Returns:
+      The text of an LLVM module.
+    """
+    emitter = LlvmEmitter(program, lanes=1, label="items", approximate=True)
+    *sizes, row = [array.size for array in program.inputs]
+    shared = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
+    columns = [f"%column{j}" for j in range(row)]
+    rest = emitter.hoist([*shared, *columns], row)
+    before, emitter.lines = emitter.lines, []
+    results = emitter.finish(rest)
+    table = len(sizes)
+    loads = [
+        f"{column}.at = getelementptr float, ptr addrspace(1) %a{table}, i64 {j * items}\n"
+        f"  {column}.of = getelementptr float, ptr addrspace(1) {column}.at, i64 %wide.item\n"
+        f"  {column} = load float, ptr addrspace(1) {column}.of"
+        for j, column in enumerate(columns)
+    ]
+    stores = [
+        f"%out{i}.at = getelementptr float, ptr addrspace(1) %a{table + 1 + i}, i64 %place\n"
+        f"  store float {result}, ptr addrspace(1) %out{i}.at"
+        for i, result in enumerate(results)
+    ]
+    arrays = len(sizes) + 1 + len(results)
+    values = {
+        "columns": "\n  ".join(loads),
+        "declarations": "\n".join(emitter.declarations()),
+        "end": emitter.label,
+        "hoisted": "\n  ".join(before),
+        "item": "\n  ".join(emitter.lines),
+        "items": items,
+        "loads": "\n  ".join(_transfers(sizes, "load")),
+        "max_threads": _ITEM_THREADS,
+        "name": _NAME,
+        "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(arrays)),
+        "stores": "\n  ".join(stores),
+        "threads": _ITEM_THREADS,
+    }
+    return Template(_MAP_TEXT).substitute(values)
 
 
 def _transfers(

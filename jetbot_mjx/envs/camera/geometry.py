@@ -74,34 +74,27 @@ def hit_plane(origin: Vector, direction: Vector, size: Size) -> Hit:
 
 
 def hit_box(origin: Vector, direction: Vector, size: Size) -> Hit:
-    """Intersect rays with a box, one face per axis, since the camera sees at most three.
+    """Intersect rays with a box, the common part of three slabs.
 
-    The face of axis a lies at the distance m = |o_a| - h_a in front of the camera, and is reached
-    at t = m/D, D = -sign(o_a) d_a. Multiplied by D > 0, the test |o_b + t d_b| ≤ h_b of the two
-    other axes needs no division.
+    The ray is in the slab of axis a while |o_a + t d_a| ≤ h_a, from t = -o_a/d_a - h_a/|d_a| to
+    t = -o_a/d_a + h_a/|d_a|.
 
     Args:
       origin: the camera in the box's frame [m].
       direction: the directions of the rays.
       size: half lengths [m].
     """
-    faces, distances, speeds = [], [], []
-    for a in range(3):
-        b, c = (a + 1) % 3, (a + 2) % 3
-        distance = jnp.abs(origin[a]) - size[a]
-        speed = -jnp.sign(origin[a]) * direction[a]
-        # A camera between the planes of both faces sees neither: no width is small enough.
-        seen = jnp.where(distance > 0, 1.0, -1.0)
-        faces.append(
-            (jnp.abs(origin[b] * speed + distance * direction[b]) <= (seen * size[b]) * speed)
-            & (jnp.abs(origin[c] * speed + distance * direction[c]) <= (seen * size[c]) * speed)
-        )
-        distances.append(distance)
-        speeds.append(speed)
-    first, second, third = faces
-    distance = jnp.where(first, distances[0], jnp.where(second, distances[1], distances[2]))
-    speed = jnp.where(first, speeds[0], jnp.where(second, speeds[1], speeds[2]))
-    return Hit(first | second | third, distance / jnp.maximum(speed, _TINY), (first, second))
+    enters, leaves = [], []
+    for o, d, half in zip(origin, direction, size, strict=True):
+        # A ray within the plane of a face has d = 0, and the sum changes no other number.
+        inverse = 1.0 / (d + 1e-20)
+        middle, reach = o * inverse, half * jnp.abs(inverse)
+        enters.append(-middle - reach)
+        leaves.append(reach - middle)
+    depth = jnp.maximum(jnp.maximum(enters[0], enters[1]), enters[2])
+    end = jnp.minimum(jnp.minimum(leaves[0], leaves[1]), leaves[2])
+    faces = depth == enters[0], depth == enters[1]
+    return Hit((depth < end) & (depth > 0), depth, faces)
 
 
 def hit_ellipsoid(origin: Vector, direction: Vector, size: Size) -> Hit:

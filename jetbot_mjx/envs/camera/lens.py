@@ -6,7 +6,8 @@ Frames: image coordinates as in OpenCV, x to the right, y down, z along the opti
 Everything here is NumPy and runs once: a lens costs a compiled program nothing but the constants.
 """
 
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -18,14 +19,14 @@ _MAX_ANGLE = np.radians(89.0)
 
 
 class Rays(NamedTuple):
-    """A `Rays` holds the directions (x, y, 1) of points of the image, as arrays that broadcast."""
+    """A `Rays` holds directions (x, y, 1), as arrays that broadcast or as scalars of one pixel."""
 
-    x: Float[np.ndarray, "h w"]
-    y: Float[np.ndarray, "h w"]
+    x: Any
+    y: Any
 
 
 class Footprint(NamedTuple):
-    """A `Footprint` holds the centres of the pixels and how directions change across one."""
+    """A `Footprint` holds the centre of pixels and how the direction changes across them."""
 
     centre: Rays
     right: Rays
@@ -61,29 +62,50 @@ def intrinsics(config: CameraConfig) -> Intrinsics:
     return Intrinsics(focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def sample_rays(config: CameraConfig, samples: int) -> list[Rays]:
-    """Return the directions of a regular grid of points within every pixel.
+class PixelGrid(NamedTuple):
+    """A `PixelGrid` holds what differs between the pixels of a camera, and what follows from it."""
+
+    columns: tuple[Float[np.ndarray, "h w"], ...]
+    """Arrays that broadcast to the size of the image."""
+    expand: Callable[[Sequence[Any]], tuple[list[Rays], Footprint]]
+    """From the columns, or their entries for one pixel, to the directions of its samples, row by
+    row, and to its footprint."""
+
+
+def pixel_grid(config: CameraConfig) -> PixelGrid:
+    """Return the directions of a regular grid of `samples`² points within every pixel.
 
     Args:
       config: the camera section.
-      samples: points per side of a pixel.
-
-    Returns:
-      `samples`² grids of the image's size, row by row.
     """
-    offsets = (np.arange(samples) + 0.5) / samples - 0.5
-    return [_rays(config, right, down) for down in offsets for right in offsets]
+    points = (np.arange(config.samples) + 0.5) / config.samples - 0.5
+    offsets = [(right, down) for down in points for right in points]
+    centre = _rays(config, 0.0, 0.0)
+    if not config.distortion and config.lens != "fisheye":
+        # Without distortion, directions are linear in the pixel: compute all from its centre.
+        matrix = intrinsics(config)
+        pitch_x, pitch_y = 1 / matrix.fx, 1 / matrix.fy
 
+        def expand_linear(columns: Sequence[Any]) -> tuple[list[Rays], Footprint]:
+            x, y = columns
+            rays = [Rays(x + right * pitch_x, y + down * pitch_y) for right, down in offsets]
+            return rays, Footprint(Rays(x, y), Rays(pitch_x, 0.0), Rays(0.0, pitch_y))
 
-def footprint(config: CameraConfig) -> Footprint:
-    """Return the directions of the pixels' centres, and their differences across a pixel."""
+        return PixelGrid(tuple(centre), expand_linear)
     left, right = _rays(config, -0.5, 0.0), _rays(config, 0.5, 0.0)
     upper, lower = _rays(config, 0.0, -0.5), _rays(config, 0.0, 0.5)
-    return Footprint(
-        centre=_rays(config, 0.0, 0.0),
-        right=Rays(right.x - left.x, right.y - left.y),
-        down=Rays(lower.x - upper.x, lower.y - upper.y),
-    )
+    samples = [_rays(config, *offset) for offset in offsets]
+
+    def expand(columns: Sequence[Any]) -> tuple[list[Rays], Footprint]:
+        centre, to_right, to_lower, *rays = (
+            Rays(*columns[i : i + 2]) for i in range(0, len(columns), 2)
+        )
+        return rays, Footprint(centre, to_right, to_lower)
+
+    to_right = Rays(right.x - left.x, right.y - left.y)
+    to_lower = Rays(lower.x - upper.x, lower.y - upper.y)
+    every = [centre, to_right, to_lower, *samples]
+    return PixelGrid(tuple(column for rays in every for column in rays), expand)
 
 
 def _rays(config: CameraConfig, right: float, down: float) -> Rays:

@@ -18,30 +18,24 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8, UInt32
 
+from jetbot_mjx.compiler import llvm_codegen
+from jetbot_mjx.compiler.kernel import Kernel, as_map
+from jetbot_mjx.compiler.lower_jaxpr import scalarize
+from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import CameraConfig
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.camera import geometry
-from jetbot_mjx.envs.camera.geometry import Hit, Vector
-from jetbot_mjx.envs.camera.lens import Footprint, Rays, footprint, sample_rays
-from jetbot_mjx.envs.camera.scene import Checker, Rgb, Scene, SceneGeom, read_scene
-
-_HITS = {
-    "plane": geometry.hit_plane,
-    "box": geometry.hit_box,
-    "sphere": geometry.hit_sphere,
-    "ellipsoid": geometry.hit_ellipsoid,
-    "cylinder": geometry.hit_cylinder,
-    "capsule": geometry.hit_capsule,
-}
-_NORMALS = {
-    "sphere": geometry.normal_sphere,
-    "ellipsoid": geometry.normal_ellipsoid,
-    "cylinder": geometry.normal_cylinder,
-    "capsule": geometry.normal_capsule,
-}
-_FUSED_GEOMS = 2
-"""Number of geoms up to which an image is one fused computation; with more, XLA would compute the
-intersections of each again for all others."""
+from jetbot_mjx.envs.camera.geometry import Vector
+from jetbot_mjx.envs.camera.lens import pixel_grid
+from jetbot_mjx.envs.camera.pixel import (
+    HITS,
+    Axes,
+    Frame,
+    Look,
+    directions,
+    pixel_colour,
+    strengths,
+)
+from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 
 _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 
@@ -53,20 +47,6 @@ class Pose(NamedTuple):
     """Position of the optical centre [m]."""
     rotation: Float[Array, "3 3"]
     """Axes of the image (right, down, forward) as columns."""
-
-
-class _Frame(NamedTuple):
-    """A `_Frame` holds what one geom looks like from one camera pose."""
-
-    origin: Vector
-    """The camera in the geom's frame [m]."""
-    axes: tuple[Vector, Vector, Vector]
-    """Right, down and forward of the image in the geom's frame."""
-    lights: tuple[Vector, ...]
-    """Directions to the lights in the geom's frame; the headlight is the last one."""
-    faces: tuple[tuple[Any, Any, Any], ...]
-    """Light on the flat faces, by which the colour is multiplied: one of a plane, three of a box,
-    none of another geom."""
 
 
 class Camera:
@@ -85,8 +65,7 @@ class Camera:
         """
         self.config = config
         self.scene: Scene = read_scene(model, robot)
-        self._samples = sample_rays(config, config.samples)
-        self._footprint = footprint(config)
+        self._grid = pixel_grid(config)
         self._standing = {
             model.body(b).name: np.asarray(model.body_pos[b], np.float32)
             for b in range(model.nbody)
@@ -136,19 +115,67 @@ class Camera:
           Colours from 0 to 255, red, green, blue, or one channel of grey; the first row is the
           upper one.
         """
-        frames = self._frames(pose, mocap_positions)
-        seen = [_shares(self.scene, frames, rays) for rays in self._samples]
-        shares = jax.tree.map(lambda *parts: sum(parts[1:], parts[0]), *seen)
-        sky = _sky(self.scene, pose, self._footprint)
-        channels = _mix(self.scene, frames, shares, sky, self._footprint, len(self._samples))
-        red, green, blue = (jnp.broadcast_to(x, self.shape[:2]) for x in channels)
+        shared = jnp.stack(jax.tree.leaves(self._frame(pose, mocap_positions)))
+        kernel = self._kernel
+        (packed,) = self._fallback(shared) if kernel is None else as_map(kernel)(shared)
+        height, width, channels = self.shape
+        words = packed.astype(jnp.uint32)
+        if channels == 1:
+            return words.astype(jnp.uint8).reshape(height, width, 1)
+        return _bytes(words).reshape(height, width, 3)
+
+    @functools.cached_property
+    def _kernel(self) -> Kernel | None:
+        """An image as one kernel; None: XLA compiles it."""
+        if self.config.impl == "xla":
+            return None
+        size = len(jax.tree.leaves(self._frame_shapes))
+        arguments = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, len(self._table))]
+        try:
+            program = scalarize(self._pixel, *arguments)
+            llvm_codegen.require(program)
+        except UnsupportedError:
+            return None
+        return Kernel(
+            program,
+            carried=0,
+            steps=1,
+            fallback=self._fallback,
+            impl=self.config.impl,
+            table=self._table,
+        )
+
+    @functools.cached_property
+    def _frame_shapes(self) -> Frame:
+        pose = Pose(
+            jax.ShapeDtypeStruct((3,), jnp.float32), jax.ShapeDtypeStruct((3, 3), jnp.float32)
+        )
+        return jax.eval_shape(lambda pose: self._frame(pose, {}), pose)
+
+    def _fallback(self, shared: Float[Array, " shared"]) -> list[Float[Array, " pixels"]]:
+        """Compute all pixels as images, which XLA fuses."""
+        # Keep the two stages apart: XLA would compute what the pixels share in every pixel.
+        shared = jax.lax.optimization_barrier(shared)
+        packed = jax.vmap(self._pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
+        # Three bytes of a pixel would be three images, each with all rays of its own.
+        return [jax.lax.optimization_barrier(packed)]
+
+    @functools.cached_property
+    def _table(self) -> Float[np.ndarray, "columns pixels"]:
+        columns = [np.broadcast_to(column, self.shape[:2]) for column in self._grid.columns]
+        return np.stack(columns).reshape(len(columns), -1).astype(np.float32)
+
+    def _pixel(self, shared: Float[Array, " shared"], columns: Sequence[Any]) -> Array:
+        """Return the colour of a pixel, or of all, as red + 256 green + 65,536 blue.
+
+        A float32 holds these 24 bits exactly.
+        """
+        frame = jax.tree.unflatten(jax.tree.structure(self._frame_shapes), list(shared))
+        channels = pixel_colour(self.scene, frame, *self._grid.expand(columns))
         if self.config.colour == "grey":
-            grey = _GREY[0] * red + (_GREY[1] * green + _GREY[2] * blue)
-            return _to_words(grey).astype(jnp.uint8)[..., None]
-        packed = _to_words(red) | (_to_words(green) << 8) | (_to_words(blue) << 16)
-        # Pack first: three bytes would be three images, each with all rays of its own.
-        packed = jax.lax.optimization_barrier(packed)
-        return jax.lax.bitcast_convert_type(packed, jnp.uint8)[..., :3]
+            channels = [sum(weight * x for weight, x in zip(_GREY, channels, strict=True))]
+        steps = [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
+        return sum(step * 256.0**k for k, step in enumerate(steps))
 
     def trace(
         self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]
@@ -163,52 +190,61 @@ class Camera:
           The depth along the optical axis [m], infinite where there is nothing, and the geom's
           index in the model, -1 where there is none.
         """
-        frames = self._frames(pose, mocap_positions)
-        shape = self.shape[:2]
-        nearest = jnp.full(shape, jnp.inf)
-        found = jnp.full(shape, -1)
-        hits = _hits(self.scene, frames, self._footprint.centre)
-        for geom, hit in zip(self.scene.geoms, hits, strict=True):
+        frame = self._frame(pose, mocap_positions)
+        nearest = jnp.full(self.shape[:2], jnp.inf)
+        found = jnp.full(self.shape[:2], -1)
+        _, footprint = self._grid.expand(self._grid.columns)
+        for geom, look in zip(self.scene.geoms, frame.looks, strict=True):
+            axes = frame.axes[geom.rotation.tobytes()]
+            rays = directions(axes, footprint.centre)
+            hit = HITS[geom.kind](look.origin, rays, geom.size)
             closer = hit.mask & (hit.depth < nearest)
             nearest = jnp.where(closer, hit.depth, nearest)
             found = jnp.where(closer, geom.geom_id, found)
         return nearest, found
 
-    def _frames(self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]) -> list[_Frame]:
+    def _frame(self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]) -> Frame:
         """Compute everything that all pixels of a frame share."""
-        frames = []
-        for geom in self.scene.geoms:
+        scene = self.scene
+        towards = [*(-light.direction for light in scene.lights), -pose.rotation[:, 2]]
+        axes, looks = {}, []
+        for geom in scene.geoms:
+            key = geom.rotation.tobytes()
+            if key not in axes:
+                right, down, forward = (_into(geom.rotation, pose.rotation[:, k]) for k in range(3))
+                lights = tuple(_into(geom.rotation, vector) for vector in towards)
+                axes[key] = Axes((right, down, forward), lights)
             position: Any = geom.position
             if geom.mocap is not None:
                 start = mocap_positions.get(geom.mocap, self._standing[geom.mocap])
                 position = position + start
-            frames.append(_frame(self.scene, geom, pose, position))
-        return jax.lax.optimization_barrier(frames)
+            origin = _into(geom.rotation, pose.position - position)
+            centre = _into(pose.rotation, position - pose.position)
+            looks.append(Look(origin, centre, _faces(scene, geom, origin, axes[key].lights)))
+        up = tuple(pose.rotation[2, k] for k in range(3))
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), Frame(axes, looks, up))
 
 
-def _frame(scene: Scene, geom: SceneGeom, pose: Pose, position: Any) -> _Frame:
-    """Compute what one geom looks like from a camera pose."""
-    difference = pose.position - position
-    towards = [*(-light.direction for light in scene.lights), -pose.rotation[:, 2]]
-    origin = _into(geom.rotation, difference)
-    right, down, forward = (_into(geom.rotation, pose.rotation[:, k]) for k in range(3))
-    lights = tuple(_into(geom.rotation, vector) for vector in towards)
+def _faces(
+    scene: Scene, geom: SceneGeom, origin: Vector, lights: Sequence[Vector]
+) -> tuple[tuple[Any, Any, Any], ...]:
+    """Return the light on the flat faces of a geom that the camera can see."""
     faces = []
+    ambient, *diffuse = strengths(scene, geom)
     for axis in {"plane": (2,), "box": (0, 1, 2)}.get(geom.kind, ()):
         side = 1.0 if geom.kind == "plane" else jnp.sign(origin[axis])
         cosines = [jnp.maximum(side * light[axis], 0.0) for light in lights]
-        ambient, *strengths = _strengths(scene, geom)
         red, green, blue = (
-            ambient[k] + sum(c * s[k] for c, s in zip(cosines, strengths, strict=True))
+            ambient[k] + sum(c * s[k] for c, s in zip(cosines, diffuse, strict=True))
             for k in range(3)
         )
         faces.append((red, green, blue))
-    return _Frame(origin, (right, down, forward), lights, tuple(faces))
+    return tuple(faces)
 
 
-def _into(rotation: Float[np.ndarray, "3 3"], vector: Any) -> Vector:
-    """Rotate a vector into a geom's frame; by nothing if the axes are the world's."""
-    if np.array_equal(rotation, np.eye(3)):
+def _into(rotation: Float[np.ndarray | Array, "3 3"], vector: Any) -> Vector:
+    """Rotate a vector into a frame with the given axes; by nothing if they are the world's."""
+    if isinstance(rotation, np.ndarray) and np.array_equal(rotation, np.eye(3)):
         return vector[0], vector[1], vector[2]
     x, y, z = (
         rotation[0, k] * vector[0] + (rotation[1, k] * vector[1] + rotation[2, k] * vector[2])
@@ -217,149 +253,12 @@ def _into(rotation: Float[np.ndarray, "3 3"], vector: Any) -> Vector:
     return x, y, z
 
 
-def _strengths(scene: Scene, geom: SceneGeom) -> list[Rgb]:
-    """Return the light on a geom from all sides, and that of each light, the headlight last."""
-    red, green, blue = (value + geom.emission for value in scene.ambient)
-    return [(red, green, blue), *(light.diffuse for light in scene.lights), scene.headlight]
-
-
-def _hits(scene: Scene, frames: Sequence[_Frame], rays: Rays) -> list[Hit]:
-    """Intersect the rays of an image with all geoms."""
-    hits, directions = [], {}
-    for geom, frame in zip(scene.geoms, frames, strict=True):
-        key = geom.rotation.tobytes()
-        if key not in directions:
-            directions[key] = _directions(frame, rays)
-        hits.append(_HITS[geom.kind](frame.origin, directions[key], geom.size))
-    return hits
-
-
-def _directions(frame: _Frame, rays: Rays) -> Vector:
-    """Return the directions of rays in a geom's frame."""
-    right, down, forward = frame.axes
-    x, y, z = (right[k] * rays.x + (down[k] * rays.y + forward[k]) for k in range(3))
-    return x, y, z
-
-
-def _shares(scene: Scene, frames: Sequence[_Frame], rays: Rays) -> list[list[Array]]:
-    """Return what one ray of every pixel sees, to be summed over the rays.
-
-    Returns:
-      For every geom: for a plane or a box, 1 where the ray sees the face, for each of its faces;
-      for another one, 1 where the ray sees it, and there the cosine to each light.
-    """
-    hits = _hits(scene, frames, rays)
-    if len(hits) > _FUSED_GEOMS:
-        hits = jax.lax.optimization_barrier(hits)
-    nearest: Any = functools.reduce(jnp.minimum, [hit.masked_depth for hit in hits], jnp.inf)
-    shares, free = [], jnp.ones((), bool)
-    for geom, frame, hit in zip(scene.geoms, frames, hits, strict=True):
-        # Where two geoms have the same depth, the first one is seen.
-        seen = hit.mask & free & (hit.depth <= nearest if len(hits) > 1 else True)
-        free &= ~seen
-        if geom.kind == "box":
-            first, second = hit.faces
-            parts = [seen & first, seen & ~first & second, seen & ~first & ~second]
-            shares.append([part.astype(jnp.float32) for part in parts])
-            continue
-        share = [seen.astype(jnp.float32)]
-        if geom.kind in _NORMALS:
-            directions = _directions(frame, rays)
-            point = geometry.along(frame.origin, directions, hit.depth)
-            normal = _NORMALS[geom.kind](point, geom.size)
-            for light in frame.lights:
-                share.append(jnp.where(seen, jnp.maximum(geometry.dot(normal, light), 0.0), 0.0))
-        shares.append(share)
-    return shares
-
-
-def _mix(
-    scene: Scene,
-    frames: Sequence[_Frame],
-    shares: Sequence[Sequence[Array]],
-    sky: Sequence[Any],
-    print_of_pixel: Footprint,
-    samples: int,
-) -> list[Array]:
-    """Return the channels of an image from what its rays see, 1 is white."""
-    rest: Any = float(samples)
-    channels: list[Any] = [0.0, 0.0, 0.0]
-    for geom, frame, share in zip(scene.geoms, frames, shares, strict=True):
-        if geom.kind in _NORMALS:
-            count, *cosines = share
-            ambient, *strengths = _strengths(scene, geom)
-            lit = [
-                count * ambient[k]
-                + sum(c * strength[k] for c, strength in zip(cosines, strengths, strict=True))
-                for k in range(3)
-            ]
-            rest = rest - count
-        else:
-            lit = [
-                sum(part * face[k] for part, face in zip(share, frame.faces, strict=True))
-                for k in range(3)
-            ]
-            rest = rest - sum(share)
-        colour = geom.rgb
-        if geom.checker is not None:
-            colour = _checker_colours(geom.checker, frame, print_of_pixel)
-        channels = [channels[k] + colour[k] * lit[k] for k in range(3)]
-    return [(total + rest * sky[k]) / samples for k, total in enumerate(channels)]
-
-
-def _checker_colours(checker: Checker, frame: _Frame, pixel: Footprint) -> list[Array]:
-    """Return the mean colour of a checker texture over every pixel's area on its plane.
-
-    The point p = o - d o_z/d_z that a pixel sees moves by t (e - d e_z/d_z) where d changes by e.
-    A checker is the product of two square waves; the mean of each over the pixel's extent is exact,
-    of the product it is for a pixel whose sides are parallel to the squares'.
-    """
-    origin = frame.origin
-    direction = _directions(frame, pixel.centre)
-    # A pixel at or above the horizon sees the plane far away, if any of its rays does.
-    down = jnp.minimum(direction[2], -1e-4)
-    slope = 1.0 / down
-    depth = -origin[2] * slope
-    changes = [
-        [frame.axes[0][k] * change.x + frame.axes[1][k] * change.y for k in range(3)]
-        for change in (pixel.right, pixel.down)
-    ]
-    waves: Any = 1.0
-    for axis in (0, 1):
-        scale = 1.0 / checker.size[axis]
-        at = origin[axis] + depth * direction[axis]
-        extent: Any = 0.0
-        for change in changes:
-            moved = change[axis] - direction[axis] * (change[2] * slope)
-            extent = extent + jnp.abs(depth * moved)
-        waves = waves * _square_wave(at * scale, jnp.maximum(extent * scale, 1e-3))
-    even = 0.5 + 0.5 * waves
-    return [
-        odd + (of_even - odd) * even for of_even, odd in zip(checker.even, checker.odd, strict=True)
-    ]
-
-
-def _square_wave(at: Array, width: Array) -> Array:
-    """Return the mean of a wave that is 1 on [0, 1), -1 on [1, 2) and so on, around a place."""
-
-    def integral(x: Array) -> Array:
-        phase = 0.5 * x
-        return 1.0 - jnp.abs(2.0 * (phase - jnp.floor(phase)) - 1.0)
-
-    return (integral(at + 0.5 * width) - integral(at - 0.5 * width)) / width
-
-
-def _sky(scene: Scene, pose: Pose, pixel: Footprint) -> Sequence[Any]:
-    """Return the colours of the sky, which change with the sine of the elevation."""
-    if scene.horizon == scene.zenith:
-        return scene.horizon
-    x, y = pixel.centre
-    right, down, forward = (pose.rotation[2, k] for k in range(3))
-    length = np.sqrt(x * x + y * y + 1.0)
-    sine = jnp.maximum(right * (x / length) + (down * (y / length) + forward / length), 0.0)
-    ends = zip(scene.horizon, scene.zenith, strict=True)
-    return [low + (high - low) * sine for low, high in ends]
-
-
-def _to_words(channel: Array) -> UInt32[Array, "h w"]:
-    return (jnp.clip(channel, 0.0, 1.0) * 255.0 + 0.5).astype(jnp.uint32)
+def _bytes(words: UInt32[Array, " pixels"]) -> UInt8[Array, " bytes"]:
+    """Return the three lower bytes of each word, one after the other."""
+    count = len(words)
+    if count % 4:
+        return jax.lax.bitcast_convert_type(words, jnp.uint8)[:, :3].reshape(-1)
+    # Four pixels are three words of bytes: a GPU writes words several times as fast.
+    a, b, c, d = words.reshape(-1, 4).T
+    joined = [a | (b << 24), (b >> 8) | (c << 16), (c >> 16) | (d << 8)]
+    return jax.lax.bitcast_convert_type(jnp.stack(joined, axis=1), jnp.uint8).reshape(-1)

@@ -1,0 +1,340 @@
+"""Compute the colour of one pixel, as a function of scalars.
+
+The function is lowered to one kernel for all pixels of all robots (`compiler.kernel`), or batched
+by `jax.vmap` for XLA. Its order keeps pixels cheap that see the ground and the sky only, which most
+do: a sphere around each geom decides whether any ray of the pixel can see it, and a branch that no
+pixel of a vector or warp takes costs nothing.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from jetbot_mjx.envs.camera import geometry
+from jetbot_mjx.envs.camera.geometry import Hit, Vector
+from jetbot_mjx.envs.camera.lens import Footprint, Rays
+from jetbot_mjx.envs.camera.scene import Checker, Rgb, Scene, SceneGeom
+
+HITS = {
+    "plane": geometry.hit_plane,
+    "box": geometry.hit_box,
+    "sphere": geometry.hit_sphere,
+    "ellipsoid": geometry.hit_ellipsoid,
+    "cylinder": geometry.hit_cylinder,
+    "capsule": geometry.hit_capsule,
+}
+"""How rays meet each kind of geom."""
+
+_NORMALS = {
+    "sphere": geometry.normal_sphere,
+    "ellipsoid": geometry.normal_ellipsoid,
+    "cylinder": geometry.normal_cylinder,
+    "capsule": geometry.normal_capsule,
+}
+
+_MARGIN = 1.1
+"""Factor on the extent of a pixel, within which a lens is not quite linear."""
+
+
+class Axes(NamedTuple):
+    """An `Axes` holds directions of one frame of a camera in the axes of a geom."""
+
+    image: tuple[Vector, Vector, Vector]
+    """Right, down and forward of the image."""
+    lights: tuple[Vector, ...]
+    """Directions to the lights; the headlight is the last one."""
+
+
+class Look(NamedTuple):
+    """A `Look` holds what one geom looks like from one camera pose."""
+
+    origin: Vector
+    """The camera in the geom's frame [m]."""
+    centre: Vector
+    """The geom in the camera's axes: right, down and forward [m]."""
+    faces: tuple[tuple[Any, Any, Any], ...]
+    """Light on the flat faces, by which the colour is multiplied: one of a plane, three of a box,
+    none of another geom."""
+
+
+class Frame(NamedTuple):
+    """A `Frame` holds everything that the pixels of a frame share."""
+
+    axes: dict[bytes, Axes]
+    """By the bytes of the geom's rotation: geoms that are turned alike share them."""
+    looks: list[Look]
+    """In the order of the scene's geoms."""
+    up: Vector
+    """How far right, down and forward of the image point upwards."""
+
+
+class _Sample(NamedTuple):
+    """A `_Sample` holds what one ray of a pixel has met so far."""
+
+    depth: Any
+    """Depth of the nearest geom but the ground [m]; infinite: none."""
+    red: Any
+    green: Any
+    blue: Any
+
+
+class _Sums(NamedTuple):
+    """A `_Sums` holds the sum of the colours of a pixel's rays, and how many see the background."""
+
+    red: Any
+    green: Any
+    blue: Any
+    ground: Any
+    """Number of rays that see the ground."""
+    sky: Any
+    """Number of rays that see nothing."""
+
+
+def ground_of(scene: Scene) -> int | None:
+    """Return the index of the first infinite plane of a scene; None: it has none."""
+    planes = (i for i, geom in enumerate(scene.geoms) if geom.kind == "plane" and not _radius(geom))
+    return next(planes, None)
+
+
+def pixel_colour(
+    scene: Scene, frame: Frame, samples: Sequence[Rays], footprint: Footprint
+) -> list[Any]:
+    """Return red, green and blue of a pixel, 1 is white: the mean over its area.
+
+    Args:
+      scene: the scene.
+      frame: what the pixels of a frame share.
+      samples: the directions of the pixel's rays.
+      footprint: the extent of the pixel.
+    """
+    ground = ground_of(scene)
+    others = [i for i in range(len(scene.geoms)) if i != ground]
+    slopes = [_ground_slope(scene, frame, ground, rays) for rays in samples]
+
+    def background() -> _Sums:
+        below = sum((slope > 0).astype(jnp.float32) for slope in slopes)
+        zero = jnp.zeros(())
+        return _Sums(zero, zero, zero, below, len(samples) - below)
+
+    def with_geoms(near: Sequence[Any]) -> _Sums:
+        found = [_Sample(jnp.float32(np.inf), *[jnp.zeros(())] * 3) for _ in samples]
+        for index, is_near in zip(others, near, strict=True):
+            found = jax.lax.cond(
+                is_near,
+                lambda before, index=index: _meet(scene, frame, index, samples, before, footprint),
+                lambda before: before,
+                found,
+            )
+        return _sum(scene, frame, ground, found, slopes)
+
+    near = [_is_near(scene.geoms[i], frame.looks[i], footprint) for i in others]
+    if not others:
+        sums = background()
+    else:
+        is_any = near[0]
+        for one in near[1:]:
+            is_any |= one
+        sums = jax.lax.cond(is_any, lambda: with_geoms(near), background)
+    # Add the background.
+    channels: list[Any] = [sums.red, sums.green, sums.blue]
+    if ground is not None:
+        geom, look = scene.geoms[ground], frame.looks[ground]
+        colour = _plane_colour(geom, look, frame, footprint, sums.ground > 0)
+        channels = [channels[k] + sums.ground * (colour[k] * look.faces[0][k]) for k in range(3)]
+    sky = _sky(scene, frame.up, footprint.centre)
+    return [(channels[k] + sums.sky * sky[k]) / len(samples) for k in range(3)]
+
+
+def _radius(geom: SceneGeom) -> float:
+    """Return the radius of a sphere around a geom [m]; 0: the geom is infinite."""
+    x, y, z = geom.size
+    match geom.kind:
+        case "plane":
+            return float(np.hypot(x, y)) if x > 0 and y > 0 else 0.0
+        case "sphere":
+            return x
+        case "capsule":
+            return x + y
+        case "cylinder":
+            return float(np.hypot(x, y))
+        case "ellipsoid":
+            return max(geom.size)
+        case _:
+            return float(np.sqrt(x * x + y * y + z * z))
+
+
+def _is_near(geom: SceneGeom, look: Look, footprint: Footprint) -> Any:
+    """Return whether any ray of a pixel can meet the sphere around a geom.
+
+    The ray through the pixel's centre passes a sphere of radius R at the distance |c × d|/|d|; the
+    others pass at most |c| e/|d| nearer, where e is half of the pixel's extent.
+    """
+    radius = _radius(geom)
+    if not radius:
+        return jnp.ones((), bool)
+    (x, y), c = footprint.centre, look.centre
+    squared = x * x + (y * y + 1.0)
+    along = c[0] * x + (c[1] * y + c[2])
+    distance = geometry.dot(c, c)
+    half = (0.5 * _MARGIN) * sum(
+        abs(part) for change in (footprint.right, footprint.down) for part in change
+    )
+    bound = radius * jnp.sqrt(squared) + jnp.sqrt(distance) * half
+    return distance * squared - along * along <= bound * bound
+
+
+def _ground_slope(scene: Scene, frame: Frame, ground: int | None, rays: Rays) -> Any:
+    """Return how steeply a ray falls towards the ground: 1/depth, at most 0 if it does not."""
+    if ground is None:
+        return jnp.zeros(())
+    look = frame.looks[ground]
+    right, down, forward = frame.axes[scene.geoms[ground].rotation.tobytes()].image
+    falls = -(right[2] * rays.x + (down[2] * rays.y + forward[2]))
+    # A camera below the ground does not see it.
+    return falls * jnp.where(look.origin[2] > 0, 1.0 / look.origin[2], 0.0)
+
+
+def _meet(
+    scene: Scene,
+    frame: Frame,
+    index: int,
+    samples: Sequence[Rays],
+    before: Sequence[_Sample],
+    footprint: Footprint,
+) -> list[_Sample]:
+    """Return what the rays of a pixel have met after one more geom."""
+    geom, look = scene.geoms[index], frame.looks[index]
+    axes = frame.axes[geom.rotation.tobytes()]
+    after = []
+    for rays, sample in zip(samples, before, strict=True):
+        direction = directions(axes, rays)
+        hit = HITS[geom.kind](look.origin, direction, geom.size)
+        closer = hit.mask & (hit.depth < sample.depth)
+        light = _light(scene, geom, look, axes, direction, hit)
+        colour = geom.rgb
+        if geom.checker is not None:
+            colour = _checker_colours(geom.checker, look.origin, axes, footprint)
+        seen = [hit.depth, *(colour[k] * light[k] for k in range(3))]
+        pairs = zip(seen, sample, strict=True)
+        after.append(_Sample(*(jnp.where(closer, new, old) for new, old in pairs)))
+    return after
+
+
+def _light(
+    scene: Scene, geom: SceneGeom, look: Look, axes: Axes, direction: Vector, hit: Hit
+) -> Sequence[Any]:
+    """Return the light on a geom where a ray enters it, by which its colour is multiplied."""
+    if geom.kind == "plane":
+        return look.faces[0]
+    if geom.kind == "box":
+        first, second = hit.faces
+        return [
+            jnp.where(first, a, jnp.where(second, b, c))
+            for a, b, c in zip(*look.faces, strict=True)
+        ]
+    point = geometry.along(look.origin, direction, hit.depth)
+    normal = _NORMALS[geom.kind](point, geom.size)
+    cosines = [jnp.maximum(geometry.dot(normal, light), 0.0) for light in axes.lights]
+    ambient, *lights = strengths(scene, geom)
+    return [
+        ambient[k] + sum(c * light[k] for c, light in zip(cosines, lights, strict=True))
+        for k in range(3)
+    ]
+
+
+def _sum(
+    scene: Scene, frame: Frame, ground: int | None, found: Sequence[_Sample], slopes: Sequence[Any]
+) -> _Sums:
+    """Add up the rays of a pixel; those that meet the ground before a geom see the ground."""
+    total = _Sums(*[jnp.zeros(())] * 5)
+    for sample, slope in zip(found, slopes, strict=True):
+        is_free = sample.depth == np.inf
+        is_ground = (slope > 0) & (sample.depth * slope > 1.0)
+        is_sky = is_free & ~is_ground
+        shown = [jnp.where(is_ground, 0.0, x) for x in (sample.red, sample.green, sample.blue)]
+        counts = [x.astype(jnp.float32) for x in (is_ground, is_sky)]
+        total = _Sums(*(a + b for a, b in zip(total, [*shown, *counts], strict=True)))
+    return total
+
+
+def _plane_colour(
+    geom: SceneGeom, look: Look, frame: Frame, footprint: Footprint, is_seen: Any
+) -> Sequence[Any]:
+    """Return the mean colour of the ground over a pixel, if it is seen there."""
+    checker = geom.checker
+    if checker is None:
+        return geom.rgb
+    axes = frame.axes[geom.rotation.tobytes()]
+    return jax.lax.cond(
+        is_seen,
+        lambda: _checker_colours(checker, look.origin, axes, footprint),
+        lambda: [jnp.zeros(())] * 3,
+    )
+
+
+def strengths(scene: Scene, geom: SceneGeom) -> list[Rgb]:
+    """Return the light on a geom from all sides, and that of each light, the headlight last."""
+    red, green, blue = (value + geom.emission for value in scene.ambient)
+    return [(red, green, blue), *(light.diffuse for light in scene.lights), scene.headlight]
+
+
+def directions(axes: Axes, rays: Rays) -> Vector:
+    """Return the directions of rays in the axes of a geom."""
+    right, down, forward = axes.image
+    x, y, z = (right[k] * rays.x + (down[k] * rays.y + forward[k]) for k in range(3))
+    return x, y, z
+
+
+def _checker_colours(checker: Checker, origin: Vector, axes: Axes, pixel: Footprint) -> list[Array]:
+    """Return the mean colour of a checker texture over every pixel's area on its plane.
+
+    The point p = o - d o_z/d_z that a pixel sees moves by t (e - d e_z/d_z) where d changes by e.
+    A checker is the product of two square waves; the mean of each over the pixel's extent is exact,
+    of the product it is for a pixel whose sides are parallel to the squares'.
+    """
+    direction = directions(axes, pixel.centre)
+    # A pixel at or above the horizon sees the plane far away, if any of its rays does.
+    down = jnp.minimum(direction[2], -1e-4)
+    slope = 1.0 / down
+    depth = -origin[2] * slope
+    changes = [
+        [axes.image[0][k] * change.x + axes.image[1][k] * change.y for k in range(3)]
+        for change in (pixel.right, pixel.down)
+    ]
+    waves: Any = 1.0
+    for axis in (0, 1):
+        scale = 1.0 / checker.size[axis]
+        at = origin[axis] + depth * direction[axis]
+        extent: Any = 0.0
+        for change in changes:
+            moved = change[axis] - direction[axis] * (change[2] * slope)
+            extent = extent + jnp.abs(depth * moved)
+        waves = waves * _square_wave(at * scale, jnp.maximum(extent * scale, 1e-3))
+    even = 0.5 + 0.5 * waves
+    return [
+        odd + (of_even - odd) * even for of_even, odd in zip(checker.even, checker.odd, strict=True)
+    ]
+
+
+def _square_wave(at: Array, width: Array) -> Array:
+    """Return the mean of a wave that is 1 on [0, 1), -1 on [1, 2) and so on, around a place."""
+
+    def integral(x: Array) -> Array:
+        phase = 0.5 * x
+        return 1.0 - jnp.abs(2.0 * (phase - jnp.floor(phase)) - 1.0)
+
+    return (integral(at + 0.5 * width) - integral(at - 0.5 * width)) / width
+
+
+def _sky(scene: Scene, up: Vector, rays: Rays) -> Sequence[Any]:
+    """Return the colours of the sky, which change with the sine of the elevation."""
+    if scene.horizon == scene.zenith:
+        return scene.horizon
+    length = jnp.sqrt(rays.x * rays.x + (rays.y * rays.y + 1.0))
+    sine = jnp.maximum((up[0] * rays.x + (up[1] * rays.y + up[2])) / length, 0.0)
+    ends = zip(scene.horizon, scene.zenith, strict=True)
+    return [low + (high - low) * sine for low, high in ends]
