@@ -439,9 +439,10 @@ class EvaluationConfig(_Section):
 
     episodes: Count = 256
     """Deterministic episodes per evaluation, on other goals than those of the report."""
-    video: bool = False
-    """Whether every evaluation also renders the first four goals of the report, into
-    `videos/<env_steps>/`; without OpenGL a line says so, and the training continues."""
+    video: Literal[False, True, "last"] = False
+    """Whether every evaluation, or only that at the end of the training (`last`), also renders the
+    first four goals of the report, into `videos/<env_steps>/`, TensorBoard and Weights & Biases.
+    Without OpenGL a line says so, and the training continues."""
 
 
 class Config(_Section):

@@ -40,6 +40,8 @@ def _parser(agents: Sequence[str]) -> cli.Parser:
     parser.add_argument("--viewer", choices=("browser", "native"), default="browser")
     parser.add_argument("--agent", choices=agents, default="policy", help="who drives at first")
     parser.add_argument("--seed", type=cli.whole_number(0), default=0, help="of the goals")
+    robots = cli.whole_number(1, 256)  # what two CPU cores still drive in real time
+    parser.add_argument("--robots", type=robots, default=1, metavar="N", help="drive N at once")
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: this machine alone)"
     )
@@ -83,6 +85,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         agent=options.agent,
         which=options.checkpoint,
         seed=options.seed,
+        robots=options.robots,
         host=options.host,
         port=options.port,
         allow=options.allow_origin,

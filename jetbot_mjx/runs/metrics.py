@@ -37,6 +37,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
 import jax
+from PIL import Image
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.imports import standing_in
@@ -50,6 +51,12 @@ with standing_in("torch", None):
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto import event_pb2, summary_pb2
 
+EVALUATION_VIDEO = "evaluation.mp4"
+"""Name of an evaluation's video, in `videos/<env_steps>/` of the run folder."""
+
+VIDEO_TAG = "eval/video"
+"""Name of the videos in TensorBoard and Weights & Biases."""
+
 MetricValues = Mapping[str, float | None]
 
 
@@ -58,6 +65,10 @@ class Sink(Protocol):
 
     def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Write the metrics at one environment step; a metric without a value is None."""
+        ...
+
+    def write_video(self, env_steps: int, mp4: Path) -> None:
+        """Write the video of an evaluation, beside which there is a GIF of the same name."""
         ...
 
     def close(self) -> None:
@@ -80,6 +91,11 @@ class Sinks:
         """Write the metrics to every sink."""
         for sink in self._sinks:
             sink.write(env_steps, metrics)
+
+    def write_video(self, env_steps: int, mp4: Path) -> None:
+        """Write the video to every sink."""
+        for sink in self._sinks:
+            sink.write_video(env_steps, mp4)
 
     def close(self) -> None:
         """Close every sink."""
@@ -156,6 +172,9 @@ class JsonlSink:
         self._file.flush()
         os.fsync(self._file.fileno())
 
+    def write_video(self, env_steps: int, mp4: Path) -> None:
+        """Leave the video out: it is a file of its own."""
+
     def close(self) -> None:
         """Close the file."""
         self._file.close()
@@ -195,7 +214,7 @@ class TensorBoardSink:
     """A sink that writes TensorBoard event files without TensorFlow.
 
     With a configuration, the file also holds its YAML as text, its settings as hyperparameters
-    beside the last success rate, and charts with success first.
+    beside the last success rate, and charts with success first. Videos are GIFs among the images.
     """
 
     def __init__(
@@ -224,11 +243,21 @@ class TensorBoardSink:
             self._describe(config)
         for entry in history:
             self._add(*entry)
+        written = {entry.env_steps: entry.timestamp for entry in history}
+        for path in sorted(folder.parent.glob(f"videos/*/{Path(EVALUATION_VIDEO).stem}.gif")):
+            env_steps = int(path.parent.name)
+            if env_steps in written:
+                self._add_video(env_steps, written[env_steps], path)
         self._writer.flush()
 
     def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Write one scalar for each metric that has a value."""
         self._add(env_steps, time.time(), metrics)
+        self._writer.flush()
+
+    def write_video(self, env_steps: int, mp4: Path) -> None:
+        """Write the GIF beside the video, which TensorBoard plays."""
+        self._add_video(env_steps, time.time(), mp4)
         self._writer.flush()
 
     def _describe(self, config: Config) -> None:
@@ -256,6 +285,14 @@ class TensorBoardSink:
         ]
         event = _EVENT(wall_time=timestamp, step=env_steps, summary=_SUMMARY(value=values))
         self._writer.write_event(event)
+
+    def _add_video(self, env_steps: int, timestamp: float, mp4: Path) -> None:
+        path = mp4.with_suffix(".gif")
+        with Image.open(path) as gif:
+            size = {"width": gif.width, "height": gif.height, "colorspace": 3}
+        shown = _SUMMARY.Image(**size, encoded_image_string=path.read_bytes())
+        summary = _SUMMARY(value=[_SUMMARY.Value(tag=VIDEO_TAG, image=shown)])
+        self._writer.write_event(_EVENT(wall_time=timestamp, step=env_steps, summary=summary))
 
     def close(self) -> None:
         """Close the event file."""

@@ -15,7 +15,7 @@ from typing import Any
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import MissingPackageError
-from jetbot_mjx.runs.metrics import History, MetricValues
+from jetbot_mjx.runs.metrics import VIDEO_TAG, History, MetricValues
 from jetbot_mjx.runs.run_dir import write_json
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
 
@@ -71,6 +71,7 @@ class WandbSink:
         self._path = run_dir / _FILE
         self._progress = _read(self._path, config.wandb)
         self._run: Any = None
+        self._last_written: int | None = None
         with self._disable_on_error():
             self._run = self._begin(config, run_dir, seeds)
             write_json(self._path, self._progress)
@@ -101,6 +102,8 @@ class WandbSink:
                 finish_timeout_raises=True,
             ),
         )
+        # The table of runs shows the best and the last success rate beside the configuration.
+        run.define_metric("eval/success_rate", summary="max,last")
         where = f"offline; later: wandb sync {Path(run.dir).parent}" if run.offline else run.url
         self._say(f"Weights & Biases: {where or 'disabled'}")
         return run
@@ -111,8 +114,16 @@ class WandbSink:
             return
         with self._disable_on_error():
             self._run.log(with_aliases(env_steps, metrics, self._names), step=env_steps)
-            self._progress["env_steps"] = env_steps
+            self._progress["env_steps"] = self._last_written = env_steps
             write_json(self._path, self._progress)
+
+    def write_video(self, env_steps: int, mp4: Path) -> None:
+        """Log the video beside the metrics of its step, unless those were logged before."""
+        if self._run is None or env_steps != self._last_written:
+            return
+        with self._disable_on_error():
+            video = importlib.import_module("wandb").Video(str(mp4), format="mp4")
+            self._run.log({VIDEO_TAG: video}, step=env_steps)
 
     def close(self) -> None:
         """Wait for pending uploads, for at most a share of `preemption_notice`."""

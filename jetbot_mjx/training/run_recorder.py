@@ -15,6 +15,7 @@ from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
 from jetbot_mjx.runs.metrics import (
+    EVALUATION_VIDEO,
     CompileClock,
     History,
     JsonlSink,
@@ -120,17 +121,19 @@ class RunRecorder(TrainerCallback):
         *,
         total_steps: int,
         stop_at_success: float | None,
+        only_last_video: bool = False,
     ) -> None:
         """Begin to count the time.
 
         Args:
           seeds: the recorder of each seed.
           evaluate: a function that evaluates a policy on the fixed goals of training.
-          video: renders a policy after each evaluation; None: no videos.
+          video: renders a policy after an evaluation; None: no videos.
           terminal: shows the progress.
           clock: measures the time that is spent on compilation.
           total_steps: environment steps of the whole training.
           stop_at_success: the success rate at which the training ends early; None: it does not.
+          only_last_video: whether only the policy at the end of the training is rendered.
         """
         self._seeds = seeds
         self._evaluate = evaluate
@@ -139,6 +142,7 @@ class RunRecorder(TrainerCallback):
         self._clock = clock
         self._total_steps = total_steps
         self._stop_at_success = stop_at_success
+        self._only_last_video = only_last_video
         self._earlier_seconds = seeds[0].standing.wall_seconds
         self._began = time.perf_counter()
         self._compiled = False
@@ -250,7 +254,7 @@ class RunRecorder(TrainerCallback):
 
     def _render_videos(self, progress: Sequence[Progress]) -> None:
         """Render a video of every seed, last: an error leaves the log and checkpoints complete."""
-        if self._video is None:
+        if self._video is None or (self._only_last_video and not self.complete):
             return
         self._set_phase(RENDERING)
         try:
@@ -369,12 +373,13 @@ class SeedRecorder:
         self._store.save(progress.env_steps, trees, about, evaluation.get("success_rate"))
 
     def render(self, video: EvaluationVideo, progress: Progress) -> None:
-        """Render a video of the policy into the run folder."""
+        """Render a video of the policy into the run folder, and log it."""
         name = checkpoint_path(self._run_dir, progress.env_steps).name
-        path = self._run_dir / "videos" / name / "evaluation.mp4"
+        path = self._run_dir / "videos" / name / EVALUATION_VIDEO
         make_folder(path.parent)
         with writing_to(path):
             video.write(path, progress.params, progress.env_steps)
+            self._sinks.write_video(progress.env_steps, path)
 
     def save_nan_dump(self, env_steps: int, nan_dump: NanDump) -> Path | None:
         """Save a dump; return its path, or None if the run holds enough of them."""

@@ -304,6 +304,7 @@ def open_recorder(
         clock,
         total_steps=total_steps,
         stop_at_success=config.stop_at_success,
+        only_last_video=config.evaluation.video == "last",
     )
 
 

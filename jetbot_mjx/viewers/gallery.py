@@ -122,7 +122,7 @@ def render_run(
     # Run the episodes.
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
-    rolled_out = _run_episodes([checkpoint], env, goals)[0]
+    rolled_out = run_episodes([checkpoint], env, goals)[0]
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     make_folder(folder)
     rendered = RenderedRun(
@@ -159,15 +159,13 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     Raises:
       UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
     """
-    path = Path(run_dir).absolute()
-    if find_checkpoint(path, "last") == path:
-        raise UserError(f"--gallery {run_dir} is one checkpoint: give the run folder it lies in")
+    path = run_folder(run_dir, "--gallery")
     # Run all chosen checkpoints on the same goals.
     chosen = early_middle_final(checkpoint_steps(path))
     checkpoints = [load_checkpoint(path, one) for one in chosen]
     env = checkpoints[0].make_env()
     goals = range(episodes)
-    rolled_out = _run_episodes(checkpoints, env, goals)
+    rolled_out = run_episodes(checkpoints, env, goals)
     folder = path / "videos"
     make_folder(folder)
     successes = [int(each.success.sum()) for each in rolled_out]
@@ -210,10 +208,31 @@ def early_middle_final(steps: Sequence[int]) -> list[int]:
     return sorted({steps[0], steps[(len(steps) - 1) // 2], steps[-1]})
 
 
-def _run_episodes(
+def run_folder(run_dir: str | Path, option: str) -> Path:
+    """Return the absolute path of a run folder.
+
+    Raises:
+      UserError: `run_dir` is no run folder, or one of its checkpoints; `option` needs several.
+    """
+    path = Path(run_dir).absolute()
+    if find_checkpoint(path, "last") == path:
+        raise UserError(f"{option} {run_dir} is one checkpoint: give the run folder it lies in")
+    return path
+
+
+def run_episodes(
     checkpoints: Sequence[Checkpoint], env: JetBotEnv, goals: Sequence[int]
 ) -> list[Episodes]:
-    """Run recorded episodes of several policies of one run with one compiled program."""
+    """Run recorded episodes of several policies of one run with one compiled program.
+
+    Args:
+      checkpoints: The policies.
+      env: The environment of the run.
+      goals: Indices of the report's fixed goals.
+
+    Returns:
+      The episodes of each policy, on the host.
+    """
     programs = ProgramCache(compiler_options(env.config))
     evaluator = Evaluator(env, checkpoints[0].networks, programs, record=True)
     keys = report_keys(max(goals) + 1)[np.asarray(goals)]

@@ -1,4 +1,4 @@
-"""Let a policy drive in real time, in the browser or in MuJoCo's window, until the user ends it."""
+"""Show a policy that drives in real time, in the browser or in MuJoCo's own window."""
 
 import contextlib
 import getpass
@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from jetbot_mjx.errors import MissingPackageError
+from jetbot_mjx.errors import MissingPackageError, UserError
 from jetbot_mjx.runs.checkpoint import Which
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
@@ -28,12 +28,13 @@ def play_live(
     agent: str = "policy",
     which: Which = "best",
     seed: int = 0,
+    robots: int = 1,
     host: str = "127.0.0.1",
     port: int | None = None,
     allow: Sequence[str] = (),
     tell: Callable[[str], None],
 ) -> Played:
-    """Trajectory in real time until the user interrupts or closes the window.
+    """Drive and show a policy in real time until the user interrupts or closes the window.
 
     Args:
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
@@ -41,6 +42,7 @@ def play_live(
       agent: The controller at the start, one of `AGENTS`.
       which: The checkpoint of a run folder.
       seed: The seed of the goals and of the random agent.
+      robots: The number of robots; MuJoCo's own window shows only one.
       host: The address that the page is served at.
       port: The port that the page is served at, or None for the first free one from 8080 on.
       allow: Origins of other pages that may connect, such as `https://hub.example.org`.
@@ -53,13 +55,15 @@ def play_live(
       UserError: there is no usable checkpoint, no viewer, no display, or the port is taken.
     """
     # Check first what can fail quickly, before the slow steps.
+    if robots > 1 and viewer == "native":
+        raise UserError(f"--robots {robots}: --viewer native shows one robot, use the browser")
     if viewer == "browser":
         server = _server()
         free: int = server.free_port(host, port)
     else:
         mujoco_window.require_window()
     tell(f"loading {run_or_checkpoint} and compiling: some seconds")
-    player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed)
+    player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed, robots=robots)
     try:
         if viewer == "browser":
             with server.ViserViewer(player, host=host, port=free, allow=allow, tell=tell) as page:
@@ -91,7 +95,7 @@ def addresses(host: str, port: int) -> list[str]:
     with contextlib.suppress(KeyError, OSError):
         name = f"{getpass.getuser()}@{name}"
     lines = [
-        f"it split_trajectories at http://{here}:{port} (Ctrl-C ends it)",
+        f"the page is at http://{here}:{port} (Ctrl-C ends it)",
         f"from elsewhere: ssh -N -L {port}:{here}:{port} {name}, and open"
         f" http://127.0.0.1:{port} there",
     ]

@@ -1,5 +1,6 @@
 """Convert the visible geoms of a MuJoCo model to triangle meshes, for other viewers."""
 
+import math
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -10,7 +11,6 @@ from jaxtyping import Float
 
 _VISIBLE_GROUPS = (0, 1, 2)  # as in MuJoCo's viewer; collision geoms are in group 3
 _ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-_SECTIONS = 48  # faces around cylinders and capsules
 _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
@@ -32,19 +32,27 @@ class Geom(NamedTuple):
     smooth: bool
     """Whether to use smooth shading, as for spheres and ellipsoids."""
 
+    def mesh_b(self) -> trimesh.Trimesh:
+        """Return the surface in the body frame [m]."""
+        pose_b = np.eye(4)
+        pose_b[:3, :3] = trimesh.transformations.quaternion_matrix(self.quat_b)[:3, :3]
+        pose_b[:3, 3] = self.position_b
+        return self.mesh.copy().apply_transform(pose_b)
 
-def visible_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
+
+def visible_geoms(model: mujoco.MjModel, sections: int = 48) -> Iterator[Geom]:
     """Return the meshes of all visible geoms, except for planes and height fields.
 
     Args:
       model: the model with all visual elements.
+      sections: the number of faces around cylinders and capsules.
 
     Yields:
       The geoms, in the order of the model.
     """
     for index in range(model.ngeom):
         geom = model.geom(index)
-        mesh = _mesh(model, index)
+        mesh = _mesh(model, index, sections)
         rgba = _rgba(model, index)
         if mesh is None or geom.group[0] not in _VISIBLE_GROUPS or rgba[3] == 0:
             continue
@@ -59,27 +67,32 @@ def visible_geoms(model: mujoco.MjModel) -> Iterator[Geom]:
         )
 
 
-def _mesh(model: mujoco.MjModel, index: int) -> trimesh.Trimesh | None:
+def _mesh(model: mujoco.MjModel, index: int, sections: int) -> trimesh.Trimesh | None:
     """Return the surface of a geom around its centre; None for planes and height fields."""
     size = model.geom_size[index]
     match mujoco.mjtGeom(model.geom_type[index]):
         case mujoco.mjtGeom.mjGEOM_BOX:
             return trimesh.creation.box(2 * size)
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
-            return trimesh.creation.cylinder(size[0], 2 * size[1], sections=_SECTIONS)
+            return trimesh.creation.cylinder(size[0], 2 * size[1], sections=sections)
         case mujoco.mjtGeom.mjGEOM_CAPSULE:
-            mesh = trimesh.creation.capsule(2 * size[1], size[0], count=[_SECTIONS // 2] * 2)
+            mesh = trimesh.creation.capsule(2 * size[1], size[0], count=[sections // 2] * 2)
             return mesh.apply_translation(-mesh.bounds.mean(axis=0))
         case mujoco.mjtGeom.mjGEOM_SPHERE:
-            return trimesh.creation.icosphere(subdivisions=3, radius=size[0])
+            return trimesh.creation.icosphere(_fineness(sections), size[0])
         case mujoco.mjtGeom.mjGEOM_ELLIPSOID:
-            return trimesh.creation.icosphere(subdivisions=3).apply_scale(size)
+            return trimesh.creation.icosphere(_fineness(sections)).apply_scale(size)
         case mujoco.mjtGeom.mjGEOM_MESH:
             mesh = model.mesh(model.geom_dataid[index])
             vertices = slice(mesh.vertadr[0], mesh.vertadr[0] + mesh.vertnum[0])
             faces = slice(mesh.faceadr[0], mesh.faceadr[0] + mesh.facenum[0])
             return trimesh.Trimesh(model.mesh_vert[vertices], model.mesh_face[faces], process=False)
     return None
+
+
+def _fineness(sections: int) -> int:
+    """Return the subdivisions of an icosahedron with about so many faces around it."""
+    return round(math.log2(sections / 6))
 
 
 def _rgba(model: mujoco.MjModel, index: int) -> tuple[float, float, float, float]:

@@ -23,6 +23,7 @@ from mujoco.rendering.classic import gl_context
 from PIL import Image
 
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.viewers.camera import Slopes, camera_axes, eye_that_sees
 from jetbot_mjx.viewers.pose import set_pose
 
 _BACKENDS = ("egl", "osmesa", "glfw")
@@ -168,12 +169,6 @@ def overview(
 ) -> mujoco.MjvCamera:
     """Return the nearest camera that looks down along x and sees all points.
 
-    In camera axes (x right, y up, z forward), let the camera be at height s and at distance d
-    behind the origin, and let k and k' be the slopes of the upper and lower borders. A point is
-    below the upper border if y - s ≤ k (z + d), and above the lower border if s - y ≤ k' (z + d).
-    One s satisfies both for all points if (k + k') d ≥ max(y - k z) - min(y + k' z). The same holds
-    for left and right.
-
     Args:
       points_w: the points [m], world frame.
       fovy: the field of view in height and width [degrees].
@@ -184,25 +179,16 @@ def overview(
     Returns:
       A free camera.
     """
-    # Express the points in camera axes, and find the distance.
     angle = math.radians(_ELEVATION)
-    ahead = np.array([math.cos(angle), 0.0, math.sin(angle)])
-    right, up = np.array([0.0, -1.0, 0.0]), np.array([-ahead[2], 0.0, ahead[0]])
-    x, y, z = (points_w @ axis for axis in (right, up, ahead))
-    slope = math.tan(math.radians(fovy) / 2)
-    k, upper, lower = sides * slope, above * slope, below * slope
-    distance = max(
-        _NEAREST - z.min(),
-        (np.max(x - k * z) - np.min(x + k * z)) / (2 * k),
-        (np.max(y - upper * z) - np.min(y + lower * z)) / (upper + lower),
-    )
-    # Centre the camera between the smallest and the largest offsets that see all points.
-    aside = (np.max(x - k * z) + np.min(x + k * z)) / 2
-    height = np.max(y - upper * (z + distance)) + np.min(y + lower * (z + distance))
+    axes_w = camera_axes(np.array([math.cos(angle), 0.0, math.sin(angle)]))
+    slopes = math.tan(math.radians(fovy) / 2) * np.array([sides, sides, below, above])
+    eye_w = eye_that_sees(points_w, axes_w, Slopes(*slopes), _NEAREST)
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
-    camera.azimuth, camera.elevation, camera.distance = 0.0, _ELEVATION, distance
-    camera.lookat[:] = aside * right + height / 2 * up
+    camera.azimuth, camera.elevation = 0.0, _ELEVATION
+    # The camera turns around the point nearest to the origin.
+    camera.distance = -float(axes_w[2] @ eye_w)
+    camera.lookat[:] = eye_w + camera.distance * axes_w[2]
     return camera
 
 

@@ -1,19 +1,22 @@
-"""Simulate one robot in real time, for any viewer.
+"""Simulate one robot or many in real time, for any viewer.
 
 Episodes follow the rules of training: a new goal is drawn when the task or the time limit ends an
-episode. One seed determines all goals. A player is not thread-safe.
+episode. One seed determines all goals. Robots do not see one another: each is alone in its own
+world. A player is not thread-safe.
 """
 
+import operator
 import time
 from pathlib import Path
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, UInt32
 
 from jetbot_mjx.compiler.xla_options import host_cpu
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
+from jetbot_mjx.envs.state import State
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
@@ -28,7 +31,10 @@ _HOLD_SECONDS = 0.4  # pause after the end of an episode, so that the user sees 
 
 
 class Player:
-    """A `Player` drives one robot with a policy of a run, a baseline, or commands of the user."""
+    """A `Player` drives robots with a policy of a run, a baseline, or commands of the user.
+
+    One of the robots is chosen: `snapshot`, `time`, `distance` and `move_goal` are about it.
+    """
 
     def __init__(
         self,
@@ -37,6 +43,7 @@ class Player:
         which: Which = "best",
         agent: str = "policy",
         seed: int = 0,
+        robots: int = 1,
     ) -> None:
         """Load the policy, compile the functions that all agents share, and begin an episode.
 
@@ -45,6 +52,7 @@ class Player:
           which: the checkpoint of a run folder.
           agent: one of `AGENTS`.
           seed: the seed of the goals and of the random agent.
+          robots: the number of robots, which drive in one compiled step.
 
         Raises:
           UserError: there is no usable checkpoint, its task cannot be built, or there is no such
@@ -56,43 +64,53 @@ class Player:
         self.run_dir = checkpoint.run_dir
         self.paused = False
         self.successes = 0
-        """Number of episodes that ended with success."""
+        """Number of episodes of all robots that ended with success."""
         self.episodes = 0
-        """Number of episodes that ended; those that the user reset are not counted."""
+        """Number of episodes of all robots that ended, without those that the user reset."""
         self.outcome: str | None = None
         """How the last episode ended, in words; None before the first end."""
+        self.robots = robots
+        """Number of robots."""
         self.frames = Rate()
         """Frame counter of the viewer, which counts every frame that it shows."""
-        # A single robot is faster on a CPU than on a GPU.
+        # A few robots are faster on a CPU than on a GPU.
         self._device = host_cpu()
         self._fns = make_viewer_fns(self.env, checkpoint.networks)
         self._key, key = self._put(tuple(jax.random.split(jax.random.PRNGKey(seed))))
+        # The first robot's goals do not depend on the number of robots.
+        keys = [key, *(jax.random.fold_in(key, robot) for robot in range(1, robots))]
         self._count = 0
         self._rate = Rate()
         self._speed = 1.0
         self.drive(0.0, 0.0)
         self._use(checkpoint)
-        self._begin(key)
-        self.cannot_move_goal = move_goal_error(self.env, self._state)
+        self._hold = np.zeros(robots, int)
+        self._robot = 0
+        self._set(self._fns.reset(self._put(jnp.stack(keys))))
+        one = jax.tree.map(operator.itemgetter(0), self._states)
+        self.cannot_move_goal = move_goal_error(self.env, one)
         """Why `move_goal` does nothing, in one line; empty if it moves the goal."""
-        self._fns.step(self._state, self._inputs())
+        # Compile now what the first episodes will need.
+        self._fns.step(self._states, self._inputs())
+        self._fns.restart(self._states, self._hold > 0)
         self._restart_clock()
 
     def tick(self) -> None:
-        """Make one control step; after the end of an episode the robot pauses for a moment."""
+        """Make one control step; after the end of an episode a robot pauses for a moment."""
         self._count += 1
-        if self._hold > 0:
-            self._hold -= 1
-            if self._hold == 0:
-                self.reset()
-            return
-        self._state, snapshot = self._fns.step(self._state, self._inputs())
-        self._set_snapshot(snapshot)
-        if self.snapshot.done > 0:
-            self.episodes += 1
-            self.successes += int(self.snapshot.success)
-            self.outcome = _outcome(self.snapshot)
-            self._hold = round(_HOLD_SECONDS / self.env.dt)
+        standing = self._hold > 0
+        if not standing.all():
+            self._set(self._fns.step(self._states, self._inputs()))
+            ended = (self.crowd.done > 0) & ~standing
+            self.episodes += int(ended.sum())
+            self.successes += int(self.crowd.success[ended].sum())
+            self._hold[ended] = round(_HOLD_SECONDS / self.env.dt)
+            if ended[self._robot]:
+                self.outcome = _outcome(self.snapshot)
+        self._hold[standing] -= 1
+        over = standing & (self._hold == 0)
+        if over.any():
+            self._set(self._fns.restart(self._states, over))
 
     def advance(self) -> int:
         """Make the control steps that are due in real time, none while paused.
@@ -114,11 +132,12 @@ class Player:
         return self._clock.wait(time.monotonic())
 
     def reset(self) -> None:
-        """Begin the next episode: the robot is at the origin, and a new goal is drawn."""
-        self._begin(self._state.key)
+        """Begin the next episode of all robots: each is at its origin, and new goals are drawn."""
+        self._hold[:] = 0
+        self._set(self._fns.restart(self._states, np.ones(self.robots, bool)))
 
     def move_goal(self, x: float, y: float) -> bool:
-        """Move the goal on the floor and restart the time limit.
+        """Move the chosen robot's goal on the floor and restart its time limit.
 
         Args:
           x: the position along the world's x axis [m].
@@ -130,9 +149,8 @@ class Player:
         if self.cannot_move_goal:
             return False
         position_w = np.array([x, y, self.snapshot.goal_w[2]], np.float32)
-        self._state, snapshot = self._fns.move(self._state, position_w)
-        self._set_snapshot(snapshot)
-        self._hold = 0
+        self._hold[self._robot] = 0
+        self._set(self._fns.move(self._states, np.int32(self._robot), position_w))
         return True
 
     def switch_checkpoint(self, env_steps: int) -> None:
@@ -172,6 +190,16 @@ class Player:
         turn = left * limits.max_yaw_rate / _NUDGES
         yaw_rate = 0.0 if turn * yaw_rate < 0 else yaw_rate + turn
         self.drive(speed + ahead * limits.max_speed / _NUDGES, yaw_rate)
+
+    @property
+    def robot(self) -> int:
+        """Index of the chosen robot."""
+        return self._robot
+
+    @robot.setter
+    def robot(self, index: int) -> None:
+        self._robot = index
+        self.snapshot = jax.tree.map(operator.itemgetter(index), self.crowd)
 
     @property
     def agent(self) -> str:
@@ -237,16 +265,15 @@ class Player:
             twist_b=np.array(self.command, np.float32),
             key=self._key,
             count=np.uint32(self._count),
+            standing=self._hold > 0,
         )
 
-    def _begin(self, key: UInt32[Array, "2"]) -> None:
-        self._state, snapshot = self._fns.reset(key)
-        self._set_snapshot(snapshot)
-        self._hold = 0
-
-    def _set_snapshot(self, snapshot: Snapshot) -> None:
-        self.snapshot: Snapshot = jax.device_get(snapshot)
-        """What a viewer shows of the last step, on the host."""
+    def _set(self, result: tuple[State, Snapshot]) -> None:
+        self._states = result[0]
+        self.crowd: Snapshot = jax.device_get(result[1])
+        """What a viewer shows of the last step of all robots, on the host."""
+        self.snapshot: Snapshot = jax.tree.map(operator.itemgetter(self._robot), self.crowd)
+        """The same of the chosen robot."""
 
     def _put(self, tree: Any) -> Any:
         return jax.device_put(tree, self._device)

@@ -1,4 +1,4 @@
-"""Compile the functions of a `Player`: reset, step and move the goal, once for all agents."""
+"""Compile the functions of a `Player`: reset, step and move a goal, for all robots and agents."""
 
 import functools
 from collections.abc import Callable, Mapping
@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.training.agents.ppo import networks as ppo_networks
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt32
 
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.compiler.xla_options import compiler_options
@@ -19,6 +19,8 @@ from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.envs.task import MovesGoal
 from jetbot_mjx.envs.wrappers import EpisodeWrapper
 from jetbot_mjx.evaluation.evaluator import BASELINES, policy_controller
+
+_REWARD = "reward/"  # prefix of the reward's terms in a state's metrics
 
 KEYBOARD = "keyboard"
 AGENTS = ("policy", *BASELINES, KEYBOARD)
@@ -38,12 +40,15 @@ class Inputs(NamedTuple):
     """Random key of the random agent."""
     count: np.uint32
     """Number of the step, which is folded into the key."""
+    standing: Bool[np.ndarray, " robots"]
+    """Robots that make no step, because their episodes have ended."""
 
 
 class Snapshot(NamedTuple):
-    """A `Snapshot` holds what a viewer shows of one step.
+    """A `Snapshot` holds what a viewer shows of one step of one robot.
 
-    Its arrays are on the device in `ViewerFns` and on the host in `Player.snapshot`.
+    Its arrays are on the host in `Player.snapshot`. In `Player.crowd` they have one more dimension
+    in front, over the robots; likewise in `ViewerFns`, on the device.
     """
 
     qpos: Float[Array | np.ndarray, " nq"]
@@ -62,17 +67,23 @@ class Snapshot(NamedTuple):
     """1 where the task ended the episode."""
     nonfinite: Float[Array | np.ndarray, ""]
     """1 where this step was not finite."""
+    rewards: Mapping[str, Float[Array | np.ndarray, ""]]
+    """Terms of this step's reward, by name."""
+    returns: Mapping[str, Float[Array | np.ndarray, ""]]
+    """Their sums over the episode, by name."""
 
 
 class ViewerFns(NamedTuple):
-    """A `ViewerFns` holds three compiled functions, which return a state and its snapshot."""
+    """A `ViewerFns` holds compiled functions of all robots, which return states and snapshots."""
 
-    reset: Callable[[UInt32[Array, "2"]], tuple[State, Snapshot]]
-    """Begin an episode from a random key."""
+    reset: Callable[[UInt32[Array, "robots 2"]], tuple[State, Snapshot]]
+    """Begin an episode of each robot from its random key."""
+    restart: Callable[[State, Bool[np.ndarray, " robots"]], tuple[State, Snapshot]]
+    """Begin the next episode of some robots, from the keys that their states carry."""
     step: Callable[[State, Inputs], tuple[State, Snapshot]]
     """Make one environment step, with the episode statistics of `EpisodeWrapper`."""
-    move: Callable[[State, Float[np.ndarray, "3"]], tuple[State, Snapshot]]
-    """Move the goal to a position [m], world frame, and restart the time limit."""
+    move: Callable[[State, np.int32, Float[np.ndarray, "3"]], tuple[State, Snapshot]]
+    """Move one robot's goal to a position [m], world frame, and restart its time limit."""
 
 
 def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerFns:
@@ -90,43 +101,75 @@ def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> Viewe
     controllers = [policy_controller(networks), *(make(env) for make in BASELINES.values())]
     limits = {"max_speed": env.config.task.max_speed, "max_yaw_rate": env.config.task.max_yaw_rate}
 
-    def snapshot(state: State) -> Snapshot:
-        return Snapshot(
-            qpos=state.pipeline_state.qpos,
-            markers=dict(env.task.markers(state.goal)),
-            goal_w=env.task.goal_position(state.goal),
-            steps=state.info["steps"],
-            done=state.done,
-            success=state.metrics["success"],
-            terminated=state.info["terminated"],
-            nonfinite=state.metrics["nonfinite_envs"],
-        )
-
-    def reset(key: UInt32[Array, "2"]) -> tuple[State, Snapshot]:
-        state = episode_env.reset(key)
-        return state, snapshot(state)
-
-    def step(state: State, inputs: Inputs) -> tuple[State, Snapshot]:
-        key = jax.random.fold_in(inputs.key, inputs.count)
+    def step_one(state: State, robot: Int[Array, ""], inputs: Inputs) -> State:
+        key = jax.random.fold_in(jax.random.fold_in(inputs.key, inputs.count), robot)
         branches = [
             *(lambda act=act: act(inputs.params, state, key) for act in controllers),
             lambda: kinematics.action_from_twist(jnp.asarray(inputs.twist_b), **limits),
         ]
-        state = episode_env.step(state, jax.lax.switch(inputs.agent, branches))
-        return state, snapshot(state)
+        return episode_env.step(state, jax.lax.switch(inputs.agent, branches))
 
-    def move(state: State, position_w: Float[Array, "3"]) -> tuple[State, Snapshot]:
+    def move_one(state: State, position_w: Float[Array, "3"]) -> State:
         assert isinstance(env.task, MovesGoal)
         goal = env.task.move_goal(state.goal, position_w)
         obs = env.blind().observe(robot_state(state.pipeline_state), goal)
         info = {**state.info, "steps": jnp.zeros(())}
         state = state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
-        if env.camera is not None:
-            state = see(env.camera, env.task, state)
-        return state, snapshot(state)
+        return state if env.camera is None else see(env.camera, env.task, state)
+
+    def reset(keys: UInt32[Array, "robots 2"]) -> tuple[State, Snapshot]:
+        states = jax.vmap(episode_env.reset)(keys)
+        return states, _snapshot(env, states)
+
+    def restart(states: State, restarted: Bool[Array, " robots"]) -> tuple[State, Snapshot]:
+        states = _where(restarted, jax.vmap(episode_env.reset)(states.key), states)
+        return states, _snapshot(env, states)
+
+    def step(states: State, inputs: Inputs) -> tuple[State, Snapshot]:
+        robots = jnp.arange(len(inputs.standing))
+        stepped = jax.vmap(step_one, in_axes=(0, 0, None))(states, robots, inputs)
+        states = _where(jnp.asarray(inputs.standing), states, stepped)
+        return states, _snapshot(env, states)
+
+    def move(
+        states: State, robot: Int[Array, ""], position_w: Float[Array, "3"]
+    ) -> tuple[State, Snapshot]:
+        moved = jax.vmap(move_one, in_axes=(0, None))(states, position_w)
+        states = _where(jnp.arange(len(states.done)) == robot, moved, states)
+        return states, _snapshot(env, states)
 
     compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))
-    return ViewerFns(compiled(reset), compiled(step), compiled(move))
+    return ViewerFns(compiled(reset), compiled(restart), compiled(step), compiled(move))
+
+
+def _snapshot(env: JetBotEnv, states: State) -> Snapshot:
+    """Return the snapshot of all robots."""
+
+    def terms(metrics: Mapping[str, Any]) -> dict[str, Any]:
+        names = (name for name in metrics if name.startswith(_REWARD))
+        return {name.removeprefix(_REWARD): metrics[name] for name in names}
+
+    return Snapshot(
+        qpos=states.pipeline_state.qpos,
+        markers=jax.vmap(lambda goal: dict(env.task.markers(goal)))(states.goal),
+        goal_w=jax.vmap(env.task.goal_position)(states.goal),
+        steps=states.info["steps"],
+        done=states.done,
+        success=states.metrics["success"],
+        terminated=states.info["terminated"],
+        nonfinite=states.metrics["nonfinite_envs"],
+        rewards=terms(states.metrics),
+        returns=terms(states.info["episode_metrics"]),
+    )
+
+
+def _where(robots: Bool[Array, " robots"], chosen: State, others: State) -> State:
+    """Return the states `chosen` of some robots, and the states `others` of all others."""
+
+    def select(one: Array, other: Array) -> Array:
+        return jnp.where(robots.reshape(-1, *[1] * (one.ndim - 1)), one, other)
+
+    return jax.tree.map(select, chosen, others)
 
 
 def move_goal_error(env: JetBotEnv, state: State) -> str:
@@ -134,7 +177,7 @@ def move_goal_error(env: JetBotEnv, state: State) -> str:
 
     Args:
       env: the environment with the task.
-      state: any state of the environment.
+      state: any state of one robot.
 
     Returns:
       The reason why goals cannot be moved, in one line; empty if they can.

@@ -272,7 +272,7 @@ class EvaluationVideo:
     GOALS = 4
     """Number of episodes side by side."""
 
-    _SIDE, _FPS = 256, 12.5  # small, so that training waits only briefly
+    _SIDE, _FPS = 256, FPS / GIF_STRIDE  # small, so that training waits only briefly
 
     def __init__(
         self, env: JetBotEnv, networks: ppo_networks.PPONetworks, programs: ProgramCache
@@ -288,7 +288,7 @@ class EvaluationVideo:
         self._evaluator = Evaluator(env, networks, programs, record=True)
 
     def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
-        """Run the episodes and write their video.
+        """Run the episodes and write their video, and a GIF of the same name.
 
         Args:
           path: the path of the mp4 file.
@@ -301,10 +301,13 @@ class EvaluationVideo:
         episodes = self._evaluator.run(params, report_keys(self.GOALS))
         trajectories = split_trajectories(self._env, episodes, range(self.GOALS))
         with VideoRenderer(self._env, self._SIDE, self._FPS) as renderer:
-            frames = renderer.render_side_by_side(
-                [(f"{env_steps:,} steps", one) for one in trajectories]
+            frames = list(
+                renderer.render_side_by_side(
+                    [(f"{env_steps:,} steps", one) for one in trajectories]
+                )
             )
-            write_mp4(path, frames, self._FPS)
+        write_mp4(path, frames, self._FPS)
+        write_gif(path.with_suffix(".gif"), frames)
 
 
 def resize_frame(frame: Frame, factor: float) -> Frame:

@@ -1,5 +1,6 @@
 """Build the control panel of a player's page in viser."""
 
+import html
 import math
 from collections.abc import Callable
 from typing import Any
@@ -9,9 +10,23 @@ import viser
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.player import SPEEDS, Player
 from jetbot_mjx.viewers.step_fns import AGENTS, KEYBOARD
-from jetbot_mjx.viewers.viser_scene import CAMERAS, Scene
+from jetbot_mjx.viewers.viser_camera import CAMERAS
+from jetbot_mjx.viewers.viser_scene import Scene
 
 _BUTTONS = ("Step", "New episode")
+
+_REWARD_BOX = '<div style="font-size:0.8em; padding:0.2em 0.8em">{}</div>'
+_REWARD_TITLE = (
+    '<div style="display:flex; opacity:0.6"><span style="flex:1">Reward of this step</span>'
+    "<span>of this episode</span></div>"
+)
+_REWARD_BAR = (
+    '<div style="display:flex"><span style="flex:1">{name} {value:+.4f}</span>'
+    "<span>{total:+.3f}</span></div>"
+    '<div style="position:relative; height:0.7em; background:rgba(128,128,128,0.2)">'
+    '<div style="position:absolute; {side}:50%; width:{width:.1f}%; height:100%;'
+    ' background:{color}"></div></div>'
+)
 
 
 class ControlPanel:
@@ -36,6 +51,8 @@ class ControlPanel:
         self.episode = gui.add_text("Episode", "", disabled=True)
         self.distance = gui.add_text("Distance", "", disabled=True)
         self.pace = gui.add_text("Pace", "", disabled=True)
+        self._largest = dict.fromkeys(player.snapshot.rewards, 1e-9)
+        self.rewards = gui.add_html("")
         self._add_choices()
         self._add_drive_controls()
         gui.add_markdown(
@@ -56,29 +73,56 @@ class ControlPanel:
         self.pace.value = (
             f"{player.steps_per_second:.0f} steps/s, {player.frames_per_second:.0f} frames/s"
         )
+        self.rewards.content = self._reward_bars()
         # Do not assign equal values: the page would rebuild the control.
         checkpoints = _labels(player)
         if checkpoints != self.checkpoint.options:
             self.checkpoint.options = checkpoints
+        if player.robots > 1 and self.robot.value != player.robot:
+            self.robot.value = player.robot
         buttons = ("Go on" if player.paused else "Pause", *_BUTTONS)
         if buttons != self.buttons.options:
             self.buttons.options = buttons
 
+    def _reward_bars(self) -> str:
+        """Return a bar for each term of the reward, relative to the largest value it has had."""
+        snapshot = self._player.snapshot
+        rows = [_REWARD_TITLE]
+        for name, reward in snapshot.rewards.items():
+            value = float(reward)
+            self._largest[name] = max(self._largest[name], abs(value))
+            rows.append(
+                _REWARD_BAR.format(
+                    name=html.escape(name),
+                    value=value,
+                    total=float(snapshot.returns[name]),
+                    side="left" if value >= 0 else "right",
+                    width=50 * abs(value) / self._largest[name],
+                    color="#2f9e44" if value >= 0 else "#e03131",
+                )
+            )
+        return _REWARD_BOX.format("".join(rows))
+
     def _add_choices(self) -> None:
         gui, player = self._server.gui, self._player
+        if player.robots > 1:
+            self.robot = robot = gui.add_slider("Robot", 0, player.robots - 1, 1, player.robot)
+            robot.on_update(lambda _: self._ask(setattr, player, "robot", robot.value))
         self.agent = gui.add_dropdown("Agent", AGENTS, initial_value=player.agent)
         self.checkpoint = gui.add_dropdown(
             "Checkpoint", _labels(player), initial_value=_label(player.checkpoint)
         )
         self.buttons = gui.add_button_group("", ("Pause", *_BUTTONS))
         self.speed = speed = gui.add_slider("Real time x", *SPEEDS, 0.1, player.speed)
-        self.camera = camera = gui.add_dropdown("Camera", CAMERAS)
+        self.camera = camera = gui.add_dropdown(
+            "Camera", CAMERAS, initial_value=self._scene.cameras.mode
+        )
         shadows = gui.add_checkbox("Shadows", False)
         self.agent.on_update(lambda _: self._ask(self._switch_agent))
         self.checkpoint.on_update(lambda _: self._ask(self._switch_checkpoint))
         self.buttons.on_click(lambda event: self._ask(self._press, event.target.value))
         speed.on_update(lambda _: self._ask(setattr, player, "speed", speed.value))
-        camera.on_update(lambda _: self._ask(setattr, self._scene, "camera", camera.value))
+        camera.on_update(lambda _: self._ask(setattr, self._scene.cameras, "mode", camera.value))
         shadows.on_update(lambda _: self._ask(self._scene.cast_shadows, shadows.value))
 
     def _add_drive_controls(self) -> None:

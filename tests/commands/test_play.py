@@ -110,6 +110,11 @@ def test_without_a_display_a_window_is_refused_at_once(smoke_run, monkeypatch, n
         play.main([str(smoke_run), "--viewer", "native"])
 
 
+def test_the_window_shows_one_robot(smoke_run, nothing_loads):
+    with pytest.raises(UserError, match="--robots 4: --viewer native shows one robot"):
+        play.main([str(smoke_run), "--viewer", "native", "--robots", "4"])
+
+
 def test_the_window_is_driven_until_it_is_closed(smoke_run, monkeypatch, capsys):
     seen = []
     monkeypatch.setattr(mujoco_window, "require_window", lambda: None)
@@ -117,7 +122,7 @@ def test_the_window_is_driven_until_it_is_closed(smoke_run, monkeypatch, capsys)
     monkeypatch.setattr(live, "Player", FakePlayer)
     assert play.main([str(smoke_run), "--viewer", "native", "--seed", "3"]) == 0
     (player,) = seen
-    assert player.given == {"which": "best", "agent": "policy", "seed": 3}
+    assert player.given == {"which": "best", "agent": "policy", "seed": 3, "robots": 1}
     assert capsys.readouterr().out.splitlines()[-1] == "1 of 2 goals reached"
 
 
@@ -154,6 +159,8 @@ def test_origins_are_read_as_browsers_write_them(text, origin):
         (["--port", "0"], "0 is too small: give at least 1"),
         (["--port", "70000"], "70000 is too large: give at most 65535"),
         (["--port", "http"], "'http' is no whole number"),
+        (["--robots", "0"], "0 is too small: give at least 1"),
+        (["--robots", "9999"], "9999 is too large: give at most 256"),
         (["--seed", "-1"], "-1 is too small"),
         (["--checkpoint", "worst"], "neither best, last nor a number"),
     ],

@@ -13,6 +13,7 @@ import types
 import jax
 import jax.numpy as jnp
 import pytest
+from PIL import Image
 from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.proto.layout_pb2 import Layout
 from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
@@ -260,6 +261,39 @@ def test_tensorboard_tells_the_configuration_and_shows_success_first(tmp_path):
     assert len(scalars) == len(set(scalars))
 
 
+def film(run_dir, steps):
+    path = run_dir / "videos" / f"{steps:012}" / metrics.EVALUATION_VIDEO
+    path.parent.mkdir(parents=True)
+    frames = [Image.new("RGB", (8, 4), (shade, 0, steps % 256)) for shade in (0, 200)]
+    frames[0].save(path.with_suffix(".gif"), save_all=True, append_images=frames[1:])
+    return path
+
+
+def videos(folder):
+    """(step, bytes) of every picture in the one event file of a folder."""
+    return [
+        (event.step, value.image.encoded_image_string)
+        for event in events(folder)
+        for value in event.summary.value
+        if value.tag == "eval/video"
+    ]
+
+
+def test_tensorboard_plays_the_videos_of_evaluations_and_keeps_them_on_resume(tmp_path):
+    folder = tmp_path / "tensorboard"
+    sink = TensorBoardSink(folder)
+    paths = {steps: film(tmp_path, steps) for steps in (0, 512, 2048)}
+    for steps, path in paths.items():
+        sink.write_video(steps, path)
+    sink.close()
+    gifs = {steps: path.with_suffix(".gif").read_bytes() for steps, path in paths.items()}
+    assert videos(folder) == list(gifs.items())
+    assert gifs[0].startswith(b"GIF")
+    # A training that resumes before the last one makes that anew.
+    TensorBoardSink(folder, HISTORY).close()
+    assert videos(folder) == [(0, gifs[0]), (512, gifs[512])]
+
+
 def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):
     folder = tmp_path / "tensorboard"
     folder.mkdir()
@@ -277,6 +311,9 @@ class TrainerCallback:
     def write(self, env_steps, metrics):
         self.log.append((self, env_steps, dict(metrics)))
 
+    def write_video(self, env_steps, mp4):
+        self.log.append((self, env_steps, mp4))
+
     def close(self):
         self.log.append((self, "closed"))
 
@@ -286,9 +323,12 @@ def test_joined_sinks_all_get_everything_and_are_all_closed():
     first, second = TrainerCallback(log), TrainerCallback(log)
     with Sinks([first, second]) as sinks:
         sinks.write(3, {"a": 1.0})
+        sinks.write_video(3, "a.mp4")
     assert log == [
         (first, 3, {"a": 1.0}),
         (second, 3, {"a": 1.0}),
+        (first, 3, "a.mp4"),
+        (second, 3, "a.mp4"),
         (first, "closed"),
         (second, "closed"),
     ]

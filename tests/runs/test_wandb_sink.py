@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 import types
+from pathlib import Path
 
 import pytest
 
@@ -26,6 +27,9 @@ class FakeWandb(types.ModuleType):
         self.__spec__ = importlib.machinery.ModuleSpec("wandb", None, origin="here")
         self.runs = []
         self.failing = set()
+
+    def Video(self, path, format):
+        return path, format
 
     def Settings(self, **settings):
         return settings
@@ -47,13 +51,18 @@ class FakeRun:
         self.wandb = wandb
         self.arguments = arguments
         self.logged = {}
+        self.defined = {}
         self.finished = False
+
+    def define_metric(self, name, **settings):
+        self.defined[name] = settings
 
     def log(self, values, step):
         if "log" in self.wandb.failing:
             raise ValueError
-        assert step not in self.logged
-        self.logged[step] = values
+        assert step == max(self.logged, default=step) or step > max(self.logged)
+        assert not self.logged.get(step, {}).keys() & values.keys()
+        self.logged.setdefault(step, {}).update(values)
 
     def finish(self):
         if "finish" in self.wandb.failing:
@@ -130,6 +139,7 @@ def test_a_run_is_told_what_it_is_and_all_that_tensorboard_is_told(wandb, track)
             "time/total_timesteps": 8192.0,
         }
     }
+    assert run.defined == {"eval/success_rate": {"summary": "max,last"}}
     assert run.finished
     assert track.said == ["Weights & Biases: https://example.com/run"]
 
@@ -145,6 +155,22 @@ def test_it_goes_on_with_the_same_run_and_no_step_is_told_twice(wandb, track):
     one, other = wandb.runs
     assert one.arguments["id"] == other.arguments["id"]
     assert [list(run.logged) for run in wandb.runs] == [[0, 10, 20], [30]]
+
+
+def test_a_video_is_told_with_the_metrics_of_its_step_and_once(wandb, track):
+    first = track()
+    for step in (0, 10):
+        first.write(step, {"a": step})
+        first.write_video(step, Path(f"{step}.mp4"))
+    second = track([History(0, 1.0, {"a": 0})])
+    second.write(10, {"a": 10})
+    second.write_video(10, Path("10.mp4"))
+    one, other = wandb.runs
+    assert [told["eval/video"] for told in one.logged.values()] == [
+        ("0.mp4", "mp4"),
+        ("10.mp4", "mp4"),
+    ]
+    assert other.logged == {}
 
 
 def test_what_was_logged_before_it_was_asked_for_is_told_first(wandb, track):
@@ -220,7 +246,8 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.runs.wandb_sink import WandbSink
 for step in (0, 10):
     sink = WandbSink(parse_config({"wandb": "jetbots"}), Path(sys.argv[1]), [], print)
-    sink.write(step, {"a": 1.0})
+    sink.write(step, {"eval/success_rate": 1.0 - step / 20})
+    sink.write_video(step, Path(sys.argv[2]))
     sink.close()
 """
 
@@ -228,8 +255,10 @@ for step in (0, 10):
 def test_the_package_itself_takes_what_it_is_told(tmp_path):
     if importlib.util.find_spec("wandb") is None:
         pytest.skip("wandb is not installed")
+    film = tmp_path / "film.mp4"
+    film.write_bytes(b"not looked into")
     done = subprocess.run(
-        [sys.executable, "-c", OFFLINE, str(tmp_path)],
+        [sys.executable, "-c", OFFLINE, str(tmp_path), str(film)],
         env={**os.environ, "WANDB_MODE": "offline"},
         capture_output=True,
         text=True,
@@ -239,6 +268,7 @@ def test_the_package_itself_takes_what_it_is_told(tmp_path):
     first, second = done.stdout.splitlines()
     told = json.loads((tmp_path / "wandb.json").read_text())
     assert told["env_steps"] == 10
+    assert len(list(tmp_path.glob("wandb/offline-*/files/media/videos/eval/*.mp4"))) == 2
     for line in (first, second):
         folder = line.removeprefix("Weights & Biases: offline; later: wandb sync ")
         assert folder.startswith(str(tmp_path / "wandb" / "offline-run-"))

@@ -6,6 +6,7 @@ import time
 import imageio.v3 as iio
 import numpy as np
 import pytest
+from PIL import Image
 
 from jetbot_mjx import load_config, make_env
 from jetbot_mjx.agents.networks import PolicyParams
@@ -80,6 +81,7 @@ def events(monkeypatch, tmp_path):
 
         def write(self, path, params, env_steps):
             time.sleep(0.2)
+            Image.new("RGB", (8, 4)).save(path.with_suffix(".gif"))
             run_dir = path.parents[2]
             found.append(("film", str(path.relative_to(run_dir)), run_dir.name, lines(run_dir)))
 
@@ -118,6 +120,14 @@ def test_every_seed_is_filmed_after_all_are_logged_and_saved(recorder, events, t
     before, after = times(tmp_path / "seed-0")
     assert before == 0
     assert after > 0.4
+
+
+def test_only_the_end_of_a_training_is_filmed_where_that_is_asked_for(recorder, events, tmp_path):
+    with recorder("evaluation.video=last", "ppo.num_timesteps=8192") as it:
+        report(it, 0, 4096)
+        assert not it.on_interval([Progress(16_384, PARAMS, {}, 1.0)])
+    films = [event[1] for event in events if event[0] == "film"]
+    assert films == ["videos/000000016384/evaluation.mp4"]
 
 
 def test_nothing_is_prepared_where_nothing_is_asked_for(recorder, tmp_path, monkeypatch):
@@ -180,6 +190,8 @@ def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
         pictures = iio.imread(path, plugin="pyav")
         assert pictures.shape[1:] == (64, video.EvaluationVideo.GOALS * 64, 3)
         assert len(pictures) > 4
+        with Image.open(path.with_suffix(".gif")) as gif:
+            assert gif.n_frames > 4
     lines = [
         json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     ]

@@ -5,6 +5,7 @@ import shutil
 
 import imageio.v3 as iio
 import jax
+import mujoco
 import numpy as np
 import pytest
 
@@ -12,7 +13,7 @@ from jetbot_mjx import render
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.viewers import many, offscreen
+from jetbot_mjx.viewers import grid_renderer, many, offscreen, robot_grid
 
 ROBOTS = 6
 
@@ -52,7 +53,7 @@ def episodes(world_env):
 
 @pytest.fixture(scope="module")
 def grid(world_env, episodes):
-    return many.place_on_grid(world_env, episodes)
+    return robot_grid.place_on_grid(world_env, episodes)
 
 
 def test_each_robot_drives_in_its_own_cell_as_it_did_alone(grid, episodes):
@@ -72,7 +73,7 @@ def test_each_robot_drives_in_its_own_cell_as_it_did_alone(grid, episodes):
 
 def test_the_first_robot_starts_at_once_and_all_end_in_time(grid):
     assert grid.start_seconds[grid.first] == pytest.approx(0, abs=1e-9)
-    assert grid.start_seconds.max() == pytest.approx(many._WAVE_SECONDS)
+    assert grid.start_seconds.max() == pytest.approx(robot_grid._WAVE_SECONDS)
     np.testing.assert_array_equal(grid.steps_at(0.0), np.zeros(ROBOTS))
     ends = grid.steps_at(grid.seconds)
     np.testing.assert_array_equal(ends, grid.steps)
@@ -92,9 +93,11 @@ def colours(frame):
 def test_goals_turn_green_when_reached(
     world_env, grid, needs_opengl, monkeypatch, smallest, detailed
 ):
-    monkeypatch.setattr(many, "_DETAILED", detailed)
-    with many.GridRenderer(world_env, ROBOTS, 300, 300, smallest_marker=smallest) as renderer:
-        camera = many.pull_back_camera(grid, renderer.fovy, 1.0, 1.0)
+    monkeypatch.setattr(grid_renderer, "_DETAILED", detailed)
+    with grid_renderer.GridRenderer(
+        world_env, ROBOTS, 300, 300, smallest_marker=smallest
+    ) as renderer:
+        camera = grid_renderer.pull_back_camera(grid, renderer.fovy, 1.0, 1.0)
         start, end = (renderer.frame(grid, at, camera) for at in (0.0, grid.seconds))
         again = renderer.frame(grid, 0.0, camera)
     np.testing.assert_array_equal(start, again)
@@ -104,8 +107,23 @@ def test_goals_turn_green_when_reached(
     assert colours(end)[1] > 3
 
 
+@pytest.mark.parametrize(("few", "segments"), [(ROBOTS, 6), (ROBOTS - 1, 2)])
+def test_the_trails_of_few_robots_are_smooth(
+    world_env, grid, needs_opengl, monkeypatch, few, segments
+):
+    monkeypatch.setattr(grid_renderer, "_FEW_ROBOTS", few)
+    with grid_renderer.GridRenderer(world_env, ROBOTS, 100, 100) as renderer:
+        camera = grid_renderer.pull_back_camera(grid, renderer.fovy, 1.0, 1.0)
+        renderer.frame(grid, grid.seconds, camera)
+        scene = renderer._renderer.scene
+        kinds = [scene.geoms[index].type for index in range(scene.ngeom)]
+    assert kinds.count(int(mujoco.mjtGeom.mjGEOM_LINE)) == ROBOTS * segments
+
+
 def test_the_camera_moves_back_from_the_first_robot_until_it_sees_all(grid):
-    near, middle, far = (many.pull_back_camera(grid, 45.0, 16 / 9, at) for at in (0, 0.5, 1))
+    near, middle, far = (
+        grid_renderer.pull_back_camera(grid, 45.0, 16 / 9, at) for at in (0, 0.5, 1)
+    )
     assert near.distance < middle.distance < far.distance
     first_w = grid.qpos[grid.first, 0, :2]
     assert np.linalg.norm(near.lookat[:2] - first_w) < 1.0

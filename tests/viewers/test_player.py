@@ -130,7 +130,7 @@ def test_a_paused_player_stands_and_takes_single_steps(player, wall):
 
 def test_an_end_draws_a_new_goal_and_puts_the_robot_back(player):
     player.agent = "scripted"
-    goal_w, key = player.snapshot.goal_w, player._state.key
+    goal_w, key = player.snapshot.goal_w, player._states.key[0]
     tick_to_the_end(player)
     assert (player.successes, player.episodes, player.outcome) == (1, 1, "reached")
     end = position(player)
@@ -207,7 +207,7 @@ def test_a_goal_that_is_moved_has_the_whole_time_limit(player):
 
 def test_the_policy_sees_at_once_where_the_goal_has_gone(player):
     player.move_goal(0.0, 0.6)
-    robot_at_rest = player._state.obs
+    robot_at_rest = player._states.obs[0]
     # Egocentric: straight to the left, 0.6 m away.
     np.testing.assert_allclose(robot_at_rest[:5], [0, 0.6, 0, 1, 0.6], atol=1e-5)
 
@@ -274,13 +274,87 @@ def test_the_obstacles_goal_moves_and_its_pillar_stays(root, monkeypatch):
     np.testing.assert_array_equal(moved.pillar_w, state.goal.pillar_w)
 
 
+# Many robots.
+
+
+@pytest.fixture(scope="module")
+def four(smoke_run):
+    return Player(smoke_run, seed=SEED, robots=4, agent="scripted")
+
+
+def test_many_robots_drive_as_each_would_alone(four, one, first_goal):
+    four.reset()
+    starts = np.array(four.crowd.goal_w)
+    assert len({tuple(goal) for goal in starts.tolist()}) == 4
+    one.agent = "scripted"
+    one.reset()
+    one.move_goal(*starts[2, :2])
+    ticks(one, 25)
+    ticks(four, 25)
+    np.testing.assert_allclose(four.crowd.qpos[2], one.snapshot.qpos, atol=1e-4)
+    # The first robot's goals are those of a player of one robot.
+    alone = Player(one.run_dir, seed=SEED, robots=2)
+    np.testing.assert_allclose(alone.crowd.goal_w[0], first_goal, rtol=1e-6)
+
+
+def test_each_robot_rests_after_its_own_end_and_begins_anew_alone(four):
+    four.reset()
+    four.robot = 1
+    assert four.move_goal(0.2, 0.0)
+    before = four.episodes, four.successes
+    while not four.snapshot.done:
+        four.tick()
+    assert four.outcome == "reached"
+    assert (four.episodes, four.successes) == (before[0] + 1, before[1] + 1)
+    end, others = np.array(four.snapshot.qpos), np.array(four.crowd.steps[[0, 2, 3]])
+    ticks(four, HOLD - 1)
+    np.testing.assert_array_equal(four.snapshot.qpos, end)
+    four.tick()
+    np.testing.assert_array_equal(position(four), 0.0)
+    assert four.time == 0
+    np.testing.assert_array_equal(four.crowd.steps[[0, 2, 3]], others + HOLD)
+    assert (four.episodes, four.successes) == (before[0] + 1, before[1] + 1)
+
+
+def test_only_the_chosen_robots_goal_moves(four):
+    four.reset()
+    ticks(four, 3)
+    before = np.array(four.crowd.goal_w)
+    four.robot = 3
+    assert four.move_goal(0.4, -0.5)
+    np.testing.assert_allclose(four.snapshot.goal_w, [0.4, -0.5, 0.05], rtol=1e-6)
+    np.testing.assert_array_equal(four.crowd.goal_w[:3], before[:3])
+    assert four.crowd.steps.tolist() == [3, 3, 3, 0]
+    four.robot = 0
+    np.testing.assert_array_equal(four.snapshot.goal_w, before[0])
+
+
+def test_random_agents_differ_from_robot_to_robot(four):
+    four.reset()
+    four.agent = "random"
+    ticks(four, 10)
+    assert len({tuple(qpos) for qpos in four.crowd.qpos.tolist()}) == 4
+    four.agent = "scripted"
+
+
+def test_the_terms_of_the_reward_add_up_over_the_episode(player):
+    player.agent = "scripted"
+    start = player.distance
+    total = 0.0
+    for _ in range(20):
+        player.tick()
+        total += float(player.snapshot.rewards["progress"])
+    assert total == pytest.approx(start - player.distance, abs=1e-4)
+    assert player.snapshot.returns["progress"] == pytest.approx(total, abs=1e-5)
+
+
 # Who drives.
 
 
 def test_every_agent_drives_its_own_way(player):
-    start, ends = player._state, {}
+    start, ends = player._states, {}
     for agent in AGENTS:
-        player._state, player.agent = start, agent
+        player._states, player.agent = start, agent
         player.drive(0.5, -1.0)
         ticks(player, 20)
         ends[agent] = np.array(player.snapshot.qpos)
@@ -291,20 +365,20 @@ def test_every_agent_drives_its_own_way(player):
 
 
 def test_the_policy_drives_as_its_checkpoint_says(player, smoke_run):
-    start, limits = player._state, player.env.config.task
+    start, limits = player._states, player.env.config.task
     ends = []
     for env_steps in (player.checkpoints[0], player.checkpoints[-1]):
         player.switch_checkpoint(env_steps)
         assert player.checkpoint == env_steps
-        player._state, player.agent = start, "policy"
+        player._states, player.agent = start, "policy"
         ticks(player, 30)
         ends.append(player.snapshot.qpos)
         # The same by hand: what the policy wants, asked for as a user would.
         policy = load_policy(smoke_run, env_steps)
-        player._state, player.agent = start, "keyboard"
+        player._states, player.agent = start, "keyboard"
         for _ in range(30):
             twist_b = kinematics.twist_from_action(
-                policy(player._state.obs),
+                policy(player._states.obs[0]),
                 max_speed=limits.max_speed,
                 max_yaw_rate=limits.max_yaw_rate,
             )

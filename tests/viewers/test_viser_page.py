@@ -55,7 +55,12 @@ def page(served, tmp_path_factory):
     with chromium.browse(tmp_path_factory.mktemp("chromium")) as page:
         # At the screen's own resolution from the start: what is slow would be drawn coarser.
         page.open(f"http://127.0.0.1:{browser.server.get_port()}/?fixedDpr=1")
-        wait_for("the page's camera", browser.server.get_clients)
+        clients = wait_for("the page's camera", browser.server.get_clients)
+        # The camera stays: the tests ask where a place is on the page, and then look there.
+        browser.panel.camera.value = "free"
+        wait_for("the choice", lambda: browser.scene.cameras.mode == "free")
+        for client in clients.values():
+            client.camera.position, client.camera.look_at = (-0.52, -1.06, 1.2), (0.14, -0.1, 0.0)
         yield page
 
 

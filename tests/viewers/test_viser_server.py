@@ -24,6 +24,8 @@ import websockets.exceptions
 import websockets.sync.client
 
 from jetbot_mjx.viewers import viser_server as module
+from jetbot_mjx.viewers.camera import camera_axes
+from jetbot_mjx.viewers.meshes import visible_geoms
 from jetbot_mjx.viewers.viser_panel import ControlPanel
 from jetbot_mjx.viewers.viser_scene import Scene
 from jetbot_mjx.viewers.viser_server import FIRST_PORT, ViserViewer, free_port
@@ -202,8 +204,19 @@ def test_an_address_of_no_machine_or_another_is_refused(host):
 # The scene.
 
 
-def node(browser, body, geom):
-    return browser.server.scene.get_handle_by_name(f"/{body}/{geom}")
+def nodes(browser, body):
+    scene = browser.server.scene
+    return [
+        node
+        for number in range(20)
+        if (node := scene.get_handle_by_name(f"/{body}/{number}")) is not None
+    ]
+
+
+def rotation(quat):
+    matrix = np.zeros(9)
+    mujoco.mju_quat2Mat(matrix, np.asarray(quat, float))
+    return matrix.reshape(3, 3)
 
 
 def test_every_visual_geom_stands_where_mujoco_puts_it(browser, player):
@@ -218,31 +231,77 @@ def test_every_visual_geom_stands_where_mujoco_puts_it(browser, player):
     data.mocap_pos[0] = player.snapshot.goal_w
     mujoco.mj_kinematics(model, data)
     seen = 0
-    for index in range(model.ngeom):
-        geom = model.geom(index)
-        if geom.group[0] == 3 or geom.name == "floor":
-            continue
-        body = model.body(geom.bodyid[0]).name
-        frame = browser.server.scene.get_handle_by_name(f"/{body}")
-        part = node(browser, body, geom.name)
-        place, turn = np.zeros(3), np.zeros(4)
-        mujoco.mju_mulPose(
-            place, turn, frame.position, frame.wxyz, np.array(part.position), np.array(part.wxyz)
+    for body in range(1, model.nbody):
+        shown = np.vstack(
+            [
+                node.vertices @ rotation(node.batched_wxyzs[0]).T + node.batched_positions[0]
+                for node in nodes(browser, model.body(body).name)
+            ]
         )
-        np.testing.assert_allclose(place, data.geom_xpos[index], atol=1e-9)
-        matrix = np.zeros(9)
-        mujoco.mju_quat2Mat(matrix, turn)
-        np.testing.assert_allclose(matrix, data.geom_xmat[index], atol=1e-6)
-        seen += 1
+        wanted = []
+        for geom in visible_geoms(model):
+            if geom.body == body:
+                index = model.geom(geom.name).id
+                wanted.append(geom.mesh.vertices @ data.geom_xmat[index].reshape(3, 3).T)
+                wanted[-1] += data.geom_xpos[index]
+                seen += 1
+        wanted = np.vstack(wanted)
+        assert len(shown) == len(wanted)
+        # The same points, in another order.
+        distances = np.linalg.norm(shown[:, None] - wanted[None, ::7], axis=-1)
+        assert distances.min(axis=0).max() < 1e-5
     assert seen == 27  # the robot's 26 and the goal
     assert np.linalg.norm(player.snapshot.qpos[QPOS_XYZ][:2]) > 0.2
 
 
-def test_the_goal_is_red_and_has_its_size(browser):
-    cube = node(browser, "goal", "goal")
-    red, green, blue = cube.color
+def test_a_frame_is_few_messages_whatever_the_number_of_robots(browser, player, monkeypatch):
+    sent = []
+    player.tick()
+    queue = browser.server._websock_server.queue_message
+    monkeypatch.setattr(
+        browser.server._websock_server, "queue_message", lambda one: (sent.append(one), queue(one))
+    )
+    browser.scene.show()
+    assert 0 < len(sent) < 40
+
+
+def test_the_goal_is_red_has_its_size_and_turns_green_when_it_is_reached(browser, player):
+    (cube,) = nodes(browser, "goal")
+    before = red, green, blue = cube.batched_colors[0].tolist()
     assert red > 3 * max(green, blue)
     np.testing.assert_allclose(np.ptp(cube.vertices, axis=0), 0.1, rtol=1e-6)
+    player.agent = "scripted"
+    while not player.snapshot.done:
+        player.tick()
+    browser.scene.show()
+    red, green, blue = cube.batched_colors[0]
+    assert green > 2 * max(red, blue)
+    player.reset()
+    browser.scene.show()
+    np.testing.assert_array_equal(cube.batched_colors[0], before)
+
+
+def trail(browser):
+    browser.scene._frame = 0
+    browser.scene.show()
+    return browser.server.scene.get_handle_by_name("/trails").points
+
+
+def test_the_trail_is_the_path_of_the_episode(browser, player):
+    browser.scene.show()
+    player.agent = "keyboard"
+    player.drive(0.5, 0.0)
+    for _ in range(90):
+        player.tick()
+        browser.scene.show()
+    points = trail(browser).reshape(-1, 3)
+    x = player.snapshot.qpos[QPOS_XYZ][0]
+    assert points[:, 0].min() == pytest.approx(0.0, abs=1e-3)
+    assert points[:, 0].max() == pytest.approx(x, abs=1e-5)
+    # It is one line.
+    np.testing.assert_array_equal(points[1:-1:2], points[2::2])
+    player.reset()
+    assert np.ptp(trail(browser).reshape(-1, 3), axis=0).max() == 0
 
 
 def test_only_shadows_need_a_floor_that_fills_the_page(browser):
@@ -280,12 +339,29 @@ def test_a_ray_that_misses_the_floor_moves_nothing(browser, player, direction):
 
 
 class Client:
+    """A page of 1100 by 720 pixels, whose camera stands at the place that the server gives it."""
+
     def __init__(self):
-        self.camera = types.SimpleNamespace(position=None, look_at=None)
+        self.camera = types.SimpleNamespace(
+            position=np.ones(3),
+            look_at=np.zeros(3),
+            fov=math.radians(55),
+            image_width=1100,
+            image_height=720,
+        )
         self.notifications = []
 
     def add_notification(self, title, body, **_):
         self.notifications.append(body)
+
+    def see(self, place_w):
+        """Where a place is on the page [pixels]."""
+        right, up, ahead = camera_axes(self.camera.look_at - self.camera.position) @ (
+            np.asarray(place_w) - self.camera.position
+        )
+        assert ahead > 0
+        focal = 360 / math.tan(self.camera.fov / 2)
+        return 550 + focal * right / ahead, 360 - focal * up / ahead
 
 
 @pytest.fixture
@@ -293,16 +369,75 @@ def client(browser, monkeypatch):
     """A page's camera, as viser would hand it out."""
     client = Client()
     monkeypatch.setattr(browser.server, "get_clients", lambda: {0: client})
+    browser.scene.cameras._moves.clear()
     yield client
     browser.panel.camera.value = "free"
     answer(browser)
 
 
-def test_the_camera_looks_at_the_robot_from_where_the_user_put_it(browser, player, client):
-    browser.panel.camera.value = "looks at the robot"
+def settle(browser):
+    for _ in range(100):
+        browser.scene.show()
+
+
+def assert_in_view(client, *places_w):
+    for place_w in places_w:
+        column, row = client.see(place_w)
+        # The panel begins at the column 765.
+        assert 10 < column < 755, place_w
+        assert 10 < row < 710, place_w
+
+
+@pytest.mark.parametrize(
+    "goal", [(0.2, 0.1), (1.1, -0.5), (-1.1, 0.2), (0.0, 1.2), (2.0, -2.5), (-0.8, -0.9)]
+)
+def test_robot_and_goal_stay_in_view_beside_the_panel(browser, player, client, goal):
+    browser.panel.camera.value = "robot and goal"
     answer(browser)
-    np.testing.assert_allclose(client.camera.look_at, player.snapshot.qpos[QPOS_XYZ])
-    assert client.camera.position is None
+    player.agent = "scripted"
+    player.move_goal(*goal)
+    settle(browser)
+    for step in range(200):
+        player.tick()
+        browser.scene.show()
+        if player.snapshot.done:
+            break
+        assert_in_view(client, player.snapshot.qpos[QPOS_XYZ], player.snapshot.goal_w)
+        if step == 0:
+            # Not from far away either: the farther of the two is near the border of the view.
+            places = [client.see(one) for one in (player.snapshot.goal_w, (0.0, 0.0, 0.0))]
+            assert math.dist(*places) > 70
+
+
+def test_the_way_a_user_turned_the_camera_is_kept(browser, player, client):
+    browser.panel.camera.value = "robot and goal"
+    answer(browser)
+    player.move_goal(0.5, 0.5)
+    settle(browser)
+    # The user looks from the other side, and zooms out: the camera stays so.
+    client.camera.position, client.camera.look_at = np.array([3.0, 3.0, 3.0]), np.zeros(3)
+    settle(browser)
+    np.testing.assert_array_equal(client.camera.position, 3.0)
+    player.move_goal(-0.9, 0.5)
+    settle(browser)
+    ahead = client.camera.look_at - client.camera.position
+    np.testing.assert_allclose(ahead / np.linalg.norm(ahead), -1 / math.sqrt(3), atol=1e-3)
+    assert np.linalg.norm(client.camera.position) < 3
+    assert_in_view(client, player.snapshot.goal_w, (0.0, 0.0, 0.0))
+
+
+def test_the_camera_stands_still_while_a_goal_is_dragged(browser, player, client):
+    browser.panel.camera.value = "robot and goal"
+    answer(browser)
+    settle(browser)
+    before = np.array(client.camera.position)
+    browser.scene._dragging = True
+    player.move_goal(2.0, 2.0)
+    settle(browser)
+    np.testing.assert_array_equal(client.camera.position, before)
+    browser.scene._dragging = False
+    settle(browser)
+    assert_in_view(client, player.snapshot.goal_w)
 
 
 def test_the_camera_drives_behind_the_robot(browser, player, client):
@@ -324,8 +459,57 @@ def test_the_camera_drives_behind_the_robot(browser, player, client):
 
 
 def test_a_free_camera_is_left_alone(browser, client):
+    browser.panel.camera.value = "free"
     answer(browser)
-    assert client.camera.look_at is None
+    before = np.array(client.camera.position)
+    settle(browser)
+    np.testing.assert_array_equal(client.camera.position, before)
+
+
+# Many robots.
+
+
+@pytest.fixture(scope="module")
+def crowd(smoke_run, unused_port):
+    player = Player(smoke_run, robots=10, agent="scripted")
+    player.paused = True
+    with ViserViewer(player, host="127.0.0.1", port=unused_port(), tell=print) as browser:
+        yield browser, player
+
+
+def test_many_robots_stand_in_cells_and_the_page_sees_all_of_them(crowd, monkeypatch):
+    browser, player = crowd
+    client = Client()
+    monkeypatch.setattr(browser.server, "get_clients", lambda: {0: client})
+    player.reset()
+    settle(browser)
+    (cube,) = nodes(browser, "goal")
+    robot = nodes(browser, "jetbot")[0].batched_positions
+    assert robot.shape == (10, 3)
+    apart = np.linalg.norm(robot[:, None] - robot, axis=-1) + 9 * np.eye(10)
+    assert apart.min() == pytest.approx(1.2, abs=0.01)
+    # Goals are where they are relative to their robots.
+    places = cube.batched_positions - robot
+    np.testing.assert_allclose(places[:, :2], player.crowd.goal_w[:, :2], atol=1e-3)
+    assert_in_view(client, *robot, *cube.batched_positions)
+
+
+def test_a_click_moves_the_goal_of_the_nearest_robot_and_chooses_it(crowd):
+    browser, player = crowd
+    player.reset()
+    browser.scene.show()
+    target = nodes(browser, "jetbot")[0].batched_positions[7] + [0.3, -0.2, 0.0]
+    before = np.array(player.crowd.goal_w)
+    browser.scene.point((target[0], target[1], 2.0), (0.0, 0.0, -1.0))
+    answer(browser)
+    assert player.robot == 7
+    assert browser.panel.robot.value == 7
+    np.testing.assert_allclose(player.snapshot.goal_w[:2], [0.3, -0.2], atol=1e-2)
+    np.testing.assert_array_equal(player.crowd.goal_w[:7], before[:7])
+    browser.panel.robot.value = 2
+    answer(browser)
+    assert player.robot == 2
+    assert browser.panel.distance.value == f"{np.linalg.norm(before[2, :2]):.2f} m"
 
 
 # The panel.
@@ -341,9 +525,25 @@ def test_the_panel_reads_what_the_player_does(browser, player):
     assert panel.episode.value == "0.0 of 4.3 s"
     assert panel.distance.value == "0.50 m"
     assert "steps/s" in panel.pace.value
+    assert "progress +0." in panel.rewards.content
     player.snapshot = player.snapshot._replace(done=np.float32(1))
     panel.update()
     assert panel.episode.value == "0.0 of 4.3 s, reached"
+
+
+def test_the_terms_of_the_reward_are_bars_relative_to_their_largest(browser, player, monkeypatch):
+    rewards = {"progress": 0.02, "<b>": -0.5}
+    monkeypatch.setattr(browser.panel, "_largest", dict.fromkeys(rewards, 1e-9))
+    for scale, width in ((1.0, 50.0), (0.5, 25.0)):
+        player.snapshot = player.snapshot._replace(
+            rewards={name: scale * value for name, value in rewards.items()},
+            returns=dict.fromkeys(rewards, 0.25),
+        )
+        bars = browser.panel._reward_bars()
+        assert bars.count(f"width:{width:.1f}%") == 2
+    assert "progress +0.0100</span><span>+0.250" in bars
+    assert "&lt;b&gt; -0.2500" in bars
+    assert bars.index("left:50%") < bars.index("right:50%")
 
 
 def test_the_panel_changes_who_drives(browser, player):
