@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jetbot_mjx import cli
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import NotFoundError
 from jetbot_mjx.interrupts import exit_on_interrupt
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx train", description=__doc__)
-    source = parser.add_mutually_exclusive_group(required=True)
+    source = parser.add_mutually_exclusive_group()
     cli.add_config_arguments(parser, source)
     source.add_argument(
         "--resume", type=cli.run_path, metavar="RUN", help="continue the run in this folder"
@@ -43,10 +43,14 @@ def _parser() -> cli.Parser:
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with exit_on_interrupt():
+        from jetbot_mjx.runs.find_run import suggest_run
         from jetbot_mjx.runs.run_dir import CONFIG, default_run_dir, stored_config
     if options.resume:
         if stored_config(options.resume) is None:
-            raise UserError(f"--resume {options.resume}: there is no run in this folder")
+            hint = suggest_run(options.resume)
+            raise NotFoundError(
+                f"--resume {options.resume}: there is no run in this folder; {hint}"
+            )
         options.config = options.resume / CONFIG
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
@@ -66,6 +70,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = (parser := _parser()).parse_args(arguments)
     if options.resume and options.run_dir:
         parser.error("--run-dir: --resume names the folder already")
+    if options.resume and options.init_from:
+        parser.error("--init-from: --resume continues with the run's own policy")
+    if not (options.config or options.resume):
+        parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
     config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
     with exit_on_interrupt():

@@ -151,7 +151,10 @@ def _find_pretrained(name: str) -> Path:
 
 def suggest_run(path: Path, root: Path = ROOT) -> str:
     """Return a remedy for a path at which there is no run."""
-    names = [run.path.name for run in list_runs(root)]
+    names = [_LATEST, *(run.path.name for run in list_runs(root))]
+    names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
+    if path.name == _PREFIX[:-1]:
+        return f"write {_PREFIX}NAME, as in {names[-1]}"
     if close := difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {close[0]}?"
     return "give a run folder or a checkpoint in it"

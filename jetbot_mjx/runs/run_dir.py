@@ -8,6 +8,7 @@ for each of them, with all of that inside.
 
 import contextlib
 import datetime
+import errno
 import fcntl
 import importlib.metadata
 import json
@@ -174,6 +175,22 @@ def writing_to(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def check_writable(path: Path) -> None:
+    """Raise an error, before long work, if a folder for its results could not be created.
+
+    Nothing is created.
+
+    Raises:
+      UserError: the path or a part of it is no folder, or may not be written.
+    """
+    with writing_to(path):
+        existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        if not existing.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        if not os.access(existing, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def make_folder(path: Path) -> None:

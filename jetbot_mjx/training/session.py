@@ -18,8 +18,10 @@ from jetbot_mjx.agents.ppo import PPO, TrainState
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, ConfigError
+from jetbot_mjx.envs.checks.runner import require_trainable
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.program_key import TRUSTED
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
@@ -179,6 +181,8 @@ def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, Task
     if _has_checkpoints(run_dirs):
         task_class = stored_task_class(run_dirs[0], config.task.name)
     env = make_env(config, task_class)
+    if config.task.name not in TRUSTED:
+        require_trainable(env.task, config)
     return env, None if task_class else collect_task_code(config.task.name)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jetbot_mjx.errors import MissingPackageError
-from jetbot_mjx.runs.checkpoint import Which
+from jetbot_mjx.runs.checkpoint import Which, find_checkpoint
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
 
@@ -53,6 +53,7 @@ def play_live(
       UserError: there is no usable checkpoint, no viewer, no display, or the port is taken.
     """
     # Check first what can fail quickly, before the slow steps.
+    find_checkpoint(run_or_checkpoint, which)
     if viewer == "browser":
         server = _server()
         free: int = server.free_port(host, port)
@@ -91,7 +92,7 @@ def addresses(host: str, port: int) -> list[str]:
     with contextlib.suppress(KeyError, OSError):
         name = f"{getpass.getuser()}@{name}"
     lines = [
-        f"it split_trajectories at http://{here}:{port} (Ctrl-C ends it)",
+        f"it drives at http://{here}:{port} (Ctrl-C ends it)",
         f"from elsewhere: ssh -N -L {port}:{here}:{port} {name}, and open"
         f" http://127.0.0.1:{port} there",
     ]

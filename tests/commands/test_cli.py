@@ -127,7 +127,7 @@ def test_train_refuses_a_path_without_a_file(refused, path, said):
         ("ppo.num_envs.x=3", "--set ppo.num_envs.x=3: num_envs is a value, not a section"),
         ("seed=[", "--set seed=[, line 1 is not valid YAML"),
         ("zzz=1", "zzz = 1 is unknown: known are seed"),
-        ("ppo.num_envs=many", "ppo.num_envs = 'many' is wrong: it should be integer"),
+        ("ppo.num_envs=many", "ppo.num_envs = 'many' is wrong: it should be a whole number"),
         ("ppo.num_envs=-1", "ppo.num_envs = -1 is wrong: it should be greater than or equal to 1"),
         ("ppo.num_envs=100", "is not a multiple of num_envs = 100: for example batch_size = 75"),
         ("ppo.discounting=1.5", "ppo.discounting = 1.5 is wrong"),
