@@ -48,6 +48,7 @@ class Parser(argparse.ArgumentParser):
             if name.startswith("--") and not any(one.startswith(name) for one in options):
                 self.error(f"unrecognized arguments: {name}{self._remedy(name.strip('-'), name)}")
         parsed, extra = self.parse_known_args(words, namespace)
+        assert parsed is not None
         if extra:
             remedy = self._remedy(extra[0].partition("=")[0])
             half = [one for one in getattr(parsed, "overrides", []) if "=" not in one]

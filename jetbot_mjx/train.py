@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jetbot_mjx import cli
-from jetbot_mjx.errors import NotFoundError
 from jetbot_mjx.interrupts import exit_on_interrupt
 
 if TYPE_CHECKING:
@@ -43,15 +42,10 @@ def _parser() -> cli.Parser:
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with exit_on_interrupt():
-        from jetbot_mjx.runs.find_run import suggest_run
-        from jetbot_mjx.runs.run_dir import CONFIG, default_run_dir, stored_config
+        from jetbot_mjx.runs.find_run import find_run_config
+        from jetbot_mjx.runs.run_dir import default_run_dir
     if options.resume:
-        if stored_config(options.resume) is None:
-            hint = suggest_run(options.resume)
-            raise NotFoundError(
-                f"--resume {options.resume}: there is no run in this folder; {hint}"
-            )
-        options.config = options.resume / CONFIG
+        options.config = find_run_config(options.resume)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
     config = cli.config_of(options, *overrides)
@@ -68,11 +62,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 75 if the training was asked to stop and can be resumed.
     """
     options = (parser := _parser()).parse_args(arguments)
-    if options.resume and options.run_dir:
-        parser.error("--run-dir: --resume names the folder already")
-    if options.resume and options.init_from:
-        parser.error("--init-from: --resume continues with the run's own policy")
-    if not (options.config or options.resume):
+    if options.resume and (options.run_dir or options.init_from):
+        name = "--run-dir" if options.run_dir else "--init-from"
+        parser.error(f"{name}: --resume continues that run, in its folder")
+    if not (options.resume or options.config):
         parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
     config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
@@ -90,7 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     programs.prefetch("advance", "init")
     with exit_on_interrupt():
         from jetbot_mjx.training import session
-    # Train.
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
         print(

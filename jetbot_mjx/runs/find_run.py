@@ -14,7 +14,7 @@ from typing import NamedTuple
 from jetbot_mjx.config import ConfigError, load_config
 from jetbot_mjx.errors import NotFoundError, UserError
 from jetbot_mjx.runs.metrics import read_history
-from jetbot_mjx.runs.run_dir import CONFIG
+from jetbot_mjx.runs.run_dir import CONFIG, stored_config
 
 ROOT = Path("runs")
 """The folder in which trainings create their run folders, relative to the current folder."""
@@ -72,6 +72,19 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
     if os.sep not in text and os.path.lexists(root / text):
         return root / text
     return Path(name)
+
+
+def find_run_config(run_dir: Path) -> Path:
+    """Return the file that holds the configuration of the run in a folder.
+
+    Raises:
+      NotFoundError: there is no run in the folder.
+      UserError: the path holds something else, or cannot be read.
+    """
+    if stored_config(run_dir) is None:
+        hint = suggest_run(run_dir)
+        raise NotFoundError(f"--resume {run_dir}: there is no run in this folder; {hint}")
+    return run_dir / CONFIG
 
 
 def list_runs(root: Path = ROOT) -> list[RunInfo]:

@@ -26,7 +26,7 @@ from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
-from jetbot_mjx.runs.metrics import CompileClock, read_history
+from jetbot_mjx.runs.metrics import CompileClock, read_history, restart_clock
 from jetbot_mjx.runs.resume import Resumption, resume
 from jetbot_mjx.runs.run_dir import (
     changed_versions,
@@ -124,6 +124,7 @@ def run(config: Config, run_dir: Path) -> Result:
     Raises:
       UserError: as for `train`.
     """
+    restart_clock()
     return train(config, run_dir, ProgramCache(compiler_options(config)))
 
 

@@ -189,7 +189,7 @@ BAD_VALUES = {
         "ppo.normalize_advantage = 'yes'",
         "true or false",
     ),
-    "number for a string": ("task: {name: 3}", "task.name = 3", "string"),
+    "number for a string": ("task: {name: 3}", "task.name = 3", "text"),
     "list for a scalar": ("ppo: {num_envs: [1, 2]}", "ppo.num_envs = [1, 2]", "whole number"),
     "mapping for a scalar": ("seed: {a: 1}", "seed = {'a': 1}", "whole number"),
     "scalar for a list": (
@@ -333,7 +333,7 @@ BAD_YAML = {
     "nested key given twice": ("ppo: {num_envs: 3, num_envs: 4}", 'line 1 .* "num_envs"'),
     "open bracket": ("seed: 1\nppo: [", "line 2 is not valid YAML"),
     "open quote": ("seed: 'x", "line 1 is not valid YAML"),
-    "tab": ("ppo:\n\tseed: 1", "line 2 is not valid YAML: .*cannot start any token"),
+    "tab": ("ppo:\n\tseed: 1", "line 2 is not valid YAML: a tab: indent by spaces"),
     "two colons": ("a: b: c", "line 1 is not valid YAML: mapping values are not allowed"),
     "unknown alias": ("seed: *nowhere", "line 1 is not valid YAML: .*nowhere"),
     "tag that runs code": ("seed: !!python/object:os.system x", "line 1 .* could not determine"),
@@ -356,7 +356,7 @@ def test_a_file_that_is_no_mapping_is_refused(refusal, text, pattern):
     ("name", "remedy"),
     [
         ("missing.yaml", "does not exist: give the path of a YAML file"),
-        ("folder", "cannot be read: Is a directory"),
+        ("folder", "is a folder: give a YAML file"),
         ("picture.png", "cannot be read: it is not UTF-8 text"),
         ("picture.png/x.yaml", "cannot be read: Not a directory"),
     ],

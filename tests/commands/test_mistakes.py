@@ -1,5 +1,6 @@
 """Natural mistakes, each with the line that it prints: the page `docs/mistakes.md` is the table."""
 
+import functools
 import importlib
 import re
 import shlex
@@ -75,14 +76,14 @@ def type_(home, monkeypatch, capfd):
     def type_(line):
         words = shlex.split(line)[1:]
         monkeypatch.setattr("sys.argv", ["jetbot-mjx", *words[1:]])
+        run = functools.partial(entry.main, words)
+        if words[0] in entry.COMMANDS:
+            module = importlib.import_module(f"jetbot_mjx.{entry.COMMANDS[words[0]].module}")
+            run = functools.partial(cli.run_command, module.main)
         with pytest.raises(SystemExit) as caught:
-            if words[0] in entry.COMMANDS:
-                module = f"jetbot_mjx.{entry.COMMANDS[words[0]].module}"
-                cli.run_command(importlib.import_module(module).main)
-            else:
-                entry.main(words)
+            run()
         out, err = capfd.readouterr()
-        return caught.value.code, out, err.replace(str(home), "/home/me")
+        return caught.value.code, out, err.replace(str(home), "~")
 
     return type_
 

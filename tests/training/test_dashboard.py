@@ -65,6 +65,12 @@ class Screen:
         os.close(self._master)
 
 
+@pytest.fixture(autouse=True)
+def clock():
+    """The time of this process since the test began, as if it were a command's."""
+    metrics.restart_clock()
+
+
 @pytest.fixture
 def screen(monkeypatch):
     for name in ("NO_COLOR", "TTY_INTERACTIVE", "TTY_COMPATIBLE", "FORCE_COLOR"):
