@@ -69,7 +69,7 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
         if not runs:
             raise NotFoundError(f"{_LATEST}: there is no run in {root}/: train one first")
         return runs[0].path
-    if os.sep not in text and os.path.lexists(root / text):
+    if Path(text).name == text and os.path.lexists(root / text):
         return root / text
     return Path(name)
 

@@ -81,6 +81,8 @@ def is_watched(console: "Console") -> bool:
 
 def in_foreground(stream: IO[str]) -> bool:
     """Return whether the terminal belongs to this process group, or to no shell at all."""
+    if not hasattr(os, "tcgetpgrp"):  # on Windows
+        return True
     try:
         return os.tcgetpgrp(stream.fileno()) == os.getpgrp()
     except (OSError, ValueError):

@@ -9,12 +9,12 @@ for each of them, with all of that inside.
 import contextlib
 import datetime
 import errno
-import fcntl
 import importlib.metadata
 import json
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,11 @@ import jax
 
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # on Windows
+    fcntl = None
 
 _PACKAGES = (
     "jetbot_mjx",
@@ -102,7 +107,8 @@ def stored_config(run_dir: Path) -> Config | None:
 def occupied(run_dir: Path) -> Iterator[None]:
     """Create a run folder if needed, and lock it against every other training.
 
-    The lock belongs to the process, so it is released however the process ends.
+    The lock belongs to the process, so it is released however the process ends. Where the system
+    has no such locks, a line on stderr says so.
 
     Raises:
       UserError: the folder cannot be written, or another training has locked it.
@@ -115,7 +121,11 @@ def occupied(run_dir: Path) -> Iterator[None]:
         raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is None:
+                line = "this system has no locks: start no second training in this run folder"
+                print(line, file=sys.stderr, flush=True)
+            else:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
             raise UserError(
