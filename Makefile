@@ -9,7 +9,7 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup sb3 train test test-gpu test-slow check format benchmark docs wheel clean
+.PHONY: setup sb3 train test test-gpu test-slow check notebooks format benchmark docs wheel clean
 
 setup: $(STAMP)
 
@@ -52,6 +52,10 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# Runs the notebooks and stores their outputs in them.
+notebooks: setup
+	$(BIN)/jupyter-execute --inplace $(sort $(wildcard notebooks/*.ipynb))
 
 format: setup
 	$(BIN)/ruff format .

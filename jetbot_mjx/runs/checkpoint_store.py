@@ -314,9 +314,8 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
     # TensorStore reports a damaged folder by many kinds of exception.
     except Exception as error:
         raise CheckpointError(
-            f"checkpoint {path} cannot be read: its files are damaged, or may not be read; another"
-            " checkpoint may be intact"
-        ) from error
+            f"checkpoint {path} cannot be read: another one may be intact; {_reason(error)}"
+        ) from None
     if digest(flat) != about[_DIGESTS][name]:
         raise CheckpointError(f"checkpoint {path} is damaged: {name} changed after it was written")
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
@@ -366,7 +365,8 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
     """
     if not folder.is_dir():
         raise _OtherArraysError(f"{folder.name} is missing")
-    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
+    # TensorStore refuses a path with `..` in it.
+    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
     keys = [key.decode() for key in ts.KvStore.open(files).result().list().result()]
     names = [key.removesuffix("/.zarray") for key in keys if key.endswith("/.zarray")]
     stored = {}
