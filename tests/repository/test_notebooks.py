@@ -150,7 +150,7 @@ def test_the_first_cell_installs_what_is_not_there(read, name, monkeypatch):
     assert code.source == read[NAMES[0]].cells[1].source
     typed = []
     shell = InteractiveShell()
-    monkeypatch.setattr(shell, "run_line_magic", lambda *words, **_: typed.append(words[:2]))
+    shell.register_magic_function(typed.append, magic_name="pip")
     monkeypatch.setattr(shell, "system", lambda line: typed.append(line))
     # Installed: nothing to do. Elsewhere: it asks for the source, and installs it.
     assert shell.run_cell(code.source).success
@@ -160,7 +160,7 @@ def test_the_first_cell_installs_what_is_not_there(read, name, monkeypatch):
     for source, package in (("https://host/x.git", "git+https://host/x.git"), ("x.whl", "x.whl")):
         named = code.source.replace('SOURCE = ""', f'SOURCE = "{source}"')
         assert shell.run_cell(named).success
-        assert typed.pop() == ("pip", f"install --quiet {package}")
+        assert typed.pop() == f"install --quiet {package}"
 
 
 def test_every_notebook_is_tested(root):
