@@ -41,16 +41,38 @@ class Parser(argparse.ArgumentParser):
     ) -> argparse.Namespace:
         """Parse all arguments, and suggest an option for one that is unknown."""
         # Before the rest, because the value after an unknown option looks like another argument.
-        for word in sys.argv[1:] if args is None else args:
+        words = list(sys.argv[1:] if args is None else args)
+        options = self._option_string_actions
+        for word in words:
             name = word.partition("=")[0]
-            options = self._option_string_actions
             if name.startswith("--") and not any(one.startswith(name) for one in options):
-                close = difflib.get_close_matches(name, options, n=1)
-                hint = f": did you mean {close[0]}?" if close else ""
-                self.error(f"unrecognized arguments: {name}{hint}")
-        parsed = super().parse_args(args, namespace)
+                self.error(f"unrecognized arguments: {name}{self._remedy(name.strip('-'), name)}")
+        parsed, extra = self.parse_known_args(words, namespace)
         assert parsed is not None
+        if extra:
+            remedy = self._remedy(extra[0].partition("=")[0])
+            half = [one for one in getattr(parsed, "overrides", []) if "=" not in one]
+            if half:
+                remedy = f": did you mean --set {half[-1]}={extra[0]}?"
+            self.error(f"unrecognized arguments: {' '.join(extra)}{remedy}")
         return parsed
+
+    def _remedy(self, setting: str, option: str = "") -> str:
+        """Return what was probably meant by an unknown argument, or nothing.
+
+        Args:
+          setting: the argument, if it was meant as a setting such as `num_envs`.
+          option: the argument as an option, such as `--num_envs`; empty if it is none.
+        """
+        close = difflib.get_close_matches(option, self._option_string_actions, n=1, cutoff=0.65)
+        if "--set" in self._option_string_actions:
+            # Only to explain an error: it takes longer than the rest of the parser.
+            from jetbot_mjx.config import ALL_KEYS
+
+            name = setting.replace("-", "_")
+            meant = [key for key in ALL_KEYS if name in (key, key.rpartition(".")[2])]
+            close = [f"--set {key}=..." for key in meant] or close
+        return f": did you mean {close[0]}?" if close else ""
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""

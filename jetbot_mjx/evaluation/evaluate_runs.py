@@ -30,7 +30,7 @@ from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, Mujoc
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
 from jetbot_mjx.runs.metrics import read_history
 from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import seed_folders, versions
+from jetbot_mjx.runs.run_dir import check_writable, seed_folders, versions
 
 Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
@@ -160,6 +160,10 @@ def compare_runs(
         in_mujoco=robustness or simulator is not None,
         ranges_file=_RangesFile.read(ranges),
     )
+    first = next(iter(entries.values())).folder
+    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
+    folder = first / _FOLDER / name if output is None else Path(output)
+    check_writable(folder)
     reports = _write_reports([(one, _target(one, options)) for one in checkpoints], options)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(checkpoints)) as advance:
@@ -168,9 +172,6 @@ def compare_runs(
                 by_run[name][seed] = _without_trajectories(next(reports))
                 advance(1)
     # Compare the reports and write the comparison.
-    first = next(iter(entries.values())).folder
-    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
-    folder = first / _FOLDER / name if output is None else Path(output)
     comparison = compare(folder.absolute(), by_run)
     with stage("writing the comparison"):
         write_comparison(comparison)
@@ -337,6 +338,9 @@ def _write_reports(
     checkpoints: Sequence[tuple[Checkpoint, _Target]], options: _Options
 ) -> Iterator[Report]:
     """Evaluate policies and write their reports, reusing compiled programs where they fit."""
+    for _, target in checkpoints:
+        if target.write:
+            check_writable(target.folder)
     episodes, robustness, in_mujoco, ranges_file = options
     keys, used_versions = report_keys(episodes), versions()
     # Build all environments first, so that an unsuitable policy is rejected before any writing.

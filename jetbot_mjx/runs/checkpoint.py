@@ -248,7 +248,8 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
 def _find(path: Path, which: Which) -> Path:
     if not path.is_dir():
         raise CheckpointNotFoundError(
-            f"no checkpoint at {path}: no such folder; {suggest_run(path)}"
+            f"no checkpoint at {path}: {'a file' if path.is_file() else 'no such folder'};"
+            f" {suggest_run(path)}"
         )
     # A run folder may contain `policy/` too, which `export` writes.
     if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():

@@ -14,7 +14,7 @@ from typing import NamedTuple
 from jetbot_mjx.config import ConfigError, load_config
 from jetbot_mjx.errors import NotFoundError, UserError
 from jetbot_mjx.runs.metrics import read_history
-from jetbot_mjx.runs.run_dir import CONFIG
+from jetbot_mjx.runs.run_dir import CONFIG, stored_config
 
 ROOT = Path("runs")
 """The folder in which trainings create their run folders, relative to the current folder."""
@@ -69,9 +69,22 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
         if not runs:
             raise NotFoundError(f"{_LATEST}: there is no run in {root}/: train one first")
         return runs[0].path
-    if os.sep not in text and os.path.lexists(root / text):
+    if Path(text).name == text and os.path.lexists(root / text):
         return root / text
     return Path(name)
+
+
+def find_run_config(run_dir: Path) -> Path:
+    """Return the file that holds the configuration of the run in a folder.
+
+    Raises:
+      NotFoundError: there is no run in the folder.
+      UserError: the path holds something else, or cannot be read.
+    """
+    if stored_config(run_dir) is None:
+        hint = suggest_run(run_dir)
+        raise NotFoundError(f"--resume {run_dir}: there is no run in this folder; {hint}")
+    return run_dir / CONFIG
 
 
 def list_runs(root: Path = ROOT) -> list[RunInfo]:
@@ -151,7 +164,10 @@ def _find_pretrained(name: str) -> Path:
 
 def suggest_run(path: Path, root: Path = ROOT) -> str:
     """Return a remedy for a path at which there is no run."""
-    names = [run.path.name for run in list_runs(root)]
+    names = [_LATEST, *(run.path.name for run in list_runs(root))]
+    names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
+    if path.name == _PREFIX[:-1]:
+        return f"write {_PREFIX}NAME, as in {names[-1]}"
     if close := difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {close[0]}?"
     return "give a run folder or a checkpoint in it"

@@ -23,7 +23,7 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   time/evaluation_seconds   time spent on this evaluation, with its compilation
   time/recording_seconds    time spent on logging, saving and rendering after the last evaluation
   time/compile_seconds      time spent on tracing and compiling in this interval
-  time/wall_seconds         time since training began, in all processes that worked on the run
+  time/wall_seconds         time of all processes that worked on the run, from their start
 """
 
 import contextlib
@@ -368,13 +368,26 @@ class CompileClock:
 
 
 _IMPORTED = time.perf_counter()
+_origin = 0.0
+"""Time of the process at which `process_seconds` is 0 [s]."""
 
 
 def process_seconds() -> float:
-    """Return the time since this process started [s].
+    """Return the time since this process started [s]: the clock of all times that are shown.
 
-    If the system does not provide it, return the time since this module was imported.
+    In a program that imports the package it counts from the beginning of the last training. If the
+    system does not tell when the process started, it counts from the import of this module.
     """
+    return _process_seconds() - _origin
+
+
+def restart_clock() -> None:
+    """Let `process_seconds` count from now on, because a program begins a training."""
+    global _origin
+    _origin = _process_seconds()
+
+
+def _process_seconds() -> float:
     try:
         after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         began = int(after_name[19]) / os.sysconf("SC_CLK_TCK")

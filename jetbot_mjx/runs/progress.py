@@ -9,6 +9,7 @@ import contextlib
 import contextvars
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from typing import IO, TYPE_CHECKING, Protocol, TextIO
@@ -17,6 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 _SECONDS_BETWEEN_LINES = 10.0
+_SECONDS_BEFORE_LINE = 2.0
+"""Time after which a stage is worth a line [s]."""
 
 Advance = Callable[[int], None]
 """Reports that so many further units of a stage are done."""
@@ -78,6 +81,8 @@ def is_watched(console: "Console") -> bool:
 
 def in_foreground(stream: IO[str]) -> bool:
     """Return whether the terminal belongs to this process group, or to no shell at all."""
+    if not hasattr(os, "tcgetpgrp"):  # on Windows
+        return True
     try:
         return os.tcgetpgrp(stream.fileno()) == os.getpgrp()
     except (OSError, ValueError):
@@ -138,16 +143,24 @@ def _bars(console: "Console") -> Iterator[_Display]:
 
 
 class _Lines:
-    """A display that prints one line per stage, and in a long one the progress now and then."""
+    """A display that prints a line for every stage that takes long, and then now and then.
+
+    A timer prints the first line of a stage, because nothing else happens in some of them.
+    """
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
+        self._lock = threading.Lock()
 
     @contextlib.contextmanager
     def stage(self, name: str, total: int | None) -> Iterator[Advance]:
         done, began = 0, time.monotonic()
         last_line = began
-        self._print(name if total is None else f"{name}: {total:,}")
+        timer = threading.Timer(
+            _SECONDS_BEFORE_LINE, self._print, [name if total is None else f"{name}: {total:,}"]
+        )
+        timer.daemon = True
+        timer.start()
 
         def advance(count: int) -> None:
             nonlocal done, last_line
@@ -158,11 +171,14 @@ class _Lines:
                 self._print(f"{name}: {done:,} of {total:,}, about {left:.0f} s left")
                 last_line = now
 
-        yield advance
+        try:
+            yield advance
+        finally:
+            timer.cancel()
 
     def _print(self, text: str) -> None:
         from jetbot_mjx.runs.metrics import process_seconds
 
         # A reader that has gone does not end the command.
-        with contextlib.suppress(OSError):
+        with self._lock, contextlib.suppress(OSError, ValueError):
             print(f"{process_seconds():7.1f} s  {text}", file=self._stream, flush=True)

@@ -8,12 +8,13 @@ for each of them, with all of that inside.
 
 import contextlib
 import datetime
-import fcntl
+import errno
 import importlib.metadata
 import json
 import os
 import platform
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,11 @@ import jax
 
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # on Windows
+    fcntl = None
 
 _PACKAGES = (
     "jetbot_mjx",
@@ -101,7 +107,8 @@ def stored_config(run_dir: Path) -> Config | None:
 def occupied(run_dir: Path) -> Iterator[None]:
     """Create a run folder if needed, and lock it against every other training.
 
-    The lock belongs to the process, so it is released however the process ends.
+    The lock belongs to the process, so it is released however the process ends. Where the system
+    has no such locks, a line on stderr says so.
 
     Raises:
       UserError: the folder cannot be written, or another training has locked it.
@@ -114,7 +121,11 @@ def occupied(run_dir: Path) -> Iterator[None]:
         raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is None:
+                line = "this system has no locks: start no second training in this run folder"
+                print(line, file=sys.stderr, flush=True)
+            else:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
             raise UserError(
@@ -174,6 +185,22 @@ def writing_to(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def check_writable(path: Path) -> None:
+    """Raise an error, before long work, if a folder for its results could not be created.
+
+    Nothing is created.
+
+    Raises:
+      UserError: the path or a part of it is no folder, or may not be written.
+    """
+    with writing_to(path):
+        existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        if not existing.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        if not os.access(existing, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
 def make_folder(path: Path) -> None:

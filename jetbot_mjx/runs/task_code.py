@@ -46,6 +46,18 @@ class TaskCode(NamedTuple):
     files: tuple[tuple[str, bytes], ...]
     """Path and content of each file; paths are relative to the folder that imports begin in."""
 
+    def to_bytes(self) -> bytes:
+        """Return the source as bytes, to be sent to another process."""
+        files = {path: content.decode("latin-1") for path, content in self.files}
+        return json.dumps({"module": self.module, "files": files}).encode()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> "TaskCode":
+        """Return the source that another process has sent."""
+        sent = json.loads(content)
+        files = ((path, text.encode("latin-1")) for path, text in sent["files"].items())
+        return cls(sent["module"], tuple(files))
+
 
 def collect_task_code(name: str) -> TaskCode | None:
     """Read the source files that a task consists of.
@@ -144,15 +156,16 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
     return TaskCode(module, tuple(sorted(files)))
 
 
-def stored_task_class(run_dir: Path, name: str) -> type[Any] | None:
+def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type[Any] | None:
     """Import the class of a task from the source that its run stored.
 
-    A line on stderr says so, once for each source. The modules are not left in `sys.modules`, so
-    that runs with different sources of one name can be used in one process.
+    A line on stderr says so, once for each source, unless `silent`. The modules are not left in
+    `sys.modules`, so that runs with different sources of one name can be used in one process.
 
     Args:
       run_dir: the run folder.
       name: the task as `package.module:Class`.
+      silent: whether to print nothing.
 
     Returns:
       The class. None if the module is to be imported by its name: the run stored no source of it,
@@ -176,7 +189,9 @@ def stored_task_class(run_dir: Path, name: str) -> type[Any] | None:
     main = _source_file(run_dir / FOLDER, module)
     if main is None:
         raise UserError(f"{folder} holds no source of {module}: delete it to run {module} itself")
-    if on_disk:
+    if silent:
+        pass
+    elif on_disk:
         reason = f"{module} on disk differs from the code this run was trained with: using the"
         _say(f"{reason} stored code {_shortened(main)}", code)
     else:

@@ -270,7 +270,8 @@ def device_memory() -> int | None:
         return stats.get("bytes_limit")
     try:
         host = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError):
+    # Windows has no such function.
+    except (AttributeError, ValueError, OSError):
         return None
     # Several CPU devices share the memory of the host.
     return host // jax.local_device_count()

@@ -87,6 +87,7 @@ class Search:
         self._evaluations = evaluations
         self._say = say
         self._batches: dict[tuple[Any, ...], Trials] = {}
+        new = not folder.exists()
         make_folder(folder)
         url = storage or f"sqlite:///{folder.absolute() / 'study.db'}"
         name = folder.name
@@ -115,6 +116,8 @@ class Search:
         # SQLAlchemy has many kinds of errors for a URL, a driver or a host that is wrong.
         except Exception as error:
             reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            if new and not any(folder.iterdir()):
+                folder.rmdir()
             raise UserError(f"--storage {url} cannot be used: {reason}") from None
         self._check_space()
 

@@ -15,12 +15,18 @@ import mujoco
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.checks import methods
-from jetbot_mjx.envs.checks.probe import DRAWS, TaskProbe, describe_error, first_key
+from jetbot_mjx.envs.checks.probe import (
+    DRAWS,
+    TaskProbe,
+    call_methods,
+    describe_error,
+    first_key,
+)
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model
-from jetbot_mjx.envs.task import make_task
+from jetbot_mjx.envs.task import Task, layout_size, make_task
 from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, UserError
 
 DRIVE_ENVS, DRIVE_STEPS = 16, 64
 """Number of robots of the test drive, and of environment steps of each."""
@@ -71,6 +77,33 @@ def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
         yield name, found
         if found and name in _PREREQUISITES:
             return
+
+
+def require_trainable(task: Task, config: Config) -> None:
+    """Raise an error, before anything is compiled, if a task's methods do not fit the training.
+
+    Args:
+      task: the task.
+      config: the configuration of the run.
+
+    Raises:
+      InvalidError: a method raises an error, or returns another shape than a training needs.
+    """
+    probe = TaskProbe(task, config)
+    where = f"task.name = {config.task.name!r}"
+    more = f"python -m jetbot_mjx.check_env {config.task.name} says more"
+    try:
+        found = jax.eval_shape(call_methods(task), probe.example)
+    except Exception as error:
+        raise InvalidError(f"{where}: {probe.explain(error)} ({more})") from error
+    wanted = {"observe": (layout_size(task.layout),)}
+    wanted |= dict.fromkeys(("reward", "terminated", "success"), ())
+    for method, shape in wanted.items():
+        if jnp.shape(found[method]) != shape:
+            raise InvalidError(
+                f"{where}: {method} has the shape {list(jnp.shape(found[method]))}: it should be"
+                f" {list(shape)} ({more})"
+            )
 
 
 # Checks of the scene and of the whole environment.
