@@ -25,11 +25,6 @@ class Estimate(NamedTuple):
     high: float | None = None
 
 
-def mean(values: Float[np.ndarray, "*n"], axis: int = -1) -> Float[np.ndarray, "*m"]:
-    """Return the mean along an axis."""
-    return np.mean(values, axis=axis)
-
-
 def mean_difference(
     a: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*m"], axis: int = -1
 ) -> Float[np.ndarray, "*k"]:
@@ -108,7 +103,7 @@ def mean_band(
     Returns:
       The lower and the upper ends.
     """
-    low, high = _interval(mean, [values], 0)
+    low, high = _interval(np.mean, [values], 0)
     return low, high
 
 

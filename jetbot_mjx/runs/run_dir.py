@@ -186,6 +186,12 @@ def make_folder(path: Path) -> None:
         path.mkdir(parents=True, exist_ok=True)
 
 
+def shortened(path: Path) -> Path:
+    """Return the path relative to the current folder if it is inside of it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
+
+
 def versions() -> dict[str, Any]:
     """Return the versions of packages and Python, the machine, the devices and the git state."""
     devices = jax.devices()

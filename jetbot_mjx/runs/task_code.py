@@ -24,7 +24,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.run_dir import write_bytes, write_json, writing_to
+from jetbot_mjx.runs.run_dir import shortened, write_bytes, write_json, writing_to
 
 FOLDER = "task"
 """Name of the folder in a run folder that holds the source of the task."""
@@ -172,24 +172,24 @@ def stored_task_class(run_dir: Path, name: str) -> type[Any] | None:
     if root is not None and on_disk and all(_holds(root / path, text) for path, text in code.files):
         return None
     # Import the stored files.
-    folder = _shortened(run_dir / FOLDER)
+    folder = shortened(run_dir / FOLDER)
     main = _source_file(run_dir / FOLDER, module)
     if main is None:
         raise UserError(f"{folder} holds no source of {module}: delete it to run {module} itself")
     if on_disk:
         reason = f"{module} on disk differs from the code this run was trained with: using the"
-        _say(f"{reason} stored code {_shortened(main)}", code)
+        _say(f"{reason} stored code {shortened(main)}", code)
     else:
-        _say(f"running the task's code stored in {_shortened(main)}", code)
+        _say(f"running the task's code stored in {shortened(main)}", code)
     try:
         found = _stored_modules(run_dir / FOLDER, code).load(module)
     except ModuleNotFoundError as error:
         raise UserError(
-            f"{_shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
+            f"{shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
             " name its folder in PYTHONPATH"
         ) from None
     if not hasattr(found, class_name):
-        raise UserError(f"task.name = {name!r}: {_shortened(main)} has no {class_name!r}")
+        raise UserError(f"task.name = {name!r}: {shortened(main)} has no {class_name!r}")
     return getattr(found, class_name)
 
 
@@ -244,12 +244,6 @@ def _holds(path: Path, content: bytes) -> bool:
         return path.read_bytes() == content
     except OSError:
         return False
-
-
-def _shortened(path: Path) -> Path:
-    """Return the path relative to the current folder if it is inside of it."""
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 _said: set[Any] = set()

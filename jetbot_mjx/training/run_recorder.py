@@ -15,6 +15,7 @@ from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
 from jetbot_mjx.runs.metrics import (
+    METRICS,
     CompileClock,
     History,
     JsonlSink,
@@ -40,9 +41,6 @@ from jetbot_mjx.training.console import (
 )
 from jetbot_mjx.viewers.offscreen import find_backend
 from jetbot_mjx.viewers.video import EvaluationVideo
-
-METRICS = "metrics.jsonl"
-"""Name of the log in the folder of a seed."""
 
 
 @dataclasses.dataclass
