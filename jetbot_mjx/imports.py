@@ -8,7 +8,9 @@ needs no OpenGL, so that a command must be able to import MuJoCo even if the bac
 `MUJOCO_GL` names is unavailable.
 """
 
+import ast
 import contextlib
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -16,29 +18,37 @@ import io
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 _Around = Callable[[], contextlib.AbstractContextManager[None]]
 
 
-def load_lazily(
-    package: str, homes: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def load_lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return a package's `__getattr__` and `__dir__`, which import public names at their first use.
+
+    The public names are those that the package's file imports for type checkers alone, in its block
+    `if TYPE_CHECKING`.
 
     Args:
       package: its full name.
-      homes: the module of the package that each public name lives in.
     """
 
+    @functools.cache
+    def homes() -> dict[str, str]:
+        tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
+        (block,) = (node for node in tree.body if isinstance(node, ast.If))
+        imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
+        return {alias.name: str(node.module) for node in imports for alias in node.names}
+
     def find(name: str) -> Any:
-        if name not in homes:
+        if name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         with without_warp_lines():
-            module = importlib.import_module(f"{package}.{homes[name]}")
+            module = importlib.import_module(homes()[name])
         return getattr(module, name)
 
-    return find, lambda: sorted(homes)
+    return find, lambda: sorted(homes())
 
 
 class LazyModule(types.ModuleType):
