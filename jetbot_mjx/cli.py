@@ -184,10 +184,7 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     """
 
     def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
+        value = int(_number(text, int))
         if value < least:
             raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
         if value > most:
@@ -200,12 +197,17 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
 positive_int = whole_number(1)
 
 
+def _number(text: str, kind: type[int] | type[float] = float) -> float:
+    try:
+        return kind(text)
+    except ValueError:
+        what = "whole number" if kind is int else "number"
+        raise argparse.ArgumentTypeError(f"{text!r} is no {what}") from None
+
+
 def fraction(text: str) -> float:
     """Parse an argument between 0 and 1."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    value = _number(text)
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
     return value
@@ -213,10 +215,7 @@ def fraction(text: str) -> float:
 
 def positive_float(text: str) -> float:
     """Parse an argument above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    value = _number(text)
     if not 0 < value <= _LARGEST:
         raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most {_LARGEST}")
     return value
@@ -224,10 +223,8 @@ def positive_float(text: str) -> float:
 
 def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     """Parse an argument that names a checkpoint of a run."""
-    if text == "best":
-        return "best"
-    if text == "last":
-        return "last"
+    if text == "best" or text == "last":
+        return text
     # Limit the digits, because Python raises an error for integers with too many of them.
     if text.isdecimal() and len(text) < 100:
         return int(text)
@@ -257,14 +254,12 @@ def add_checkpoint_arguments(
         "a run folder or one checkpoint folder of it; or latest, the name of a folder in runs/, or"
         " pretrained:NAME"
     )
+    nargs = None
     if several:
-        what += "; several are compared"
-        parser.add_argument("run", nargs="+", type=run_path, metavar="RUN", help=what)
+        nargs, what = "+", f"{what}; several are compared"
     elif default is not None:
-        what += f" (default: {default})"
-        parser.add_argument("run", nargs="?", type=run_path, metavar="RUN", help=what)
-    else:
-        parser.add_argument("run", type=run_path, metavar="RUN", help=what)
+        nargs, what = "?", f"{what} (default: {default})"
+    parser.add_argument("run", nargs=nargs, type=run_path, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,

@@ -77,14 +77,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "ranges": options.ranges,
         "simulator": options.simulator,
     }
-    if len(options.run) > 1 or seed_folders(Path(options.run[0])):
-        with cli.show_progress():
+    with cli.show_progress():
+        if len(options.run) > 1 or seed_folders(Path(options.run[0])):
             result = evaluate_runs.compare_runs(options.run, **settings)
-        print(tables.summarize_comparison(result))
-    else:
-        with cli.show_progress():
+            text = tables.summarize_comparison(result)
+        else:
             result = evaluate_runs.evaluate_run(options.run[0], **settings)
-        print(tables.summarize_report(result))
+            text = tables.summarize_report(result)
+    print(text)
     below = tables.below_target(result, options.min_success)
     print("".join(f"{line}\n" for line in below), end="")
     return BELOW_TARGET if below else 0

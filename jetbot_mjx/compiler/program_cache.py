@@ -161,7 +161,6 @@ class _CacheHits:
         jax.monitoring.unregister_event_listener(self._listen)
 
     def _listen(self, event: str, **kwargs: str | int) -> None:
-        del kwargs
         self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
 
 

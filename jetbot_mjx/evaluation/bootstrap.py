@@ -66,7 +66,6 @@ def probability_of_improvement(
 
     Source: Agarwal et al., NeurIPS 34 (2021), section 4, arXiv:2108.13264.
     """
-    del axis
     x, y = np.asarray(a)[..., :, None], np.asarray(b)[..., None, :]
     return np.mean((x > y) + 0.5 * (x == y), axis=(-2, -1))
 

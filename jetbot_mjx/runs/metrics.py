@@ -303,7 +303,6 @@ class CompileClock:
         jax.monitoring.register_event_listener(self._count)
 
     def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        del kwargs
         end = time.perf_counter()
         with self._lock:
             if event in self._EVENTS:
@@ -313,7 +312,6 @@ class CompileClock:
                 self.saved_seconds += duration_secs
 
     def _count(self, event: str, **kwargs: str | int) -> None:
-        del kwargs
         with self._lock:
             self.cached += event == self._CACHE_HIT
 

@@ -289,7 +289,6 @@ class _StoredModules(importlib.abc.MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         """Return the spec of a stored module or of a folder of such modules."""
-        del path, target
         if fullname not in self._names:
             return None
         folder = str(self._folder.joinpath(*fullname.split(".")))
@@ -339,7 +338,6 @@ class _StoredLoader(importlib.abc.SourceLoader):
         self._path, self._content, self._import = path, content, import_
 
     def get_filename(self, fullname: str) -> str:
-        del fullname
         return self._path
 
     def get_data(self, path: str) -> bytes:
