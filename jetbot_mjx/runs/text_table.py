@@ -17,6 +17,6 @@ def text_table(rows: Sequence[Sequence[str]], left: int = 1) -> str:
         "  ".join(
             cell.ljust(width) if column < left else cell.rjust(width)
             for column, (cell, width) in enumerate(zip(row, widths, strict=True))
-        )
+        ).rstrip()
         for row in rows
     )
