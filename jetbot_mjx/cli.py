@@ -15,7 +15,7 @@ import io
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -119,16 +119,14 @@ def prepare_device() -> None:
     use_compilation_cache()
 
 
-@contextlib.contextmanager
-def show_progress() -> Iterator[None]:
+def show_progress() -> contextlib.AbstractContextManager[None]:
     """Show the progress inside the context on standard error, where it does not mix with results.
 
     The commands that take more than two seconds use it.
     """
     from jetbot_mjx.runs import progress
 
-    with progress.show_progress(sys.stderr):
-        yield
+    return progress.show_progress(sys.stderr)
 
 
 def require_device() -> None:

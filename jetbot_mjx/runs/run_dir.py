@@ -13,6 +13,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shutil
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -174,6 +175,29 @@ def writing_to(path: Path) -> Iterator[None]:
         yield
     except OSError as error:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+@contextlib.contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder, and put it in the place of `folder` when it is complete.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    earlier = folder.with_name(f".{folder.name}.earlier")
+    with writing_to(folder):
+        for leftover in (unfinished, earlier):
+            shutil.rmtree(leftover, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        try:
+            yield unfinished
+            if folder.exists():
+                folder.rename(earlier)
+            unfinished.rename(folder)
+        finally:
+            for leftover in (unfinished, earlier):
+                shutil.rmtree(leftover, ignore_errors=True)
 
 
 def make_folder(path: Path) -> None:
