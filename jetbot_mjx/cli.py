@@ -15,7 +15,7 @@ import io
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -141,16 +141,14 @@ def prepare_device() -> None:
     use_compilation_cache()
 
 
-@contextlib.contextmanager
-def show_progress() -> Iterator[None]:
+def show_progress() -> contextlib.AbstractContextManager[None]:
     """Show the progress inside the context on standard error, where it does not mix with results.
 
     The commands that take more than two seconds use it.
     """
     from jetbot_mjx.runs import progress
 
-    with progress.show_progress(sys.stderr):
-        yield
+    return progress.show_progress(sys.stderr)
 
 
 def require_device() -> None:
@@ -206,10 +204,7 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     """
 
     def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
+        value = int(_number(text, int))
         if value < least:
             raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
         if value > most:
@@ -222,12 +217,17 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
 positive_int = whole_number(1)
 
 
+def _number(text: str, kind: type[int] | type[float] = float) -> float:
+    try:
+        return kind(text)
+    except ValueError:
+        what = "whole number" if kind is int else "number"
+        raise argparse.ArgumentTypeError(f"{text!r} is no {what}") from None
+
+
 def fraction(text: str) -> float:
     """Parse an argument between 0 and 1."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    value = _number(text)
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
     return value
@@ -235,10 +235,7 @@ def fraction(text: str) -> float:
 
 def positive_float(text: str) -> float:
     """Parse an argument above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    value = _number(text)
     if not 0 < value <= _LARGEST:
         raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most {_LARGEST}")
     return value
@@ -246,10 +243,8 @@ def positive_float(text: str) -> float:
 
 def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     """Parse an argument that names a checkpoint of a run."""
-    if text == "best":
-        return "best"
-    if text == "last":
-        return "last"
+    if text == "best" or text == "last":
+        return text
     # Limit the digits, because Python raises an error for integers with too many of them.
     if text.isdecimal() and len(text) < 100:
         return int(text)
@@ -279,14 +274,12 @@ def add_checkpoint_arguments(
         "a run folder or one checkpoint folder of it; or latest, the name of a folder in runs/, or"
         " pretrained:NAME"
     )
+    nargs = None
     if several:
-        what += "; several are compared"
-        parser.add_argument("run", nargs="+", type=run_path, metavar="RUN", help=what)
+        nargs, what = "+", f"{what}; several are compared"
     elif default is not None:
-        what += f" (default: {default})"
-        parser.add_argument("run", nargs="?", type=run_path, metavar="RUN", help=what)
-    else:
-        parser.add_argument("run", type=run_path, metavar="RUN", help=what)
+        nargs, what = "?", f"{what} (default: {default})"
+    parser.add_argument("run", nargs=nargs, type=run_path, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,

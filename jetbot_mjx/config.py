@@ -504,31 +504,20 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _trainer_can(self) -> Self:
-        if self.trainer == "brax":
-            if self.ppo.learning_rate_schedule == "LINEAR":
+        linear = self.ppo.learning_rate_schedule == "LINEAR"
+        physical = self.ppo.normalizer == "physical"
+        for is_set, setting, other_remedy in (
+            (linear, "ppo.learning_rate_schedule = 'LINEAR'", ", or NONE or ADAPTIVE_KL"),
+            (physical, "ppo.normalizer = 'physical'", ", or ppo.normalizer = 'brax'"),
+            (self.task.sees, f"task.observation = {self.task.observation!r}", ""),
+            (self.deterministic, "deterministic = true", ""),
+            (self.init_from is not None, "init_from", ""),
+            (self.seeds > 1, f"seeds = {self.seeds}", ""),
+        ):
+            if is_set and self.trainer == "brax":
                 raise ValueError(
-                    "ppo.learning_rate_schedule = 'LINEAR' is not known to trainer = 'brax':"
-                    " take trainer = 'resumable', or NONE or ADAPTIVE_KL"
-                )
-            if self.ppo.normalizer == "physical":
-                raise ValueError(
-                    "ppo.normalizer = 'physical' is not known to trainer = 'brax':"
-                    " take trainer = 'resumable', or ppo.normalizer = 'brax'"
-                )
-            if self.task.sees:
-                raise ValueError(
-                    f"task.observation = {self.task.observation!r} is not known to trainer ="
-                    " 'brax': take 'resumable'"
-                )
-            if self.deterministic:
-                raise ValueError(
-                    "deterministic = true is not known to trainer = 'brax': take 'resumable'"
-                )
-            if self.init_from is not None:
-                raise ValueError("init_from is not known to trainer = 'brax': take 'resumable'")
-            if self.seeds > 1:
-                raise ValueError(
-                    f"seeds = {self.seeds} is not known to trainer = 'brax': take 'resumable'"
+                    f"{setting} is not known to trainer = 'brax': take trainer = 'resumable'"
+                    f"{other_remedy}"
                 )
         return self
 

@@ -23,7 +23,6 @@ Protocol: JAX sees the kernel as a primitive.
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import math
 import threading
@@ -98,20 +97,12 @@ class Kernel:
 class Backend(Protocol):
     """A `Backend` compiles and launches kernels for one platform."""
 
-    @property
-    def IMPL(self) -> str:
-        """Return the back end's name in `physics.impl`."""
-        ...
-
-    @property
-    def PLATFORM(self) -> str:
-        """Return the JAX platform that the back end serves."""
-        ...
-
-    @property
-    def NEEDS(self) -> str:
-        """Return one line that names the hardware and packages that the back end needs."""
-        ...
+    IMPL: str
+    """The back end's name in `physics.impl`."""
+    PLATFORM: str
+    """The JAX platform that the back end serves."""
+    NEEDS: str
+    """One line that names the hardware and packages that the back end needs."""
 
     def is_available(self) -> bool:
         """Return whether JAX has the platform and every requirement of the back end is met."""
@@ -198,9 +189,7 @@ def _run(*leaves: Any, kernel: Kernel) -> list[Array]:
         return _compiled(*leaves, kernel=kernel)
 
 
-@functools.partial(jax.jit, static_argnames="kernel")
-def _compiled(*leaves: Array, kernel: Kernel) -> list[Array]:
-    return _kernel_p.bind(*leaves, kernel=kernel)
+_compiled = jax.jit(_kernel_p.bind, static_argnames="kernel")
 
 
 def _batch(
@@ -305,15 +294,10 @@ def cached_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     if not cache or not jax.config.values["jax_enable_compilation_cache"]:
         return make()
     path = Path(cache) / f"{kind}-{hashlib.sha256(key).hexdigest()}"
-    digest, _, content = (read_trusted(path) or b"").partition(b"\n")
-    if digest == _digest(content):
-        return content
-    content = make()
-    # A folder that cannot be written only costs time: the content is made again next time.
-    with contextlib.suppress(OSError):
-        write_private(path, _digest(content) + b"\n" + content)
+    content = read_trusted(path)
+    if content is None:
+        content = make()
+        # A folder that cannot be written only costs time: the content is made again next time.
+        with contextlib.suppress(OSError):
+            write_private(path, content)
     return content
-
-
-def _digest(content: bytes) -> bytes:
-    return hashlib.sha256(content).hexdigest().encode()

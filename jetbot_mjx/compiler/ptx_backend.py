@@ -23,9 +23,9 @@ from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 
-IMPL = "ptx"
-PLATFORM = "cuda"
-NEEDS = "an NVIDIA GPU, llvmlite (pip install llvmlite) and an XLA that launches PTX"
+IMPL: str = "ptx"
+PLATFORM: str = "cuda"
+NEEDS: str = "an NVIDIA GPU, llvmlite (pip install llvmlite) and an XLA that launches PTX"
 
 _MAX_THREADS = 256
 """Largest number of robots in a block: with 255 registers each, it fills a multiprocessor."""

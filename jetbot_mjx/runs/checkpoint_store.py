@@ -204,7 +204,6 @@ class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
     def should_preserve(
         self, checkpoints: Sequence[Any], *, context: checkpoint_managers.PreservationContext
     ) -> Sequence[bool]:
-        del context
         success = [self._success.get(one.step, -1.0) for one in checkpoints]
         best = max(range(len(success)), key=lambda index: (success[index], index), default=0)
         first_of_latest = len(checkpoints) - self._latest

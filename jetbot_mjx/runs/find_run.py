@@ -6,15 +6,15 @@ the package, as `pretrained:NAME`.
 
 import difflib
 import os
-import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
 
-from jetbot_mjx.config import ConfigError, load_config
+from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import NotFoundError, UserError
-from jetbot_mjx.runs.metrics import read_history
+from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.run_dir import CONFIG, stored_config
+from jetbot_mjx.runs.text_table import text_table
 
 ROOT = Path("runs")
 """The folder in which trainings create their run folders, relative to the current folder."""
@@ -109,11 +109,10 @@ def read_info(run_dir: Path) -> RunInfo | None:
     try:
         config = load_config(run_dir / CONFIG)
         # Of several seeds, show the first.
-        seeds = sorted(run_dir.glob("seed-*/metrics.jsonl"))
-        log = seeds[0] if seeds else run_dir / "metrics.jsonl"
-        history = read_history(log, sys.maxsize)
+        seeds = sorted(run_dir.glob(f"seed-*/{METRICS}"))
+        history = read_history(seeds[0] if seeds else run_dir / METRICS)
         changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
-    except (ConfigError, OSError):
+    except (UserError, OSError):
         return None
     rates = [line.metrics.get("eval/success_rate") for line in history]
     task = config.task
@@ -142,15 +141,10 @@ def runs_table(runs: list[RunInfo]) -> str:
         )
         for run in runs
     ]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = [
-        f"{row[0]:{widths[0]}}  {row[1]:{widths[1]}}  {row[2]:>{widths[2]}}"
-        f"  {row[3]:>{widths[3]}}  {row[4]:>{widths[4]}}"
-        for row in rows
-    ]
+    table = text_table(rows, left=2)
     if any(run.env_steps < run.num_timesteps for run in runs):
-        lines.append("* stopped before its last step, or reached stop_at_success")
-    return "\n".join(lines)
+        table += "\n* stopped before its last step, or reached stop_at_success"
+    return table
 
 
 def _find_pretrained(name: str) -> Path:

@@ -13,6 +13,7 @@ import importlib.metadata
 import json
 import os
 import platform
+import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -203,6 +204,29 @@ def check_writable(path: Path) -> None:
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
 
 
+@contextlib.contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder, and put it in the place of `folder` when it is complete.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    earlier = folder.with_name(f".{folder.name}.earlier")
+    with writing_to(folder):
+        for leftover in (unfinished, earlier):
+            shutil.rmtree(leftover, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        try:
+            yield unfinished
+            if folder.exists():
+                folder.rename(earlier)
+            unfinished.rename(folder)
+        finally:
+            for leftover in (unfinished, earlier):
+                shutil.rmtree(leftover, ignore_errors=True)
+
+
 def make_folder(path: Path) -> None:
     """Create a folder for results inside a run folder if it does not exist.
 
@@ -211,6 +235,12 @@ def make_folder(path: Path) -> None:
     """
     with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
+
+
+def shortened(path: Path) -> Path:
+    """Return the path relative to the current folder if it is inside of it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 def versions() -> dict[str, Any]:

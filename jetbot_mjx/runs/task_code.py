@@ -24,7 +24,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.run_dir import write_bytes, write_json, writing_to
+from jetbot_mjx.runs.run_dir import shortened, write_bytes, write_json, writing_to
 
 FOLDER = "task"
 """Name of the folder in a run folder that holds the source of the task."""
@@ -185,7 +185,7 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type
     if root is not None and on_disk and all(_holds(root / path, text) for path, text in code.files):
         return None
     # Import the stored files.
-    folder = _shortened(run_dir / FOLDER)
+    folder = shortened(run_dir / FOLDER)
     main = _source_file(run_dir / FOLDER, module)
     if main is None:
         raise UserError(f"{folder} holds no source of {module}: delete it to run {module} itself")
@@ -193,18 +193,18 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type
         pass
     elif on_disk:
         reason = f"{module} on disk differs from the code this run was trained with: using the"
-        _say(f"{reason} stored code {_shortened(main)}", code)
+        _say(f"{reason} stored code {shortened(main)}", code)
     else:
-        _say(f"running the task's code stored in {_shortened(main)}", code)
+        _say(f"running the task's code stored in {shortened(main)}", code)
     try:
         found = _stored_modules(run_dir / FOLDER, code).load(module)
     except ModuleNotFoundError as error:
         raise UserError(
-            f"{_shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
+            f"{shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
             " name its folder in PYTHONPATH"
         ) from None
     if not hasattr(found, class_name):
-        raise UserError(f"task.name = {name!r}: {_shortened(main)} has no {class_name!r}")
+        raise UserError(f"task.name = {name!r}: {shortened(main)} has no {class_name!r}")
     return getattr(found, class_name)
 
 
@@ -261,12 +261,6 @@ def _holds(path: Path, content: bytes) -> bool:
         return False
 
 
-def _shortened(path: Path) -> Path:
-    """Return the path relative to the current folder if it is inside of it."""
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
-
-
 _said: set[Any] = set()
 
 
@@ -310,7 +304,6 @@ class _StoredModules(importlib.abc.MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         """Return the spec of a stored module or of a folder of such modules."""
-        del path, target
         if fullname not in self._names:
             return None
         folder = str(self._folder.joinpath(*fullname.split(".")))
@@ -360,7 +353,6 @@ class _StoredLoader(importlib.abc.SourceLoader):
         self._path, self._content, self._import = path, content, import_
 
     def get_filename(self, fullname: str) -> str:
-        del fullname
         return self._path
 
     def get_data(self, path: str) -> bytes:

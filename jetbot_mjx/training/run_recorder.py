@@ -16,6 +16,7 @@ from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
 from jetbot_mjx.runs.metrics import (
     EVALUATION_VIDEO,
+    METRICS,
     CompileClock,
     History,
     JsonlSink,
@@ -41,9 +42,6 @@ from jetbot_mjx.training.console import (
 )
 from jetbot_mjx.viewers.offscreen import find_backend
 from jetbot_mjx.viewers.video import EvaluationVideo
-
-METRICS = "metrics.jsonl"
-"""Name of the log in the folder of a seed."""
 
 
 @dataclasses.dataclass

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.agents.ppo import PPO, TrainState
@@ -27,7 +28,7 @@ from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
-from jetbot_mjx.runs.metrics import CompileClock, read_history, restart_clock
+from jetbot_mjx.runs.metrics import METRICS, CompileClock, read_history, restart_clock
 from jetbot_mjx.runs.resume import Resumption, resume
 from jetbot_mjx.runs.run_dir import (
     changed_versions,
@@ -51,7 +52,6 @@ from jetbot_mjx.training.dashboard import open_terminal
 from jetbot_mjx.training.memory import advice, device_memory, sizes
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import (
-    METRICS,
     RunRecorder,
     SeedRecorder,
     Standing,
@@ -453,10 +453,10 @@ def summary(result: Result) -> str:
         )
     if len(lines) > 1:
         # Its statistics take half a second to import.
-        from jetbot_mjx.evaluation.bootstrap import bootstrap, mean
+        from jetbot_mjx.evaluation.bootstrap import bootstrap
 
         rates = [standing.best.success_rate for standing in result.standings if standing.best]
-        over_seeds = bootstrap(mean, rates)
+        over_seeds = bootstrap(np.mean, rates)
         lines.append(
             f"{len(lines)} seeds: {over_seeds.value:.2%} success in the mean"
             f" (95 % interval {over_seeds.low:.2%} .. {over_seeds.high:.2%})"
