@@ -104,7 +104,8 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     text = kernel.text(IMPL, lambda: kernel_text(kernel))
     robots = leaves[0].shape[0]
-    shapes = [jax.ShapeDtypeStruct((robots, *x), jnp.float32) for x in kernel.result_shapes]
+    dtype = kernel.result_dtype
+    shapes = [jax.ShapeDtypeStruct((robots, *x), dtype) for x in kernel.result_shapes]
     table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
     return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves, *table))
 
