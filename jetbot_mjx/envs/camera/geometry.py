@@ -90,11 +90,11 @@ def hit_box(origin: Vector, direction: Vector, size: Size) -> Hit:
         b, c = (a + 1) % 3, (a + 2) % 3
         distance = jnp.abs(origin[a]) - size[a]
         speed = -jnp.sign(origin[a]) * direction[a]
-        # A camera between the planes of both faces sees neither: no width is small enough.
-        seen = jnp.where(distance > 0, 1.0, -1.0)
+        # A camera between the planes of both faces sees neither, and no ray leaves through them.
+        towards = jnp.where(distance > 0, speed, -1.0)
         faces.append(
-            (jnp.abs(origin[b] * speed + distance * direction[b]) <= (seen * size[b]) * speed)
-            & (jnp.abs(origin[c] * speed + distance * direction[c]) <= (seen * size[c]) * speed)
+            (jnp.abs(origin[b] * speed + distance * direction[b]) <= size[b] * towards)
+            & (jnp.abs(origin[c] * speed + distance * direction[c]) <= size[c] * towards)
         )
         distances.append(distance)
         speeds.append(speed)

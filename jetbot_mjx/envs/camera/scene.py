@@ -104,7 +104,7 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
     horizon, zenith = _read_sky(model)
     return Scene(
         tuple(geoms),
-        ambient=_rgb(headlight.ambient * active + model.light_ambient.sum(axis=0)),
+        ambient=_rgb(headlight.ambient * active + model.light_active @ model.light_ambient),
         headlight=_rgb(headlight.diffuse * active),
         lights=tuple(_read_light(model, light) for light in range(model.nlight)),
         horizon=horizon,
@@ -158,9 +158,11 @@ def _read_geom(
         size = np.repeat(size[0], 3)
     material = int(model.geom_matid[geom])
     rgba = _rgba(model, geom)
-    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+    texture = -1
+    if material >= 0:
+        texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
     checker, tint = None, np.ones(3)
-    if material >= 0 and texture >= 0:
+    if texture >= 0:
         image = _texture(model, texture)
         tint = image.reshape(-1, 3).mean(axis=0)
         if kind == "plane":
