@@ -13,9 +13,11 @@ ROBOT = "jetbot"
 _XML = """
 <mujoco>
   <compiler angle="radian"/>
+  <statistic extent="1"/>
+  <default><geom contype="0" conaffinity="0"/></default>
   <visual>
     <headlight ambient="{ambient}" diffuse="{headlight}" specular="0 0 0"/>
-    <map znear="0.001" zfar="60"/>
+    <map znear="0.01" zfar="1000"/>
     <quality shadowsize="0" offsamples="4"/>
     <global offwidth="1024" offheight="1024"/>
   </visual>
@@ -23,7 +25,7 @@ _XML = """
   <worldbody>
     {world}
     <body name="jetbot" mocap="true">
-      <geom name="eye" type="sphere" size="0.001" group="3" contype="0" conaffinity="0"/>
+      <geom name="eye" type="sphere" size="0.001" group="3"/>
       <camera name="eye" fovy="{fovy}"/>
     </body>
     {bodies}
@@ -37,7 +39,7 @@ def make_model(
 ):
     """Compile a scene whose geoms stand on mocap bodies `0`, `1`, ..., the eye on the robot."""
     bodies = "".join(
-        f'<body name="{i}" mocap="true"><geom name="{i}" contype="0" conaffinity="0" {geom}/></body>'
+        f'<body name="{i}" mocap="true"><geom name="{i}" {geom}/></body>'
         for i, geom in enumerate(geoms)
     )
     xml = _XML.format(

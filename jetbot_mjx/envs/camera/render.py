@@ -327,7 +327,7 @@ def _checker_colours(checker: Checker, frame: _Frame, pixel: Footprint) -> list[
     waves: Any = 1.0
     for axis in (0, 1):
         scale = 1.0 / checker.size[axis]
-        at = origin[axis] + depth * direction[axis]
+        at = (origin[axis] - checker.start[axis]) + depth * direction[axis]
         extent: Any = 0.0
         for change in changes:
             moved = change[axis] - direction[axis] * (change[2] * slope)
@@ -350,15 +350,20 @@ def _square_wave(at: Array, width: Array) -> Array:
 
 
 def _sky(scene: Scene, pose: Pose, pixel: Footprint) -> Sequence[Any]:
-    """Return the colours of the sky, which change with the sine of the elevation."""
+    """Return the colours of the sky, which change from the horizon to the zenith.
+
+    MuJoCo's gradients are mixed by m = √2 e / √(1 + e²), where e is the elevation, 1 at the zenith.
+    Of the sine s of that angle, m = 1 - √(1 - s) (1 - 0.3754 s - 0.1205 s²), to within 0.003.
+    """
     if scene.horizon == scene.zenith:
         return scene.horizon
     x, y = pixel.centre
     right, down, forward = (pose.rotation[2, k] for k in range(3))
     length = np.sqrt(x * x + y * y + 1.0)
     sine = jnp.maximum(right * (x / length) + (down * (y / length) + forward / length), 0.0)
+    part = 1.0 - jnp.sqrt(jnp.maximum(1.0 - sine, 0.0)) * (1.0 - sine * (0.3754 + 0.1205 * sine))
     ends = zip(scene.horizon, scene.zenith, strict=True)
-    return [low + (high - low) * sine for low, high in ends]
+    return [low + (high - low) * part for low, high in ends]
 
 
 def _to_words(channel: Array) -> UInt32[Array, "h w"]:
