@@ -58,7 +58,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from jetbot_mjx.agents import gae
-from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, update_normalizer
+from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
 from jetbot_mjx.config import PPOConfig
 
@@ -143,7 +143,7 @@ class PPO:
         self,
         config: PPOConfig,
         env: Env,
-        networks: ppo_networks.PPONetworks,
+        networks: Networks,
         *,
         num_envs: int | None = None,
         axis_name: str | None = None,
