@@ -163,6 +163,26 @@ def make_vision_networks(
     )
 
 
+def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
+    """Return the memory of what the encoders compute from one observation [bytes].
+
+    Args:
+      config: the layers, and whether policy and value function share them.
+      shapes: the shapes of the observation's parts.
+    """
+    layers = _CNNS[config.cnn]
+    images = [shape for name, shape in shapes.items() if is_image(name)]
+    height, width, _ = images[0]
+    channels = sum(shape[2] for shape in images)
+    count = layers.features
+    for c_out, side, stride in layers.convolutions:
+        height, width = ((size - side) // stride + 1 for size in (height, width))
+        count += height * width * (side * side * channels + c_out)
+        channels = c_out
+    encoders = 1 if config.shared_cnn else 2
+    return encoders * count * jnp.dtype(_dtype(config.cnn_dtype)).itemsize
+
+
 def _check_size(cnn: str, shapes: Shapes) -> None:
     """Raise an error if an image is too small for convolutions."""
     for height, width, _ in (shape for name, shape in shapes.items() if is_image(name)):

@@ -311,3 +311,28 @@ def test_bfloat16_computes_nearly_the_same():
     assert one.dtype == other.dtype == jnp.float32
     # bfloat16 has 8 bits; 1 % of the largest feature.
     assert 0 < np.abs(one - other).max() < 0.02 * np.abs(one).max()
+
+
+@pytest.mark.parametrize("shared", [True, False])
+@pytest.mark.parametrize("cnn", SMALLEST)
+def test_the_memory_of_activations_is_what_a_gradient_keeps(cnn, shared):
+    shapes = {PIXELS: (40, 48, 3)}
+    ppo = make_ppo(shapes, cnn=cnn, shared_cnn=shared)
+    params = jax.eval_shape(lambda: init(ppo))
+
+    def kept(count):
+        """Bytes that the backward pass of `count` images reads."""
+        obs = {PIXELS: jax.ShapeDtypeStruct((count, *shapes[PIXELS]), jnp.uint8)}
+        kept = jax.eval_shape(
+            lambda params, obs: jax.vjp(
+                lambda p: ppo.networks.encode(init_normalizer(shapes), p, obs), params
+            )[1],
+            params,
+            obs,
+        )
+        return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
+
+    network = NetworkConfig(cnn=cnn, shared_cnn=shared, cnn_dtype="float32")
+    counted = vision.activation_bytes(network, shapes)
+    # It keeps the signs of relu and the parts of patches besides.
+    assert 0.9 * counted <= kept(9) - kept(8) <= 1.5 * counted
