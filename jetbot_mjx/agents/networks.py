@@ -147,7 +147,9 @@ def make_policy(networks: Networks, params: PolicyParams) -> Policy:
     Returns:
       The policy, which takes one observation or any batch of observations.
     """
-    inference = ppo_networks.make_inference_fn(networks)
+    # Brax takes whatever has the attributes of its `PPONetworks`.
+    any_networks: Any = networks
+    inference = ppo_networks.make_inference_fn(any_networks)
     greedy, exploring = inference(params, deterministic=True), inference(params)
 
     def policy(

@@ -171,7 +171,9 @@ class PPO:
             if config.normalize_observations and config.normalizer == "physical"
             else None
         )
-        self._make_policy = ppo_networks.make_inference_fn(self.networks)
+        # Brax takes whatever has the attributes of its `PPONetworks`.
+        any_networks: Any = networks
+        self._make_policy = ppo_networks.make_inference_fn(any_networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
         self._loss_and_gradient = gradients.loss_and_pgrad(
