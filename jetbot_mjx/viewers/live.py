@@ -91,7 +91,7 @@ def addresses(host: str, port: int) -> list[str]:
     with contextlib.suppress(KeyError, OSError):
         name = f"{getpass.getuser()}@{name}"
     lines = [
-        f"it split_trajectories at http://{here}:{port} (Ctrl-C ends it)",
+        f"it plays at http://{here}:{port} (Ctrl-C ends it)",
         f"from elsewhere: ssh -N -L {port}:{here}:{port} {name}, and open"
         f" http://127.0.0.1:{port} there",
     ]
