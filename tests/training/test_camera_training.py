@@ -6,19 +6,25 @@ import subprocess
 import sys
 
 import gliding
+import jax
 import numpy as np
 import pytest
 
 pytest.importorskip("gymnasium")
 
-from jetbot_mjx import check_env, evaluate, load_policy, train
+from jetbot_mjx import check_env, evaluate, load_policy, make_env, train
 from jetbot_mjx.adapters import JetBotGymEnv
+from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.deployment.numpy_policy import portable_policy
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
+from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, read_about
+from jetbot_mjx.runs.nan_dump import load_nan_dump, save_nan_dump
+from jetbot_mjx.runs.nan_replay import replay_nan_dump
 
 STEP = 512  # environment steps in one training step
 SETTINGS = {
@@ -183,3 +189,20 @@ def test_an_export_refuses_images_in_one_line(run):
     with pytest.raises(UserError, match="only policies that observe numbers") as error:
         portable_policy(load_checkpoint(run))
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("randomization", [{}, {"start_x": [0.0, 0.1]}])
+def test_a_nan_dump_with_images_is_replayed(tmp_path, randomization):
+    config = parse_config(SETTINGS | {"randomization": randomization})
+    env = make_env(config)
+    wrapped = wrap_for_training(env, config.task.episode_length)
+    state = jax.tree.map(lambda x: x[0], jax.jit(wrapped.reset)(report_keys(1)))
+    actions = np.full((16, 2), 0.5, np.float32)
+    actions[1] = np.nan
+    dump = NanDump(found=True, env_state=state, actions=actions, step=np.int32(1))
+    path = save_nan_dump(tmp_path, config, STEP, jax.device_get(dump))
+    stored = load_nan_dump(path)
+    np.testing.assert_array_equal(stored.nan_dump.env_state.obs[PIXELS], state.obs[PIXELS])
+    first, second = replay_nan_dump(stored, env)
+    assert first.nonfinite == []
+    assert "reward" in second.nonfinite
