@@ -194,6 +194,11 @@ class CameraConfig(_Section):
                 f"distortion has {len(self.distortion)} coefficients: lens = {self.lens} takes at"
                 f" most {most}"
             )
+        if self.calibration_size is not None and self.matrix is None:
+            raise ValueError(
+                f"calibration_size = {list(self.calibration_size)} is that of a matrix, and there"
+                " is none: give both, or only fovy"
+            )
         values = [*self.position, *self.distortion, *(self.matrix or ())]
         if not all(map(math.isfinite, values)):
             raise ValueError("position, matrix and distortion should be finite numbers")

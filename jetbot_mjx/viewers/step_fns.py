@@ -7,10 +7,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
-from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.camera.wrapper import see, with_camera
@@ -86,7 +85,7 @@ class ViewerFns(NamedTuple):
     """Move one robot's goal to a position [m], world frame, and restart its time limit."""
 
 
-def make_viewer_fns(env: JetBotEnv, networks: ppo_networks.PPONetworks) -> ViewerFns:
+def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
     """Build the functions of a player; each one is compiled at its first use.
 
     Args:

@@ -164,8 +164,8 @@ BAD_VALUES = {
     ),
     "typo of a section": ("pppo: {seed: 3}", "pppo = {'seed': 3}", "did you mean ppo?"),
     "unknown key": (
-        "robot: {colour: red}",
-        "robot.colour = 'red'",
+        "robot: {shade: red}",
+        "robot.shade = 'red'",
         "is unknown: known are preset",
     ),
     "unknown section": ("zzz: {a: 1}", "zzz = {'a': 1}", "known are seed, seeds, trainer,"),
@@ -256,9 +256,9 @@ BAD_VALUES = {
     "unknown robot": ("robot: {preset: isac}", "robot.preset = 'isac'", "'isaac' or 'real'"),
     "unknown trainer": ("trainer: sac", "trainer = 'sac'", "should be 'resumable' or 'brax'"),
     "unknown observation": (
-        "task: {observation: camera}",
-        "task.observation = 'camera'",
-        "'world' or 'egocentric'",
+        "task: {observation: lidar}",
+        "task.observation = 'lidar'",
+        "'world', 'egocentric', 'camera'",
     ),
     "unknown activation": (
         "ppo: {network: {activation: sigmoid}}",

@@ -149,8 +149,8 @@ class Camera:
 
     def _fallback(self, shared: Float[Array, " shared"]) -> list[UInt8[Array, " bytes"]]:
         """Compute all pixels by XLA."""
-        # Keep the stages apart: XLA would compute what the pixels share in every pixel, and all rays
-        # of a pixel for each of its channels.
+        # Keep the stages apart: XLA would compute what the pixels share in every pixel, and all
+        # rays of a pixel for each of its channels.
         shared = jax.lax.optimization_barrier(shared)
         channels = jax.vmap(self._pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
         channels = jax.lax.optimization_barrier(channels)

@@ -26,7 +26,7 @@ def layout(probe: TaskProbe) -> Iterator[str]:
     if not isinstance(fields, tuple) or not all(isinstance(field, Field) for field in fields):
         yield "layout is no tuple of Field(name, size, unit, frame): make it one"
         return
-    if not fields:
+    if not fields and not probe.config.task.sees:
         yield "layout is empty: name at least one Field"
     names = [field.name for field in fields]
     for name in sorted({name for name in names if names.count(name) > 1}):
