@@ -281,3 +281,48 @@ def test_the_examples_train_and_evaluate(num_envs, root, tmp_path, monkeypatch, 
     assert re.search(r"^[012] of 2 goals, \d+ steps", capsys.readouterr().out, re.MULTILINE)
     with pytest.raises(UserError, match="does not exist"):
         sb3_eval.main(["--policy", "nothing"])
+
+
+SEES = {"task": {"observation": "camera"}, "camera": {"width": 36, "height": 36}}
+
+
+def test_its_own_cnn_policy_trains_on_images():
+    env = JetBotVecEnv(2, config=SEES)
+    assert env.observation_space == gymnasium.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+    model = sb3.PPO("CnnPolicy", env, n_steps=8, batch_size=8, n_epochs=1, device="cpu")
+    model.learn(16)
+    assert model.rollout_buffer.observations.dtype == np.uint8
+    assert model.rollout_buffer.observations.std() > 10
+
+
+def test_an_episodes_last_image_is_given_before_the_next_episodes_first():
+    env = JetBotVecEnv(3, max_episode_length=24, config=SEES)
+    before = env.reset()
+    for _ in range(24):
+        obs, _, done, infos = env.step(np.tile(np.float32([-1.0, 1.0]), (3, 1)))
+    assert done.all()
+    for index, info in enumerate(infos):
+        last = info["terminal_observation"]
+        assert last.shape == (36, 36, 3)
+        # The robot has turned, and a new episode begins where the first one began, elsewhere aimed.
+        assert np.abs(last.astype(int) - obs[index]).mean() > 1
+        assert (
+            np.abs(obs[index].astype(int) - before[index]).mean()
+            < np.abs(last.astype(int) - before[index]).mean()
+        )
+
+
+def test_numbers_beside_an_image_are_a_dictionary():
+    sees = {**SEES, "task": {"observation": "camera+egocentric"}}
+    env = JetBotVecEnv(2, config=sees)
+    obs = env.reset()
+    assert set(obs) == {"pixels/front", "state"}
+    assert env.observation_space.contains({name: part[0] for name, part in obs.items()})
+    both = JetBotVectorEnv(2, config=sees)
+    seen, _ = both.reset(seed=0)
+    assert both.observation_space.contains(seen)
+
+
+def test_one_robot_in_mujoco_says_that_it_does_not_see():
+    with pytest.raises(UserError, match=r"observes numbers only.*a batch of robots sees"):
+        JetBotGymEnv(config=SEES)

@@ -3,6 +3,7 @@
 import importlib
 from unittest import mock
 
+import jax
 import mujoco
 import numpy as np
 import pytest
@@ -10,6 +11,10 @@ from camera_scenes import Scenes, make_model, turned
 from mujoco.rendering.classic import gl_context
 from numpy.lib.stride_tricks import sliding_window_view
 
+from jetbot_mjx.config import CameraConfig, Config
+from jetbot_mjx.envs.camera.render import Camera
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers import offscreen
 
@@ -204,3 +209,27 @@ def test_a_small_picture_looks_like_a_large_one_made_smaller(beside):
         difference = np.abs(images - large.reshape(-1, 32, 7, 32, 7, 3).mean((2, 4)))
         assert difference.mean() < 3.0
         assert np.percentile(difference, 99) < 40
+
+
+@pytest.mark.parametrize("change", [{}, {"lens": "fisheye"}, {"colour": "grey", "samples": 1}])
+def test_the_kernel_draws_what_xla_draws(change):
+    env = make_env(Config())
+    shared = {"width": 24, "height": 24, **change}
+    one, other = (
+        Camera(CameraConfig(impl=impl, **shared), env.mj_model) for impl in ("auto", "xla")
+    )
+    assert other._kernel is None
+    keys = jax.random.split(jax.random.PRNGKey(0), 16)
+    states = jax.vmap(env.reset)(keys)
+
+    def images(camera):
+        def render(state):
+            robot = robot_state(state.pipeline_state)
+            pose = camera.pose(robot.position_w, robot.quat)
+            return camera.render(pose, env.task.markers(state.goal))
+
+        return np.asarray(jax.jit(jax.vmap(render))(states)).astype(int)
+
+    ours, theirs = images(one), images(other)
+    assert np.abs(ours - theirs).max() <= 1 or (np.abs(ours - theirs) > 1).mean() < 1e-3
+    assert ours.std() > 10
