@@ -13,7 +13,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import identity_observation_preprocessor
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.agents.vision import is_image, make_vision_networks
+from jetbot_mjx.agents.vision import VisionNetworks, is_image, make_vision_networks
 from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import NetworkConfig
 
@@ -27,6 +27,10 @@ _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
 
 Observation = Float[Array | np.ndarray, "*batch obs"] | Mapping[str, Array | np.ndarray]
 """One observation or any batch of them: a vector of numbers, or a dictionary with images."""
+
+
+Networks = ppo_networks.PPONetworks | VisionNetworks
+"""Policy and value networks: Brax's, or those that see."""
 
 
 class PolicyParams(NamedTuple):
@@ -76,7 +80,7 @@ def make_networks(
     action_size: int,
     *,
     normalize: bool,
-) -> Any:
+) -> Networks:
     """Build the policy and value networks: Brax's, behind an encoder if there are images.
 
     Args:
@@ -133,7 +137,7 @@ def update_normalizer(normalizer: Any, obs: Observation, axis_name: str | None =
     return running_statistics.update(normalizer, obs, pmap_axis_name=axis_name)
 
 
-def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Policy:
+def make_policy(networks: Networks, params: PolicyParams) -> Policy:
     """Bind networks and parameters into a policy.
 
     Args:
@@ -143,7 +147,9 @@ def make_policy(networks: ppo_networks.PPONetworks, params: PolicyParams) -> Pol
     Returns:
       The policy, which takes one observation or any batch of observations.
     """
-    inference = ppo_networks.make_inference_fn(networks)
+    # Brax takes whatever has the attributes of its `PPONetworks`.
+    any_networks: Any = networks
+    inference = ppo_networks.make_inference_fn(any_networks)
     greedy, exploring = inference(params, deterministic=True), inference(params)
 
     def policy(

@@ -58,7 +58,7 @@ from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
 from jetbot_mjx.agents import gae
-from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, update_normalizer
+from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
 from jetbot_mjx.config import PPOConfig
 
@@ -143,7 +143,7 @@ class PPO:
         self,
         config: PPOConfig,
         env: Env,
-        networks: ppo_networks.PPONetworks,
+        networks: Networks,
         *,
         num_envs: int | None = None,
         axis_name: str | None = None,
@@ -171,7 +171,9 @@ class PPO:
             if config.normalize_observations and config.normalizer == "physical"
             else None
         )
-        self._make_policy = ppo_networks.make_inference_fn(self.networks)
+        # Brax takes whatever has the attributes of its `PPONetworks`.
+        any_networks: Any = networks
+        self._make_policy = ppo_networks.make_inference_fn(any_networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
         self._loss_and_gradient = gradients.loss_and_pgrad(

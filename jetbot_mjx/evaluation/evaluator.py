@@ -12,10 +12,9 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.agents.networks import PolicyParams, make_policy
+from jetbot_mjx.agents.networks import Networks, PolicyParams, make_policy
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
@@ -158,7 +157,7 @@ def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[f
     return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
 
 
-def policy_controller(networks: ppo_networks.PPONetworks) -> Controller:
+def policy_controller(networks: Networks) -> Controller:
     """Return a controller that applies a policy deterministically.
 
     Args:
@@ -181,7 +180,7 @@ class Evaluator:
     def __init__(
         self,
         env: JetBotEnv | DomainRandomizationWrapper,
-        networks: ppo_networks.PPONetworks,
+        networks: Networks,
         programs: ProgramCache,
         *,
         baselines: bool = False,

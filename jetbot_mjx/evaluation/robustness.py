@@ -21,10 +21,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, Int, UInt32
 
-from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
 from jetbot_mjx.config import RandomizationConfig, read_yaml
@@ -96,7 +95,7 @@ class Sweeper:
     def __init__(
         self,
         env: JetBotEnv,
-        networks: ppo_networks.PPONetworks,
+        networks: Networks,
         keys: UInt32[Array, "n 2"],
         sweeps: Sequence[Sweep] = SWEEPS,
     ) -> None:
@@ -171,7 +170,7 @@ class Sweeper:
 
 def sweep(
     env: JetBotEnv,
-    networks: ppo_networks.PPONetworks,
+    networks: Networks,
     params: PolicyParams,
     keys: UInt32[Array, "n 2"],
     sweeps: Sequence[Sweep] = SWEEPS,
@@ -211,7 +210,7 @@ class MujocoEvaluator:
     def __init__(
         self,
         env: JetBotEnv,
-        networks: ppo_networks.PPONetworks,
+        networks: Networks,
         ranges: RandomizationConfig | None = None,
         numerics: Numerics = OTHER_NUMERICS,
     ) -> None:

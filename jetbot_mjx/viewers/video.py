@@ -16,11 +16,10 @@ import imageio.v3 as iio
 import jax
 import mujoco
 import numpy as np
-from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from jetbot_mjx.agents.networks import PolicyParams
+from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
@@ -274,9 +273,7 @@ class EvaluationVideo:
 
     _SIDE, _FPS = 256, FPS / GIF_STRIDE  # small, so that training waits only briefly
 
-    def __init__(
-        self, env: JetBotEnv, networks: ppo_networks.PPONetworks, programs: ProgramCache
-    ) -> None:
+    def __init__(self, env: JetBotEnv, networks: Networks, programs: ProgramCache) -> None:
         """Prepare the program, which compiles at its first use.
 
         Args:
