@@ -8,14 +8,20 @@ _DIMMED = 0.6  # brightness of the image below a heat map
 _HOT = np.array([[255, 60, 0], [255, 235, 60]])  # colours of half and of full heat
 
 
-def enlarge(image: UInt8[np.ndarray, "h w c"], side: int) -> UInt8[np.ndarray, "height width 3"]:
-    """Return an image in RGB whose pixels are squares, without smoothing.
+def resize_nearest(
+    image: UInt8[np.ndarray, "h w c"], side: int
+) -> UInt8[np.ndarray, "height width 3"]:
+    """Return an image in RGB in another size, without smoothing.
+
+    Pixels become squares; of an image that is much too large, every n-th pixel stays.
 
     Args:
       image: the image, in RGB or of one channel of grey.
-      side: the longer side of the result, up to rounding to whole squares [pixels].
+      side: the longer side of the result, up to the rounding to whole squares [pixels].
     """
-    factor = max(1, round(side / max(image.shape[:2])))
+    longer = max(image.shape[:2])
+    every, factor = (max(1, round(ratio)) for ratio in (longer / side, side / longer))
+    image = image[::every, ::every]
     rgb = np.broadcast_to(image, (*image.shape[:2], 3))
     return rgb.repeat(factor, axis=0).repeat(factor, axis=1)
 

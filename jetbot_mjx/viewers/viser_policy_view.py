@@ -7,7 +7,7 @@ import viser
 from jaxtyping import UInt8
 
 from jetbot_mjx.viewers.player import Player
-from jetbot_mjx.viewers.policy_view import enlarge, overlay_heat
+from jetbot_mjx.viewers.policy_view import overlay_heat, resize_nearest
 from jetbot_mjx.viewers.realtime import Clock
 
 _SIDE, _SIDE_OF_TWO = 200, 140  # [pixels] longer side of one image, and of two side by side
@@ -34,7 +34,7 @@ class PolicyView:
         self._image_clock = Clock(1 / _IMAGES_PER_SECOND, now)
         self._map_clock = Clock(1 / _MAPS_PER_SECOND, now)
         self._map: UInt8[np.ndarray, "height width 3"] | None = None
-        image = enlarge(player.image(), _SIDE)
+        image = resize_nearest(player.image(), _SIDE)
         self.image = gui.add_image(image, label=_SEES, format="png")
         self.looks = gui.add_checkbox("What it looks at", False)
 
@@ -53,16 +53,16 @@ class PolicyView:
         image = self._player.image()
         if not self.looks.value:
             self._map = None
-            self.image.image = enlarge(image, _SIDE)
+            self.image.image = resize_nearest(image, _SIDE)
             self._set_label(_SEES)
             return
         if redraw or self._map is None:
             heat = self._player.occlusion_map()
             largest = float(heat.max())
             overlay = overlay_heat(image, heat, max(largest, _LEAST_HEAT))
-            self._map = enlarge(overlay, _SIDE_OF_TWO)
+            self._map = resize_nearest(overlay, _SIDE_OF_TWO)
             self._set_label(_LOOKS.format(largest))
-        self.image.image = _side_by_side(enlarge(image, _SIDE_OF_TWO), self._map)
+        self.image.image = _side_by_side(resize_nearest(image, _SIDE_OF_TWO), self._map)
 
     def _set_label(self, label: str) -> None:
         # Do not assign equal values: the page would rebuild the control.

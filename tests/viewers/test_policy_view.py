@@ -16,7 +16,7 @@ from jetbot_mjx.evaluation.occlusion import occlusion_map
 from jetbot_mjx.runs.checkpoint import Checkpoint, about_policy
 from jetbot_mjx.viewers import player as player_module
 from jetbot_mjx.viewers.player import Player
-from jetbot_mjx.viewers.policy_view import enlarge, overlay_heat
+from jetbot_mjx.viewers.policy_view import overlay_heat, resize_nearest
 
 SEEING = {
     "task": {"observation": "camera"},
@@ -27,15 +27,15 @@ SEEING = {
 
 def test_enlarging_makes_squares_and_grey_becomes_rgb():
     image = np.arange(4 * 6 * 3, dtype=np.uint8).reshape(4, 6, 3)
-    large = enlarge(image, 20)  # 3.3 times as long
+    large = resize_nearest(image, 20)  # 3.3 times as long
     assert large.shape == (12, 18, 3)
     np.testing.assert_array_equal(large[::3, ::3], image)
     for row in range(3):
         for column in range(3):
             np.testing.assert_array_equal(large[row::3, column::3], image)
-    grey = enlarge(image[..., :1], 6)
+    grey = resize_nearest(image[..., :1], 6)
     np.testing.assert_array_equal(grey, np.repeat(image[..., :1], 3, axis=2))
-    assert enlarge(image, 2).shape == image.shape
+    np.testing.assert_array_equal(resize_nearest(image, 3), image[::2, ::2])
 
 
 @pytest.mark.parametrize("channels", [1, 3])
