@@ -9,12 +9,12 @@ STAMP := $(VENV)/.installed
 DOCS_STAMP := $(VENV)/.installed-docs
 SB3_STAMP := $(VENV)/.installed-sb3
 
-.PHONY: setup sb3 train test test-gpu test-slow check format benchmark docs wheel clean
+.PHONY: setup sb3 train test test-gpu test-slow check notebooks format benchmark docs wheel clean
 
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: Python %d.%d is too old: jetbot_mjx needs 3.11 or newer; say make PYTHON=python3.11" % sys.version_info[:2])'
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and "error: jetbot_mjx needs Python 3.11, 3.12 or 3.13, not %d.%d; say make PYTHON=python3.11" % sys.version_info[:2])'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@touch $@
@@ -52,6 +52,10 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+# Runs the notebooks and stores their outputs in them.
+notebooks: setup
+	$(BIN)/jupyter-execute --inplace $(sort $(wildcard notebooks/*.ipynb))
 
 format: setup
 	$(BIN)/ruff format .

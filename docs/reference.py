@@ -138,9 +138,13 @@ def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
     if "enum" in schema:
         return " or ".join(f"`{value}`" for value in schema["enum"])
     match schema["type"]:
+        case "array" if "prefixItems" in schema:
+            # The bounds are those of single items: the meaning says them.
+            return f"list of {len(schema['prefixItems'])} {_kind(schema['prefixItems'][0], ())}s"
         case "array":
             inner = _kind(schema["items"], bounds)
-            return f"list of at least {schema.get('minItems', 0)}; each a {inner}"
+            least = f" of at least {schema['minItems']}" if "minItems" in schema else ""
+            return f"list{least}; each a {inner}"
         case "object":
             return f"keys of your own; each {_kind(schema['additionalProperties'], bounds)}"
         case "null":

@@ -36,17 +36,4 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 # Configurations and runs refer to tasks by these names, independently of the module they are in.
-__getattr__, __dir__ = _load_lazily(
-    __name__,
-    {
-        "GoalTask": "envs.task",
-        "PRETRAINED": "runs.checkpoint",
-        "JetBotEnv": "envs.jetbot_env",
-        "State": "envs.state",
-        "Task": "envs.task",
-        "load_config": "config",
-        "load_policy": "runs.checkpoint",
-        "make_env": "envs.jetbot_env",
-        "wrap_for_training": "envs.wrappers",
-    },
-)
+__getattr__, __dir__ = _load_lazily(__name__)

@@ -8,6 +8,7 @@ import difflib
 import runpy
 import sys
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import NamedTuple
 
 from jetbot_mjx import __version__, cli
@@ -66,7 +67,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     parser = _parser()
     if words and not words[0].startswith("-"):
+        # Only to explain an error: it takes longer than the list of commands.
+        from jetbot_mjx.config import shipped_configs
+
         close = difflib.get_close_matches(words[0], COMMANDS, n=1)
+        if Path(words[0]).stem in shipped_configs():
+            close = [f"train {words[0]}"]
         remedy = f": did you mean {close[0]}?" if close else ""
         parser.error(f"there is no command {words[0]!r}{remedy}")
     parser.parse_args(words)

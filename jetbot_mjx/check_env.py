@@ -36,16 +36,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     name = options.task if ":" in (options.task or "") else f"{_BUILT_IN}:{options.task}"
     config = cli.config_of(options, *([f"task.name={name}"] if options.task else []))
     with exit_on_interrupt():
-        from jetbot_mjx.envs.checks.runner import CHECKS, MEANINGS, check_task
+        from jetbot_mjx.envs.checks.runner import CHECKS, check_task
     cli.prepare_device()
     # Check, and print each result as soon as it is known.
     errors, remaining = 0, list(CHECKS)
     for name, findings in check_task(config):
         errors += len(findings)
         remaining.remove(name)
-        print(f"{'wrong' if findings else 'ok':5}  {name:8}  {MEANINGS[name]}", flush=True)
+        print(f"{'wrong' if findings else 'ok':5}  {name:8}  {CHECKS[name][1]}", flush=True)
         for finding in findings:
-            print(f"{'':7}- {finding.message}", flush=True)
+            print(f"{'':7}- {finding}", flush=True)
     # Summarise.
     if errors and remaining:
         print(f"not checked until that is corrected: {', '.join(remaining)}")

@@ -15,7 +15,7 @@ import io
 import os
 import sys
 import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
@@ -41,16 +41,38 @@ class Parser(argparse.ArgumentParser):
     ) -> argparse.Namespace:
         """Parse all arguments, and suggest an option for one that is unknown."""
         # Before the rest, because the value after an unknown option looks like another argument.
-        for word in sys.argv[1:] if args is None else args:
+        words = list(sys.argv[1:] if args is None else args)
+        options = self._option_string_actions
+        for word in words:
             name = word.partition("=")[0]
-            options = self._option_string_actions
             if name.startswith("--") and not any(one.startswith(name) for one in options):
-                close = difflib.get_close_matches(name, options, n=1)
-                hint = f": did you mean {close[0]}?" if close else ""
-                self.error(f"unrecognized arguments: {name}{hint}")
-        parsed = super().parse_args(args, namespace)
+                self.error(f"unrecognized arguments: {name}{self._remedy(name.strip('-'), name)}")
+        parsed, extra = self.parse_known_args(words, namespace)
         assert parsed is not None
+        if extra:
+            remedy = self._remedy(extra[0].partition("=")[0])
+            half = [one for one in getattr(parsed, "overrides", []) if "=" not in one]
+            if half:
+                remedy = f": did you mean --set {half[-1]}={extra[0]}?"
+            self.error(f"unrecognized arguments: {' '.join(extra)}{remedy}")
         return parsed
+
+    def _remedy(self, setting: str, option: str = "") -> str:
+        """Return what was probably meant by an unknown argument, or nothing.
+
+        Args:
+          setting: the argument, if it was meant as a setting such as `num_envs`.
+          option: the argument as an option, such as `--num_envs`; empty if it is none.
+        """
+        close = difflib.get_close_matches(option, self._option_string_actions, n=1, cutoff=0.65)
+        if "--set" in self._option_string_actions:
+            # Only to explain an error: it takes longer than the rest of the parser.
+            from jetbot_mjx.config import ALL_KEYS
+
+            name = setting.replace("-", "_")
+            meant = [key for key in ALL_KEYS if name in (key, key.rpartition(".")[2])]
+            close = [f"--set {key}=..." for key in meant] or close
+        return f": did you mean {close[0]}?" if close else ""
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
@@ -119,16 +141,14 @@ def prepare_device() -> None:
     use_compilation_cache()
 
 
-@contextlib.contextmanager
-def show_progress() -> Iterator[None]:
+def show_progress() -> contextlib.AbstractContextManager[None]:
     """Show the progress inside the context on standard error, where it does not mix with results.
 
     The commands that take more than two seconds use it.
     """
     from jetbot_mjx.runs import progress
 
-    with progress.show_progress(sys.stderr):
-        yield
+    return progress.show_progress(sys.stderr)
 
 
 def require_device() -> None:
@@ -184,10 +204,7 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
     """
 
     def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
+        value = int(_number(text, int))
         if value < least:
             raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
         if value > most:
@@ -200,12 +217,17 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
 positive_int = whole_number(1)
 
 
+def _number(text: str, kind: type[int] | type[float] = float) -> float:
+    try:
+        return kind(text)
+    except ValueError:
+        what = "whole number" if kind is int else "number"
+        raise argparse.ArgumentTypeError(f"{text!r} is no {what}") from None
+
+
 def fraction(text: str) -> float:
     """Parse an argument between 0 and 1."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    value = _number(text)
     if not 0 <= value <= 1:
         raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
     return value
@@ -213,10 +235,7 @@ def fraction(text: str) -> float:
 
 def positive_float(text: str) -> float:
     """Parse an argument above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    value = _number(text)
     if not 0 < value <= _LARGEST:
         raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most {_LARGEST}")
     return value
@@ -224,10 +243,8 @@ def positive_float(text: str) -> float:
 
 def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     """Parse an argument that names a checkpoint of a run."""
-    if text == "best":
-        return "best"
-    if text == "last":
-        return "last"
+    if text == "best" or text == "last":
+        return text
     # Limit the digits, because Python raises an error for integers with too many of them.
     if text.isdecimal() and len(text) < 100:
         return int(text)
@@ -257,14 +274,12 @@ def add_checkpoint_arguments(
         "a run folder or one checkpoint folder of it; or latest, the name of a folder in runs/, or"
         " pretrained:NAME"
     )
+    nargs = None
     if several:
-        what += "; several are compared"
-        parser.add_argument("run", nargs="+", type=run_path, metavar="RUN", help=what)
+        nargs, what = "+", f"{what}; several are compared"
     elif default is not None:
-        what += f" (default: {default})"
-        parser.add_argument("run", nargs="?", type=run_path, metavar="RUN", help=what)
-    else:
-        parser.add_argument("run", type=run_path, metavar="RUN", help=what)
+        nargs, what = "?", f"{what} (default: {default})"
+    parser.add_argument("run", nargs=nargs, type=run_path, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,

@@ -32,11 +32,15 @@ from pydantic_core import ErrorDetails, PydanticCustomError
 from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
-from jetbot_mjx.errors import InvalidError
+from jetbot_mjx.errors import InvalidError, NotFoundError
 
 
 class ConfigError(InvalidError):
     """Raised when a configuration is invalid; states the key, the value and the remedy."""
+
+
+class ConfigNotFoundError(ConfigError, NotFoundError):
+    """Raised when there is no such file; callers may also catch a `FileNotFoundError`."""
 
 
 def _integral(value: object) -> object:
@@ -189,6 +193,11 @@ class CameraConfig(_Section):
             raise ValueError(
                 f"distortion has {len(self.distortion)} coefficients: lens = {self.lens} takes at"
                 f" most {most}"
+            )
+        if self.calibration_size is not None and self.matrix is None:
+            raise ValueError(
+                f"calibration_size = {list(self.calibration_size)} is that of a matrix, and there"
+                " is none: give both, or only fovy"
             )
         values = [*self.position, *self.distortion, *(self.matrix or ())]
         if not all(map(math.isfinite, values)):
@@ -500,31 +509,20 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _trainer_can(self) -> Self:
-        if self.trainer == "brax":
-            if self.ppo.learning_rate_schedule == "LINEAR":
+        linear = self.ppo.learning_rate_schedule == "LINEAR"
+        physical = self.ppo.normalizer == "physical"
+        for is_set, setting, other_remedy in (
+            (linear, "ppo.learning_rate_schedule = 'LINEAR'", ", or NONE or ADAPTIVE_KL"),
+            (physical, "ppo.normalizer = 'physical'", ", or ppo.normalizer = 'brax'"),
+            (self.task.sees, f"task.observation = {self.task.observation!r}", ""),
+            (self.deterministic, "deterministic = true", ""),
+            (self.init_from is not None, "init_from", ""),
+            (self.seeds > 1, f"seeds = {self.seeds}", ""),
+        ):
+            if is_set and self.trainer == "brax":
                 raise ValueError(
-                    "ppo.learning_rate_schedule = 'LINEAR' is not known to trainer = 'brax':"
-                    " take trainer = 'resumable', or NONE or ADAPTIVE_KL"
-                )
-            if self.ppo.normalizer == "physical":
-                raise ValueError(
-                    "ppo.normalizer = 'physical' is not known to trainer = 'brax':"
-                    " take trainer = 'resumable', or ppo.normalizer = 'brax'"
-                )
-            if self.task.sees:
-                raise ValueError(
-                    f"task.observation = {self.task.observation!r} is not known to trainer ="
-                    " 'brax': take 'resumable'"
-                )
-            if self.deterministic:
-                raise ValueError(
-                    "deterministic = true is not known to trainer = 'brax': take 'resumable'"
-                )
-            if self.init_from is not None:
-                raise ValueError("init_from is not known to trainer = 'brax': take 'resumable'")
-            if self.seeds > 1:
-                raise ValueError(
-                    f"seeds = {self.seeds} is not known to trainer = 'brax': take 'resumable'"
+                    f"{setting} is not known to trainer = 'brax': take trainer = 'resumable'"
+                    f"{other_remedy}"
                 )
         return self
 
@@ -569,7 +567,7 @@ class Config(_Section):
           ConfigError: it differs in settings other than `CHANGEABLE_ON_RESUME`.
         """
         now, then = changed.flat(), self.flat()
-        for key in then.keys() | now.keys():
+        for key in {**then, **now}:
             if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME:
                 raise ConfigError(
                     f"{key} = {now.get(key)!r} is not what the run began with,"
@@ -656,7 +654,7 @@ def find_config(name: str | Path) -> Path:
       The path, which need not exist if it names a folder.
 
     Raises:
-      ConfigError: a plain name is neither a file nor a configuration of the package.
+      ConfigNotFoundError: a plain name is neither a file nor a configuration of the package.
     """
     path = Path(name)
     # A reader of the documentation may name `configs/gpu.yaml` in another folder.
@@ -667,7 +665,7 @@ def find_config(name: str | Path) -> Path:
         return found
     close = difflib.get_close_matches(path.stem, shipped, n=1)
     hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"
-    raise ConfigError(f"config {name} does not exist: {hint}")
+    raise ConfigNotFoundError(f"config {name} does not exist: {hint}")
 
 
 def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Config:
@@ -712,8 +710,12 @@ def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
         raise ConfigError(f"{source}: {_explain(error.errors()[0])}") from None
 
 
-def read_yaml(path: Path) -> dict[str, Any]:
+def read_yaml(path: Path, what: str = "config") -> dict[str, Any]:
     """Read a YAML file of settings; an empty file gives an empty dictionary.
+
+    Args:
+      path: the file.
+      what: the argument that names the file, for error messages.
 
     Raises:
       ConfigError: the file cannot be read, or does not hold `key: value` lines.
@@ -721,16 +723,34 @@ def read_yaml(path: Path) -> dict[str, Any]:
     try:
         text = path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"config {path} does not exist: give the path of a YAML file") from None
+        message = f"{what} {path} does not exist: give the path of a YAML file"
+        raise ConfigNotFoundError(message) from None
     except (OSError, UnicodeDecodeError) as error:
+        if path.is_dir():
+            raise ConfigError(f"{what} {path} is a folder: {_of_folder(path, what)}") from None
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
-        raise ConfigError(f"config {path} cannot be read: {reason}") from None
-    values = _parse_yaml(text, f"config {path}")
+        raise ConfigError(f"{what} {path} cannot be read: {reason}") from None
+    values = _parse_yaml(text, f"{what} {path}")
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise ConfigError(f"config {path} holds {values!r}: write `key: value` lines")
+        raise ConfigError(f"{what} {path} holds {values!r}: write `key: value` lines")
     return values
+
+
+def _of_folder(path: Path, what: str) -> str:
+    """Return the remedy for a folder in the place of a file."""
+    is_run = what == "config" and (path / "config.yaml").is_file()
+    return f"to continue that run, give --resume {path}" if is_run else "give a YAML file"
+
+
+_YAML_PROBLEMS = {
+    r"found character '\t' that cannot start any token": "a tab: indent by spaces",
+    "expected <block end>, but found '<block mapping start>'": (
+        "it is indented neither as the line above it nor as the section it belongs to"
+    ),
+}
+"""What is meant by messages that speak of a parser's inner life."""
 
 
 def _parse_yaml(text: str, source: str) -> object:
@@ -740,7 +760,8 @@ def _parse_yaml(text: str, source: str) -> object:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}" if mark else ""
-        raise ConfigError(f"{source}{place} is not valid YAML: {problem}") from None
+        reason = _YAML_PROBLEMS.get(problem, problem)
+        raise ConfigError(f"{source}{place} is not valid YAML: {reason}") from None
     # Errors that ruamel.yaml does not convert: `!!int x`, `!!bool x`, endless integers or nesting.
     except (ValueError, LookupError, RecursionError) as error:
         raise ConfigError(f"{source} is not valid YAML: {error}") from None
@@ -783,22 +804,39 @@ def _explain(error: ErrorDetails) -> str:
         case "too_short":
             return f"{key} = {value!r} is wrong: it should have at least 1 item"
         case "extra_forbidden":
-            known = _known_keys(location[:-1])
-            close = difflib.get_close_matches(location[-1], known, n=1)
-            # A key may also be that of another section, such as learning_rate without `ppo.`.
-            elsewhere = [name for name in _ALL_KEYS if name.rpartition(".")[2] == location[-1]]
-            hint = f"known are {', '.join(known)}"
-            if elsewhere or close:
-                hint = f"did you mean {(elsewhere or close)[0]}?"
-            return f"{key} = {value!r} is unknown: {hint}"
+            return f"{key} = {value!r} is unknown: {_likely_key(location)}"
         case "value_error":
             prefix = f"{key}: " if key else ""
             return prefix + str(error["ctx"]["error"]) if "ctx" in error else error["msg"]
         case "model_type" | "model_attributes_type":
-            return f"{key} = {value!r} is not a section: write its keys below it"
+            return f"{key} = {value!r} is not a section: write its keys below it, indented"
         case _:
             wanted = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-            return f"{key} = {value!r} is wrong: it should be {wanted}"
+            return f"{key} = {value!r} is wrong: it should be {_KINDS.get(wanted, wanted)}"
+
+
+_KINDS = {
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+    "string": "text",
+    "dictionary": "a dictionary",
+}
+"""Pydantic's names of types, in words."""
+
+
+def _likely_key(location: Sequence[str]) -> str:
+    """Return a remedy for an unknown key: the one that was probably meant, or all there are."""
+    *sections, key = location
+    # YAML nests what `--set` writes with dots.
+    if not sections and key in ALL_KEYS:
+        section, _, last = key.rpartition(".")
+        return f"write `{last}` below `{section}:`, indented"
+    # A key may be that of another section, such as learning_rate without `ppo.`.
+    elsewhere = [name for name in ALL_KEYS if name.rpartition(".")[2] == key]
+    known = _known_keys(sections)
+    likely = elsewhere or difflib.get_close_matches(key, known, n=1)
+    return f"did you mean {likely[0]}?" if likely else f"known are {', '.join(known)}"
 
 
 def _known_keys(location: Sequence[str]) -> list[str]:
@@ -811,5 +849,5 @@ def _known_keys(location: Sequence[str]) -> list[str]:
     return list(model.model_fields)
 
 
-_ALL_KEYS = tuple(Config().flat())
+ALL_KEYS = tuple(Config().flat())
 """Every setting with its section, such as `ppo.learning_rate`."""

@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 1 if a success rate is below `--min-success`.
     """
     with exit_on_interrupt():
-        from jetbot_mjx.evaluation import evaluate_runs, terminal_summary
+        from jetbot_mjx.evaluation import evaluate_runs, tables
         from jetbot_mjx.evaluation.evaluator import MOST_GOALS, REPORT_GOALS
         from jetbot_mjx.runs.run_dir import seed_folders
     options = _parser(REPORT_GOALS, MOST_GOALS, evaluate_runs.SIMULATORS).parse_args(arguments)
@@ -77,15 +77,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "ranges": options.ranges,
         "simulator": options.simulator,
     }
-    if len(options.run) > 1 or seed_folders(Path(options.run[0])):
-        with cli.show_progress():
+    with cli.show_progress():
+        if len(options.run) > 1 or seed_folders(Path(options.run[0])):
             result = evaluate_runs.compare_runs(options.run, **settings)
-        print(terminal_summary.summarize_comparison(result))
-    else:
-        with cli.show_progress():
+            text = tables.summarize_comparison(result)
+        else:
             result = evaluate_runs.evaluate_run(options.run[0], **settings)
-        print(terminal_summary.summarize_report(result))
-    below = terminal_summary.below_target(result, options.min_success)
+            text = tables.summarize_report(result)
+    print(text)
+    below = tables.below_target(result, options.min_success)
     print("".join(f"{line}\n" for line in below), end="")
     return BELOW_TARGET if below else 0
 

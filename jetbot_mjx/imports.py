@@ -8,7 +8,9 @@ needs no OpenGL, so that a command must be able to import MuJoCo even if the bac
 `MUJOCO_GL` names is unavailable.
 """
 
+import ast
 import contextlib
+import functools
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -16,29 +18,37 @@ import io
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 _Around = Callable[[], contextlib.AbstractContextManager[None]]
 
 
-def load_lazily(
-    package: str, homes: Mapping[str, str]
-) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
+def load_lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
     """Return a package's `__getattr__` and `__dir__`, which import public names at their first use.
+
+    The public names are those that the package's file imports for type checkers alone, in its block
+    `if TYPE_CHECKING`.
 
     Args:
       package: its full name.
-      homes: the module of the package that each public name lives in.
     """
 
+    @functools.cache
+    def homes() -> dict[str, str]:
+        tree = ast.parse(Path(str(sys.modules[package].__file__)).read_text(encoding="utf-8"))
+        (block,) = (node for node in tree.body if isinstance(node, ast.If))
+        imports = (node for node in block.body if isinstance(node, ast.ImportFrom))
+        return {alias.name: str(node.module) for node in imports for alias in node.names}
+
     def find(name: str) -> Any:
-        if name not in homes:
+        if name not in homes():
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
         with without_warp_lines():
-            module = importlib.import_module(f"{package}.{homes[name]}")
+            module = importlib.import_module(homes()[name])
         return getattr(module, name)
 
-    return find, lambda: sorted(homes)
+    return find, lambda: sorted(homes())
 
 
 class LazyModule(types.ModuleType):
@@ -56,15 +66,6 @@ class _Trimesh(LazyModule):
     @staticmethod
     def Trimesh(*arguments: Any, **options: Any) -> Any:
         return importlib.import_module("trimesh").Trimesh(*arguments, **options)
-
-
-class _Comet(types.ModuleType):
-    """A placeholder for the logging service of tensorboardX's own writer, which is not used."""
-
-    CometLogger = None
-
-    def __init__(self) -> None:
-        super().__init__("tensorboardX.comet_utils")
 
 
 @contextlib.contextmanager
@@ -89,39 +90,23 @@ def standing_in(name: str, module: types.ModuleType | None) -> Iterator[None]:
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """An import finder that runs a context manager around the execution of some modules."""
-
-    def __init__(self, around: Mapping[str, _Around]) -> None:
-        self._around = around
+    """An import finder that runs the context managers of `_AROUND` around modules' execution."""
 
     def find_spec(
         self, fullname: str, path: Sequence[str] | None, target: types.ModuleType | None = None
     ) -> importlib.machinery.ModuleSpec | None:
-        if fullname not in self._around:
+        if fullname not in _AROUND:
             return None
         spec = importlib.machinery.PathFinder.find_spec(fullname, path, target)
         if spec is not None and spec.loader is not None:
-            spec.loader = _Loader(spec.loader, self._around[fullname])
+            around, execute = _AROUND[fullname], spec.loader.exec_module
+
+            def exec_module(module: types.ModuleType) -> None:
+                with around():
+                    execute(module)
+
+            spec.loader.exec_module = exec_module
         return spec
-
-
-class _Loader(importlib.abc.Loader):
-    """A loader that runs a context manager around another loader's execution of a module."""
-
-    def __init__(self, loader: importlib.abc.Loader, around: _Around) -> None:
-        self._loader = loader
-        self._do_around = around
-
-    def create_module(self, spec: importlib.machinery.ModuleSpec) -> types.ModuleType | None:
-        return self._loader.create_module(spec)
-
-    def exec_module(self, module: types.ModuleType) -> None:
-        with self._do_around():
-            self._loader.exec_module(module)
-
-    def __getattr__(self, name: str) -> Any:
-        # Forward everything else, such as requests for the source of the module.
-        return getattr(self._loader, name)
 
 
 @contextlib.contextmanager
@@ -154,12 +139,15 @@ def _opengl() -> Iterator[None]:
         yield
 
 
+_COMET = types.ModuleType("tensorboardX.comet_utils")
+_COMET.CometLogger = None  # pyright: ignore[reportAttributeAccessIssue]
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
     "mujoco.rendering.classic.gl_context": _opengl,
-    "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _Comet()),
+    # Stand in for a logging service of tensorboardX's own writer, which is not used.
+    "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _COMET),
 }
 """Context managers by the name of the module that they surround."""
 
@@ -171,4 +159,4 @@ def install_lazy_imports() -> None:
     libraries in its own way.
     """
     if not any(isinstance(finder, _Finder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, _Finder(_AROUND))
+        sys.meta_path.insert(0, _Finder())

@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jetbot_mjx import cli
-from jetbot_mjx.errors import UserError
 from jetbot_mjx.interrupts import exit_on_interrupt
 
 if TYPE_CHECKING:
@@ -21,7 +20,7 @@ if TYPE_CHECKING:
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx train", description=__doc__)
-    source = parser.add_mutually_exclusive_group(required=True)
+    source = parser.add_mutually_exclusive_group()
     cli.add_config_arguments(parser, source)
     source.add_argument(
         "--resume", type=cli.run_path, metavar="RUN", help="continue the run in this folder"
@@ -43,11 +42,10 @@ def _parser() -> cli.Parser:
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with exit_on_interrupt():
-        from jetbot_mjx.runs.run_dir import CONFIG, default_run_dir, stored_config
+        from jetbot_mjx.runs.find_run import find_run_config
+        from jetbot_mjx.runs.run_dir import default_run_dir
     if options.resume:
-        if stored_config(options.resume) is None:
-            raise UserError(f"--resume {options.resume}: there is no run in this folder")
-        options.config = options.resume / CONFIG
+        options.config = find_run_config(options.resume)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
     config = cli.config_of(options, *overrides)
@@ -64,8 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 75 if the training was asked to stop and can be resumed.
     """
     options = (parser := _parser()).parse_args(arguments)
-    if options.resume and options.run_dir:
-        parser.error("--run-dir: --resume names the folder already")
+    if options.resume and (options.run_dir or options.init_from):
+        name = "--run-dir" if options.run_dir else "--init-from"
+        parser.error(f"{name}: --resume continues that run, in its folder")
+    if not (options.resume or options.config):
+        parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
     config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
     with exit_on_interrupt():
@@ -82,7 +83,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
     programs.prefetch("advance", "init")
     with exit_on_interrupt():
         from jetbot_mjx.training import session
-    # Train.
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
         print(

@@ -98,7 +98,8 @@ class AdapterBase:
             assert self._renderer is not None
             self._renderer.show(self._poses()[0])
 
-    def _close(self) -> None:
+    def close(self) -> None:
         """Close the renderer."""
         if self._renderer is not None:
             self._renderer.close()
+        super().close()  # pyright: ignore[reportAttributeAccessIssue]

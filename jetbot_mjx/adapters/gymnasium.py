@@ -125,10 +125,6 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         """
         return self._frames()[0] if self.render_mode == "rgb_array" else None
 
-    def close(self) -> None:
-        """Close the renderer."""
-        self._close()
-
     def _poses(self) -> list[Pose]:
         now = self._steps * self.config.physics.ctrl_dt
         return [Pose(self.robot.data.qpos, self.robot.goal, now)]

@@ -112,10 +112,6 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         self._show()
         return steps.obs, steps.reward, done, infos
 
-    def close(self) -> None:
-        """Close the renderer."""
-        self._close()
-
     def get_images(self) -> Sequence[UInt8[np.ndarray, "height width 3"]]:
         """Return an image of every robot.
 
@@ -190,7 +186,6 @@ class JetBotVecEnv(AdapterBase, VecEnv):
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
         """Return False for every environment: wrappers such as `VecMonitor` hold the batch."""
-        del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
     def _shared(self, name: str) -> Any:

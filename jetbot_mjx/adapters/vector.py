@@ -131,10 +131,5 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
         """
         return tuple(self._frames()) if self.render_mode == "rgb_array" else None
 
-    def close_extras(self, **kwargs: Any) -> None:
-        """Close the renderer."""
-        del kwargs
-        self._close()
-
     def _poses(self) -> list[Pose]:
         return self.batch.poses()

@@ -9,11 +9,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.agents.networks import make_policy as make_policy
     from jetbot_mjx.agents.ppo import PPO as PPO
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {
-        "PPO": "ppo",
-        "make_networks": "networks",
-        "make_policy": "networks",
-    },
-)
+__getattr__, __dir__ = load_lazily(__name__)

@@ -28,6 +28,7 @@ from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt8
 
 from jetbot_mjx.config import NetworkConfig
+from jetbot_mjx.errors import InvalidError
 
 Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of the parts of an observation, by name."""
@@ -42,6 +43,14 @@ class _Layers(NamedTuple):
     convolutions: tuple[tuple[int, int, int], ...]
     """Channels, side of the kernel and stride of each convolution [pixels]."""
     features: int
+
+    @property
+    def smallest(self) -> int:
+        """Return the side of the smallest image [pixels], which leaves one row of outputs."""
+        size = 1
+        for _, side, stride in reversed(self.convolutions):
+            size = (size - 1) * stride + side
+        return size
 
 
 _CNNS = {
@@ -89,8 +98,12 @@ def make_vision_networks(
 
     Returns:
       The networks.
+
+    Raises:
+      InvalidError: the images are too small for the convolutions.
     """
     layers = _CNNS[config.cnn]
+    _check_size(config.cnn, shapes)
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
     images = [name for name in sorted(shapes) if is_image(name)]
     numbers = {name: shape for name, shape in shapes.items() if not is_image(name)}
@@ -148,6 +161,37 @@ def make_vision_networks(
         heads=heads,
         encode=encode,
     )
+
+
+def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
+    """Return the memory of what the encoders compute from one observation [bytes].
+
+    Args:
+      config: the layers, and whether policy and value function share them.
+      shapes: the shapes of the observation's parts.
+    """
+    layers = _CNNS[config.cnn]
+    images = [shape for name, shape in shapes.items() if is_image(name)]
+    height, width, _ = images[0]
+    channels = sum(shape[2] for shape in images)
+    count = layers.features
+    for c_out, side, stride in layers.convolutions:
+        height, width = ((size - side) // stride + 1 for size in (height, width))
+        count += height * width * (side * side * channels + c_out)
+        channels = c_out
+    encoders = 1 if config.shared_cnn else 2
+    return encoders * count * jnp.dtype(_dtype(config.cnn_dtype)).itemsize
+
+
+def _check_size(cnn: str, shapes: Shapes) -> None:
+    """Raise an error if an image is too small for convolutions."""
+    for height, width, _ in (shape for name, shape in shapes.items() if is_image(name)):
+        if min(height, width) < _CNNS[cnn].smallest:
+            sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in _CNNS.items())
+            raise InvalidError(
+                f"camera.width = {width} and camera.height = {height} are too small for"
+                f" ppo.network.cnn = {cnn!r}: make both at least that of the network ({sizes})"
+            )
 
 
 def _joined(images: Mapping[str, UInt8[Array, "*batch h w c"]]) -> UInt8[Array, "*batch h w c"]:

@@ -17,6 +17,7 @@ items:
   %item = phi i32 [%thread, %entry], [%next, %$end]
   %wide.item = zext i32 %item to i64
   %place = add i64 %before, %wide.item
+  %first.byte = mul i64 %place, $results
   $columns
   $item
   $stores

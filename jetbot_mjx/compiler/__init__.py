@@ -13,4 +13,4 @@ from jetbot_mjx.imports import load_lazily
 if TYPE_CHECKING:
     from jetbot_mjx.compiler.program_cache import ProgramCache as ProgramCache
 
-__getattr__, __dir__ = load_lazily(__name__, {"ProgramCache": "program_cache"})
+__getattr__, __dir__ = load_lazily(__name__)

@@ -81,14 +81,14 @@ def map_kernel_text(
 ) -> str:
     """Write the LLVM module whose function XLA calls for a kernel with a table.
 
-    The function takes float32 arrays of shape (robots, ...) and the table, and returns arrays of
-    shape (robots, items).
+    The function takes float32 arrays of shape (robots, ...) and the table, and returns the bytes of
+    all robots, of shape (robots, items x results).
 
     Args:
       function: the text of the function from `llvm_codegen.map_text`.
       sizes: the number of scalars per robot in each argument.
       items: the number of items of a robot.
-      results: the number of results.
+      results: the number of bytes of an item.
       name: the name of the function, a C identifier.
       machine: the processor, one of `MACHINES`.
 
@@ -96,19 +96,19 @@ def map_kernel_text(
       The text of an LLVM module.
     """
     # The address of a robot's row is that of its array, plus the row; all share the table.
-    rows = [*sizes, 0, *[items] * results]
+    rows = [*(4 * size for size in sizes), 0, items * results]
     block = {
         "addresses": "\n  ".join(
             f"{_address(i)}\n"
             f"  %row{i} = mul i64 %index, {size}\n"
-            f"  %p{i} = getelementptr float, ptr %a{i}, i64 %row{i}"
+            f"  %p{i} = getelementptr i8, ptr %a{i}, i64 %row{i}"
             for i, size in enumerate(rows)
         ),
         "pointers": ", ".join(f"ptr %p{i}" for i in range(len(rows))),
         "step": STEP,
     }
     text = function + _template("xla_map.ll").substitute(block)
-    return _call(text, len(sizes) + 1, results, name=name, machine=machine, robots=1)
+    return _call(text, len(sizes) + 1, 1, name=name, machine=machine, robots=1)
 
 
 def _template(file: str) -> Template:

@@ -151,10 +151,7 @@ def _pad(equation: Any, params: Any, x: ScalarArray, padding: ScalarArray) -> Sc
 
 
 def _iota(equation: Any, params: Any) -> ScalarArray:
-    shape, axis = params["shape"], params["dimension"]
-    counts = np.arange(shape[axis]).astype(params["dtype"])
-    counts = counts.reshape([-1 if i == axis else 1 for i in range(len(shape))])
-    return constant_array(np.broadcast_to(counts, shape))
+    return constant_array(np.indices(params["shape"], params["dtype"])[params["dimension"]])
 
 
 def _empty(equation: Any, params: Any) -> ScalarArray:

@@ -1,13 +1,14 @@
-"""Run a step of one robot as one kernel for all robots, or a function of every item of a robot.
+"""Run a step of one robot as one kernel for all robots, or a function of every pixel of a robot.
 
 Motivation: `jax.vmap` and XLA compile MJX's step to hundreds of kernels, and every value that
 passes from one kernel to the next goes through memory. Lowered to scalars (`lower_jaxpr`), the
 same step is one kernel that reads a robot's state, runs all physics steps of an environment step,
 and writes the state back.
 
-An image is the other case: a function of what a robot's camera shares and of a pixel. With
-`Kernel.table` the program runs once for every column of a table, for every robot, and what depends
-on the robot only is computed once per robot (CPU) or thread (GPU).
+An image is the other case: a function of what the pixels of a robot's camera share, and of what
+differs between them. With `Kernel.table` the program runs once for every column of a table, an
+item, for every robot. What depends on the robot only is computed once per robot (CPU) or thread
+(GPU), and the results are bytes.
 
 Protocol: JAX sees the kernel as a primitive.
 
@@ -23,7 +24,6 @@ Protocol: JAX sees the kernel as a primitive.
 
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import math
 import threading
@@ -37,7 +37,7 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import ad, batching, mlir
-from jaxtyping import Array, Float, PyTree
+from jaxtyping import Array, Float, PyTree, UInt8
 
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
 from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
@@ -57,7 +57,8 @@ class Kernel:
 
     program: ScalarProgram
     """The function. A step's results have the shapes of its first `carried` arguments; with a
-    table, its last argument is a column of it, and its results are scalars."""
+    table, its last argument is a column of it, and its results are scalars from 0 to 255, which
+    are rounded down to bytes."""
     carried: int
     """Number of argument leaves that are carried from step to step."""
     steps: int
@@ -92,26 +93,23 @@ class Kernel:
         """Return the shapes of the results of one robot."""
         if self.table is None:
             return self.argument_shapes[: self.carried]
-        return [(self.table.shape[1],)] * len(self.program.outputs)
+        return [(self.table.shape[1] * len(self.program.outputs),)]
+
+    @property
+    def result_dtype(self) -> Any:
+        """Return the dtype of the results."""
+        return np.dtype(np.float32 if self.table is None else np.uint8)
 
 
 class Backend(Protocol):
     """A `Backend` compiles and launches kernels for one platform."""
 
-    @property
-    def IMPL(self) -> str:
-        """Return the back end's name in `physics.impl`."""
-        ...
-
-    @property
-    def PLATFORM(self) -> str:
-        """Return the JAX platform that the back end serves."""
-        ...
-
-    @property
-    def NEEDS(self) -> str:
-        """Return one line that names the hardware and packages that the back end needs."""
-        ...
+    IMPL: str
+    """The back end's name in `physics.impl`."""
+    PLATFORM: str
+    """The JAX platform that the back end serves."""
+    NEEDS: str
+    """One line that names the hardware and packages that the back end needs."""
 
     def is_available(self) -> bool:
         """Return whether JAX has the platform and every requirement of the back end is met."""
@@ -148,7 +146,7 @@ def as_step(kernel: Kernel) -> Step:
     return step
 
 
-def as_map(kernel: Kernel) -> Callable[[PyTree], list[Array]]:
+def as_map(kernel: Kernel) -> Callable[[PyTree], UInt8[Array, " bytes"]]:
     """Return a kernel with a table as a JAX function of one robot, which `jax.vmap` can batch.
 
     Args:
@@ -156,9 +154,9 @@ def as_map(kernel: Kernel) -> Callable[[PyTree], list[Array]]:
 
     Returns:
       A function of a pytree, whose leaves are the kernel's arguments and must be float32. It
-      returns an array with an entry for every item, for each result. It cannot be differentiated.
+      returns the bytes of all items, one after the other. It cannot be differentiated.
     """
-    return lambda shared: _kernel_p.bind(*jax.tree.leaves(shared), kernel=kernel)
+    return lambda shared: _kernel_p.bind(*jax.tree.leaves(shared), kernel=kernel)[0]
 
 
 _kernel_p = Primitive("robot_kernel")
@@ -188,7 +186,7 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
 @_kernel_p.def_abstract_eval
 def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
     batch = _batch_shape(kernel, leaves)
-    return [ShapedArray((*batch, *shape), np.float32) for shape in kernel.result_shapes]
+    return [ShapedArray((*batch, *shape), kernel.result_dtype) for shape in kernel.result_shapes]
 
 
 @_kernel_p.def_impl
@@ -198,9 +196,7 @@ def _run(*leaves: Any, kernel: Kernel) -> list[Array]:
         return _compiled(*leaves, kernel=kernel)
 
 
-@functools.partial(jax.jit, static_argnames="kernel")
-def _compiled(*leaves: Array, kernel: Kernel) -> list[Array]:
-    return _kernel_p.bind(*leaves, kernel=kernel)
+_compiled = jax.jit(_kernel_p.bind, static_argnames="kernel")
 
 
 def _batch(
@@ -305,15 +301,10 @@ def cached_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     if not cache or not jax.config.values["jax_enable_compilation_cache"]:
         return make()
     path = Path(cache) / f"{kind}-{hashlib.sha256(key).hexdigest()}"
-    digest, _, content = (read_trusted(path) or b"").partition(b"\n")
-    if digest == _digest(content):
-        return content
-    content = make()
-    # A folder that cannot be written only costs time: the content is made again next time.
-    with contextlib.suppress(OSError):
-        write_private(path, _digest(content) + b"\n" + content)
+    content = read_trusted(path)
+    if content is None:
+        content = make()
+        # A folder that cannot be written only costs time: the content is made again next time.
+        with contextlib.suppress(OSError):
+            write_private(path, content)
     return content
-
-
-def _digest(content: bytes) -> bytes:
-    return hashlib.sha256(content).hexdigest().encode()

@@ -22,9 +22,9 @@ from jaxtyping import Array
 from jetbot_mjx.compiler import ffi_wrapper, llvm_codegen
 from jetbot_mjx.compiler.kernel import Kernel, cached_bytes, runs_correctly
 
-IMPL = "llvm"
-PLATFORM = "cpu"
-NEEDS = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
+IMPL: str = "llvm"
+PLATFORM: str = "cpu"
+NEEDS: str = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
 
 _NAME = "physics"
 _LEVEL = 2
@@ -33,16 +33,10 @@ _LEVEL = 2
 _XLA_NAME = re.compile(r"jetbot_mjx_[0-9a-f]{64}")
 
 
-class _Loaded(NamedTuple):
-    """A `_Loaded` holds machine code that XLA may call until the process ends."""
-
-    engine: Any
-    code: bytes
-
-
 _lock = threading.Lock()
-_loaded: dict[str, _Loaded] = {}
-"""Loaded kernels by the name under which XLA calls them."""
+_loaded: dict[str, tuple[Any, bytes]] = {}
+"""The engine and machine code of loaded kernels, by the name under which XLA calls them. XLA may
+call them until the process ends."""
 
 
 class _Host(NamedTuple):
@@ -110,7 +104,8 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     text = kernel.text(IMPL, lambda: kernel_text(kernel))
     robots = leaves[0].shape[0]
-    shapes = [jax.ShapeDtypeStruct((robots, *x), jnp.float32) for x in kernel.result_shapes]
+    dtype = kernel.result_dtype
+    shapes = [jax.ShapeDtypeStruct((robots, *x), dtype) for x in kernel.result_shapes]
     table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
     return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves, *table))
 
@@ -129,7 +124,7 @@ def _register(name: str, code: bytes) -> None:
     engine = _load(code)
     address = ctypes.c_void_p(engine.get_function_address(_NAME))
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
-    _loaded[name] = _Loaded(engine, code)
+    _loaded[name] = engine, code
 
 
 def kernels_in(lowered: str) -> dict[str, bytes]:
@@ -141,7 +136,7 @@ def kernels_in(lowered: str) -> dict[str, bytes]:
     Returns:
       Their machine code, by the names under which XLA calls them.
     """
-    return {name: _loaded[name].code for name in sorted(set(_XLA_NAME.findall(lowered)))}
+    return {name: _loaded[name][1] for name in sorted(set(_XLA_NAME.findall(lowered)))}
 
 
 def register(kernels: Mapping[str, bytes]) -> None:

@@ -73,8 +73,8 @@ def map_text(program: ScalarProgram, *, lanes: int, items: int) -> str:
     """Write an LLVM function that runs a program for every item of a robot.
 
     The parameters of the function are the addresses of a robot's arguments, one after the other, of
-    the table with a row of `items` values for each scalar of the program's last argument, and of
-    the results, a row of `items` values each. All are float32.
+    the table with a row of `items` values for each scalar of the program's last argument, all
+    float32, and of the results, bytes of one item after the other.
 
     Args:
       program: the function of (arguments of a robot ..., a column of the table), with scalar
@@ -105,12 +105,12 @@ def map_text(program: ScalarProgram, *, lanes: int, items: int) -> str:
         emitter.add(f"{column}.at = getelementptr float, ptr %table, i64 {j * items}")
         emitter.add(f"{column}.of = getelementptr float, ptr {column}.at, i64 %item")
         emitter.add(f"{column} = load {vector}, ptr {column}.of, align 4")
-    for i, result in enumerate(emitter.finish(rest)):
-        address = emitter.do(f"getelementptr float, ptr %out{i}, i64 %item")
-        emitter.add(f"store {vector} {result}, ptr {address}, align 4")
+    kind, interleaved = emitter.interleave(emitter.finish(rest))
+    place = emitter.do(f"mul i64 %item, {len(program.outputs)}")
+    address = emitter.do(f"getelementptr i8, ptr %out, i64 {place}")
+    emitter.add(f"store {kind} {interleaved}, ptr {address}, align 1")
     parameters = [f"ptr noalias %in{i}" for i in range(len(shared))]
-    parameters += ["ptr noalias %table"]
-    parameters += [f"ptr noalias %out{i}" for i in range(len(program.outputs))]
+    parameters += ["ptr noalias %table", "ptr noalias %out"]
     return "\n".join(
         [
             *emitter.declarations(),
@@ -223,6 +223,41 @@ class LlvmEmitter:
         first = self.do(f"insertelement {vector} poison, float {name}, i64 0")
         mask = f"<{self._lanes} x i32> zeroinitializer"
         return self.do(f"shufflevector {vector} {first}, {vector} poison, {mask}")
+
+    def interleave(self, names: Sequence[str]) -> tuple[str, str]:
+        """Convert vectors of floats from 0 to 255 to bytes, those of a lane one after the other.
+
+        Args:
+          names: the names of the vectors.
+
+        Returns:
+          LLVM's type and the name of the vector of all bytes.
+        """
+        lanes, vector = self._lanes, self.type("f")
+
+        def shuffle(size: int, one: str, other: str, places: Sequence[int | None]) -> str:
+            mask = ", ".join("i32 poison" if i is None else f"i32 {i}" for i in places)
+            kind = f"<{size} x i8>"
+            return self.do(
+                f"shufflevector {kind} {one}, {kind} {other}, <{len(places)} x i32> <{mask}>"
+            )
+
+        joined = ""
+        for i, name in enumerate(names):
+            part = self.do(f"fptoui {vector} {name} to <{lanes} x i8>")
+            if i == 0:
+                joined = part
+                continue
+            size = i * lanes
+            # Both operands of a shuffle have one length.
+            padding = [None] * (size - lanes)
+            part = shuffle(lanes, part, "poison", [*range(lanes), *padding])
+            joined = shuffle(size, joined, part, range(size + lanes))
+        count = len(names)
+        if count > 1:
+            places = [i * lanes + lane for lane in range(lanes) for i in range(count)]
+            joined = shuffle(count * lanes, joined, "poison", places)
+        return f"<{count * lanes} x i8>", joined
 
     def declarations(self) -> list[str]:
         """Return the declarations of the LLVM intrinsics that programs call."""

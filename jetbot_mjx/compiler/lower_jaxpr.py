@@ -161,22 +161,17 @@ class _JaxprLowering:
         rows = zip(*(array.ravel() for array in arrays), strict=True)
         return scalar_array((self._graph.apply(op, *row) for row in rows), arrays[0].shape)
 
-    def _where(self, condition: Scalar, if_false: ScalarArray, if_true: ScalarArray) -> ScalarArray:
-        """Select one of two arrays by one condition for all elements."""
-        pairs = zip(if_false.ravel(), if_true.ravel(), strict=True)
-        return scalar_array((self._graph.select(condition, a, b) for a, b in pairs), if_false.shape)
-
-    def _where_rows(
-        self, condition: ScalarArray, if_false: ScalarArray, if_true: ScalarArray
+    def _where(
+        self, condition: Scalar | ScalarArray, if_false: ScalarArray, if_true: ScalarArray
     ) -> ScalarArray:
-        """Select between two arrays by one condition for each index of the leading axes."""
-        condition = condition.reshape(*condition.shape, *[1] * (if_false.ndim - condition.ndim))
-        rows = zip(
-            np.broadcast_to(condition, if_false.shape).ravel(),
-            if_false.ravel(),
-            if_true.ravel(),
-            strict=True,
+        """Select between two arrays by one condition, or one for each index of leading axes."""
+        if not isinstance(condition, np.ndarray):
+            condition = scalar_array([condition], ())
+        trailing = [1] * (if_false.ndim - condition.ndim)
+        arrays = np.broadcast_arrays(
+            condition.reshape((*condition.shape, *trailing)), if_false, if_true
         )
+        rows = zip(*(array.ravel() for array in arrays), strict=True)
         return scalar_array((self._graph.select(*row) for row in rows), if_false.shape)
 
     # Rules of primitives that call functions: jit, scan, while, cond.
@@ -262,7 +257,7 @@ class _JaxprLowering:
             rows = row_conditions(state)
             updated = self.lower(params["body_jaxpr"], [*body_consts, *state])
             pairs = zip(state, updated, strict=True)
-            return [self._where_rows(rows, *pair) for pair in pairs] if rows.ndim else updated
+            return [self._where(rows, *pair) for pair in pairs] if rows.ndim else updated
 
         state = list(operands[second:])
         with contextlib.suppress(UnsupportedError):
@@ -444,20 +439,15 @@ class _JaxprLowering:
     def _select_n(
         self, equation: Any, params: Any, which: ScalarArray, *cases: ScalarArray
     ) -> ScalarArray:
-        shape = cases[0].shape
-        which = np.broadcast_to(which, shape)
         result = cases[-1]
         for i in reversed(range(len(cases) - 1)):
-            later = [self._is_later(index, i) for index in which.ravel()]
-            rows = zip(later, cases[i].ravel(), result.ravel(), strict=True)
-            result = scalar_array((self._graph.select(*row) for row in rows), shape)
+            # The index of a case is a bool or an integer.
+            later = [
+                x if x.dtype == bool else self._graph.apply("gt", x, x.dtype.type(i))
+                for x in which.ravel()
+            ]
+            result = self._where(scalar_array(later, which.shape), cases[i], result)
         return result
-
-    def _is_later(self, which: Scalar, case: int) -> Scalar:
-        """Return whether a branch index, bool or integer, selects a later case."""
-        if which.dtype == bool:
-            return which
-        return self._graph.apply("gt", which, which.dtype.type(case))
 
     def _clamp(
         self, equation: Any, params: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray

@@ -27,7 +27,6 @@ from jetbot_mjx.compiler.xla_options import Options
 
 _UNUSED_DAYS = 30
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
-_DIGEST_BYTES = hashlib.sha256().digest_size
 
 
 class ProgramCache:
@@ -162,20 +161,16 @@ class _CacheHits:
         jax.monitoring.unregister_event_listener(self._listen)
 
     def _listen(self, event: str, **kwargs: str | int) -> None:
-        del kwargs
         self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
 
 
 def _load(path: Path) -> jax.stages.Compiled | None:
-    """Load the program in a file; return None if it is missing, not trusted or cannot be loaded."""
+    """Load the program in a file; return None if it is missing, damaged, untrusted or unusable."""
     began = time.perf_counter()
     content = read_trusted(path)
     if content is None:
         return None
-    digest, body = content[:_DIGEST_BYTES], content[_DIGEST_BYTES:]
-    if hashlib.sha256(body).digest() != digest:
-        return None
-    seconds, kernels, ids, serialized = pickle.loads(body)
+    seconds, kernels, ids, serialized = pickle.loads(content)
     llvm_backend.register(kernels)
     devices = {device.id: device for device in jax.devices()}
     try:
@@ -214,9 +209,9 @@ def _save(
     except (NotImplementedError, ValueError):
         # Devices of this kind cannot serialize programs.
         return
-    body = pickle.dumps((seconds, kernels, ids, serialized))
+    content = pickle.dumps((seconds, kernels, ids, serialized))
     with contextlib.suppress(OSError):
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
                 other.unlink(missing_ok=True)
-        write_private(path, hashlib.sha256(body).digest() + body)
+        write_private(path, content)

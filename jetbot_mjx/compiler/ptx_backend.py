@@ -23,9 +23,9 @@ from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 
-IMPL = "ptx"
-PLATFORM = "cuda"
-NEEDS = "an NVIDIA GPU, llvmlite (pip install llvmlite) and an XLA that launches PTX"
+IMPL: str = "ptx"
+PLATFORM: str = "cuda"
+NEEDS: str = "an NVIDIA GPU, llvmlite (pip install llvmlite) and an XLA that launches PTX"
 
 _MAX_THREADS = 256
 """Largest number of robots in a block: with 255 registers each, it fills a multiprocessor."""
@@ -78,7 +78,8 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
         threads, blocks = _ITEM_THREADS, robots
     architecture = _architecture()
     text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
-    results = [jax.ShapeDtypeStruct((robots, *x), jnp.float32) for x in kernel.result_shapes]
+    dtype = kernel.result_dtype
+    results = [jax.ShapeDtypeStruct((robots, *x), dtype) for x in kernel.result_shapes]
     call = jax.ffi.ffi_call(_TARGET, results)
     return list(
         call(
@@ -178,9 +179,10 @@ def map_kernel_text(program: ScalarProgram, *, items: int) -> str:
     """Write a kernel with a table as LLVM IR.
 
     Its parameters are the addresses of all arguments, float32 arrays of shape (robots, ...), of the
-    table, of shape (scalars of the program's last argument, items), and of all results, of shape
-    (robots, items). A block of threads computes one robot: each thread loads what the items share,
-    computes what follows from it, and goes through the items in strides of a block.
+    table, of shape (scalars of the program's last argument, items), and of the results, bytes of
+    shape (robots, items x results). A block of threads computes one robot: each thread loads what
+    the items share, computes what follows from it, and goes through the items in strides of a
+    block.
 
     Args:
       program: the function of (arguments of a robot ..., a column of the table), with scalar
@@ -205,11 +207,12 @@ def map_kernel_text(program: ScalarProgram, *, items: int) -> str:
         for j, column in enumerate(columns)
     ]
     stores = [
-        f"%out{i}.at = getelementptr float, ptr addrspace(1) %a{table + 1 + i}, i64 %place\n"
-        f"  store float {result}, ptr addrspace(1) %out{i}.at"
+        f"%byte{i} = fptoui float {result} to i8\n"
+        f"  %out{i} = add i64 %first.byte, {i}\n"
+        f"  %out{i}.at = getelementptr i8, ptr addrspace(1) %a{table + 1}, i64 %out{i}\n"
+        f"  store i8 %byte{i}, ptr addrspace(1) %out{i}.at"
         for i, result in enumerate(results)
     ]
-    arrays = len(sizes) + 1 + len(results)
     values = {
         "columns": "\n  ".join(loads),
         "declarations": "\n".join(emitter.declarations()),
@@ -220,7 +223,8 @@ def map_kernel_text(program: ScalarProgram, *, items: int) -> str:
         "loads": "\n  ".join(_transfers(sizes, "load")),
         "max_threads": _ITEM_THREADS,
         "name": _NAME,
-        "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(arrays)),
+        "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(table + 2)),
+        "results": len(results),
         "stores": "\n  ".join(stores),
         "threads": _ITEM_THREADS,
     }

@@ -2,9 +2,11 @@
 
 A cached program is machine code, and the cache folder may be shared with other users. As ssh does
 with its keys, a file is trusted if it and its folder belong to this user or to root and nobody else
-may write to either. On a system without file owners, such as Windows, every file is trusted.
+may write to either. On a system without file owners, such as Windows, every file is trusted. Each
+file begins with the digest of its content, by which a damaged one is recognised.
 """
 
+import hashlib
 import os
 import stat
 import sys
@@ -12,6 +14,7 @@ import tempfile
 import threading
 from pathlib import Path
 
+_DIGEST_BYTES = hashlib.sha256().digest_size
 _lock = threading.Lock()
 _warned: set[Path] = set()
 """Folders that the user has been warned about."""
@@ -21,11 +24,11 @@ def read_trusted(path: Path) -> bytes | None:
     """Return the content of a file that nobody but this user and root can have written.
 
     Args:
-      path: the file.
+      path: a file that `write_private` wrote.
 
     Returns:
-      The content; None if the file does not exist or is not trusted. A file that is not trusted
-      costs one line on stderr, once per folder.
+      The content; None if the file does not exist, is damaged or is not trusted. A file that is not
+      trusted costs one line on stderr, once per folder.
     """
     try:
         reason = distrust(path.parent, path.parent.stat())
@@ -33,7 +36,8 @@ def read_trusted(path: Path) -> bytes | None:
             with path.open("rb") as file:
                 reason = distrust(path, os.fstat(file.fileno()))
                 if reason is None:
-                    return file.read()
+                    digest, content = file.read(_DIGEST_BYTES), file.read()
+                    return content if digest == hashlib.sha256(content).digest() else None
     except OSError:
         return None
     tell_once(path.parent, reason)
@@ -45,7 +49,7 @@ def write_private(path: Path, content: bytes) -> None:
 
     Args:
       path: the file. Nothing is written if its folder is not trusted, as it would not be read.
-      content: the whole content of the file.
+      content: the whole content that `read_trusted` returns.
 
     Raises:
       OSError: the folder does not exist, or the file cannot be written.
@@ -55,7 +59,7 @@ def write_private(path: Path, content: bytes) -> None:
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         written = Path(folder) / path.name
         with open(os.open(written, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
-            file.write(content)
+            file.write(hashlib.sha256(content).digest() + content)
         written.replace(path)
 
 

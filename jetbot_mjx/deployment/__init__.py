@@ -8,6 +8,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.deployment.drive_comparison import compare_drive as compare_drive
     from jetbot_mjx.deployment.policy_export import export_policy as export_policy
 
-__getattr__, __dir__ = load_lazily(
-    __name__, {"compare_drive": "drive_comparison", "export_policy": "policy_export"}
-)
+__getattr__, __dir__ = load_lazily(__name__)

@@ -1,8 +1,6 @@
 """Export one policy: write its files, and check each of them against JAX."""
 
-import contextlib
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -21,7 +19,7 @@ from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
 from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import write_json, writing_to
+from jetbot_mjx.runs.run_dir import atomic_folder, write_json, writing_to
 
 FOLDER = "policy"
 """Name of the folder of an export in the run folder."""
@@ -71,7 +69,10 @@ def export_policy(
     env = checkpoint.make_env()
     policy = portable_policy(checkpoint)
     source = Source(policy, as_jax(checkpoint, env))
-    with _atomic_folder(folder) as unfinished:
+    with writing_to(folder):
+        if folder.exists() and not (folder / FILE).is_file():
+            raise UserError(f"{folder} is there and no export: give --out a folder that is not")
+    with atomic_folder(folder) as unfinished:
         recording = record(checkpoint, env)
         # Write each format and check its output against JAX.
         differences = {}
@@ -102,27 +103,6 @@ def _write_spec(
     }
     spec["recording"] = {"file": RECORDING, "observations": len(recording.obs)}
     write_json(folder / FILE, spec)
-
-
-@contextlib.contextmanager
-def _atomic_folder(folder: Path) -> Iterator[Path]:
-    """Yield a temporary folder, and rename it to `folder` when it is complete."""
-    unfinished = folder.with_name(f".{folder.name}.unfinished")
-    earlier = folder.with_name(f".{folder.name}.earlier")
-    with writing_to(folder):
-        if folder.exists() and not (folder / FILE).is_file():
-            raise UserError(f"{folder} is there and no export: give --out a folder that is not")
-        for leftover in (unfinished, earlier):
-            shutil.rmtree(leftover, ignore_errors=True)
-        unfinished.mkdir(parents=True)
-        try:
-            yield unfinished
-            if folder.exists():
-                folder.rename(earlier)
-            unfinished.rename(folder)
-        finally:
-            for leftover in (unfinished, earlier):
-                shutil.rmtree(leftover, ignore_errors=True)
 
 
 def summarize_export(exported: ExportedPolicy) -> str:

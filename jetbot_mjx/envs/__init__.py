@@ -20,17 +20,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.envs.task_template import write_task_template as write_task_template
     from jetbot_mjx.envs.wrappers import wrap_for_training as wrap_for_training
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {
-        "GoalTask": "task",
-        "JetBotEnv": "jetbot_env",
-        "RobotState": "task",
-        "State": "state",
-        "Task": "task",
-        "DomainRandomizationWrapper": "domain_randomization",
-        "make_env": "jetbot_env",
-        "wrap_for_training": "wrappers",
-        "write_task_template": "task_template",
-    },
-)
+__getattr__, __dir__ = load_lazily(__name__)

@@ -99,6 +99,8 @@ class JetBotEnv(brax.envs.Env):
             # The model of a built-in task is built later, when a program is compiled.
             if type(self.task).build_scene is not GoalTask.build_scene:
                 _ = self.physics.model
+        except UserError:
+            raise
         except (RuntimeError, ValueError) as error:
             reason = " ".join(str(error).split())
             if isinstance(error, NotImplementedError):

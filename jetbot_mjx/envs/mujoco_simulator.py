@@ -17,7 +17,7 @@ import jax
 import mujoco
 import mujoco.rollout
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.envs import mjx
@@ -232,7 +232,8 @@ class MujocoPhysics(Physics):
         inputs = np.concatenate([np.asarray(ctrl).reshape(count, -1), mocap], axis=1)
         own = {name: np.asarray(x).reshape(count, -1) for name, x in changed.items()}
         # Step the finite robots.
-        finite = _is_finite(states, inputs, *own.values())
+        numbers = np.concatenate([states, inputs, *own.values()], axis=1)
+        finite = np.isfinite(numbers).all(axis=1)
         after = np.full(states.shape, np.nan, np.float32)
         if finite.any():
             models = self._model_cache.models({name: x[finite] for name, x in own.items()})
@@ -302,10 +303,6 @@ class _ModelCache:
         # Recompute the constants that MuJoCo derives from masses and positions.
         mujoco.mj_setConst(model, self._data)
         return model
-
-
-def _is_finite(*columns: Float[np.ndarray, "n _"]) -> Bool[np.ndarray, " n"]:
-    return np.asarray(np.isfinite(np.concatenate(columns, axis=1)).all(axis=1))
 
 
 def _cores() -> int:

@@ -5,8 +5,10 @@ built as `Class(task_config)` and named in YAML as `package.module:Class`. No me
 axis: batch with `jax.vmap`. Frames: `_w` world, `_b` body (x forward, y left, z up).
 """
 
+import difflib
 import importlib
 import math
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
@@ -17,7 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
 from jetbot_mjx.config import TaskConfig
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
 
 Goal = PyTree
 """Arrays in any pytree that a task draws for an episode; `GoalTask` draws a position [m], world
@@ -332,7 +334,9 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     found: Any = task_class or _import_class(config.name)
     _check_members(config.name, found, METHODS)
     if found is Task:
-        raise UserError(f"task.name = {config.name!r} is the contract, not a task: derive from it")
+        raise InvalidError(
+            f"task.name = {config.name!r} is the contract, not a task: derive from it"
+        )
     task = found(config)
     _check_members(config.name, task, ("layout",))
     return task
@@ -342,17 +346,30 @@ def _import_class(name: str) -> Any:
     """Import what a name `package.module:Class` stands for, which may be no class."""
     module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
-        raise UserError(f"task.name = {name!r} is wrong: write package.module:Class")
+        # Python itself separates a class from its module by a dot.
+        likely = ":".join(module_name.rpartition(".")[::2])
+        hint = f", perhaps {likely}" if not separator and likely[0] not in ".:" else ""
+        raise InvalidError(f"task.name = {name!r} is wrong: write package.module:Class{hint}")
+    if module_name.endswith(".py"):
+        likely = f"{module_name.removesuffix('.py').replace(os.sep, '.')}:{class_name}"
+        raise InvalidError(f"task.name = {name!r} names a file: write the module, {likely}")
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
-        raise UserError(
+        raise MissingPackageError(
             f"task.name = {name!r}: no module named {error.name!r} can be imported;"
             " install it, or name its folder in PYTHONPATH"
         ) from None
+    except SyntaxError as error:
+        raise InvalidError(
+            f"task.name = {name!r}: {error.filename}, line {error.lineno}, is no Python:"
+            f" {error.msg}"
+        ) from None
     task_class: Any = getattr(module, class_name, None)
     if task_class is None:
-        raise UserError(f"task.name = {name!r}: {module_name} has no {class_name!r}")
+        close = difflib.get_close_matches(class_name, dir(module), n=1)
+        hint = f": did you mean {close[0]!r}?" if close else ""
+        raise InvalidError(f"task.name = {name!r}: {module_name} has no {class_name!r}{hint}")
     return task_class
 
 
@@ -360,7 +377,7 @@ def _check_members(name: str, task: object, members: Sequence[str]) -> None:
     """Raise an error if a task or its class lacks members of the interface."""
     missing = [member for member in members if not hasattr(task, member)]
     if missing:
-        raise UserError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
+        raise InvalidError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
 
 
 METHODS = (

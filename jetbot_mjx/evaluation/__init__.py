@@ -13,15 +13,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.evaluation.html_report import write_comparison as write_comparison
     from jetbot_mjx.evaluation.html_report import write_report as write_report
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {
-        "Evaluator": "evaluator",
-        "report_keys": "evaluator",
-        "write_comparison": "html_report",
-        "write_report": "html_report",
-        "compare_runs": "evaluate_runs",
-        "evaluate_in_mujoco": "evaluate_runs",
-        "evaluate_run": "evaluate_runs",
-    },
-)
+__getattr__, __dir__ = load_lazily(__name__)

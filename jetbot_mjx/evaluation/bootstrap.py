@@ -25,11 +25,6 @@ class Estimate(NamedTuple):
     high: float | None = None
 
 
-def mean(values: Float[np.ndarray, "*n"], axis: int = -1) -> Float[np.ndarray, "*m"]:
-    """Return the mean along an axis."""
-    return np.mean(values, axis=axis)
-
-
 def mean_difference(
     a: Float[np.ndarray, "*n"], b: Float[np.ndarray, "*m"], axis: int = -1
 ) -> Float[np.ndarray, "*k"]:
@@ -71,7 +66,6 @@ def probability_of_improvement(
 
     Source: Agarwal et al., NeurIPS 34 (2021), section 4, arXiv:2108.13264.
     """
-    del axis
     x, y = np.asarray(a)[..., :, None], np.asarray(b)[..., None, :]
     return np.mean((x > y) + 0.5 * (x == y), axis=(-2, -1))
 
@@ -108,7 +102,7 @@ def mean_band(
     Returns:
       The lower and the upper ends.
     """
-    low, high = _interval(mean, [values], 0)
+    low, high = _interval(np.mean, [values], 0)
     return low, high
 
 

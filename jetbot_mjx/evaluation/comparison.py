@@ -22,7 +22,6 @@ from jetbot_mjx.evaluation.bootstrap import (
     Estimate,
     bootstrap,
     interquartile_mean,
-    mean,
     mean_band,
     mean_difference,
     median_estimate,
@@ -245,7 +244,7 @@ def _of_one_seed(report: Report) -> tuple[Aggregate, Aggregate]:
 
 def _over_seeds(values: Sequence[float]) -> Aggregate:
     return Aggregate(
-        "seeds", len(values), bootstrap(mean, values), bootstrap(interquartile_mean, values)
+        "seeds", len(values), bootstrap(np.mean, values), bootstrap(interquartile_mean, values)
     )
 
 

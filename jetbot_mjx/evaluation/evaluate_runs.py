@@ -1,6 +1,5 @@
 """Evaluate the policies of runs on fixed goals, write their reports, and compare the runs."""
 
-import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, get_args
@@ -18,7 +17,6 @@ from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compa
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, Summary, report_keys, summarize
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
 from jetbot_mjx.evaluation.report import (
-    CurvePoint,
     Report,
     by_goal,
     compare_with_best_known,
@@ -26,11 +24,11 @@ from jetbot_mjx.evaluation.report import (
     learning_curve,
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
-from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, sweep
+from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, Sweeper
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.runs.metrics import read_history
+from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import seed_folders, versions
+from jetbot_mjx.runs.run_dir import check_writable, seed_folders, shortened, versions
 
 Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
@@ -71,17 +69,8 @@ def evaluate_run(
       UserError: there is no usable checkpoint, or the folder cannot be written.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    options = _Options(
-        episodes,
-        robustness=robustness,
-        in_mujoco=robustness or simulator is not None,
-        ranges_file=_RangesFile.read(ranges),
-    )
-    if output is not None:
-        target = _Target(Path(output))
-    else:
-        target = _Target(report_folder(*options.describe_report(checkpoint)))
-    return next(_write_reports([(checkpoint, target)], options))
+    options = _Options(episodes, robustness, simulator, _read_ranges(ranges), ranges)
+    return next(_write_reports([checkpoint], options, None if output is None else Path(output)))
 
 
 def evaluate_in_mujoco(
@@ -108,13 +97,8 @@ def evaluate_in_mujoco(
       UserError: there is no usable checkpoint, or JAX was told to do without a CPU.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    ranges_file = _RangesFile.read(ranges)
-    evaluator = MujocoEvaluator(
-        checkpoint.make_env(),
-        checkpoint.networks,
-        ranges_file.ranges if ranges_file else checkpoint.config.randomization,
-        numerics,
-    )
+    robots = _read_ranges(ranges) or checkpoint.config.randomization
+    evaluator = MujocoEvaluator(checkpoint.make_env(), checkpoint.networks, robots, numerics)
     return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
@@ -151,56 +135,41 @@ def compare_runs(
     """
     # Load all policies and check that they can be compared.
     entries = _load_runs([Path(path) for path in runs], which)
-    check_comparable({name: entry.config for name, entry in entries.items()})
+    check_comparable({name: entry.first.config for name, entry in entries.items()})
     # Evaluate each policy and write its report.
     checkpoints = [one for entry in entries.values() for one in entry.seeds.values()]
-    options = _Options(
-        episodes,
-        robustness=robustness,
-        in_mujoco=robustness or simulator is not None,
-        ranges_file=_RangesFile.read(ranges),
-    )
-    reports = _write_reports([(one, _target(one, options)) for one in checkpoints], options)
+    options = _Options(episodes, robustness, simulator, _read_ranges(ranges), ranges)
+    first = next(iter(entries.values())).folder
+    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
+    folder = first / _FOLDER / name if output is None else Path(output)
+    check_writable(folder)
+    reports = _write_reports(checkpoints, options, again=False)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(checkpoints)) as advance:
         for name, entry in entries.items():
             for seed in entry.seeds:
-                by_run[name][seed] = _without_trajectories(next(reports))
+                report = next(reports)
+                # Drop the trajectories, which are large and already plotted.
+                by_run[name][seed] = report._replace(episodes=report.episodes._replace(qpos=None))
                 advance(1)
     # Compare the reports and write the comparison.
-    first = next(iter(entries.values())).folder
-    name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
-    folder = first / _FOLDER / name if output is None else Path(output)
     comparison = compare(folder.absolute(), by_run)
     with stage("writing the comparison"):
         write_comparison(comparison)
     return comparison
 
 
-def _target(checkpoint: Checkpoint, options: "_Options") -> "_Target":
-    """Return where the report on a policy goes, unless there is one that is at least as full."""
-    wanted = options.describe_report(checkpoint)
-    found = find_report(*wanted)
-    return _Target(found or report_folder(*wanted), write=found is None)
-
-
-class _RangesFile(NamedTuple):
-    """A `_RangesFile` holds the ranges of `--ranges`, which replace those of every run."""
-
-    path: Path
-    ranges: RandomizationConfig
-
-    @classmethod
-    def read(cls, path: str | Path | None) -> "_RangesFile | None":
-        if path is None:
-            return None
-        ranges = load_config(path).randomization
-        if not ranges.drawn:
-            raise UserError(
-                f"--ranges {path}: it randomizes nothing; give a configuration with ranges below"
-                " `randomization`, such as configs/real_jetbot.yaml"
-            )
-        return cls(Path(path), ranges)
+def _read_ranges(path: str | Path | None) -> RandomizationConfig | None:
+    """Read the ranges of `--ranges`, which replace those of every run."""
+    if path is None:
+        return None
+    ranges = load_config(path).randomization
+    if not ranges.drawn:
+        raise UserError(
+            f"--ranges {path}: it randomizes nothing; give a configuration with ranges below"
+            " `randomization`, such as configs/real_jetbot.yaml"
+        )
+    return ranges
 
 
 class _Options(NamedTuple):
@@ -208,29 +177,10 @@ class _Options(NamedTuple):
 
     episodes: int
     robustness: bool
-    in_mujoco: bool
-    ranges_file: _RangesFile | None
-
-    def ranges_of(self, config: Config) -> RandomizationConfig:
-        """Return the ranges of `--ranges`, or those of the run."""
-        return self.ranges_file.ranges if self.ranges_file else config.randomization
-
-    def describe_report(self, checkpoint: Checkpoint) -> tuple[Path, str, int, frozenset[str]]:
-        """Return the arguments of `report_folder` for the report of a policy."""
-        parts = {
-            "robustness": self.robustness,
-            "mujoco": self.in_mujoco,
-            "randomized": bool(self.ranges_of(checkpoint.config).drawn),
-        }
-        has = frozenset(name for name, wanted in parts.items() if wanted)
-        return checkpoint.results_dir / _FOLDER, checkpoint.path.name, self.episodes, has
-
-
-class _Target(NamedTuple):
-    """A `_Target` holds the folder of a report, and whether the report is to be written there."""
-
-    folder: Path
-    write: bool = True
+    simulator: Simulator | None
+    ranges: RandomizationConfig | None
+    """The ranges of `--ranges`; None: those of each run."""
+    ranges_file: str | Path | None
 
 
 class RunEntry(NamedTuple):
@@ -240,9 +190,9 @@ class RunEntry(NamedTuple):
     seeds: Mapping[str, Checkpoint]
 
     @property
-    def config(self) -> Config:
-        """Return the configuration of the first seed."""
-        return next(iter(self.seeds.values())).config
+    def first(self) -> Checkpoint:
+        """Return the policy of the first seed."""
+        return next(iter(self.seeds.values()))
 
 
 def _load_runs(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
@@ -256,7 +206,7 @@ def _load_runs(paths: Sequence[Path], which: Which) -> dict[str, RunEntry]:
             place = checkpoint.path.resolve()
             if place in owners:
                 raise UserError(
-                    f"{path} and {owners[place]} are the same policy, {_relative(checkpoint.path)}:"
+                    f"{path} and {owners[place]} are the same policy, {shortened(checkpoint.path)}:"
                     " name each once"
                 )
             owners[place] = path
@@ -276,7 +226,7 @@ def _names(entries: Sequence[RunEntry]) -> list[str]:
     for entry in entries:
         name = "/".join(entry.folder.parts[-length:])
         if folders.count(entry.folder) > 1:
-            name += f" @ {next(iter(entry.seeds.values())).env_steps:,}"
+            name += f" @ {entry.first.env_steps:,}"
         names.append(name)
     return names
 
@@ -334,25 +284,45 @@ def _program_key(config: Config, env: JetBotEnv, ranges: RandomizationConfig) ->
 
 
 def _write_reports(
-    checkpoints: Sequence[tuple[Checkpoint, _Target]], options: _Options
+    checkpoints: Sequence[Checkpoint],
+    options: _Options,
+    output: Path | None = None,
+    *,
+    again: bool = True,
 ) -> Iterator[Report]:
-    """Evaluate policies and write their reports, reusing compiled programs where they fit."""
-    episodes, robustness, in_mujoco, ranges_file = options
+    """Evaluate policies and write their reports, reusing compiled programs where they fit.
+
+    Args:
+      checkpoints: the policies.
+      options: what they are evaluated on.
+      output: the folder of the report; None: the one that `report_folder` chooses.
+      again: whether to write a report also where there is one that is at least as full.
+    """
+    episodes, robustness, simulator, given_ranges, ranges_file = options
+    in_mujoco = robustness or simulator is not None
+    for checkpoint in checkpoints:
+        check_writable(output or checkpoint.results_dir / _FOLDER)
     keys, used_versions = report_keys(episodes), versions()
     # Build all environments first, so that an unsuitable policy is rejected before any writing.
-    envs = [checkpoint.make_env() for checkpoint, _ in checkpoints]
+    envs = [checkpoint.make_env() for checkpoint in checkpoints]
     evaluators = None
-    for (checkpoint, target), env in zip(checkpoints, envs, strict=True):
+    for checkpoint, env in zip(checkpoints, envs, strict=True):
         config, params = checkpoint.config, checkpoint.params
-        ranges = options.ranges_of(config)
+        ranges = given_ranges or config.randomization
+        # Choose the folder of the report.
+        parts = {"robustness": robustness, "mujoco": in_mujoco, "randomized": bool(ranges.drawn)}
+        has = frozenset(name for name, wanted in parts.items() if wanted)
+        wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, episodes, has
+        fuller = None if again else find_report(*wanted)
         if evaluators is None or evaluators.key != _program_key(config, env, ranges):
             evaluators = _Evaluators.build(checkpoint, env, keys, ranges, in_mujoco=in_mujoco)
         # Run the fixed goals, which most parts of the report are computed from.
         finished = jax.device_get(evaluators.nominal.run(params, keys))
         best_known, missing = compare_with_best_known(config, finished)
-        run_dir = _relative(checkpoint.run_dir)
+        run_dir = shortened(checkpoint.run_dir)
+        history = read_history(checkpoint.run_dir / METRICS)
         report = Report(
-            folder=target.folder,
+            folder=output or fuller or report_folder(*wanted),
             run=run_dir,
             checkpoint=checkpoint.path,
             env_steps=checkpoint.env_steps,
@@ -361,45 +331,24 @@ def _write_reports(
             baselines=evaluators.baselines,
             goal_bins=by_goal(finished, env.dt),
             failures=find_failures(finished, run_dir, checkpoint.env_steps),
-            learning_curve=_learning_curve(checkpoint.run_dir),
+            learning_curve=learning_curve((one.env_steps, one.metrics) for one in history),
             episodes=finished,
             versions=used_versions,
             ranges=ranges if ranges.drawn else None,
-            ranges_file=ranges_file.path if ranges_file else None,
+            ranges_file=None if ranges_file is None else Path(ranges_file),
             best_known=best_known,
             best_known_missing=missing,
         )
         # Add the optional evaluations on other robots and in the other simulator.
         if robustness:
-            sweep_keys = report_keys(min(episodes, SWEEP_GOALS))
-            swept = sweep(env, checkpoint.networks, params, sweep_keys)
-            report = report._replace(robustness=swept)
+            sweeper = Sweeper(env, checkpoint.networks, report_keys(min(episodes, SWEEP_GOALS)))
+            report = report._replace(robustness=sweeper.run(params))
         if evaluators.randomized:
             on_others = summarize(evaluators.randomized.run(params, keys), env.dt)
             report = report._replace(randomized=on_others)
         if evaluators.mujoco:
             report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
-        if target.write:
+        if fuller is None:
             with stage("writing the report"):
                 write_report(report)
         yield report
-
-
-def _without_trajectories(report: Report) -> Report:
-    """Return a report without trajectories, which are large and already plotted."""
-    return report._replace(episodes=report.episodes._replace(qpos=None))
-
-
-def _relative(path: Path) -> Path:
-    """Return the path relative to the current folder if it is inside of it."""
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
-
-
-def _learning_curve(run_dir: Path) -> tuple[CurvePoint, ...]:
-    path = run_dir / "metrics.jsonl"
-    try:
-        history = read_history(path, sys.maxsize)
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from None
-    return learning_curve((line.env_steps, line.metrics) for line in history)

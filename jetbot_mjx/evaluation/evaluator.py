@@ -168,7 +168,6 @@ def policy_controller(networks: Networks) -> Controller:
     """
 
     def act(params: PolicyParams, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        del key
         return make_policy(networks, params)(state.obs)
 
     return act
@@ -254,7 +253,6 @@ class Evaluator:
 
 def _random(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        del params, state
         return jax.random.uniform(key, (env.action_size,), minval=-1.0, maxval=1.0)
 
     return act
@@ -264,7 +262,6 @@ def _constant(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     """Return a controller that holds the middle of the action range: half speed straight ahead."""
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        del params, state, key
         return jnp.zeros(env.action_size)
 
     return act
@@ -280,7 +277,6 @@ def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     cone = 0.6  # [rad] heading error within which it drives
 
     def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        del params, key
         robot = robot_state(state.pipeline_state)
         offset_w = env.task.goal_position(state.goal)[:2] - robot.position_w[:2]
         goal_b = kinematics.to_body(kinematics.yaw(robot.quat), offset_w)

@@ -15,22 +15,8 @@ import jinja2
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
+from jetbot_mjx.evaluation import learning_curves, plots
 from jetbot_mjx.evaluation.comparison import Comparison
-from jetbot_mjx.evaluation.learning_curves import (
-    plot_learning_curve,
-    plot_learning_curves,
-    plot_runs,
-)
-from jetbot_mjx.evaluation.plots import (
-    THEMES,
-    plot_by_goal,
-    plot_distributions,
-    plot_robustness,
-    plot_trajectories,
-    shown_trajectories,
-    theme,
-    to_png,
-)
 from jetbot_mjx.evaluation.report import Report, replay_command
 from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, write_text, writing_to
 
@@ -95,17 +81,17 @@ def write_report(report: Report) -> Path:
     """
     # Choose the figures.
     episodes = report.episodes
-    shown = shown_trajectories(episodes)
+    shown = plots.shown_trajectories(episodes)
     successes = sum(bool(episodes.success[index] > 0) for index in shown)
     figures = {
-        "by_goal": lambda: plot_by_goal(report.goal_bins),
-        "trajectories": lambda: plot_trajectories(episodes, which=shown),
-        "distributions": lambda: plot_distributions(report),
+        "by_goal": lambda: plots.plot_by_goal(report.goal_bins),
+        "trajectories": lambda: plots.plot_trajectories(episodes, which=shown),
+        "distributions": lambda: plots.plot_distributions(report),
     }
     if report.learning_curve:
-        figures["learning_curve"] = lambda: plot_learning_curve(report)
+        figures["learning_curve"] = lambda: learning_curves.plot_learning_curve(report)
     if report.robustness:
-        figures["robustness"] = lambda: plot_robustness(report.robustness)
+        figures["robustness"] = lambda: plots.plot_robustness(report.robustness)
     # Write them with the commands that reproduce the report and show its failures.
     goals = [failure.goal for failure in report.failures if failure.replay][:_MAX_REPLAYED]
     return _write(
@@ -136,9 +122,9 @@ def write_comparison(comparison: Comparison) -> Path:
     Raises:
       UserError: the folder cannot be written.
     """
-    figures = {"runs": lambda: plot_runs(comparison)}
+    figures = {"runs": lambda: learning_curves.plot_runs(comparison)}
     if any(run.learning_curve for run in comparison.runs):
-        figures["learning_curves"] = lambda: plot_learning_curves(comparison)
+        figures["learning_curves"] = lambda: learning_curves.plot_learning_curves(comparison)
     links = [
         [os.path.relpath(one.folder / "report", comparison.folder) for one in run.seeds.values()]
         for run in comparison.runs
@@ -181,9 +167,9 @@ def _write(
 def _draw(draw: Callable[[], Figure]) -> list[bytes]:
     """Draw a figure in every theme and return the PNG files."""
     pngs = []
-    for name in THEMES:
-        with theme(name):
-            pngs.append(to_png(draw()))
+    for name in plots.THEMES:
+        with plots.theme(name):
+            pngs.append(plots.to_png(draw()))
     return pngs
 
 

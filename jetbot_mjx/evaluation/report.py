@@ -231,7 +231,6 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
     distance, bearing = goal_positions(episodes)
     edges = _ring_edges(distance)
     ring = np.clip(np.digitize(distance, edges) - 1, 0, len(edges) - 2)
-    width = 360 / SECTORS
     sector = _sectors(bearing)
     won = np.asarray(episodes.success) > 0
     seconds = np.asarray(episodes.steps) * ctrl_dt
@@ -239,9 +238,14 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
     for r in range(len(edges) - 1):
         for s in range(SECTORS):
             here = (ring == r) & (sector == s)
-            limits = (edges[r], edges[r + 1], (s - 0.5) * width, (s + 0.5) * width)
+            limits = (edges[r], edges[r + 1], *_sector_limits(s))
             bins.append(_goal_bin(limits, won[here], seconds[here]))
     return tuple(bins)
+
+
+def _sector_limits(sector: int) -> tuple[float, float]:
+    """Return the lowest and highest bearing of a sector [°]."""
+    return (sector - 0.5) * 360 / SECTORS, (sector + 0.5) * 360 / SECTORS
 
 
 def _sectors(bearing: Float[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
@@ -275,10 +279,7 @@ def compare_with_best_known(
         ours, theirs = float(seconds[here].mean()), float(best[here].mean())
         return TimeGap(low, high, int(here.sum()), ours, theirs, ours / theirs - 1)
 
-    width = 360 / SECTORS
-    by_direction = tuple(
-        gap((s - 0.5) * width, (s + 0.5) * width, won & (sector == s)) for s in range(SECTORS)
-    )
+    by_direction = tuple(gap(*_sector_limits(s), won & (sector == s)) for s in range(SECTORS))
     median, p95 = float(np.median(best)), float(np.percentile(best, 95))
     return BestKnown(median, p95, gap(-180.0, 180.0, won), by_direction), None
 

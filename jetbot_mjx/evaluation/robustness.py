@@ -168,40 +168,14 @@ class Sweeper:
         return dict(zip(self._robots, summaries, strict=True))
 
 
-def sweep(
-    env: JetBotEnv,
-    networks: Networks,
-    params: PolicyParams,
-    keys: UInt32[Array, "n 2"],
-    sweeps: Sequence[Sweep] = SWEEPS,
-) -> tuple[SweepResult, ...]:
-    """Evaluate one policy over all parameters; use `Sweeper` for several policies.
-
-    Args:
-      env: one unwrapped environment with its preset's robot.
-      networks: the networks of the policy.
-      params: parameters of the policy.
-      keys: one reset key for each episode, such as `report_keys(128)`.
-      sweeps: the parameters with their values.
-
-    Returns:
-      One result for each sweep.
-    """
-    return Sweeper(env, networks, keys, sweeps).run(params)
-
-
 class MujocoResult(NamedTuple):
     """A `MujocoResult` holds the metrics of a policy in C MuJoCo, on the goals of the report."""
 
     numerics: Numerics
     policy: Summary
     """Metrics with the preset's robot."""
-    randomized: Summary | None
+    randomized: Summary | None = None
     """Metrics with a robot sampled for each goal; None without ranges to sample from."""
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the numerics and metrics as JSON values."""
-        return json_values(self)
 
 
 class MujocoEvaluator:
@@ -229,12 +203,10 @@ class MujocoEvaluator:
         self._numerics, self._dt = numerics, env.dt
         simulator = in_mujoco(env, numerics)
         programs = ProgramCache(compiler_options(env.config))
-        self._preset = Evaluator(simulator, networks, programs)
-        self._randomized = (
-            Evaluator(DomainRandomizationWrapper(simulator, ranges=ranges), networks, programs)
-            if ranges is not None and ranges.drawn
-            else None
-        )
+        envs: list[JetBotEnv | DomainRandomizationWrapper] = [simulator]
+        if ranges is not None and ranges.drawn:
+            envs.append(DomainRandomizationWrapper(simulator, ranges=ranges))
+        self._evaluators = [Evaluator(one, networks, programs) for one in envs]
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> MujocoResult:
         """Evaluate a policy.
@@ -244,13 +216,8 @@ class MujocoEvaluator:
           keys: one reset key for each episode, such as `report_keys(1024)`.
         """
         with default_device_cpu(), stage("in C MuJoCo"):
-            return MujocoResult(
-                self._numerics,
-                summarize(self._preset.run(params, keys), self._dt),
-                summarize(self._randomized.run(params, keys), self._dt)
-                if self._randomized
-                else None,
-            )
+            found = [summarize(one.run(params, keys), self._dt) for one in self._evaluators]
+        return MujocoResult(self._numerics, *found)
 
 
 def robust_range(result: SweepResult) -> tuple[float, float] | None:

@@ -1,50 +1,102 @@
-"""Format the results of policies and runs as tables for the terminal."""
+"""Format the results of evaluations as tables and lines for the terminal."""
 
 from collections.abc import Mapping
 
 from jetbot_mjx.evaluation.bootstrap import Estimate
 from jetbot_mjx.evaluation.comparison import Comparison
-from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary
 from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.result_names import fuller_report
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, robust_range
+from jetbot_mjx.runs.text_table import text_table
+
+
+def summarize_report(report: Report) -> str:
+    """Return the results of one policy."""
+    text = (
+        f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
+        f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
+        f"{best_known_lines(report)}{robustness_table(report)}"
+        f"report: {report.folder / 'report.html'}"
+    )
+    if fuller := fuller_report(report.folder, report.checkpoint.name):
+        text += f" (the one in {fuller} stays as it is)"
+    if report.policy.nonfinite_envs:
+        text += f"\n{report.policy.nonfinite_envs} episodes ended in a non-finite state"
+    return text
+
+
+def summarize_comparison(comparison: Comparison) -> str:
+    """Return the results of all policies of a comparison, and the differences between its runs."""
+    runs = comparison.runs
+    policies = {
+        seed if len(runs) == 1 else f"{run.name} {seed}" if len(run.seeds) > 1 else run.name: report
+        for run in runs
+        for seed, report in run.seeds.items()
+    }
+    text = (
+        f"{comparison.episodes} fixed goals (set {GOAL_SET_VERSION}), {len(policies)} policies\n"
+        f"{policies_table(policies)}\n\n{runs_table(comparison)}"
+    )
+    if comparison.pairs:
+        text += f"\n\n{pairs_table(comparison)}"
+    return f"{text}\nreport: {comparison.folder / 'comparison.html'}"
+
+
+def below_target(result: Report | Comparison, target: float) -> list[str]:
+    """Return a line for every run whose success rate is below the target.
+
+    Args:
+      result: The report of one policy, or a comparison.
+      target: The smallest accepted success rate, between 0 and 1.
+
+    Returns:
+      The lines. They name the run where there are several.
+    """
+    rates: Mapping[str, float]
+    if isinstance(result, Report):
+        rates = {"": result.policy.success_rate}
+    else:
+        rates = {run.name: run.success_rate.mean.value or 0.0 for run in result.runs}
+    prefix = "{}: " if len(rates) > 1 else ""
+    return [
+        f"{prefix.format(name)}success {rate:.2%} is below the {target:.2%} asked for"
+        for name, rate in rates.items()
+        if rate < target
+    ]
 
 
 def policies_table(policies: Mapping[str, Report]) -> str:
     """Return a table of policies by name, with the baselines below them."""
-    baselines = next(iter(policies.values())).baselines
-    rows: list[tuple[str, Summary]] = []
+    first = next(iter(policies.values()))
+    rows = [("", "success", "95 % interval", "to goal", "p95", "path", "return")]
     for name, report in policies.items():
-        rows.append((name, report.policy))
-        if report.randomized:
-            rows.append((f"{name}, randomised robots", report.randomized))
+        rows += _rows(name, report.policy, report.randomized)
         if report.mujoco:
-            rows.append((f"{name} in C MuJoCo", report.mujoco.policy))
-            if report.mujoco.randomized:
-                randomized = report.mujoco.randomized
-                rows.append((f"{name} in C MuJoCo, randomised robots", randomized))
-    rows += baselines.items()
-    width = max(10, *(len(name) for name, _ in rows))
-    head = (
-        f"{'':{width}}  {'success':>8}  {'95 % interval':>16}  {'to goal':>8}  {'p95':>7}"
-        f"  {'path':>5}  {'return':>7}"
-    )
-    lines = [head, *(_row(name, row, width) for name, row in rows)]
-    if best := next(iter(policies.values())).best_known:
-        lines.append(
-            f"{'best known':{width}}  {'-':>8}  {'-':>16}  {best.time_to_goal_median:6.2f} s"
-            f"  {best.time_to_goal_p95:5.2f} s  {'-':>5}  {'-':>7}"
+            rows += _rows(f"{name} in C MuJoCo", report.mujoco.policy, report.mujoco.randomized)
+    for name, summary in first.baselines.items():
+        rows += _rows(name, summary)
+    if best := first.best_known:
+        times = f"{best.time_to_goal_median:.2f} s", f"{best.time_to_goal_p95:.2f} s"
+        rows.append(("best known", "-", "-", *times, "-", "-"))
+    return text_table(rows)
+
+
+def _rows(name: str, *summaries: Summary | None) -> list[tuple[str, ...]]:
+    """Return a row of metrics, and a second one if there are metrics on randomised robots."""
+    return [
+        (
+            title,
+            f"{one.success_rate:.2%}",
+            f"{one.success_low:.2%} .. {one.success_high:.2%}",
+            _value(one.time_to_goal_median, "{:.2f} s"),
+            _value(one.time_to_goal_p95, "{:.2f} s"),
+            _value(one.path_efficiency, "{:.0%}"),
+            f"{one.episode_return:+.3f}",
         )
-    return "\n".join(lines)
-
-
-def _row(name: str, summary: Summary, width: int) -> str:
-    interval = f"{summary.success_low:.2%} .. {summary.success_high:.2%}"
-    return (
-        f"{name:{width}}  {summary.success_rate:8.2%}  {interval:>16}"
-        f"  {_value(summary.time_to_goal_median, '{:.2f} s'):>8}"
-        f"  {_value(summary.time_to_goal_p95, '{:.2f} s'):>7}"
-        f"  {_value(summary.path_efficiency, '{:.0%}'):>5}  {summary.episode_return:+7.3f}"
-    )
+        for title, one in zip((name, f"{name}, randomised robots"), summaries, strict=False)
+        if one
+    ]
 
 
 def best_known_lines(report: Report) -> str:
@@ -83,19 +135,20 @@ def robustness_table(report: Report) -> str:
 
 def runs_table(comparison: Comparison) -> str:
     """Return a table of the results of each run over its seeds."""
-    width = max(10, *(len(run.name) for run in comparison.runs))
-    lines = [
-        f"{'':{width}}  {'success, mean':>28}  {'interquartile mean':>28}"
-        f"  {'time to goal, mean':>24}  95 % intervals over"
+    rows = [
+        ("", "success, mean", "interquartile mean", "time to goal, mean", "95 % intervals over")
     ]
-    for run in comparison.runs:
-        lines.append(
-            f"{run.name:{width}}  {_estimate(run.success_rate.mean, '{:.2%}'):>28}"
-            f"  {_estimate(run.success_rate.iqm, '{:.2%}'):>28}"
-            f"  {_estimate(run.time_to_goal.mean, '{:.2f} s'):>24}"
-            f"  {run.success_rate.count:,} {run.success_rate.over}"
+    rows += [
+        (
+            run.name,
+            _estimate(run.success_rate.mean, "{:.2%}"),
+            _estimate(run.success_rate.iqm, "{:.2%}"),
+            _estimate(run.time_to_goal.mean, "{:.2f} s"),
+            f"{run.success_rate.count:,} {run.success_rate.over}",
         )
-    return "\n".join(lines)
+        for run in comparison.runs
+    ]
+    return text_table(rows)
 
 
 def pairs_table(comparison: Comparison) -> str:

@@ -11,13 +11,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.runs.nan_replay import replay_nan_dump as replay_nan_dump
     from jetbot_mjx.runs.pretrained_runs import copy_pretrained as copy_pretrained
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {
-        "PRETRAINED": "checkpoint",
-        "load_checkpoint": "checkpoint",
-        "load_policy": "checkpoint",
-        "copy_pretrained": "pretrained_runs",
-        "replay_nan_dump": "nan_replay",
-    },
-)
+__getattr__, __dir__ = load_lazily(__name__)

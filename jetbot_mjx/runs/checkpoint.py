@@ -248,26 +248,23 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
 
 
 def _find(path: Path, which: Which) -> Path:
+    def missing(reason: str) -> CheckpointNotFoundError:
+        return CheckpointNotFoundError(f"no checkpoint at {path}: {reason}")
+
     if not path.is_dir():
-        raise CheckpointNotFoundError(
-            f"no checkpoint at {path}: no such folder; {suggest_run(path)}"
-        )
+        what = "a file" if path.is_file() else "no such folder"
+        raise missing(f"{what}; {suggest_run(path)}")
     # A run folder may contain `policy/` too, which `export` writes.
     if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():
         return path
     if seeds := sorted(path.glob("seed-*")):
-        raise CheckpointError(
-            f"no checkpoint at {path}: it holds several seeds; name one, such as {seeds[0]}"
-        )
+        raise missing(f"it holds several seeds; name one, such as {seeds[0]}")
     if not (path / FOLDER).is_dir() and (runs := list_runs(path)):
         names = ", ".join(run.path.name for run in runs[:8]) + (", ..." if runs[8:] else "")
-        raise CheckpointNotFoundError(
-            f"no checkpoint at {path}: it holds {len(runs)} runs; name one of {names}"
-        )
+        raise missing(f"it holds {len(runs)} runs; name one of {names}")
     if not (path / FOLDER).is_dir():
-        raise CheckpointNotFoundError(
-            f"no checkpoint at {path}: it holds neither {FOLDER}/ nor {POLICY}/;"
-            " give a run folder or a checkpoint in it"
+        raise missing(
+            f"it holds neither {FOLDER}/ nor {POLICY}/; give a run folder or a checkpoint in it"
         )
     steps = checkpoint_steps(path)
     if not steps:

@@ -204,7 +204,6 @@ class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
     def should_preserve(
         self, checkpoints: Sequence[Any], *, context: checkpoint_managers.PreservationContext
     ) -> Sequence[bool]:
-        del context
         success = [self._success.get(one.step, -1.0) for one in checkpoints]
         best = max(range(len(success)), key=lambda index: (success[index], index), default=0)
         first_of_latest = len(checkpoints) - self._latest
@@ -309,9 +308,13 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
     wanted = flatten(template)
     try:
         flat = _read_arrays(path / name, wanted)
+    except _OtherArraysError as error:
+        raise CheckpointError(f"checkpoint {path} cannot be read: {error}") from None
     # TensorStore reports a damaged folder by many kinds of exception.
     except Exception as error:
-        raise CheckpointError(f"checkpoint {path} cannot be read: {_reason(error)}") from None
+        raise CheckpointError(
+            f"checkpoint {path} cannot be read: another one may be intact; {_reason(error)}"
+        ) from None
     if digest(flat) != about[_DIGESTS][name]:
         raise CheckpointError(f"checkpoint {path} is damaged: {name} changed after it was written")
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
@@ -349,6 +352,10 @@ def _digest_json(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
+class _OtherArraysError(Exception):
+    """Raised when a checkpoint holds other arrays than are wanted."""
+
+
 def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Read the arrays that Orbax wrote, one after the other, and raise at the first wrong one.
 
@@ -356,8 +363,9 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
     caller cannot catch.
     """
     if not folder.is_dir():
-        raise ValueError(f"{folder.name} is missing")
-    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder}/"}}
+        raise _OtherArraysError(f"{folder.name} is missing")
+    # TensorStore refuses a path with `..` in it.
+    files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
     keys = [key.decode() for key in ts.KvStore.open(files).result().list().result()]
     names = [key.removesuffix("/.zarray") for key in keys if key.endswith("/.zarray")]
     stored = {}
@@ -369,11 +377,11 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
 
 
 def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raise a `ValueError` if names, shapes or dtypes of the stored arrays are not as wanted."""
+    """Raise an error if names, shapes or dtypes of the stored arrays are not as wanted."""
     for name in sorted(wanted.keys() | stored.keys()):
         ours, theirs = (_describe(arrays.get(name)) for arrays in (wanted, stored))
         if ours != theirs:
-            raise ValueError(f"{name} is {theirs}, and should be {ours}")
+            raise _OtherArraysError(f"{name} is {theirs}, and should be {ours}")
 
 
 def _reason(error: Exception) -> str:

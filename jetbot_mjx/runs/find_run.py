@@ -6,15 +6,15 @@ the package, as `pretrained:NAME`.
 
 import difflib
 import os
-import sys
 import time
 from pathlib import Path
 from typing import NamedTuple
 
-from jetbot_mjx.config import ConfigError, load_config
+from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import NotFoundError, UserError
-from jetbot_mjx.runs.metrics import read_history
-from jetbot_mjx.runs.run_dir import CONFIG
+from jetbot_mjx.runs.metrics import METRICS, read_history
+from jetbot_mjx.runs.run_dir import CONFIG, stored_config
+from jetbot_mjx.runs.text_table import text_table
 
 ROOT = Path("runs")
 """The folder in which trainings create their run folders, relative to the current folder."""
@@ -69,9 +69,22 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
         if not runs:
             raise NotFoundError(f"{_LATEST}: there is no run in {root}/: train one first")
         return runs[0].path
-    if os.sep not in text and os.path.lexists(root / text):
+    if Path(text).name == text and os.path.lexists(root / text):
         return root / text
     return Path(name)
+
+
+def find_run_config(run_dir: Path) -> Path:
+    """Return the file that holds the configuration of the run in a folder.
+
+    Raises:
+      NotFoundError: there is no run in the folder.
+      UserError: the path holds something else, or cannot be read.
+    """
+    if stored_config(run_dir) is None:
+        hint = suggest_run(run_dir)
+        raise NotFoundError(f"--resume {run_dir}: there is no run in this folder; {hint}")
+    return run_dir / CONFIG
 
 
 def list_runs(root: Path = ROOT) -> list[RunInfo]:
@@ -96,11 +109,10 @@ def read_info(run_dir: Path) -> RunInfo | None:
     try:
         config = load_config(run_dir / CONFIG)
         # Of several seeds, show the first.
-        seeds = sorted(run_dir.glob("seed-*/metrics.jsonl"))
-        log = seeds[0] if seeds else run_dir / "metrics.jsonl"
-        history = read_history(log, sys.maxsize)
+        seeds = sorted(run_dir.glob(f"seed-*/{METRICS}"))
+        history = read_history(seeds[0] if seeds else run_dir / METRICS)
         changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
-    except (ConfigError, OSError):
+    except (UserError, OSError):
         return None
     rates = [line.metrics.get("eval/success_rate") for line in history]
     task = config.task
@@ -129,15 +141,10 @@ def runs_table(runs: list[RunInfo]) -> str:
         )
         for run in runs
     ]
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    lines = [
-        f"{row[0]:{widths[0]}}  {row[1]:{widths[1]}}  {row[2]:>{widths[2]}}"
-        f"  {row[3]:>{widths[3]}}  {row[4]:>{widths[4]}}"
-        for row in rows
-    ]
+    table = text_table(rows, left=2)
     if any(run.env_steps < run.num_timesteps for run in runs):
-        lines.append("* stopped before its last step, or reached stop_at_success")
-    return "\n".join(lines)
+        table += "\n* stopped before its last step, or reached stop_at_success"
+    return table
 
 
 def _find_pretrained(name: str) -> Path:
@@ -151,7 +158,10 @@ def _find_pretrained(name: str) -> Path:
 
 def suggest_run(path: Path, root: Path = ROOT) -> str:
     """Return a remedy for a path at which there is no run."""
-    names = [run.path.name for run in list_runs(root)]
+    names = [_LATEST, *(run.path.name for run in list_runs(root))]
+    names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
+    if path.name == _PREFIX[:-1]:
+        return f"write {_PREFIX}NAME, as in {names[-1]}"
     if close := difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {close[0]}?"
     return "give a run folder or a checkpoint in it"

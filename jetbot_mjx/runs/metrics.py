@@ -23,7 +23,7 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   time/evaluation_seconds   time spent on this evaluation, with its compilation
   time/recording_seconds    time spent on logging, saving and rendering after the last evaluation
   time/compile_seconds      time spent on tracing and compiling in this interval
-  time/wall_seconds         time since training began, in all processes that worked on the run
+  time/wall_seconds         time of all processes that worked on the run, from their start
 """
 
 import contextlib
@@ -40,6 +40,7 @@ import jax
 from PIL import Image
 
 from jetbot_mjx.config import Config
+from jetbot_mjx.errors import UserError
 from jetbot_mjx.imports import standing_in
 from jetbot_mjx.runs.run_dir import write_text
 from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
@@ -50,6 +51,9 @@ with standing_in("torch", None):
     from tensorboardX import summary as tensorboard_summary
     from tensorboardX.event_file_writer import EventsWriter
     from tensorboardX.proto import event_pb2, summary_pb2
+
+METRICS = "metrics.jsonl"
+"""Name of the file of metrics in a run folder."""
 
 EVALUATION_VIDEO = "evaluation.mp4"
 """Name of an evaluation's video, in `videos/<env_steps>/` of the run folder."""
@@ -129,7 +133,7 @@ class History(NamedTuple):
     metrics: MetricValues
 
 
-def read_history(path: Path, last: int) -> list[History]:
+def read_history(path: Path, last: float = math.inf) -> list[History]:
     """Read the metrics that an earlier training wrote.
 
     Args:
@@ -138,11 +142,16 @@ def read_history(path: Path, last: int) -> list[History]:
 
     Returns:
       The lines up to that step, without those that are incomplete.
+
+    Raises:
+      UserError: the file cannot be read.
     """
-    if not path.is_file():
-        return []
+    try:
+        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+    except OSError as error:
+        raise UserError(f"{path} cannot be read: {error.strerror}") from None
     found = []
-    for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
+    for line in text.splitlines():
         with contextlib.suppress(ValueError, LookupError, TypeError, AttributeError):
             values = json.loads(line)
             env_steps, timestamp = values.pop("env_steps"), values.pop("timestamp")
@@ -331,7 +340,6 @@ class CompileClock:
         jax.monitoring.register_event_listener(self._count)
 
     def _listen(self, event: str, duration_secs: float, **kwargs: str | int) -> None:
-        del kwargs
         end = time.perf_counter()
         with self._lock:
             if event in self._EVENTS:
@@ -341,7 +349,6 @@ class CompileClock:
                 self.saved_seconds += duration_secs
 
     def _count(self, event: str, **kwargs: str | int) -> None:
-        del kwargs
         with self._lock:
             self.cached += event == self._CACHE_HIT
 
@@ -368,13 +375,26 @@ class CompileClock:
 
 
 _IMPORTED = time.perf_counter()
+_origin = 0.0
+"""Time of the process at which `process_seconds` is 0 [s]."""
 
 
 def process_seconds() -> float:
-    """Return the time since this process started [s].
+    """Return the time since this process started [s]: the clock of all times that are shown.
 
-    If the system does not provide it, return the time since this module was imported.
+    In a program that imports the package it counts from the beginning of the last training. If the
+    system does not tell when the process started, it counts from the import of this module.
     """
+    return _process_seconds() - _origin
+
+
+def restart_clock() -> None:
+    """Let `process_seconds` count from now on, because a program begins a training."""
+    global _origin
+    _origin = _process_seconds()
+
+
+def _process_seconds() -> float:
     try:
         after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
         began = int(after_name[19]) / os.sysconf("SC_CLK_TCK")

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import PRETRAINED
-from jetbot_mjx.runs.run_dir import writing_to
+from jetbot_mjx.runs.run_dir import atomic_folder
 
 
 def copy_pretrained(folder: Path) -> tuple[Path, ...]:
@@ -25,12 +25,6 @@ def copy_pretrained(folder: Path) -> tuple[Path, ...]:
         if target.exists():
             raise UserError(f"{target} is there already: give --out another folder")
     for source, target in runs.items():
-        unfinished = target.with_name(f".{target.name}.unfinished")
-        with writing_to(target):
-            shutil.rmtree(unfinished, ignore_errors=True)
-            try:
-                shutil.copytree(source, unfinished)
-                unfinished.rename(target)
-            finally:
-                shutil.rmtree(unfinished, ignore_errors=True)
+        with atomic_folder(target) as unfinished:
+            shutil.copytree(source, unfinished, dirs_exist_ok=True)
     return tuple(runs.values())

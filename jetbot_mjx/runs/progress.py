@@ -9,23 +9,23 @@ import contextlib
 import contextvars
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
-from typing import IO, TYPE_CHECKING, Protocol, TextIO
+from typing import IO, TYPE_CHECKING, TextIO
 
 if TYPE_CHECKING:
     from rich.console import Console
 
 _SECONDS_BETWEEN_LINES = 10.0
+_SECONDS_BEFORE_LINE = 2.0
+"""Time after which a stage is worth a line [s]."""
 
 Advance = Callable[[int], None]
 """Reports that so many further units of a stage are done."""
 
 
-class _Display(Protocol):
-    def stage(self, name: str, total: int | None) -> contextlib.AbstractContextManager[Advance]: ...
-
-
+_Display = Callable[[str, int | None], contextlib.AbstractContextManager[Advance]]
 _DISPLAY: contextvars.ContextVar[_Display | None] = contextvars.ContextVar("display", default=None)
 
 
@@ -44,7 +44,7 @@ def stage(name: str, total: int | None = None) -> Iterator[Advance]:
     if display is None:
         yield lambda count: None
         return
-    with display.stage(name, total) as advance:
+    with display(name, total) as advance:
         yield advance
 
 
@@ -59,7 +59,7 @@ def show_progress(stream: TextIO) -> Iterator[None]:
     from rich.console import Console
 
     console = Console(file=stream, highlight=False)
-    with _bars(console) if is_watched(console) else contextlib.nullcontext(_Lines(stream)) as shown:
+    with _bars(console) if is_watched(console) else contextlib.nullcontext(_lines(stream)) as shown:
         token = _DISPLAY.set(shown)
         try:
             yield
@@ -78,6 +78,8 @@ def is_watched(console: "Console") -> bool:
 
 def in_foreground(stream: IO[str]) -> bool:
     """Return whether the terminal belongs to this process group, or to no shell at all."""
+    if not hasattr(os, "tcgetpgrp"):  # on Windows
+        return True
     try:
         return os.tcgetpgrp(stream.fileno()) == os.getpgrp()
     except (OSError, ValueError):
@@ -106,7 +108,6 @@ def _bars(console: "Console") -> Iterator[_Display]:
 
     class Clock(ProgressColumn):
         def render(self, task: Task) -> Text:
-            del task
             return Text(f"{process_seconds():.0f} s", "dim")
 
     progress = Progress(
@@ -124,30 +125,40 @@ def _bars(console: "Console") -> Iterator[_Display]:
         redirect_stderr=sys.stderr.isatty(),
     )
 
-    class Bars:
-        @contextlib.contextmanager
-        def stage(self, name: str, total: int | None) -> Iterator[Advance]:
-            task = progress.add_task(name, total=total)
-            try:
-                yield lambda count: progress.advance(task, count)
-            finally:
-                progress.remove_task(task)
+    @contextlib.contextmanager
+    def show(name: str, total: int | None) -> Iterator[Advance]:
+        task = progress.add_task(name, total=total)
+        try:
+            yield lambda count: progress.advance(task, count)
+        finally:
+            progress.remove_task(task)
 
     with progress:
-        yield Bars()
+        yield show
 
 
-class _Lines:
-    """A display that prints one line per stage, and in a long one the progress now and then."""
+def _lines(stream: TextIO) -> _Display:
+    """Return a display that prints a line for every stage that takes long, and then now and then.
 
-    def __init__(self, stream: TextIO) -> None:
-        self._stream = stream
+    A timer prints the first line of a stage, because nothing else happens in some of them.
+    """
+    from jetbot_mjx.runs.metrics import process_seconds
+
+    lock = threading.Lock()
+
+    def say(text: str) -> None:
+        # A reader that has gone does not end the command.
+        with lock, contextlib.suppress(OSError, ValueError):
+            print(f"{process_seconds():7.1f} s  {text}", file=stream, flush=True)
 
     @contextlib.contextmanager
-    def stage(self, name: str, total: int | None) -> Iterator[Advance]:
+    def show(name: str, total: int | None) -> Iterator[Advance]:
         done, began = 0, time.monotonic()
         last_line = began
-        self._print(name if total is None else f"{name}: {total:,}")
+        first = name if total is None else f"{name}: {total:,}"
+        timer = threading.Timer(_SECONDS_BEFORE_LINE, say, [first])
+        timer.daemon = True
+        timer.start()
 
         def advance(count: int) -> None:
             nonlocal done, last_line
@@ -155,14 +166,12 @@ class _Lines:
             now = time.monotonic()
             if total and done < total and now - last_line >= _SECONDS_BETWEEN_LINES:
                 left = (now - began) * (total - done) / max(done, 1)
-                self._print(f"{name}: {done:,} of {total:,}, about {left:.0f} s left")
+                say(f"{name}: {done:,} of {total:,}, about {left:.0f} s left")
                 last_line = now
 
-        yield advance
+        try:
+            yield advance
+        finally:
+            timer.cancel()
 
-    def _print(self, text: str) -> None:
-        from jetbot_mjx.runs.metrics import process_seconds
-
-        # A reader that has gone does not end the command.
-        with contextlib.suppress(OSError):
-            print(f"{process_seconds():7.1f} s  {text}", file=self._stream, flush=True)
+    return show

@@ -8,12 +8,14 @@ for each of them, with all of that inside.
 
 import contextlib
 import datetime
-import fcntl
+import errno
 import importlib.metadata
 import json
 import os
 import platform
+import shutil
 import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,11 @@ import jax
 
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
+
+try:
+    import fcntl
+except ModuleNotFoundError:  # on Windows
+    fcntl = None
 
 _PACKAGES = (
     "jetbot_mjx",
@@ -101,7 +108,8 @@ def stored_config(run_dir: Path) -> Config | None:
 def occupied(run_dir: Path) -> Iterator[None]:
     """Create a run folder if needed, and lock it against every other training.
 
-    The lock belongs to the process, so it is released however the process ends.
+    The lock belongs to the process, so it is released however the process ends. Where the system
+    has no such locks, a line on stderr says so.
 
     Raises:
       UserError: the folder cannot be written, or another training has locked it.
@@ -114,7 +122,11 @@ def occupied(run_dir: Path) -> Iterator[None]:
         raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
     with file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if fcntl is None:
+                line = "this system has no locks: start no second training in this run folder"
+                print(line, file=sys.stderr, flush=True)
+            else:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
             file.seek(0)
             raise UserError(
@@ -176,6 +188,45 @@ def writing_to(path: Path) -> Iterator[None]:
         raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
+def check_writable(path: Path) -> None:
+    """Raise an error, before long work, if a folder for its results could not be created.
+
+    Nothing is created.
+
+    Raises:
+      UserError: the path or a part of it is no folder, or may not be written.
+    """
+    with writing_to(path):
+        existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+        if not existing.is_dir():
+            raise NotADirectoryError(errno.ENOTDIR, os.strerror(errno.ENOTDIR))
+        if not os.access(existing, os.W_OK):
+            raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+
+@contextlib.contextmanager
+def atomic_folder(folder: Path) -> Iterator[Path]:
+    """Yield a temporary folder, and put it in the place of `folder` when it is complete.
+
+    Raises:
+      UserError: the folder cannot be written.
+    """
+    unfinished = folder.with_name(f".{folder.name}.unfinished")
+    earlier = folder.with_name(f".{folder.name}.earlier")
+    with writing_to(folder):
+        for leftover in (unfinished, earlier):
+            shutil.rmtree(leftover, ignore_errors=True)
+        unfinished.mkdir(parents=True)
+        try:
+            yield unfinished
+            if folder.exists():
+                folder.rename(earlier)
+            unfinished.rename(folder)
+        finally:
+            for leftover in (unfinished, earlier):
+                shutil.rmtree(leftover, ignore_errors=True)
+
+
 def make_folder(path: Path) -> None:
     """Create a folder for results inside a run folder if it does not exist.
 
@@ -184,6 +235,12 @@ def make_folder(path: Path) -> None:
     """
     with writing_to(path):
         path.mkdir(parents=True, exist_ok=True)
+
+
+def shortened(path: Path) -> Path:
+    """Return the path relative to the current folder if it is inside of it."""
+    here = Path.cwd()
+    return path.relative_to(here) if path.is_relative_to(here) else path
 
 
 def versions() -> dict[str, Any]:

@@ -24,7 +24,7 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.run_dir import write_bytes, write_json, writing_to
+from jetbot_mjx.runs.run_dir import shortened, write_bytes, write_json, writing_to
 
 FOLDER = "task"
 """Name of the folder in a run folder that holds the source of the task."""
@@ -45,6 +45,18 @@ class TaskCode(NamedTuple):
     """Name of the task's module."""
     files: tuple[tuple[str, bytes], ...]
     """Path and content of each file; paths are relative to the folder that imports begin in."""
+
+    def to_bytes(self) -> bytes:
+        """Return the source as bytes, to be sent to another process."""
+        files = {path: content.decode("latin-1") for path, content in self.files}
+        return json.dumps({"module": self.module, "files": files}).encode()
+
+    @classmethod
+    def from_bytes(cls, content: bytes) -> "TaskCode":
+        """Return the source that another process has sent."""
+        sent = json.loads(content)
+        files = ((path, text.encode("latin-1")) for path, text in sent["files"].items())
+        return cls(sent["module"], tuple(files))
 
 
 def collect_task_code(name: str) -> TaskCode | None:
@@ -144,15 +156,16 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
     return TaskCode(module, tuple(sorted(files)))
 
 
-def stored_task_class(run_dir: Path, name: str) -> type[Any] | None:
+def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type[Any] | None:
     """Import the class of a task from the source that its run stored.
 
-    A line on stderr says so, once for each source. The modules are not left in `sys.modules`, so
-    that runs with different sources of one name can be used in one process.
+    A line on stderr says so, once for each source, unless `silent`. The modules are not left in
+    `sys.modules`, so that runs with different sources of one name can be used in one process.
 
     Args:
       run_dir: the run folder.
       name: the task as `package.module:Class`.
+      silent: whether to print nothing.
 
     Returns:
       The class. None if the module is to be imported by its name: the run stored no source of it,
@@ -172,24 +185,26 @@ def stored_task_class(run_dir: Path, name: str) -> type[Any] | None:
     if root is not None and on_disk and all(_holds(root / path, text) for path, text in code.files):
         return None
     # Import the stored files.
-    folder = _shortened(run_dir / FOLDER)
+    folder = shortened(run_dir / FOLDER)
     main = _source_file(run_dir / FOLDER, module)
     if main is None:
         raise UserError(f"{folder} holds no source of {module}: delete it to run {module} itself")
-    if on_disk:
+    if silent:
+        pass
+    elif on_disk:
         reason = f"{module} on disk differs from the code this run was trained with: using the"
-        _say(f"{reason} stored code {_shortened(main)}", code)
+        _say(f"{reason} stored code {shortened(main)}", code)
     else:
-        _say(f"running the task's code stored in {_shortened(main)}", code)
+        _say(f"running the task's code stored in {shortened(main)}", code)
     try:
         found = _stored_modules(run_dir / FOLDER, code).load(module)
     except ModuleNotFoundError as error:
         raise UserError(
-            f"{_shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
+            f"{shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
             " name its folder in PYTHONPATH"
         ) from None
     if not hasattr(found, class_name):
-        raise UserError(f"task.name = {name!r}: {_shortened(main)} has no {class_name!r}")
+        raise UserError(f"task.name = {name!r}: {shortened(main)} has no {class_name!r}")
     return getattr(found, class_name)
 
 
@@ -246,12 +261,6 @@ def _holds(path: Path, content: bytes) -> bool:
         return False
 
 
-def _shortened(path: Path) -> Path:
-    """Return the path relative to the current folder if it is inside of it."""
-    here = Path.cwd()
-    return path.relative_to(here) if path.is_relative_to(here) else path
-
-
 _said: set[Any] = set()
 
 
@@ -295,7 +304,6 @@ class _StoredModules(importlib.abc.MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
         """Return the spec of a stored module or of a folder of such modules."""
-        del path, target
         if fullname not in self._names:
             return None
         folder = str(self._folder.joinpath(*fullname.split(".")))
@@ -345,7 +353,6 @@ class _StoredLoader(importlib.abc.SourceLoader):
         self._path, self._content, self._import = path, content, import_
 
     def get_filename(self, fullname: str) -> str:
-        del fullname
         return self._path
 
     def get_data(self, path: str) -> bytes:

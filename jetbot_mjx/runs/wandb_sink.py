@@ -148,9 +148,5 @@ def _read(path: Path, project: str | None) -> dict[str, Any]:
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
         progress = json.loads(path.read_text(encoding="utf-8"))
         if progress["project"] == project and isinstance(progress["id"], str):
-            return {
-                "project": project,
-                "id": progress["id"],
-                "env_steps": int(progress["env_steps"]),
-            }
+            return {**progress, "env_steps": int(progress["env_steps"])}
     return {"project": project, "id": uuid.uuid4().hex[:8], "env_steps": -1}

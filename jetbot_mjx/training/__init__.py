@@ -9,11 +9,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.training.session import Result as Result
     from jetbot_mjx.training.session import run as run
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {
-        "Result": "session",
-        "run": "session",
-        "plan_memory": "memory_plan",
-    },
-)
+__getattr__, __dir__ = load_lazily(__name__)

@@ -6,7 +6,7 @@ import time
 from collections.abc import Sequence
 from typing import TextIO
 
-from jetbot_mjx.runs.metrics import MetricValues, mean_of
+from jetbot_mjx.runs.metrics import MetricValues, mean_of, process_seconds
 
 COMPILING = "compiling"
 TRAINING = "training"
@@ -52,7 +52,7 @@ class Terminal:
             _formatted(mean, "eval/success_rate", "success {:6.1%}"),
             _formatted(mean, "eval/time_to_goal_median", "to goal {:4.2f} s"),
             _formatted(mean, "time/env_steps_per_second", "{:>10,.0f} steps/s"),
-            f"{mean.get('time/wall_seconds') or 0.0:6.1f} s",
+            f"{process_seconds():6.1f} s",
             self._eta(env_steps, speed) if speed else "",
             f"(compiling {compiled:.1f} s)" if compiled and compiled > 0.5 else "",
         )

@@ -23,7 +23,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
-from jetbot_mjx.runs.metrics import History, MetricValues
+from jetbot_mjx.runs.metrics import History, MetricValues, process_seconds
 from jetbot_mjx.runs.progress import in_foreground, is_watched
 from jetbot_mjx.training.console import COMPILING, Terminal
 
@@ -97,7 +97,7 @@ class Dashboard(Terminal):
         self._speed = "-"
         self._phase: str | None = None
         self._spent: dict[str, float] = {}
-        self._began = self._phase_began = time.monotonic()
+        self._phase_began = time.monotonic()
         # Show the history before the progress bar begins to measure the speed.
         steps = 0
         for entries in zip(*histories, strict=False):
@@ -140,7 +140,9 @@ class Dashboard(Terminal):
         with self._lock:
             if self._phase is not None:
                 self._spent[self._phase] = self._seconds_in(self._phase)
-            self._phase, self._phase_began = name, now
+            # The start of the process belongs to the first phase, which is that of compiling.
+            self._phase_began = now if self._spent else now - process_seconds()
+            self._phase = name
             if name is not None:
                 self._spent.setdefault(name, 0.0)
 
@@ -257,7 +259,7 @@ class Dashboard(Terminal):
         rows = [self._table(), "", self._progress, self._speed, phases]
         if self._nonfinite:
             rows.append(Text(f"{self._nonfinite:,.0f} non-finite states or gradients", "bold red"))
-        elapsed = _clock(time.monotonic() - self._began)
+        elapsed = _clock(process_seconds())
         title = Text(self._title, "bold")
         panel = Panel(
             Group(*rows), title=title, title_align="left", subtitle=elapsed, width=_MAX_WIDTH

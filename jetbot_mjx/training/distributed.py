@@ -160,6 +160,32 @@ def broadcast_from_primary(trees: Sequence[PyTree], template: PyTree, count: int
     return jax.tree.unflatten(structure, arrays)
 
 
+def broadcast_bytes(source: Callable[[], bytes]) -> bytes:
+    """Copy bytes of the first process to all processes.
+
+    Args:
+      source: a function that returns the bytes, which only the first process calls.
+
+    Returns:
+      The first process's bytes, on every host.
+
+    Raises:
+      UserError: as for `run_on_primary`.
+    """
+    content = b""
+
+    def measure() -> int:
+        nonlocal content
+        content = source()
+        return len(content)
+
+    length = run_on_primary(measure)
+    if jax.process_count() == 1 or length == 0:
+        return content
+    local = np.frombuffer(content or bytes(length), np.uint8)
+    return np.asarray(multihost_utils.broadcast_one_to_all(local)).tobytes()
+
+
 def _read_environment() -> tuple[str | None, int | None, int | None]:
     """Return the address, number of processes and index that the environment variables give.
 

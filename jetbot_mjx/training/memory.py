@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import PyTree
 
 from jetbot_mjx.agents.ppo import PPO
+from jetbot_mjx.agents.vision import activation_bytes
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
@@ -54,7 +55,7 @@ class Sizes(NamedTuple):
     unroll: int
     """The last observation of one unroll."""
     layers: int
-    """The activations of both networks for one sample."""
+    """The activations of both networks and of their convolutions for one sample."""
     parameters: int
     """One copy of the networks, Adam's moments, the normaliser and the sums of metrics."""
 
@@ -71,7 +72,7 @@ class Footprint(NamedTuple):
     environments: int
     """The states of the environments."""
     collecting: int
-    """One physics step of all environments, and the collected steps."""
+    """One physics step or the actions of all environments, and the collected steps."""
     learning: int
     """The collected steps, their shuffled copy, and the activations of a minibatch."""
     evaluation: int
@@ -113,13 +114,15 @@ def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
     environments = _bytes(state.env_state)
     network = config.network
     units = sum(network.policy_hidden_layer_sizes) + sum(network.value_hidden_layer_sizes)
+    size = env.observation_size
+    encoded = 0 if isinstance(size, int) else activation_bytes(network, size)
     return Sizes(
         environment=environments // config.num_envs,
         physics=_physics(env),
         sample=collected // samples,
         learned=learned // samples,
         unroll=ends // unrolls,
-        layers=_FLOAT * units,
+        layers=_FLOAT * units + encoded,
         parameters=_bytes(state) - environments,
     )
 
@@ -154,6 +157,8 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
     environments = -(-ppo.num_envs // device_count)
     # Add up the parts; every seed takes all of them but the evaluation.
     stepped = environments * each.environment
+    # An environment is stepped after its action is known, not at the same time.
+    working = max(each.physics, each.layers)
     collected = samples * each.sample + unrolls * each.unroll
     shuffled = samples * each.learned + unrolls * each.unroll
     return Footprint(
@@ -161,7 +166,7 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
         batch_size=ppo.batch_size,
         parameters=config.seeds * each.parameters,
         environments=config.seeds * stepped,
-        collecting=config.seeds * (collected + environments * each.physics),
+        collecting=config.seeds * (collected + environments * working),
         learning=config.seeds
         * (
             collected
@@ -170,7 +175,7 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
             + each.parameters
             + int(_LAYERS * minibatch * each.layers)
         ),
-        evaluation=config.evaluation.episodes * (2 * each.environment + each.physics),
+        evaluation=config.evaluation.episodes * (2 * each.environment + working),
     )
 
 
@@ -270,7 +275,8 @@ def device_memory() -> int | None:
         return stats.get("bytes_limit")
     try:
         host = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError):
+    # Windows has no such function.
+    except (AttributeError, ValueError, OSError):
         return None
     # Several CPU devices share the memory of the host.
     return host // jax.local_device_count()

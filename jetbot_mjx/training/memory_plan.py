@@ -7,6 +7,7 @@ import jax
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.text_table import text_table
 from jetbot_mjx.training.memory import GIB, Footprint, device_memory, ladder, sizes
 from jetbot_mjx.training.ppo_trainer import build_ppo
 
@@ -59,24 +60,24 @@ def plan_memory(config: Config, memory: float | None = None) -> MemoryPlan:
 def memory_table(plan: MemoryPlan) -> str:
     """Return a plan as a table for the terminal."""
     parts = ("parameters", "environments", "collecting", "learning", "evaluation")
-    lines = [
-        f"GiB on each of {plan.device_count} x {jax.devices()[0].device_kind},"
-        f" which has {plan.limit / GIB:.1f}; > marks the configuration",
-        f"  {'num_envs':>10}  {'batch_size':>10}  "
-        + "  ".join(f"{one:>12}" for one in parts)
-        + f"  {'needed':>8}",
+    rows = [("", "num_envs", "batch_size", *parts, "needed", "")]
+    rows += [
+        (
+            ">" if one.num_envs == plan.config.ppo.num_envs else "",
+            f"{one.num_envs:,}",
+            f"{one.batch_size:,}",
+            *(f"{getattr(one, part) / GIB:.3f}" for part in parts),
+            f"{one.total / GIB:.3f}",
+            "" if one.total <= plan.limit else "does not fit",
+        )
+        for one in plan.footprints
     ]
-    for one in plan.footprints:
-        mark = ">" if one.num_envs == plan.config.ppo.num_envs else " "
-        values = "  ".join(f"{getattr(one, part) / GIB:12.3f}" for part in parts)
-        fits = "" if one.total <= plan.limit else "  does not fit"
-        lines.append(
-            f"{mark} {one.num_envs:10,}  {one.batch_size:10,}  {values}"
-            f"  {one.total / GIB:8.3f}{fits}"
-        )
-    if (best := plan.largest) is None:
-        return "\n".join(
-            [*lines, "none of them fits: try a smaller network or evaluation.episodes"]
-        )
-    settings = f"--set ppo.num_envs={best.num_envs} --set ppo.batch_size={best.batch_size}"
-    return "\n".join([*lines, f"the largest of these that fits: {settings}"])
+    remedy = "none of them fits: try a smaller network or evaluation.episodes"
+    if best := plan.largest:
+        settings = f"--set ppo.num_envs={best.num_envs} --set ppo.batch_size={best.batch_size}"
+        remedy = f"the largest of these that fits: {settings}"
+    return (
+        f"GiB on each of {plan.device_count} x {jax.devices()[0].device_kind},"
+        f" which has {plan.limit / GIB:.1f}; > marks the configuration\n"
+        f"{text_table(rows)}\n{remedy}"
+    )

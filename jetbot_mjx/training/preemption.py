@@ -57,7 +57,9 @@ class Preemption:
         if threading.current_thread() is not threading.main_thread():
             return self
         self._reader, self._writer = os.pipe()
-        os.set_blocking(self._writer, False)
+        # On Windows, Python 3.11 cannot do this, and does not need it.
+        if hasattr(os, "set_blocking"):
+            os.set_blocking(self._writer, False)
         self._former_fd = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
         for number in _SIGNALS:
             # A shell makes its background jobs ignore Ctrl-C; keep it so.

@@ -16,6 +16,7 @@ from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
 from jetbot_mjx.runs.metrics import (
     EVALUATION_VIDEO,
+    METRICS,
     CompileClock,
     History,
     JsonlSink,
@@ -41,9 +42,6 @@ from jetbot_mjx.training.console import (
 )
 from jetbot_mjx.viewers.offscreen import find_backend
 from jetbot_mjx.viewers.video import EvaluationVideo
-
-METRICS = "metrics.jsonl"
-"""Name of the log in the folder of a seed."""
 
 
 @dataclasses.dataclass
@@ -123,7 +121,7 @@ class RunRecorder(TrainerCallback):
         stop_at_success: float | None,
         only_last_video: bool = False,
     ) -> None:
-        """Begin to count the time.
+        """Prepare to record.
 
         Args:
           seeds: the recorder of each seed.
@@ -144,7 +142,6 @@ class RunRecorder(TrainerCallback):
         self._stop_at_success = stop_at_success
         self._only_last_video = only_last_video
         self._earlier_seconds = seeds[0].standing.wall_seconds
-        self._began = time.perf_counter()
         self._compiled = False
         self._compile_seconds = 0.0
         self._unlogged_compile_seconds = 0.0
@@ -173,8 +170,8 @@ class RunRecorder(TrainerCallback):
 
     @property
     def wall_seconds(self) -> float:
-        """Return the time since the training began, in all processes [s]."""
-        return self._earlier_seconds + time.perf_counter() - self._began
+        """Return the time of all processes that worked on the run, from their start [s]."""
+        return self._earlier_seconds + process_seconds()
 
     def say(self, *lines: str) -> None:
         """Print lines on the terminal."""
@@ -344,7 +341,7 @@ class SeedRecorder:
           progress: the progress of this seed.
           summary: the evaluation of its policy.
           metrics: the values to log.
-          wall_seconds: time since the training began [s].
+          wall_seconds: time of all processes that worked on the run [s].
         """
         standing = self.standing
         standing.env_steps, standing.last = progress.env_steps, summary
@@ -361,7 +358,7 @@ class SeedRecorder:
         Args:
           progress: the progress of this seed.
           evaluation: the metrics of the policy; empty if it was not evaluated.
-          wall_seconds: time since the training began [s].
+          wall_seconds: time of all processes that worked on the run [s].
         """
         self.standing.wall_seconds = wall_seconds
         trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}

@@ -7,24 +7,28 @@ modules receive what they need as required arguments.
 
 import contextlib
 import importlib.util
+import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.agents.ppo import PPO, TrainState
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, ConfigError
+from jetbot_mjx.envs.checks.runner import require_trainable
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.program_key import TRUSTED
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
 from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
-from jetbot_mjx.runs.metrics import CompileClock, read_history
+from jetbot_mjx.runs.metrics import METRICS, CompileClock, read_history, restart_clock
 from jetbot_mjx.runs.resume import Resumption, resume
 from jetbot_mjx.runs.run_dir import (
     changed_versions,
@@ -37,6 +41,7 @@ from jetbot_mjx.runs.run_dir import (
 from jetbot_mjx.runs.task_code import (
     TaskCode,
     collect_task_code,
+    read_task_code,
     stored_task_class,
     write_task_code,
 )
@@ -47,7 +52,6 @@ from jetbot_mjx.training.dashboard import open_terminal
 from jetbot_mjx.training.memory import advice, device_memory, sizes
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import (
-    METRICS,
     RunRecorder,
     SeedRecorder,
     Standing,
@@ -122,6 +126,7 @@ def run(config: Config, run_dir: Path) -> Result:
     Raises:
       UserError: as for `train`.
     """
+    restart_clock()
     return train(config, run_dir, ProgramCache(compiler_options(config)))
 
 
@@ -173,13 +178,42 @@ def _has_checkpoints(run_dirs: Sequence[Path]) -> bool:
 def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, TaskCode | None]:
     """Build the environment, and return it with the source of its task if that is to be stored.
 
-    A run that has checkpoints continues with the task that it was begun with.
+    A run that has checkpoints continues with the task that it was begun with. Of several processes,
+    all train the task of the first one, which sends its source to those that lack it.
     """
+    name = config.task.name
     task_class = None
-    if _has_checkpoints(run_dirs):
-        task_class = stored_task_class(run_dirs[0], config.task.name)
+    if not distributed.is_primary():
+        task_class = _sent_task_class(name)
+    else:
+        resumes = _has_checkpoints(run_dirs)
+        _send_task_code(name, run_dirs[0] if resumes else None)
+        task_class = stored_task_class(run_dirs[0], name) if resumes else None
     env = make_env(config, task_class)
-    return env, None if task_class else collect_task_code(config.task.name)
+    if name not in TRUSTED:
+        require_trainable(env.task, config)
+    return env, None if task_class else collect_task_code(name)
+
+
+def _send_task_code(name: str, run_dir: Path | None) -> None:
+    """Send the source of a task to the other processes: the stored one, or that of a new run."""
+
+    def source() -> bytes:
+        code = read_task_code(run_dir) if run_dir else collect_task_code(name)
+        return code.to_bytes() if code else b""
+
+    if jax.process_count() > 1:
+        distributed.broadcast_bytes(source)
+
+
+def _sent_task_class(name: str) -> type[Any] | None:
+    """Return the class of the task that the first process has sent; None: import it by its name."""
+    content = distributed.broadcast_bytes(bytes)
+    if not content:
+        return None
+    with tempfile.TemporaryDirectory() as folder:
+        write_task_code(Path(folder), TaskCode.from_bytes(content))
+        return stored_task_class(Path(folder), name, silent=True)
 
 
 def _store_run(training: Training) -> None:
@@ -419,10 +453,10 @@ def summary(result: Result) -> str:
         )
     if len(lines) > 1:
         # Its statistics take half a second to import.
-        from jetbot_mjx.evaluation.bootstrap import bootstrap, mean
+        from jetbot_mjx.evaluation.bootstrap import bootstrap
 
         rates = [standing.best.success_rate for standing in result.standings if standing.best]
-        over_seeds = bootstrap(mean, rates)
+        over_seeds = bootstrap(np.mean, rates)
         lines.append(
             f"{len(lines)} seeds: {over_seeds.value:.2%} success in the mean"
             f" (95 % interval {over_seeds.low:.2%} .. {over_seeds.high:.2%})"

@@ -10,7 +10,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.tuning.space import read_space as read_space
     from jetbot_mjx.tuning.trials import Trials as Trials
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {"Parameter": "space", "Search": "search", "Trials": "trials", "read_space": "space"},
-)
+__getattr__, __dir__ = load_lazily(__name__)

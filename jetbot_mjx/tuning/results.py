@@ -4,7 +4,7 @@ import csv
 import io
 import statistics
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -88,16 +88,12 @@ def _trials_table(study: optuna.Study) -> str:
 def _csv(study: optuna.Study) -> str:
     names = sorted({name for trial in study.trials for name in trial.params})
     text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["trial", "state", "score", "success_rate", "mean_seconds", *names, "error"])
+    columns = ["trial", "state", "score", "success_rate", "mean_seconds", *names, "error"]
+    writer = csv.DictWriter(text, columns, extrasaction="ignore", lineterminator="\n")
+    writer.writeheader()
     for trial in study.trials:
-        known: Mapping[str, Any] = trial.user_attrs
-        writer.writerow(
-            [trial.number, trial.state.name, trial.value]
-            + [known.get("success_rate"), known.get("mean_seconds")]
-            + [trial.params.get(name) for name in names]
-            + [known.get("error")]
-        )
+        own = {"trial": trial.number, "state": trial.state.name, "score": trial.value}
+        writer.writerow({**trial.user_attrs, **trial.params, **own})
     return text.getvalue()
 
 

@@ -11,6 +11,7 @@ search has not used, and evaluated on the report's goals, which chose nothing.
 """
 
 import contextlib
+import operator
 import threading
 import time
 import warnings
@@ -27,7 +28,7 @@ from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, report_keys
 from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import make_folder
 from jetbot_mjx.tuning.space import TRACED, Parameter, with_values
-from jetbot_mjx.tuning.trials import Outcome, Trials
+from jetbot_mjx.tuning.trials import Outcome, Trials, mean_seconds
 
 try:
     import optuna
@@ -84,12 +85,14 @@ class Search:
         """
         self._config = config
         self._space = list(space)
+        self._traced_names = [one.name for one in space if one.name in TRACED]
+        self._static_names = [one.name for one in space if one.name not in TRACED]
         self._evaluations = evaluations
         self._say = say
         self._batches: dict[tuple[Any, ...], Trials] = {}
+        new = not folder.exists()
         make_folder(folder)
         url = storage or f"sqlite:///{folder.absolute() / 'study.db'}"
-        name = folder.name
         optuna.logging.set_verbosity(optuna.logging.ERROR)
         warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
         # Heartbeats are recorded here, for a whole round of trials.
@@ -99,11 +102,11 @@ class Search:
                 url,
                 heartbeat_interval=_BEAT_SECONDS,
                 grace_period=_STALE_SECONDS,
-                heartbeat_stale_trial_callback=(optuna.storages.RetryHeartbeatStaleTrialCallback()),
+                heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
             )
             self.study = optuna.create_study(
                 storage=self._storage,
-                study_name=name,
+                study_name=folder.name,
                 direction="maximize",
                 load_if_exists=True,
             )
@@ -114,7 +117,9 @@ class Search:
             )
         # SQLAlchemy has many kinds of errors for a URL, a driver or a host that is wrong.
         except Exception as error:
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
+            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            if new and not any(folder.iterdir()):
+                folder.rmdir()
             raise UserError(f"--storage {url} cannot be used: {reason}") from None
         self._check_space()
 
@@ -174,17 +179,17 @@ class Search:
         done: dict[str, list[tuple[Outcome, float, float]]] = {name: [] for name in chosen}
         for batch, members in self._groups([values for _, values, _ in work]):
             outcomes = batch.run(
-                [self._traced(work[i][1]) for i in members], [work[i][2] for i in members]
+                [self._values(work[i][1], self._traced_names) for i in members],
+                [work[i][2] for i in members],
             )
             stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
             with stage("episodes of the report's goals", len(members) * REPORT_GOALS):
                 episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
-            success = np.asarray(episodes.success)
-            limit = self._config.task.episode_length
-            steps = np.where(success > 0, np.asarray(episodes.steps), limit)
-            for row, i in enumerate(members):
-                seconds = float(steps[row].mean() * self._config.physics.ctrl_dt)
-                done[work[i][0]].append((outcomes[row], float(success[row].mean()), seconds))
+            rates = np.asarray(episodes.success).mean(axis=1).tolist()
+            seconds = mean_seconds(episodes, self._config)
+            results = zip(outcomes, rates, seconds, strict=True)
+            for i, result in zip(members, results, strict=True):
+                done[work[i][0]].append(result)
         return [
             Entrant(
                 name,
@@ -198,10 +203,7 @@ class Search:
 
     def _check_space(self) -> None:
         """Refuse a study that was begun with another space or configuration."""
-        given = {
-            "space": [str(one) for one in self._space],
-            "config": self._config.to_yaml(),
-        }
+        given = {"space": [str(one) for one in self._space], "config": self._config.to_yaml()}
         stored = self.study.user_attrs
         for key, value in given.items():
             if key not in stored:
@@ -212,7 +214,7 @@ class Search:
                     " new --output"
                 )
         # Begin with the given configuration, if the space contains it.
-        own = {one.name: _setting(self._config, one.name) for one in self._space}
+        own = self._values({}, [one.name for one in self._space])
         if not self.study.get_trials(deepcopy=False) and all(
             one.contains(own[one.name]) for one in self._space
         ):
@@ -272,7 +274,7 @@ class Search:
                 self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
         for batch, members in self._groups([values for _, values in valid]):
             outcomes = batch.run(
-                [self._traced(valid[i][1]) for i in members],
+                [self._values(valid[i][1], self._traced_names) for i in members],
                 [self._config.seed + valid[i][0].number for i in members],
             )
             for i, outcome in zip(members, outcomes, strict=True):
@@ -286,30 +288,17 @@ class Search:
     def _groups(self, drawn: Sequence[Mapping[str, Any]]) -> Iterator[tuple[Trials, list[int]]]:
         """Yield the programs and the indices of the trials that each of them trains."""
         groups: dict[tuple[Any, ...], list[int]] = {}
-        static = [one.name for one in self._space if one.name not in TRACED]
         for index, values in enumerate(drawn):
-            key = tuple(values.get(name, _setting(self._config, name)) for name in static)
+            key = tuple(self._values(values, self._static_names).values())
             groups.setdefault(key, []).append(index)
         for key, members in groups.items():
             if key not in self._batches:
-                config = with_values(
-                    self._config, dict(zip(static, key, strict=True)), source="tune"
-                )
-                self._batches[key] = Trials(config, self._traced_names(), self._evaluations)
+                static = dict(zip(self._static_names, key, strict=True))
+                config = with_values(self._config, static, source="tune")
+                self._batches[key] = Trials(config, self._traced_names, self._evaluations)
             yield self._batches[key], members
 
-    def _traced_names(self) -> list[str]:
-        return [one.name for one in self._space if one.name in TRACED]
-
-    def _traced(self, values: Mapping[str, Any]) -> dict[str, float]:
-        return {
-            name: values.get(name, _setting(self._config, name)) for name in self._traced_names()
-        }
-
-
-def _setting(config: Config, name: str) -> Any:
-    """Return the value of a setting, such as `ppo.learning_rate`."""
-    value: Any = config
-    for part in name.split("."):
-        value = getattr(value, part)
-    return value
+    def _values(self, drawn: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
+        """Return the values of settings: those that were drawn, or those of the configuration."""
+        given = {name: operator.attrgetter(name)(self._config) for name in names}
+        return {name: drawn.get(name, value) for name, value in given.items()}

@@ -82,7 +82,7 @@ def read_space(path: str | Path, config: Config) -> list[Parameter]:
       ConfigError: the file cannot be read, an entry is malformed, or a setting does not accept an
         end of its range or one of its choices.
     """
-    values = read_yaml(Path(path))
+    values = read_yaml(Path(path), "--space")
     if not values:
         raise ConfigError(
             f"{path} is empty: write lines such as ppo.discounting: {{low: 0.9, high: 0.99}}"

@@ -61,7 +61,6 @@ class Trials:
         self._names = tuple(names)
         env = make_env(config)
         self._env = wrap_for_training(env, config.task.episode_length)
-        self._ctrl_dt = env.dt
         self._networks = make_networks(
             config.ppo.network,
             env.observation_size,
@@ -115,15 +114,12 @@ class Trials:
                 rates.append(np.asarray(episodes.success).mean(axis=1))
                 advance(1)
         assert episodes is not None
-        # A failed episode counts with the full time limit.
-        limit = self._config.task.episode_length
-        lasted = np.where(np.asarray(episodes.success) > 0, np.asarray(episodes.steps), limit)
-        seconds = lasted.mean(axis=1) * self._ctrl_dt
+        seconds = mean_seconds(episodes, self._config)
         params = jax.device_get(state.policy_params)
         return [
             Outcome(
                 tuple(float(rate[i]) for rate in rates),
-                float(seconds[i]),
+                seconds[i],
                 jax.tree.map(lambda x, i=i: x[i], params),
             )
             for i in range(count)
@@ -154,3 +150,10 @@ class Trials:
         self, traced: Mapping[str, Float[Array, ""]], state: TrainState, steps: Any
     ) -> TrainState:
         return self._ppo(traced).advance(state, steps, jnp.ones((), bool))[0]
+
+
+def mean_seconds(episodes: Episodes, config: Config) -> list[float]:
+    """Return the mean duration of each policy's episodes [s]; a failed one counts in full."""
+    success, steps = np.asarray(episodes.success), np.asarray(episodes.steps)
+    lasted = np.where(success > 0, steps, config.task.episode_length)
+    return (lasted.mean(axis=1) * config.physics.ctrl_dt).tolist()

@@ -12,14 +12,4 @@ if TYPE_CHECKING:
     from jetbot_mjx.viewers.many import render_training_strip as render_training_strip
     from jetbot_mjx.viewers.player import Player as Player
 
-__getattr__, __dir__ = load_lazily(
-    __name__,
-    {
-        "Player": "player",
-        "play_live": "live",
-        "render_gallery": "gallery",
-        "render_many": "many",
-        "render_run": "gallery",
-        "render_training_strip": "many",
-    },
-)
+__getattr__, __dir__ = load_lazily(__name__)

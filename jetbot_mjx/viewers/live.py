@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal, NamedTuple
 
 from jetbot_mjx.errors import MissingPackageError, UserError
-from jetbot_mjx.runs.checkpoint import Which
+from jetbot_mjx.runs.checkpoint import Which, find_checkpoint
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
 
@@ -57,6 +57,7 @@ def play_live(
     # Check first what can fail quickly, before the slow steps.
     if robots > 1 and viewer == "native":
         raise UserError(f"--robots {robots}: --viewer native shows one robot, use the browser")
+    find_checkpoint(run_or_checkpoint, which)
     if viewer == "browser":
         server = _server()
         free: int = server.free_port(host, port)

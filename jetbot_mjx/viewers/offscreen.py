@@ -50,10 +50,11 @@ context.make_current()
 mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 150)
 """
 
-_REMEDY = (
+_REMEDY_LINUX = (
     "install one of libegl1 with a GPU driver or libegl-mesa0, or"
     " libosmesa6 (Debian and Ubuntu: apt-get install libegl1 libegl-mesa0)"
 )
+_REMEDY_ELSEWHERE = "run it in a session with a display, where GLFW can open a window"
 
 
 class Renderer:
@@ -216,6 +217,7 @@ def find_backend() -> str:
         probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
         if subprocess.run(probe, env=environment, capture_output=True).returncode == 0:
             return backend
+    remedy = _REMEDY_LINUX if sys.platform == "linux" else _REMEDY_ELSEWHERE
     if wanted in _BACKENDS:
-        raise UserError(f"MUJOCO_GL = {wanted!r} does not work here: unset it, or {_REMEDY}")
-    raise UserError(f"no OpenGL for pictures: {_REMEDY}")
+        raise UserError(f"MUJOCO_GL = {wanted!r} does not work here: unset it, or {remedy}")
+    raise UserError(f"no OpenGL for pictures: {remedy}")

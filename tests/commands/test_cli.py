@@ -71,9 +71,12 @@ def refused(here, capfd):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ([], "one of the arguments --config CONFIG --resume is required"),
+        ([], "name a configuration, as in `train jetbot`, or a run to --resume"),
         (["--config", SMOKE, "--resume", "run"], "--resume: not allowed with argument --config"),
-        (["--resume", "run", "--run-dir", "run"], "--run-dir: --resume names the folder already"),
+        (
+            ["--resume", "run", "--run-dir", "run"],
+            "--run-dir: --resume continues that run, in its folder",
+        ),
         (["--config", SMOKE, "--seeds", "x"], "argument --seeds: invalid int value: 'x'"),
         (["--config"], "argument --config: expected one argument"),
         (["--config", SMOKE, "more"], "argument CONFIG: not allowed with argument --config"),
@@ -112,8 +115,8 @@ def test_train_refuses_a_bad_file(refused, tmp_path, name):
     ("path", "said"),
     [
         ("nonsense.yaml", f"config nonsense.yaml does not exist: {FILE_OR_NAME}"),
-        (".", "config . cannot be read: Is a directory"),
-        ("", "config . cannot be read: Is a directory"),
+        (".", "config . is a folder: give a YAML file"),
+        ("", "config . is a folder: give a YAML file"),
     ],
 )
 def test_train_refuses_a_path_without_a_file(refused, path, said):
@@ -127,7 +130,7 @@ def test_train_refuses_a_path_without_a_file(refused, path, said):
         ("ppo.num_envs.x=3", "--set ppo.num_envs.x=3: num_envs is a value, not a section"),
         ("seed=[", "--set seed=[, line 1 is not valid YAML"),
         ("zzz=1", "zzz = 1 is unknown: known are seed"),
-        ("ppo.num_envs=many", "ppo.num_envs = 'many' is wrong: it should be integer"),
+        ("ppo.num_envs=many", "ppo.num_envs = 'many' is wrong: it should be a whole number"),
         ("ppo.num_envs=-1", "ppo.num_envs = -1 is wrong: it should be greater than or equal to 1"),
         ("ppo.num_envs=100", "is not a multiple of num_envs = 100: for example batch_size = 75"),
         ("ppo.discounting=1.5", "ppo.discounting = 1.5 is wrong"),
@@ -174,8 +177,9 @@ def test_train_refuses_what_the_stock_trainer_cannot_do(refused, setting, said):
 @pytest.mark.parametrize("run", ["nothing", "empty"])
 def test_train_refuses_to_resume_where_there_is_no_run(refused, here, run):
     (here / "empty").mkdir()
+    remedy = "give a run folder or a checkpoint in it"
     line = refused(train, "--resume", run)
-    assert line == f"error: --resume {run}: there is no run in this folder\n"
+    assert line == f"error: --resume {run}: there is no run in this folder; {remedy}\n"
 
 
 def test_train_refuses_environments_that_the_devices_cannot_share(refused, monkeypatch):
@@ -288,7 +292,7 @@ def test_evaluate_refuses_a_success_rate_that_is_none(refused, value, said):
     ("make", "said"),
     [
         (lambda path: None, "no such folder; give a run folder or a checkpoint in it"),
-        (lambda path: path.write_text("x"), "no such folder; give a run folder"),
+        (lambda path: path.write_text("x"), "a file; give a run folder"),
         (lambda path: path.mkdir(), "it holds neither checkpoints/ nor policy/; give a run folder"),
         (lambda path: (path / "src").mkdir(parents=True), "neither checkpoints/ nor policy/"),
         (lambda path: (path / "checkpoints").mkdir(parents=True), "the run saved none"),

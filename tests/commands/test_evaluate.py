@@ -21,7 +21,7 @@ from jetbot_mjx.evaluation import (
     evaluate_runs,
     html_report,
 )
-from jetbot_mjx.evaluation.evaluator import BASELINES, Summary
+from jetbot_mjx.evaluation.evaluator import BASELINES, Summary, json_values
 from jetbot_mjx.evaluation.robustness import SWEEPS, SweepResult
 from jetbot_mjx.evaluation.tables import policies_table
 from jetbot_mjx.runs import checkpoint_store
@@ -173,9 +173,9 @@ def test_the_markdown_shows_the_figures_beside_it(judged):
 def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monkeypatch):
     run_dir, _, (first, _), _ = judged
 
-    def sweep(env, networks, params, keys):
+    def run(sweeper, params):
         """Fails with every policy on everything but the preset, and asks for no compiler."""
-        assert len(keys) == EPISODES
+        assert len(sweeper._keys) == EPISODES
         values = json.loads(first["report.json"])["policy"]
         good, bad = (
             Summary(**values)._replace(success_rate=rate, success_low=0.9 * rate, success_high=rate)
@@ -190,7 +190,7 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
             for one in SWEEPS
         )
 
-    monkeypatch.setattr(evaluate_runs, "sweep", sweep)
+    monkeypatch.setattr(evaluate_runs.Sweeper, "run", run)
     code, said = judge(run_dir, "--robustness", "--output", tmp_path)
     assert code == 0
     assert "wheel-floor friction        1 to 1 × preset" in said
@@ -231,7 +231,7 @@ def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_pa
     assert f"--episodes {EPISODES} --simulator mujoco\n" in page
     # And without a report, the same again.
     again = evaluate_in_mujoco(run_dir, episodes=EPISODES)
-    assert json.loads(json.dumps(again.to_json())) == values["mujoco"]
+    assert json.loads(json.dumps(json_values(again))) == values["mujoco"]
 
 
 def test_another_simulator_that_there_is_not_is_refused(judged, capfd):

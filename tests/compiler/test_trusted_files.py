@@ -108,8 +108,15 @@ def test_a_file_is_written_for_this_user_alone(folder):
     finally:
         os.umask(before)
     (path,) = folder.iterdir()
-    assert path.read_bytes() == b"second"
+    assert read_trusted(path) == b"second"
     assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_damaged_file_counts_as_missing(folder):
+    path = folder / "program"
+    write_private(path, b"code")
+    path.write_bytes(path.read_bytes()[:-1] + b"d")
+    assert read_trusted(path) is None
 
 
 def test_nothing_is_written_where_nobody_would_read_it(folder):

@@ -17,10 +17,10 @@ from jetbot_mjx.evaluation.plots import plot_robustness
 from jetbot_mjx.evaluation.robustness import (
     SWEEPS,
     Sweep,
+    Sweeper,
     SweepResult,
     as_json,
     robust_range,
-    sweep,
 )
 
 EPISODES = 16
@@ -131,7 +131,7 @@ def swept():
     sweeps = [one._replace(values=values[one.name]) for one in SWEEPS if one.name in values]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(robustness, "DomainRandomizationWrapper", Counted)
-        results = sweep(env, networks, params, report_keys(EPISODES), sweeps)
+        results = Sweeper(env, networks, report_keys(EPISODES), sweeps).run(params)
     return env, results
 
 

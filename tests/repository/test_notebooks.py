@@ -1,5 +1,7 @@
 """The notebooks run from top to bottom, as a reader would, on the smallest configuration."""
 
+import importlib.util
+import re
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,7 @@ pytest.importorskip("nbclient")
 
 import nbformat
 from ipykernel.kernelspec import write_kernel_spec
+from IPython.core.interactiveshell import InteractiveShell
 from nbclient import NotebookClient
 
 NAMES = ("01_environment", "02_train", "03_evaluate_and_render", "04_own_task")
@@ -33,8 +36,8 @@ def execute(root, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
         patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
-        # As many as the film of an evaluation shows, whose program is the same.
-        patch.setenv("JETBOT_EPISODES", "4")
+        # As many as are rendered, whose program is the same.
+        patch.setenv("JETBOT_EPISODES", "3")
         patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
         patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
         # Nothing of the user's own Jupyter, and nothing left in it.
@@ -128,11 +131,36 @@ def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, gliding_profi
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_committed_notebooks_hold_no_outputs(read, name):
+def test_committed_notebooks_hold_the_outputs_of_one_run(read, name):
     nbformat.validate(read[name])
     code = [cell for cell in read[name].cells if cell.cell_type == "code"]
-    assert code
-    assert all(cell.outputs == [] and cell.execution_count is None for cell in code)
+    assert [cell.execution_count for cell in code] == list(range(1, len(code) + 1))
+    assert images(read[name])  # none of the outputs is an error
+    assert not re.search(r"Traceback|Error:", text(read[name]))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_committed_notebooks_are_small(root, name):
+    assert (root / "notebooks" / f"{name}.ipynb").stat().st_size < 1_000_000
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_first_cell_installs_what_is_not_there(read, name, monkeypatch):
+    code = next(cell for cell in read[name].cells if cell.cell_type == "code")
+    assert code.source == read[NAMES[0]].cells[1].source
+    typed = []
+    shell = InteractiveShell()
+    shell.register_magic_function(typed.append, magic_name="pip")
+    monkeypatch.setattr(shell, "system", lambda line: typed.append(line))
+    # Installed: nothing to do. Elsewhere: it asks for the source, and installs it.
+    assert shell.run_cell(code.source).success
+    assert typed == []
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    assert "name a SOURCE" in str(shell.run_cell(code.source).error_in_exec)
+    for source, package in (("https://host/x.git", "git+https://host/x.git"), ("x.whl", "x.whl")):
+        named = code.source.replace('SOURCE = ""', f'SOURCE = "{source}"')
+        assert shell.run_cell(named).success
+        assert typed.pop() == f"install --quiet {package}"
 
 
 def test_every_notebook_is_tested(root):

@@ -237,7 +237,7 @@ def test_a_module_imports_no_more_than_it_needs(name):
 def test_a_public_name_is_that_of_its_module(package):
     face = importlib.import_module(package)
     for node in ast.walk(ast.parse(Path(face.__file__).read_text("utf-8"))):
-        # What type checkers are told is what there is.
+        # What type checkers are told is what there is at run time.
         if isinstance(node, ast.ImportFrom) and node.module.startswith(f"{package}."):
             for alias in node.names:
                 if not alias.name.startswith("_") and not alias.asname.startswith("_"):

@@ -38,6 +38,13 @@ def test_a_checkpoint_explains_itself(smoke_run):
     assert checkpoint.run_dir == smoke_run
 
 
+def test_a_run_is_found_from_a_folder_beside_it(smoke_run, monkeypatch, tmp_path):
+    (tmp_path / "notebooks").mkdir()
+    shutil.copytree(smoke_run, tmp_path / "run")
+    monkeypatch.chdir(tmp_path / "notebooks")
+    assert load_checkpoint("../run", "last").env_steps == 65_536
+
+
 def test_checkpoints_stand_at_the_stated_interval(smoke_run):
     assert checkpoint_steps(smoke_run) == [0, 16_384, 32_768, 49_152, 65_536]
 

@@ -18,19 +18,26 @@ def test_nothing_is_shown_in_a_program_that_imports_the_package(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_elsewhere_a_stage_is_a_line_at_once_with_the_seconds_since_the_start():
+def test_elsewhere_a_stage_that_takes_long_is_a_line_with_the_seconds_since_the_start(monkeypatch):
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.2)
     stream = io.StringIO()
     with show_progress(stream):
         with stage("compiling"):
+            assert stream.getvalue() == ""
+            deadline = time.monotonic() + 10
+            while not stream.getvalue().endswith("\n") and time.monotonic() < deadline:
+                time.sleep(0.01)
             assert re.fullmatch(r" *\d+\.\d s  compiling\n", stream.getvalue())
+        with stage("keys"):
+            pass
         with stage("frames", 1_200) as advance:
-            for _ in range(1_200):
-                advance(1)
+            time.sleep(0.4)
+            advance(1_200)
     lines = [line.split(" s  ") for line in stream.getvalue().splitlines()]
     assert [text for _, text in lines] == ["compiling", "frames: 1,200"]
     assert 0 < float(lines[0][0]) <= float(lines[1][0])
     with stage("more"):
-        pass
+        time.sleep(0.4)
     assert "more" not in stream.getvalue()
 
 
@@ -44,13 +51,14 @@ def test_a_long_stage_tells_how_far_it_is_and_how_long_it_will_take(monkeypatch)
             advance(1)
     said = [line.split(" s  ")[1] for line in stream.getvalue().splitlines()]
     assert said == [
-        "frames: 100",
         "frames: 40 of 100, about 15 s left",
         "frames: 80 of 100, about 5 s left",
     ]
 
 
-def test_a_reader_that_has_gone_ends_no_command():
+def test_a_reader_that_has_gone_ends_no_command(monkeypatch):
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
+
     class Gone(io.StringIO):
         def write(self, text):
             raise BrokenPipeError
@@ -58,6 +66,7 @@ def test_a_reader_that_has_gone_ends_no_command():
     done = []
     with show_progress(Gone()), stage("frames", 1) as advance:
         advance(1)
+        time.sleep(0.1)
         done.append(True)
     assert done
 
@@ -90,6 +99,7 @@ def test_a_terminal_has_a_bar_with_an_estimate_that_goes_away_in_the_end(screen)
 
 def test_a_simple_terminal_gets_lines(screen, monkeypatch):
     monkeypatch.setenv("TERM", "dumb")
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
     with show_progress(screen.stream), stage("compiling"):
         screen.until(" s  compiling\r\n")
     assert "\x1b" not in screen.text

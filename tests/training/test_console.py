@@ -10,13 +10,16 @@ from jetbot_mjx.training.console import EVALUATING, Terminal
 
 
 @pytest.fixture
-def lines():
+def lines(monkeypatch):
     """The lines that the progress of a training of 10,000 steps prints for some reports."""
 
     def lines(*reports):
         stream = io.StringIO()
         sink = Terminal(10_000, stream)
         for env_steps, metrics in reports:
+            monkeypatch.setattr(
+                console, "process_seconds", lambda wall=metrics["time/wall_seconds"]: wall
+            )
             sink.write(env_steps, [metrics])
         assert stream.getvalue().endswith("\n")
         return stream.getvalue().splitlines()

@@ -37,6 +37,15 @@ STOCK = ["--set", "trainer=brax", "--set", "ppo.normalizer=brax"]
 VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 
+TASK = """
+from jetbot_mjx import GoalTask
+from sent_tools import NAME
+
+class Sent(GoalTask):
+    name = NAME
+"""
+
+
 # The other processes: the training command, one training step a call, telling what it holds.
 
 
@@ -200,6 +209,41 @@ def test_they_end_with_the_bits_of_one_process_on_two_devices(alone, finished):
 
 
 # One process by itself: nothing to wait for, and mistakes that cost one line.
+
+
+def test_a_process_without_the_task_and_the_run_trains_the_source_of_the_first(
+    tmp_path, unused_port
+):
+    (tmp_path / "tasks").mkdir()
+    (tmp_path / "tasks" / "sent_task.py").write_text(TASK)
+    (tmp_path / "tasks" / "sent_tools.py").write_text("NAME = 'sent'\n")
+    run_dirs = [tmp_path / "run", tmp_path / "elsewhere"]
+
+    def train_together(num_steps, path):
+        port = unused_port()
+        settings = ["--set", "task.name=sent_task:Sent", "--set", "evaluation.episodes=4"]
+        settings += ["--set", f"ppo.num_timesteps={num_steps * SIZE}"]
+        begun = [
+            start(
+                ["--config", SMOKE, "--distributed", *settings, "--run-dir", folder],
+                JAX_COORDINATOR_ADDRESS=f"127.0.0.1:{port}",
+                JAX_NUM_PROCESSES="2",
+                JAX_PROCESS_ID=str(index),
+                **({"PYTHONPATH": path} if index == 0 else {}),
+            )
+            for index, folder in enumerate(run_dirs)
+        ]
+        return [Ended(process) for process in begun]
+
+    # A new run, and its continuation where nobody has the module any more.
+    with_task = os.pathsep.join([str(tmp_path / "tasks"), os.environ["PYTHONPATH"]])
+    for num_steps, path in ((4, with_task), (8, os.environ["PYTHONPATH"])):
+        first, second = train_together(num_steps, path)
+        assert (first.code, second.code) == (0, 0), first.err + second.err
+        assert second.said == ""
+        assert second.complained == ""
+    assert (run_dirs[0] / "task" / "sent_tools.py").is_file()
+    assert not run_dirs[1].exists()
 
 
 def test_alone_nothing_is_exchanged():

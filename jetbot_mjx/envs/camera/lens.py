@@ -141,23 +141,36 @@ def _undistort(
             y * radial + 2 * p2 * x * y + p1 * (r2 + 2 * y * y),
         )
 
+    def derivatives(x: np.ndarray, y: np.ndarray) -> tuple[np.ndarray, ...]:
+        """Return dx"/dx, dx"/dy, dy"/dx and dy"/dy."""
+        (above_x, above_y), (below_x, below_y) = distort(x + step, y), distort(x - step, y)
+        xx, yx = (above_x - below_x) / (2 * step), (above_y - below_y) / (2 * step)
+        (above_x, above_y), (below_x, below_y) = distort(x, y + step), distort(x, y - step)
+        return xx, (above_x - below_x) / (2 * step), yx, (above_y - below_y) / (2 * step)
+
+    step = 1e-6
     wanted_x, wanted_y = np.broadcast_arrays(x, y)
     x, y = wanted_x, wanted_y
-    step = 1e-6
-    for _ in range(50):
+    # What is no lens may overflow, which the check finds.
+    with np.errstate(all="ignore"):
+        for _ in range(50):
+            at_x, at_y = distort(x, y)
+            xx, xy, yx, yy = derivatives(x, y)
+            error_x, error_y = wanted_x - at_x, wanted_y - at_y
+            if max(np.abs(error_x).max(), np.abs(error_y).max()) < 1e-12:
+                break
+            determinant = xx * yy - xy * yx
+            x = x + (yy * error_x - xy * error_y) / determinant
+            y = y + (xx * error_y - yx * error_x) / determinant
         at_x, at_y = distort(x, y)
-        (xx, yx), (xy, yy) = distort(x + step, y), distort(x, y + step)
-        xx, xy = (xx - at_x) / step, (xy - at_x) / step
-        yx, yy = (yx - at_y) / step, (yy - at_y) / step
-        error_x, error_y = wanted_x - at_x, wanted_y - at_y
-        determinant = xx * yy - xy * yx
-        x = x + (yy * error_x - xy * error_y) / determinant
-        y = y + (xx * error_y - yx * error_x) / determinant
-    at_x, at_y = distort(x, y)
-    error = np.maximum(np.abs(at_x - wanted_x), np.abs(at_y - wanted_y))
-    # Past the turning point of the polynomial the image would show a direction twice.
-    if not (np.all(error < 1e-5) and np.all(determinant > 0)):
-        raise _no_lens(coefficients)
+        error = np.maximum(np.abs(at_x - wanted_x), np.abs(at_y - wanted_y))
+        # Past a turning point of the polynomial the image would show a direction twice.
+        turns = False
+        for part in np.linspace(0.0, 1.0, 65):
+            xx, xy, yx, yy = derivatives(part * x, part * y)
+            turns |= not np.all(xx * yy - xy * yx > 0)
+        if turns or not np.all(error < 1e-5):
+            raise _no_lens(coefficients)
     return x, y
 
 

@@ -308,12 +308,14 @@ def _checker_colours(checker: Checker, origin: Vector, axes: Axes, pixel: Footpr
     waves: Any = 1.0
     for axis in (0, 1):
         scale = 1.0 / checker.size[axis]
-        at = origin[axis] + depth * direction[axis]
-        extent: Any = 0.0
+        at = (origin[axis] - checker.start[axis]) + depth * direction[axis]
+        squared: Any = 0.0
         for change in changes:
-            moved = change[axis] - direction[axis] * (change[2] * slope)
-            extent = extent + jnp.abs(depth * moved)
-        waves = waves * _square_wave(at * scale, jnp.maximum(extent * scale, 1e-3))
+            moved = depth * (change[axis] - direction[axis] * (change[2] * slope))
+            squared = squared + moved * moved
+        # A pixel's shadow on the axis has the variance of an interval of this length.
+        extent = jnp.sqrt(squared) * scale
+        waves = waves * _square_wave(at * scale, jnp.maximum(extent, 1e-3))
     even = 0.5 + 0.5 * waves
     return [
         odd + (of_even - odd) * even for of_even, odd in zip(checker.even, checker.odd, strict=True)
@@ -331,10 +333,15 @@ def _square_wave(at: Array, width: Array) -> Array:
 
 
 def _sky(scene: Scene, up: Vector, rays: Rays) -> Sequence[Any]:
-    """Return the colours of the sky, which change with the sine of the elevation."""
+    """Return the colours of the sky, which change from the horizon to the zenith.
+
+    MuJoCo's gradients are mixed by m = √2 e / √(1 + e²), where e is the elevation, 1 at the zenith.
+    Of the sine s of that angle, m = 1 - √(1 - s) (1 - 0.3754 s - 0.1205 s²), to within 0.003.
+    """
     if scene.horizon == scene.zenith:
         return scene.horizon
     length = jnp.sqrt(rays.x * rays.x + (rays.y * rays.y + 1.0))
     sine = jnp.maximum((up[0] * rays.x + (up[1] * rays.y + up[2])) / length, 0.0)
+    part = 1.0 - jnp.sqrt(jnp.maximum(1.0 - sine, 0.0)) * (1.0 - sine * (0.3754 + 0.1205 * sine))
     ends = zip(scene.horizon, scene.zenith, strict=True)
-    return [low + (high - low) * sine for low, high in ends]
+    return [low + (high - low) * part for low, high in ends]

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8, UInt32
+from jaxtyping import Array, Float, Int, UInt8
 
 from jetbot_mjx.compiler import llvm_codegen
 from jetbot_mjx.compiler.kernel import Kernel, as_map
@@ -117,12 +117,8 @@ class Camera:
         """
         shared = jnp.stack(jax.tree.leaves(self._frame(pose, mocap_positions)))
         kernel = self._kernel
-        (packed,) = self._fallback(shared) if kernel is None else as_map(kernel)(shared)
-        height, width, channels = self.shape
-        words = packed.astype(jnp.uint32)
-        if channels == 1:
-            return words.astype(jnp.uint8).reshape(height, width, 1)
-        return _bytes(words).reshape(height, width, 3)
+        values = self._fallback(shared)[0] if kernel is None else as_map(kernel)(shared)
+        return values.reshape(self.shape)
 
     @functools.cached_property
     def _kernel(self) -> Kernel | None:
@@ -147,35 +143,31 @@ class Camera:
 
     @functools.cached_property
     def _frame_shapes(self) -> Frame:
-        pose = Pose(
-            jax.ShapeDtypeStruct((3,), jnp.float32), jax.ShapeDtypeStruct((3, 3), jnp.float32)
-        )
+        shapes: Any = [jax.ShapeDtypeStruct(x, jnp.float32) for x in ((3,), (3, 3))]
+        pose = Pose(*shapes)
         return jax.eval_shape(lambda pose: self._frame(pose, {}), pose)
 
-    def _fallback(self, shared: Float[Array, " shared"]) -> list[Float[Array, " pixels"]]:
-        """Compute all pixels as images, which XLA fuses."""
-        # Keep the two stages apart: XLA would compute what the pixels share in every pixel.
+    def _fallback(self, shared: Float[Array, " shared"]) -> list[UInt8[Array, " bytes"]]:
+        """Compute all pixels by XLA."""
+        # Keep the stages apart: XLA would compute what the pixels share in every pixel, and all
+        # rays of a pixel for each of its channels.
         shared = jax.lax.optimization_barrier(shared)
-        packed = jax.vmap(self._pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
-        # Three bytes of a pixel would be three images, each with all rays of its own.
-        return [jax.lax.optimization_barrier(packed)]
+        channels = jax.vmap(self._pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
+        channels = jax.lax.optimization_barrier(channels)
+        return [jnp.stack(channels, axis=-1).astype(jnp.uint8).reshape(-1)]
 
     @functools.cached_property
     def _table(self) -> Float[np.ndarray, "columns pixels"]:
         columns = [np.broadcast_to(column, self.shape[:2]) for column in self._grid.columns]
         return np.stack(columns).reshape(len(columns), -1).astype(np.float32)
 
-    def _pixel(self, shared: Float[Array, " shared"], columns: Sequence[Any]) -> Array:
-        """Return the colour of a pixel, or of all, as red + 256 green + 65,536 blue.
-
-        A float32 holds these 24 bits exactly.
-        """
+    def _pixel(self, shared: Float[Array, " shared"], columns: Float[Array, " columns"]) -> Any:
+        """Return the channels of a pixel, whole numbers from 0 to 255 as floats."""
         frame = jax.tree.unflatten(jax.tree.structure(self._frame_shapes), list(shared))
-        channels = pixel_colour(self.scene, frame, *self._grid.expand(columns))
+        channels = pixel_colour(self.scene, frame, *self._grid.expand(list(columns)))
         if self.config.colour == "grey":
             channels = [sum(weight * x for weight, x in zip(_GREY, channels, strict=True))]
-        steps = [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
-        return sum(step * 256.0**k for k, step in enumerate(steps))
+        return [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
 
     def trace(
         self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]
@@ -221,7 +213,7 @@ class Camera:
             origin = _into(geom.rotation, pose.position - position)
             centre = _into(pose.rotation, position - pose.position)
             looks.append(Look(origin, centre, _faces(scene, geom, origin, axes[key].lights)))
-        up = tuple(pose.rotation[2, k] for k in range(3))
+        up = pose.rotation[2, 0], pose.rotation[2, 1], pose.rotation[2, 2]
         return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), Frame(axes, looks, up))
 
 
@@ -251,14 +243,3 @@ def _into(rotation: Float[np.ndarray | Array, "3 3"], vector: Any) -> Vector:
         for k in range(3)
     )
     return x, y, z
-
-
-def _bytes(words: UInt32[Array, " pixels"]) -> UInt8[Array, " bytes"]:
-    """Return the three lower bytes of each word, one after the other."""
-    count = len(words)
-    if count % 4:
-        return jax.lax.bitcast_convert_type(words, jnp.uint8)[:, :3].reshape(-1)
-    # Four pixels are three words of bytes: a GPU writes words several times as fast.
-    a, b, c, d = words.reshape(-1, 4).T
-    joined = [a | (b << 24), (b >> 8) | (c << 16), (c >> 16) | (d << 8)]
-    return jax.lax.bitcast_convert_type(jnp.stack(joined, axis=1), jnp.uint8).reshape(-1)

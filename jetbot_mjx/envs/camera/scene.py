@@ -30,10 +30,12 @@ class Checker(NamedTuple):
     """A `Checker` holds a checker texture on a plane."""
 
     even: Rgb
-    """Colour of the square whose corner is the plane's origin, in the quadrant x, y > 0."""
+    """Colour of the square whose least x and y are those of `start`."""
     odd: Rgb
     size: tuple[float, float]
     """Side lengths of a square [m]."""
+    start: tuple[float, float]
+    """Where the squares begin [m], in the plane's frame."""
 
 
 class SceneGeom(NamedTuple):
@@ -78,9 +80,9 @@ class Scene(NamedTuple):
 def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
     """Return the visible geoms, lights and sky of a model.
 
-    The robot itself is left out: its camera looks past it. Specular light, shadows, reflections and
-    transparency are not rendered. A plane may have MuJoCo's checker texture; any other texture is
-    replaced by its mean colour.
+    The robot itself is left out: its camera looks past it. Specular light, shadows, reflections,
+    transparency and haze are not rendered. A plane may have MuJoCo's checker texture; any other
+    texture is replaced by its mean colour.
 
     Args:
       model: the compiled model with its visual elements.
@@ -104,7 +106,7 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
     horizon, zenith = _read_sky(model)
     return Scene(
         tuple(geoms),
-        ambient=_rgb(headlight.ambient * active + model.light_ambient.sum(axis=0)),
+        ambient=_rgb(headlight.ambient * active + model.light_active @ model.light_ambient),
         headlight=_rgb(headlight.diffuse * active),
         lights=tuple(_read_light(model, light) for light in range(model.nlight)),
         horizon=horizon,
@@ -158,9 +160,11 @@ def _read_geom(
         size = np.repeat(size[0], 3)
     material = int(model.geom_matid[geom])
     rgba = _rgba(model, geom)
-    texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
+    texture = -1
+    if material >= 0:
+        texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
     checker, tint = None, np.ones(3)
-    if material >= 0 and texture >= 0:
+    if texture >= 0:
         image = _texture(model, texture)
         tint = image.reshape(-1, 3).mean(axis=0)
         if kind == "plane":
@@ -205,13 +209,15 @@ def _read_checker(
         return None
     repeat = model.mat_texrepeat[material]
     # MuJoCo counts repetitions per metre if the texture is uniform or the plane infinite, else over
-    # half of the plane. They begin at the origin, and a square is as long as a repetition.
+    # half of the plane, and a square is as long as a repetition. They begin at the origin of an
+    # infinite plane, and at the corner of a finite one where x is least and y is greatest.
     spans = [1.0 if model.mat_texuniform[material] or half == 0 else half for half in size[:2]]
     tint = np.asarray(rgba[:3])
     return Checker(
         even=_rgb(colours[1] * tint),
         odd=_rgb(colours[0] * tint),
         size=(float(spans[0] / repeat[0]), float(spans[1] / repeat[1])),
+        start=(-float(size[0]), float(size[1])),
     )
 
 

@@ -179,6 +179,30 @@ def first_key() -> jax.Array:
     return jax.random.PRNGKey(0)
 
 
+def method_calls(task: Task, transition: Transition) -> dict[str, tuple[Any, ...]]:
+    """Return the calls of all methods of a task for one transition.
+
+    Args:
+      task: the task.
+      transition: the step of a robot.
+
+    Returns:
+      The function and its arguments, by the name of the method.
+    """
+    before, after, goal, action = transition
+    calls: dict[str, tuple[Any, ...]] = {
+        "observe": (task.observe, after, goal),
+        "reward": (task.reward, before, after, goal, action),
+        "terminated": (task.terminated, after, goal),
+        "success": (task.success, after, goal),
+        "goal_position": (task.goal_position, goal),
+        "markers": (task.markers, goal),
+    }
+    if isinstance(task, AdvancesGoal):
+        calls["advance"] = (task.advance, before, after, goal)
+    return calls
+
+
 def call_methods(task: Task) -> Callable[[Transition], dict[str, Any]]:
     """Return a function that calls all methods of a task for one transition.
 
@@ -190,19 +214,10 @@ def call_methods(task: Task) -> Callable[[Transition], dict[str, Any]]:
     """
 
     def call(transition: Transition) -> dict[str, Any]:
-        before, after, goal, action = transition
-        reward, terms = task.reward(before, after, goal, action)
-        results = {
-            "observe": task.observe(after, goal),
-            "reward": reward,
-            TERMS: dict(terms),
-            "terminated": task.terminated(after, goal),
-            "success": task.success(after, goal),
-            "goal_position": task.goal_position(goal),
-            "markers": dict(task.markers(goal)),
-        }
-        if isinstance(task, AdvancesGoal):
-            results["advance"] = task.advance(before, after, goal)
-        return results
+        calls = method_calls(task, transition)
+        results = {name: function(*given) for name, (function, *given) in calls.items()}
+        reward, terms = results["reward"]
+        markers = dict(results["markers"])
+        return {**results, "reward": reward, TERMS: dict(terms), "markers": markers}
 
     return call

@@ -6,7 +6,7 @@ an error message, but on another problem than intended.
 
 import collections
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,35 +15,33 @@ import mujoco
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.checks import methods
-from jetbot_mjx.envs.checks.probe import DRAWS, TaskProbe, describe_error, first_key
+from jetbot_mjx.envs.checks.probe import (
+    DRAWS,
+    TaskProbe,
+    call_methods,
+    describe_error,
+    first_key,
+)
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model
-from jetbot_mjx.envs.task import make_task
+from jetbot_mjx.envs.task import Task, layout_size, make_task
 from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, UserError
 
 DRIVE_ENVS, DRIVE_STEPS = 16, 64
 """Number of robots of the test drive, and of environment steps of each."""
 
 
-class Finding(NamedTuple):
-    """A `Finding` describes a rule that a task breaks."""
-
-    check: str
-    """Name of the check, a key of `CHECKS`."""
-    message: str
-    """The error and its remedy, in one line."""
-
-
-def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
+def check_task(config: Config) -> Iterator[tuple[str, list[str]]]:
     """Check the task that a configuration names.
 
     Args:
       config: the configuration of the run.
 
     Yields:
-      The name and the findings of each check, in the order of `CHECKS`. No finding is repeated. If
-      a check in `_PREREQUISITES` has findings, the checks after it are skipped.
+      The name and the findings of each check, in the order of `CHECKS`. A finding is one line with
+      an error and its remedy, and none is repeated. If a check in `_PREREQUISITES` has findings,
+      the checks after it are skipped.
 
     Raises:
       UserError: there is no such task, or it rejects the configuration.
@@ -54,11 +52,11 @@ def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
     except UserError:
         raise
     except Exception as error:
-        yield "layout", [Finding("layout", describe_error(error, config.task.name, ()))]
+        yield "layout", [describe_error(error, config.task.name, ())]
         return
     # Run the checks.
     seen: set[str] = set()
-    for name, check in CHECKS.items():
+    for name, (check, _) in CHECKS.items():
         messages: list[str] = []
         try:
             messages.extend(check(probe))
@@ -66,11 +64,38 @@ def check_task(config: Config) -> Iterator[tuple[str, list[Finding]]]:
             messages.append(str(error))
         except Exception as error:
             messages.append(probe.explain(error))
-        found = [Finding(name, one) for one in dict.fromkeys(messages) if one not in seen]
+        found = [one for one in dict.fromkeys(messages) if one not in seen]
         seen.update(messages)
         yield name, found
         if found and name in _PREREQUISITES:
             return
+
+
+def require_trainable(task: Task, config: Config) -> None:
+    """Raise an error, before anything is compiled, if a task's methods do not fit the training.
+
+    Args:
+      task: the task.
+      config: the configuration of the run.
+
+    Raises:
+      InvalidError: a method raises an error, or returns another shape than a training needs.
+    """
+    probe = TaskProbe(task, config)
+    where = f"task.name = {config.task.name!r}"
+    more = f"python -m jetbot_mjx.check_env {config.task.name} says more"
+    try:
+        found = jax.eval_shape(call_methods(task), probe.example)
+    except Exception as error:
+        raise InvalidError(f"{where}: {probe.explain(error)} ({more})") from error
+    wanted = {"observe": (layout_size(task.layout),)}
+    wanted |= dict.fromkeys(("reward", "terminated", "success"), ())
+    for method, shape in wanted.items():
+        if jnp.shape(found[method]) != shape:
+            raise InvalidError(
+                f"{where}: {method} has the shape {list(jnp.shape(found[method]))}: it should be"
+                f" {list(shape)} ({more})"
+            )
 
 
 # Checks of the scene and of the whole environment.
@@ -190,35 +215,24 @@ def _type(leaf: Any) -> tuple[Any, ...]:
     return leaf.shape, leaf.dtype, leaf.weak_type
 
 
-CHECKS: Mapping[str, Callable[[TaskProbe], Iterator[str]]] = {
-    "layout": methods.layout,
-    "purity": methods.purity,
-    "types": methods.types,
-    "draws": methods.draws,
-    "batches": methods.batches,
-    "finite": methods.finite,
-    "reward": methods.reward,
-    "endings": methods.endings,
-    "goal": methods.goal,
-    "scene": _scene,
-    "drive": _drive,
+CHECKS: Mapping[str, tuple[Callable[[TaskProbe], Iterator[str]], str]] = {
+    "layout": (
+        methods.layout,
+        "names, sizes, units, frames and smallest deviations of the observation",
+    ),
+    "purity": (methods.purity, "methods trace, twice into the same program, and leave self alone"),
+    "types": (methods.types, "shapes and dtypes as the contract has them, none of them weak"),
+    "draws": (methods.draws, "a key gives one draw, and another key another"),
+    "batches": (methods.batches, "jax.vmap gives what a loop gives"),
+    "finite": (methods.finite, f"{DRAWS} ordinary and extreme robots each, goals and actions too"),
+    "reward": (methods.reward, "the terms add up to the reward"),
+    "endings": (methods.endings, "success ends an episode, and none ends where it begins"),
+    "goal": (methods.goal, "goal_position follows move_goal"),
+    "scene": (_scene, "MuJoCo and MJX build it, markers place its bodies"),
+    "drive": (_drive, f"{DRIVE_ENVS} robots for {DRIVE_STEPS} steps, traced once and finite"),
 }
-"""Checks by name, in their order; each one yields a line for every error."""
-
-MEANINGS: Mapping[str, str] = {
-    "layout": "names, sizes, units, frames and smallest deviations of the observation",
-    "purity": "methods trace, twice into the same program, and leave self alone",
-    "types": "shapes and dtypes as the contract has them, none of them weak",
-    "draws": "a key gives one draw, and another key another",
-    "batches": "jax.vmap gives what a loop gives",
-    "finite": f"{DRAWS} ordinary and extreme robots each, goals and actions too",
-    "reward": "the terms add up to the reward",
-    "endings": "success ends an episode, and none ends where it begins",
-    "goal": "goal_position follows move_goal",
-    "scene": "MuJoCo and MJX build it, markers place its bodies",
-    "drive": f"{DRIVE_ENVS} robots for {DRIVE_STEPS} steps, traced once and finite",
-}
-"""Descriptions of the checks."""
+"""The checks by name, in their order, with what they look at; each yields a line for every error.
+"""
 
 _PREREQUISITES = ("layout", "purity", "types")
 """Checks without which all checks after them would fail as well."""

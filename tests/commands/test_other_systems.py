@@ -1,0 +1,69 @@
+"""What macOS and Windows lack is missing here: a training runs all the same, or says so."""
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.find_run import find_run
+from jetbot_mjx.viewers import offscreen
+
+SETTINGS = ["ppo.num_timesteps=8192", "checkpoint_interval=8192", "evaluation.episodes=8"]
+
+WITHOUT = """
+import ctypes, os, signal, sys, time
+for name in ("fcntl", "termios", "pwd", "grp", "resource"):
+    sys.modules[name] = None
+from jetbot_mjx import cli, train
+from jetbot_mjx.training import session  # its libraries keep what they found
+
+for name in ("tcgetpgrp", "getpgrp", "sysconf", "geteuid", "sched_getaffinity"):
+    delattr(os, name)
+for name in ("SIGHUP", "SIGUSR1", "pthread_kill"):
+    delattr(signal, name)
+del time.CLOCK_BOOTTIME
+
+def load(self, name, *arguments, **keywords):
+    if name is None:
+        raise TypeError("bad argument type for built-in operation")
+    original(self, name, *arguments, **keywords)
+
+# As Windows answers `ctypes.CDLL(None)`.
+original, ctypes.CDLL.__init__ = ctypes.CDLL.__init__, load
+cli.run_command(train.main)
+"""
+
+
+def test_a_training_runs_where_windows_lacks_what_unix_has(tmp_path):
+    arguments = [part for setting in SETTINGS for part in ("--set", setting)]
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT, "smoke", "--run-dir", "run", *arguments],
+        cwd=tmp_path,
+        env={**os.environ, "JAX_PLATFORMS": "cpu"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "this system has no locks: start no second training in this run folder" in done.stderr
+    assert "best policy: " in done.stdout
+    assert (tmp_path / "run" / "checkpoints" / "000000008192").is_dir()
+
+
+@pytest.mark.parametrize(("system", "said"), [("linux", "libegl1"), ("darwin", "GLFW")])
+def test_without_opengl_the_remedy_is_one_of_this_system(monkeypatch, system, said):
+    monkeypatch.setattr(sys, "platform", system)
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("MUJOCO_GL", raising=False)
+    failed = subprocess.CompletedProcess([], 1)
+    monkeypatch.setattr(offscreen.subprocess, "run", lambda *args, **kwargs: failed)
+    with pytest.raises(UserError, match=said) as caught:
+        offscreen.find_backend.__wrapped__()
+    assert "\n" not in str(caught.value)
+
+
+def test_a_path_with_either_separator_is_no_name(tmp_path):
+    (tmp_path / "a" / "b").mkdir(parents=True)
+    assert find_run("a", tmp_path) == tmp_path / "a"
+    assert str(find_run("a/b", tmp_path)) == "a/b"
