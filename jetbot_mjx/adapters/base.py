@@ -1,18 +1,18 @@
 """The construction and the rendering that all adapters share."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from jaxtyping import UInt8
 
 from jetbot_mjx.adapters.arguments import Source, requires_extra, resolve
+from jetbot_mjx.adapters.batched_env import unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
+from jetbot_mjx.agents.vision import is_image
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.task import layout_size
-from jetbot_mjx.errors import UserError
 
 with requires_extra("gymnasium"):
     import gymnasium
@@ -24,6 +24,26 @@ class _HasEnv(Protocol):
 
 
 Simulation = TypeVar("Simulation", bound=_HasEnv)
+
+
+def observation_space(size: int | Mapping[str, tuple[int, ...]]) -> "spaces.Space[Any]":
+    """Return the space of an observation: a `Box`, or a `Dict` if numbers stand beside an image.
+
+    Images are uint8 of shape (height, width, channels), 0 to 255, as Stable-Baselines3 expects
+    them.
+
+    Args:
+      size: the length of the vector, or the shapes of the parts.
+    """
+    if isinstance(size, int):
+        return spaces.Box(-np.inf, np.inf, (size,))
+    parts: dict[str, spaces.Space[Any]] = {
+        name: spaces.Box(0, 255, shape, np.uint8)
+        if is_image(name)
+        else spaces.Box(-np.inf, np.inf, shape)
+        for name, shape in size.items()
+    }
+    return unwrap_single(parts) if len(parts) == 1 else spaces.Dict(parts)
 
 
 class AdapterBase:
@@ -39,7 +59,7 @@ class AdapterBase:
 
     def _construct(
         self, simulate: Callable[[Config], Simulation], config: Source, *given: Any
-    ) -> tuple[Simulation, spaces.Box, spaces.Box]:
+    ) -> tuple[Simulation, spaces.Space[Any], spaces.Box]:
         """Build the simulation and the renderer, and set `config`, `render_mode` and `metadata`.
 
         Args:
@@ -54,11 +74,6 @@ class AdapterBase:
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         self.config, mode, rendering_dt = resolve(config, *given)
-        if self.config.task.sees:
-            raise UserError(
-                f"task.observation = {self.config.task.observation!r}: the adapters observe numbers"
-                " only, world or egocentric; make_env and wrap_for_training render images"
-            )
         self.render_mode = mode
         # A script that imports an adapter has no other reason to set up JAX's cache.
         use_compilation_cache()
@@ -70,7 +85,7 @@ class AdapterBase:
             "render_modes": [one for one in RENDER_MODES if one == mode or is_available(one)],
             "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
         }
-        observations = spaces.Box(-np.inf, np.inf, (layout_size(env.task.layout),))
+        observations = observation_space(env.observation_size)
         return simulation, observations, spaces.Box(-1.0, 1.0, (env.action_size,))
 
     def _poses(self) -> list[Pose]:

@@ -1,11 +1,12 @@
 """The batched MJX environment with NumPy arrays in and out, for trainers written in Python."""
 
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions, check_count
 from jetbot_mjx.adapters.renderer import Pose
@@ -15,7 +16,8 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.wrappers import wrap_for_training
 
-Observations = Float[np.ndarray, "n obs"]
+Observations = Float[np.ndarray, "n obs"] | UInt8[np.ndarray, "n h w c"] | dict[str, np.ndarray]
+"""Numbers, images, or both by name."""
 Rewards = Float[np.ndarray, " n"]
 Flags = Bool[np.ndarray, " n"]
 
@@ -41,6 +43,20 @@ class Steps(NamedTuple):
         return self.terminated | self.truncated
 
 
+def unwrap_single(parts: Any) -> Any:
+    """Return the only part of an observation, or the observation if it is none of several parts."""
+    if isinstance(parts, Mapping) and len(parts) == 1:
+        return next(iter(parts.values()))
+    return parts
+
+
+def observation_at(obs: Observations, index: int | np.intp) -> Any:
+    """Return the observation of one robot."""
+    if isinstance(obs, dict):
+        return {name: part[index] for name, part in obs.items()}
+    return obs[index]
+
+
 class BatchedEnv:
     """Robots in one compiled program, which resets those whose episode ends."""
 
@@ -60,20 +76,22 @@ class BatchedEnv:
         self.num_envs = int(num_envs)
         self._reset_keys = ResetKeys(seed, self.num_envs)
         self.env = make_env(config)
-        wrapped: Any = wrap_for_training(self.env, config.task.episode_length)
+        length = config.task.episode_length
+        wrapped: Any = wrap_for_training(self.env, length, final_images=True)
         options = compiler_options(config)
 
-        def step(state: State, actions: jax.Array) -> tuple[State, tuple[jax.Array, ...]]:
+        def step(state: State, actions: jax.Array) -> tuple[State, tuple[Any, ...]]:
             state = wrapped.step(state, actions)
             info, metrics = state.info, state.metrics
             flags = (info["terminated"], info["truncation"], metrics["success"])
             flags = jnp.stack([*flags, metrics["nonfinite_envs"]]) > 0
-            return state, (state.obs, state.reward, flags, info["final_obs"])
+            obs, final_obs = unwrap_single(state.obs), unwrap_single(info["final_obs"])
+            return state, (obs, state.reward, flags, final_obs)
 
         self._reset = jax.jit(wrapped.reset, compiler_options=options)
         self._step = jax.jit(step, compiler_options=options)
         self._state: State | None = None
-        self._results: tuple[jax.Array, ...] | None = None
+        self._results: tuple[Any, ...] | None = None
 
     def reset(self, seed: Seed = None) -> Observations:
         """Begin an episode in every environment.
@@ -92,7 +110,7 @@ class BatchedEnv:
         keys = self._reset_keys(seed, current)
         self._results = None
         state = self._state = self._reset(keys)
-        return np.array(state.obs)
+        return jax.tree.map(np.array, jax.device_get(unwrap_single(state.obs)))
 
     def start(self, actions: np.ndarray) -> None:
         """Start a step on the device, without waiting for it.
@@ -109,7 +127,8 @@ class BatchedEnv:
     def finish(self) -> Steps:
         """Wait for the step that `start` began, and return its results as the caller's arrays."""
         assert self._results is not None, "start() comes before finish()"
-        obs, reward, flags, final_obs = (np.array(x) for x in jax.device_get(self._results))
+        results = jax.tree.map(np.array, jax.device_get(self._results))
+        obs, reward, flags, final_obs = results
         self._results = None
         terminated, truncated, success, nonfinite = flags
         return Steps(obs, reward, terminated, truncated, success, nonfinite, final_obs)

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Source, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
-from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards
+from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
 from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.errors import UserError
 
@@ -103,7 +103,7 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(done):
             infos[index] = {
-                "terminal_observation": steps.final_obs[index],
+                "terminal_observation": observation_at(steps.final_obs, index),
                 "TimeLimit.truncated": bool(steps.truncated[index]),
                 "is_success": bool(steps.success[index]),
             }

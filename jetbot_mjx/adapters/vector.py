@@ -7,7 +7,7 @@ from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Seed, Source, requires_extra
 from jetbot_mjx.adapters.base import AdapterBase
-from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards
+from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
 
 with requires_extra("gymnasium"):
@@ -109,7 +109,7 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
         if done.any():
             final_obs = np.full(self.num_envs, None, object)
             for index in np.flatnonzero(done):
-                final_obs[index] = steps.final_obs[index]
+                final_obs[index] = observation_at(steps.final_obs, index)
             final_info = {"is_success": steps.success & done, "_is_success": done.copy()}
             if steps.nonfinite.any():
                 final_info |= {"nonfinite_world": steps.nonfinite}

@@ -25,6 +25,7 @@ from jetbot_mjx.envs.robot_model import (
 )
 from jetbot_mjx.envs.state import PhysicsState, robot_state
 from jetbot_mjx.envs.task import AdvancesGoal, Goal, RobotState, layout_size
+from jetbot_mjx.errors import UserError
 
 # MuJoCo prints each of these warnings once per episode and appends it to a file in the working
 # directory. They are suppressed, since `Step.finite` reports the same.
@@ -72,8 +73,14 @@ class MujocoJetBot:
           task_class: the class of the task; None: the one that `task.name` imports.
 
         Raises:
-          UserError: the task or its scene cannot be built.
+          UserError: the task or its scene cannot be built, or the policy sees images.
         """
+        if config.task.sees:
+            raise UserError(
+                f"task.observation = {config.task.observation!r}: one robot in C MuJoCo observes"
+                " numbers only, world or egocentric; a batch of robots sees (JetBotVectorEnv,"
+                " JetBotVecEnv)"
+            )
         programs = _programs(config.model_dump_json(), task_class)
         self.env, self.model, self._reset, self._task_step = programs
         self.data = mujoco.MjData(self.model)

@@ -40,6 +40,8 @@ def wrap_for_training(
     episode_length: int,
     action_repeat: int = 1,
     randomization_fn: RandomizationFn | None = None,
+    *,
+    final_images: bool = False,
 ) -> Env:
     """Wrap an environment for a trainer: batched, with automatic resets and domain randomization.
 
@@ -53,6 +55,8 @@ def wrap_for_training(
       action_repeat: environment steps for which each action is repeated.
       randomization_fn: draws one physics model per environment. The batch of models must be as
         large as the batch of keys given to `reset`. None: all environments share one model.
+      final_images: whether `info["final_obs"]` has images too, which costs a second image in every
+        step; otherwise it has the numbers only.
 
     Returns:
       The batched environment: `reset` takes keys of shape (n, 2), `step` takes actions of shape
@@ -60,9 +64,11 @@ def wrap_for_training(
     """
 
     def wrap_one(env: JetBotEnv) -> Any:
-        randomized = maybe_randomize(env.blind())
-        episodes = NewEpisodeWrapper(EpisodeWrapper(randomized, episode_length, action_repeat))
-        return with_camera(episodes, env.camera)
+        one = maybe_randomize(env.blind())
+        if final_images:
+            one = with_camera(one, env.camera)
+        one = NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))
+        return one if final_images else with_camera(one, env.camera)
 
     if randomization_fn is None:
         return VmapWrapper(wrap_one(env))

@@ -6,13 +6,29 @@ import pytest
 from camera_scenes import ROBOT, make_model
 
 from jetbot_mjx.config import CameraConfig, ConfigError, parse_config
-from jetbot_mjx.envs.camera.lens import footprint, intrinsics, sample_rays
+from jetbot_mjx.envs.camera.lens import Footprint, Rays, intrinsics, pixel_grid
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import InvalidError
 
 JETBOT = {"width": 224, "height": 224, "matrix": (114.0, 113.0, 113.5, 110.0)}
 """A wide lens: 160 degrees from corner to corner, as calibrations of JetBots give it."""
+
+
+def _whole(config, rays):
+    shape = config.height, config.width
+    return Rays(*(np.broadcast_to(np.asarray(x, np.float32), shape) for x in rays))
+
+
+def footprint(config):
+    """The centres of all pixels and their differences, as arrays of the image's size."""
+    grid = pixel_grid(config)
+    return Footprint(*(_whole(config, rays) for rays in grid.expand(grid.columns)[1]))
+
+
+def sample_rays(config, samples):
+    grid = pixel_grid(config.model_copy(update={"samples": samples}))
+    return [_whole(config, rays) for rays in grid.expand(grid.columns)[0]]
 
 
 def project_opencv(x, y, coefficients):
