@@ -201,13 +201,18 @@ def test_a_gallery_shows_the_first_the_middle_and_the_last(steps, chosen):
 @pytest.fixture
 def stages(monkeypatch):
     """Name and total of every stage that is shown, however short."""
-    shown, original = [], progress._Lines.stage
+    shown, original = [], progress._lines
 
-    def stage(self, name, total):
-        shown.append((name, total))
-        return original(self, name, total)
+    def lines(stream):
+        show = original(stream)
 
-    monkeypatch.setattr(progress._Lines, "stage", stage)
+        def record(name, total):
+            shown.append((name, total))
+            return show(name, total)
+
+        return record
+
+    monkeypatch.setattr(progress, "_lines", lines)
     return shown
 
 

@@ -50,7 +50,9 @@ def test_what_is_not_there_is_told_with_the_likely_name(runs):
     assert isinstance(caught.value, FileNotFoundError)
     with pytest.raises(CheckpointError, match="give a run folder or a checkpoint in it"):
         find_checkpoint("something else")
-    with pytest.raises(NotFoundError, match="there are jetbot_egocentric, real_jetbot"):
+    with pytest.raises(
+        NotFoundError, match="there are jetbot_camera, jetbot_egocentric, real_jetbot"
+    ):
         find_run("pretrained:x")
 
 
@@ -127,7 +129,7 @@ def test_configurations_are_found_by_name(tmp_path, monkeypatch):
     [
         ("jetbot_egocentrc", "did you mean jetbot_egocentric?"),
         ("configs/smokee.yaml", "did you mean smoke?"),
-        ("xyz", "give a file, or one of gpu, isaac_sb3,"),
+        ("xyz", "give a file, or one of camera_gpu, gpu, isaac_sb3,"),
     ],
 )
 def test_a_mistaken_configuration_is_told_the_likely_one(tmp_path, monkeypatch, name, told):

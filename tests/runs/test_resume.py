@@ -752,7 +752,7 @@ def test_resume_names_the_folder_already(tmp_path, capsys):
         train.main(["--resume", str(tmp_path), "--run-dir", str(tmp_path)])
     assert caught.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
-    assert "--run-dir: --resume names the folder already" in line
+    assert "--run-dir: --resume continues that run, in its folder" in line
 
 
 def test_resume_and_config_exclude_each_other(tmp_path, smoke, capsys):
