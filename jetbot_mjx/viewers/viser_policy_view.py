@@ -13,7 +13,7 @@ from jetbot_mjx.viewers.realtime import Clock
 _SIDE, _SIDE_OF_TWO = 200, 140  # [pixels] longer side of one image, and of two side by side
 _GAP = 8  # [pixels] between the two
 _IMAGES_PER_SECOND, _MAPS_PER_SECOND = 15, 4
-_LEAST_HEAT = 0.1  # change of the action that is drawn in yellow, if none is larger
+_LEAST_HEAT = 0.5  # change of the action that is drawn in yellow, if none is larger
 
 _SEES = "What the policy sees"
 _LOOKS = "What it sees, and what it looks at (the action changes by up to {:.2f})"
