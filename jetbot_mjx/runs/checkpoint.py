@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
@@ -212,10 +213,11 @@ def _check_parts(obs: Any, shapes: Mapping[str, Sequence[int]]) -> None:
     if not fits:
         raise InvalidError(f"observation: expected {wanted}; got {_parts(obs)}")
     images = [name for name in shapes if len(shapes[name]) == 3]
-    if wrong := [name for name in images if np.asarray(obs[name]).dtype != np.uint8]:
+    dtypes = {name: jnp.asarray(obs[name]).dtype for name in images}
+    if wrong := [name for name, dtype in dtypes.items() if dtype != np.uint8]:
         raise InvalidError(
-            f"observation: {wrong[0]} has the dtype {np.asarray(obs[wrong[0]]).dtype}: it should be"
-            " uint8, 0 to 255"
+            f"observation: {wrong[0]} has the dtype {dtypes[wrong[0]]}: it should be uint8,"
+            " 0 to 255"
         )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float, UInt8
 
 from jetbot_mjx.compiler.xla_options import host_cpu
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
@@ -242,6 +243,22 @@ class Player:
         """Horizontal distance from the axle midpoint to the goal [m]."""
         offset = self.snapshot.goal_w - self.snapshot.qpos[QPOS_XYZ]
         return float(np.hypot(offset[0], offset[1]))
+
+    @property
+    def sees(self) -> bool:
+        """Return whether the policy sees through the robot's camera."""
+        return self.env.camera is not None
+
+    def image(self) -> UInt8[np.ndarray, "h w c"]:
+        """Return the newest image of the chosen robot's camera; only if the policy sees."""
+        return np.asarray(self._fns.see(self._states, np.int32(self._robot)))
+
+    def occlusion_map(self) -> Float[np.ndarray, "h w"]:
+        """Return how far the policy's action changes if a pixel of that image is covered.
+
+        The policy is that of the checkpoint, whoever drives; `evaluation.occlusion` explains it.
+        """
+        return np.asarray(self._fns.occlusion(self._states, np.int32(self._robot), self._params))
 
     @property
     def steps_per_second(self) -> float:

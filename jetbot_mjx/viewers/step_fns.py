@@ -7,17 +7,18 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
-from jetbot_mjx.agents.networks import Networks, PolicyParams
+from jetbot_mjx.agents.networks import Networks, PolicyParams, make_policy
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.camera.wrapper import see, with_camera
+from jetbot_mjx.envs.camera.wrapper import PIXELS, see, with_camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.envs.task import MovesGoal
 from jetbot_mjx.envs.wrappers import EpisodeWrapper
 from jetbot_mjx.evaluation.evaluator import BASELINES, policy_controller
+from jetbot_mjx.evaluation.occlusion import occlusion_map
 
 _REWARD = "reward/"  # prefix of the reward's terms in a state's metrics
 
@@ -83,6 +84,10 @@ class ViewerFns(NamedTuple):
     """Make one environment step, with the episode statistics of `EpisodeWrapper`."""
     move: Callable[[State, np.int32, Float[np.ndarray, "3"]], tuple[State, Snapshot]]
     """Move one robot's goal to a position [m], world frame, and restart its time limit."""
+    see: Callable[[State, np.int32], UInt8[Array, "h w c"]]
+    """Return the newest image of one robot's camera."""
+    occlusion: Callable[[State, np.int32, PolicyParams], Float[Array, "h w"]]
+    """Return the occlusion map of a policy for what one robot's camera sees."""
 
 
 def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
@@ -93,7 +98,8 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
       networks: the networks of the policies.
 
     Returns:
-      The functions; `move` may only be called if `move_goal_error` returns an empty string.
+      The functions; `move` may only be called if `move_goal_error` returns an empty string, `see`
+      and `occlusion` only if the environment has a camera.
     """
     episodes = EpisodeWrapper(env.blind(), env.config.task.episode_length)
     episode_env = with_camera(episodes, env.camera)
@@ -137,8 +143,18 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
         states = _where(jnp.arange(len(states.done)) == robot, moved, states)
         return states, _snapshot(env, states)
 
+    def see_one(states: State, robot: Int[Array, ""]) -> UInt8[Array, "h w c"]:
+        assert env.camera is not None
+        return states.obs[PIXELS][robot, ..., -env.camera.shape[2] :]
+
+    def occlusion(
+        states: State, robot: Int[Array, ""], params: PolicyParams
+    ) -> Float[Array, "h w"]:
+        obs = jax.tree.map(lambda part: part[robot], states.obs)
+        return occlusion_map(make_policy(networks, params), obs)
+
     compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))
-    return ViewerFns(compiled(reset), compiled(restart), compiled(step), compiled(move))
+    return ViewerFns(*map(compiled, (reset, restart, step, move, see_one, occlusion)))
 
 
 def _snapshot(env: JetBotEnv, states: State) -> Snapshot:

@@ -8,7 +8,7 @@ import contextlib
 import functools
 import io
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, Self
 
@@ -16,17 +16,19 @@ import imageio.v3 as iio
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_XYZ
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.run_dir import write_bytes
 from jetbot_mjx.viewers.offscreen import Renderer, overview
+from jetbot_mjx.viewers.policy_view import resize_nearest
 
 VIEW = 400
 """Side of one view [pixels]."""
@@ -40,6 +42,7 @@ GIF_STRIDE = 2
 _HOLD_SECONDS = 0.6  # pause after the end, so that the viewer sees it
 # Lengths as fractions of the view's side.
 _INSET = (0.30, 0.225)  # width and height of the onboard camera's image
+_SEEN, _SEEN_OF_MANY = 0.32, 0.24  # longer side of what a policy sees, alone and side by side
 _MARGIN = 0.03  # between the border and text or inset
 _TEXT = 0.05  # height of the font
 _TRAIL_STEPS = 4  # environment steps per segment of the trail
@@ -126,6 +129,7 @@ class VideoRenderer:
         self._fovy = float(env.mj_model.vis.global_.fovy)
         self._side, self._fps = side, fps
         width, height = (round(share * side) for share in _INSET)
+        self._policy_image = None if env.camera is None else _image_fn(env.camera)
         with contextlib.ExitStack() as stack:
             self._view = stack.enter_context(Renderer(env.mj_model, width=side, height=side))
             self._inset = stack.enter_context(Renderer(env.mj_model, width=width, height=height))
@@ -133,6 +137,8 @@ class VideoRenderer:
 
     def render_episode(self, trajectory: Trajectory) -> Iterator[Frame]:
         """Render one episode: chase camera with the onboard camera as inset, and the top view.
+
+        If the policy sees, the inset is its image.
 
         Args:
           trajectory: the episode.
@@ -174,9 +180,14 @@ class VideoRenderer:
     def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
         chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
         top = self._frame_with_trail(trajectory, step, "top")
-        # In the lower corner the inset hides a goal only while the robot drives away from it.
-        chase = self._with_inset(chase, trajectory, step, top=False)
-        return np.hstack([self._with_text(chase, trajectory, step), top])
+        inset = self._inset_image(trajectory, step, _SEEN)
+        if self._policy_image is None:
+            # In the lower corner the inset hides a goal only while the robot drives away from it.
+            chase = self._with_inset(chase, inset, top=False, left=False)
+            return np.hstack([self._with_text(chase, trajectory, step), top])
+        chase = self._with_inset(chase, inset, top=True, left=True)
+        beside = round(_MARGIN * self._side) + inset.shape[1]
+        return np.hstack([self._with_text(chase, trajectory, step, beside=beside), top])
 
     def frame_count(self, trajectories: Sequence[Trajectory]) -> int:
         """Return the number of frames of a video of one trajectory, or of several side by side."""
@@ -199,27 +210,48 @@ class VideoRenderer:
         view = self._frame_with_trail(trajectory, step, camera)
         # A white line between neighbouring views.
         view = np.pad(view[:, :-1], ((0, 0), (0, 1), (0, 0)), constant_values=255)
-        return self._with_text(
-            self._with_inset(view, trajectory, step, top=True), trajectory, step, heading
-        )
+        inset = self._inset_image(trajectory, step, _SEEN_OF_MANY)
+        view = self._with_inset(view, inset, top=True, left=False)
+        return self._with_text(view, trajectory, step, heading)
 
-    def _with_inset(self, view: Frame, trajectory: Trajectory, step: int, *, top: bool) -> Frame:
-        """Insert the onboard camera's image with a white border in a corner on the right."""
-        inset = self._inset.frame(
-            trajectory.qpos[step], trajectory.markers, "onboard", shadows=False
-        )
-        inset = np.pad(inset, ((2, 2), (2, 2), (0, 0)), constant_values=255)
+    def _inset_image(self, trajectory: Trajectory, step: int, share: float) -> Frame:
+        """Return what the policy sees, or the onboard camera's image, with a white border.
+
+        Args:
+          trajectory: the episode.
+          step: the index of the state.
+          share: the longer side of what the policy sees, as a fraction of the view's side.
+        """
+        qpos, markers = trajectory.qpos[step], trajectory.markers
+        if self._policy_image is None:
+            image = self._inset.frame(qpos, markers, "onboard", shadows=False)
+        else:
+            seen = np.asarray(self._policy_image(qpos, markers))
+            image = resize_nearest(seen, round(share * self._side))
+        return np.pad(image, ((2, 2), (2, 2), (0, 0)), constant_values=255)
+
+    def _with_inset(self, view: Frame, inset: Frame, *, top: bool, left: bool) -> Frame:
+        """Insert an image in a corner of a view."""
         height, width = inset.shape[:2]
         margin = round(_MARGIN * self._side)
-        first = margin if top else self._side - margin - height
+        row = margin if top else self._side - margin - height
+        column = margin if left else self._side - margin - width
         view = view.copy()
-        view[first : first + height, self._side - margin - width : self._side - margin] = inset
+        view[row : row + height, column : column + width] = inset
         return view
 
     def _with_text(
-        self, frame: Frame, trajectory: Trajectory, step: int, heading: str = ""
+        self,
+        frame: Frame,
+        trajectory: Trajectory,
+        step: int,
+        heading: str = "",
+        beside: int = 0,
     ) -> Frame:
-        """Write heading, goal number, time, remaining distance and outcome into a view."""
+        """Write heading, goal number, time, remaining distance and outcome into a view.
+
+        The text begins at the left border of the view, or right of the column `beside`.
+        """
         lines = [(heading, "black")] if heading else []
         lines += [
             (f"goal {trajectory.goal_number}  {step * trajectory.dt:4.2f} s", "black"),
@@ -233,7 +265,7 @@ class VideoRenderer:
         draw = ImageDraw.Draw(image)
         size, margin = _TEXT * self._side, round(_MARGIN * self._side)
         for row, (text, colour) in enumerate(lines):
-            position = (margin, margin + row * 1.15 * size)
+            position = (beside + margin, margin + row * 1.15 * size)
             # The white outline makes text readable on any background, but narrows the spaces.
             spaced = text.replace(" ", "  ")
             draw.text(
@@ -248,6 +280,18 @@ class VideoRenderer:
     def __exit__(self, *exception: object) -> None:
         """Free the cameras."""
         self._stack.close()
+
+
+def _image_fn(camera: Camera) -> Callable[..., UInt8[Array, "h w c"]]:
+    """Return a compiled function of `qpos` and markers: the image of a robot's camera."""
+
+    @jax.jit
+    def image(
+        qpos: Float[Array, " nq"], markers: Mapping[str, Float[Array, "3"]]
+    ) -> UInt8[Array, "h w c"]:
+        return camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), markers)
+
+    return image
 
 
 @functools.cache

@@ -11,6 +11,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.player import SPEEDS, Player
 from jetbot_mjx.viewers.step_fns import AGENTS, KEYBOARD
 from jetbot_mjx.viewers.viser_camera import CAMERAS
+from jetbot_mjx.viewers.viser_policy_view import PolicyView
 from jetbot_mjx.viewers.viser_scene import Scene
 
 _BUTTONS = ("Step", "New episode")
@@ -51,6 +52,7 @@ class ControlPanel:
         self.episode = gui.add_text("Episode", "", disabled=True)
         self.distance = gui.add_text("Distance", "", disabled=True)
         self.pace = gui.add_text("Pace", "", disabled=True)
+        self.policy_view = PolicyView(gui, player) if player.sees else None
         self._largest = dict.fromkeys(player.snapshot.rewards, 1e-9)
         self.rewards = gui.add_html("")
         self._add_choices()

@@ -107,6 +107,8 @@ class ViserViewer:
             self.scene.show()
         if self._panel_clock.due(time.monotonic()):
             self.panel.update()
+        if self.panel.policy_view is not None:
+            self.panel.policy_view.update()
 
     def close(self) -> None:
         """Stop the server."""

@@ -395,7 +395,7 @@ def commands(block):
     for line in block.replace("\\\n", " ").splitlines():
         words = []
         lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
-        lexer.wordchars += "$,:[]{}"
+        lexer.wordchars += "$,:[]{}+"
         for word in [*lexer, ";"]:
             if set(word) <= set(";&|"):
                 if words:

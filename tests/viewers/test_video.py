@@ -6,10 +6,14 @@ from pathlib import Path
 
 import imageio.v3 as iio
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -54,13 +58,20 @@ def renderer(world_env, needs_opengl):
 
 
 @pytest.fixture
-def written(monkeypatch):
+def places():
+    """Where all that is `written` begins [pixels]."""
+    return []
+
+
+@pytest.fixture
+def written(monkeypatch, places):
     """All that is written into pictures."""
     texts = []
     original = ImageDraw.ImageDraw.text
 
     def text(self, place, text, *arguments, **options):
         texts.append(" ".join(text.split()))
+        places.append(place)
         return original(self, place, text, *arguments, **options)
 
     monkeypatch.setattr(ImageDraw.ImageDraw, "text", text)
@@ -151,6 +162,37 @@ def test_the_inset_is_what_the_robot_sees(renderer, drive):
 
     assert red_in_corner((0.3, 0.0)) > 5
     assert red_in_corner((-0.9, 0.0)) == 0
+
+
+@pytest.fixture(scope="module")
+def seeing_env():
+    config = {"task": {"observation": "camera"}, "camera": {"width": 16, "height": 12, "frames": 2}}
+    return make_env(parse_config(config))
+
+
+def test_what_a_policy_sees_is_in_the_upper_left_corner(
+    seeing_env, drive, written, places, needs_opengl
+):
+    one = drive((0.0, 0.2), (0.3, 0.1))
+    camera = seeing_env.camera
+    qpos = jnp.asarray(one.qpos[0])
+    seen = np.asarray(camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), one.markers))
+    assert ((seen[..., 0] > 90) & (seen[..., 1] < 40)).any()  # the cube
+    with VideoRenderer(seeing_env, SIDE, FPS) as renderer:
+        frame = next(renderer.render_episode(one))
+        margin, border, square = round(0.03 * SIDE), 2, 2
+        inner = frame[margin + border :, margin + border :][: 12 * square, : 16 * square]
+        np.testing.assert_allclose(inner[::square, ::square].astype(int), seen, atol=1)
+        np.testing.assert_array_equal(inner[::square], inner[1::square])
+        assert (frame[margin : margin + border, margin : margin + 2 * border + 32] == 255).all()
+        # The text is beside it; of several views, each has its own at the upper right.
+        assert written[0] == "goal 7 0.00 s"
+        assert {x for x, _ in places} == {margin + 2 * border + 32 + margin}
+        places.clear()
+        views = next(renderer.render_side_by_side([("0 steps", one), ("9 steps", one)]))
+        assert {x for x, _ in places} == {margin}
+        corner = views[margin + border :, : SIDE - margin - border][: 12 * square, -16 * square :]
+        np.testing.assert_array_equal(corner, inner)
 
 
 @pytest.mark.parametrize("seed", range(5))
