@@ -113,8 +113,11 @@ class AdapterBase:
             assert self._renderer is not None
             self._renderer.show(self._poses()[0])
 
-    def close(self) -> None:
-        """Close the renderer."""
+    def _close_renderer(self) -> None:
         if self._renderer is not None:
             self._renderer.close()
+
+    def close(self) -> None:
+        """Close the renderer, and what Gymnasium's own class has open."""
+        self._close_renderer()
         super().close()  # pyright: ignore[reportAttributeAccessIssue]

@@ -193,5 +193,9 @@ class JetBotVecEnv(AdapterBase, VecEnv):
             return getattr(self, name)
         return getattr(self.batch.env, name)
 
+    def close(self) -> None:
+        """Close the renderer; the base class of Stable-Baselines3 has nothing to close."""
+        self._close_renderer()
+
     def _poses(self) -> list[Pose]:
         return self.batch.poses()
