@@ -1,7 +1,7 @@
 """Copy the trained policies that come with the package: `python -m jetbot_mjx.pretrained`.
 
-There is one run for each of three configurations. The copies are run folders like any other: evaluate
-them, render them, export them, compare them with your own runs, or train them further.
+There is one run for each of three configurations. The copies are run folders like any other:
+evaluate them, render them, compare them with your own runs, or train them further.
 """
 
 from collections.abc import Sequence
