@@ -147,18 +147,18 @@ def shown(monkeypatch):
             view.update()
         return asked.count("image"), asked.count("map")
 
-    return view, after
+    return view, after, heat
 
 
 def test_the_panel_shows_the_image_and_no_map_unless_it_is_switched_on(shown):
-    view, after = shown
+    view, after, _ = shown
     assert after(1.0) == (15, 0)
     assert view.image.image.shape == (192, 192, 3)
     assert view.image.label == "What the policy sees"
 
 
 def test_the_map_lies_beside_the_image_and_is_computed_a_few_times_a_second(shown):
-    view, after = shown
+    view, after, heat = shown
     view.looks.value = True
     assert after(1 / 15, 1) == (1, 1)  # at once
     images, maps = after(1.0)
@@ -171,6 +171,11 @@ def test_the_map_lies_beside_the_image_and_is_computed_a_few_times_a_second(show
     yellow = (both[:, 136:, :3] == [255, 235, 60]).all(axis=-1)
     np.testing.assert_array_equal(np.argwhere(yellow)[[0, -1]], [[16, 16], [31, 31]])
     assert view.image.label.endswith("up to 0.50)")
+    # Changes that are all small light nothing up.
+    heat *= 0.2
+    after(0.5)
+    assert view.image.label.endswith("up to 0.10)")
+    assert (view.image.image[:, 136:, 0] < 200).all()
     view.looks.value = False
     assert after(0.5)[1] == 0
     assert view.image.label == "What the policy sees"
