@@ -246,3 +246,10 @@ def test_a_plane_that_is_infinite_one_way_only_ends_the_other_way():
     is_seen = np.asarray(found) >= 0
     assert 0 < is_seen.sum() < 112  # of 128 below the horizon
     assert ((image[..., 0] > 0) == is_seen).all()
+
+
+def test_a_light_that_is_off_may_have_a_position():
+    lamp = '<light type="spot" pos="0 0 1" active="{}"/>'
+    assert Scenes(make_model([], lamp.format("false"))).camera.scene.lights == ()
+    with pytest.raises(UserError, match="has a position"):
+        Scenes(make_model([], lamp.format("true")))
