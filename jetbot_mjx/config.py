@@ -538,13 +538,18 @@ class Config(_Section):
         return self
 
     def for_any_device(self) -> "Config":
-        """Return a copy with `physics.impl = "auto"`, unless it is `xla`.
+        """Return a copy whose `physics.impl` and `camera.impl` are "auto", unless they are `xla`.
 
         A run that requested a kernel for one kind of device can then be evaluated on others too.
         """
-        if self.physics.impl == "xla":
-            return self
-        return self.model_copy(update={"physics": self.physics.model_copy(update={"impl": "auto"})})
+        sections = {"physics": self.physics, "camera": self.camera}
+        return self.model_copy(
+            update={
+                name: section.model_copy(update={"impl": "auto"})
+                for name, section in sections.items()
+                if section.impl != "xla"
+            }
+        )
 
     def of_each_seed(self) -> list["Config"]:
         """Return one configuration for each seed, with `seeds = 1`."""
@@ -799,6 +804,8 @@ def _explain(error: ErrorDetails) -> str:
     match error["type"]:
         case "invalid_key":
             return f"{key} = {value!r} is no key: keys should be strings"
+        case "missing" if isinstance(error["input"], list | tuple):
+            return f"{'.'.join(location[:-1])} = {list(value)} is wrong: it lacks items"
         case "tuple_type":
             return f"{key} = {value!r} is wrong: it should be a list"
         case "too_short":

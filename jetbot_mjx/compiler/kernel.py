@@ -69,6 +69,8 @@ class Kernel:
     impl: str = "auto"
     """Name of the back end that must run the kernel; `auto` takes the back end of the platform, or
     the fallback if there is none."""
+    setting: str = "physics.impl"
+    """Key of the setting that chose `impl`, for error messages."""
     table: Float[np.ndarray, "rows items"] | None = None
     """What differs between the items of a robot; None: the kernel is a step."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
@@ -175,8 +177,8 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
     for leaf, shape in zip(leaves, shapes, strict=True):
         if leaf.dtype != np.float32:
             raise UserError(
-                f"one kernel steps float32 only, not {leaf.dtype}: cast it, or choose"
-                " physics.impl = xla"
+                f"one kernel takes float32 only, not {leaf.dtype}: cast it, or choose"
+                f" {kernel.setting} = xla"
             )
         if leaf.shape != (*batch, *shape):
             raise ValueError(f"an argument of shape {leaf.shape}, not {(*batch, *shape)}")
@@ -215,6 +217,10 @@ batching.primitive_batchers[_kernel_p] = _batch
 
 
 def _differentiate(primals: Any, tangents: Any, *, kernel: Kernel) -> Any:
+    if kernel.table is not None:
+        raise UserError(
+            f"an image as one kernel cannot be differentiated: choose {kernel.setting} = xla"
+        )
     raise UserError(
         "physics as one kernel cannot be differentiated: choose physics.impl = xla; for jax.grad"
         " and other reverse modes also physics.iterations = 1, for MJX's solver is a loop"
@@ -266,7 +272,7 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
         else:
             raise UserError(
-                f"physics.impl = {kernel.impl}: this program is for"
+                f"{kernel.setting} = {kernel.impl}: this program is for"
                 f" {backend.PLATFORM if backend else 'another platform'}: choose xla or auto"
             )
         shapes = kernel.result_shapes

@@ -15,18 +15,14 @@ import mujoco
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jetbot_mjx.compiler import kernel, llvm_backend, llvm_codegen, ptx_backend
+from jetbot_mjx.compiler import kernel, llvm_codegen
+from jetbot_mjx.compiler.backends import BACKENDS, require_backend
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.envs import cholesky, mjx
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
-
-BACKENDS: tuple[kernel.Backend, ...] = (ptx_backend, llvm_backend)
-"""Back ends that can compile a step as one kernel."""
-
-kernel.register(*BACKENDS)
 
 _PLATFORMS = {"gpu": "cuda"}
 """Names of lowering platforms, where they differ from those of JAX's devices."""
@@ -53,12 +49,7 @@ class Physics:
         """Indices of the model's leaves that are traced: they may differ from robot to robot."""
         self._lock = threading.Lock()
         self._kernel: kernel.Step | UnsupportedError | None = None
-        for backend in BACKENDS:
-            if config.impl == backend.IMPL and not backend.is_available():
-                raise UserError(
-                    f"physics.impl = {config.impl} needs {backend.NEEDS}; this is"
-                    f" {jax.default_backend()}: choose xla or auto"
-                )
+        require_backend(config.impl, "physics.impl")
 
     @functools.cached_property
     def model(self) -> mjx.Model:

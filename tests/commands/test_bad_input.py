@@ -39,6 +39,7 @@ from jetbot_mjx.training import ppo_trainer
         ("ppo: {network: {policy_hidden_layer_sizes: 32}}", "it should be a list"),
         ("ppo: {network: {policy_hidden_layer_sizes: []}}", "should have at least 1 item"),
         ("ppo: {1: 2}", "is no key: keys should be strings"),
+        ("camera: {position: [0, 0]}", "camera.position = [0, 0] is wrong: it lacks items"),
         ("task: {options: {a: [1]}}", "task.options.a = [1] is wrong"),
     ],
 )

@@ -149,6 +149,16 @@ def test_a_step_casts_what_it_is_given():
 def test_without_an_nvidia_gpu_there_is_none():
     with pytest.raises(UserError, match=r"physics\.impl = ptx needs an NVIDIA GPU.* cpu"):
         make_env(parse_config({"physics": {"impl": "ptx"}}))
+    with pytest.raises(UserError, match=r"camera\.impl = ptx needs an NVIDIA GPU.* cpu"):
+        make_env(parse_config({"task": {"observation": "camera"}, "camera": {"impl": "ptx"}}))
+
+
+def test_a_run_with_a_kernel_of_one_device_can_be_used_on_any():
+    there = parse_config({"physics": {"impl": "ptx"}, "camera": {"impl": "ptx"}})
+    here = there.for_any_device()
+    assert (here.physics.impl, here.camera.impl) == ("auto", "auto")
+    xla = parse_config({"physics": {"impl": "xla"}, "camera": {"impl": "xla"}})
+    assert xla.for_any_device() == xla
 
 
 @pytest.mark.parametrize("impl", ["auto", "llvm"])

@@ -95,9 +95,13 @@ class _Sums(NamedTuple):
 
 
 def ground_of(scene: Scene) -> int | None:
-    """Return the index of the first infinite plane of a scene; None: it has none."""
-    planes = (i for i, geom in enumerate(scene.geoms) if geom.kind == "plane" and not _radius(geom))
-    return next(planes, None)
+    """Return the index of the first plane that is infinite both ways; None: there is none."""
+    infinite = (
+        i
+        for i, geom in enumerate(scene.geoms)
+        if geom.kind == "plane" and geom.size[0] == geom.size[1] == 0
+    )
+    return next(infinite, None)
 
 
 def pixel_colour(

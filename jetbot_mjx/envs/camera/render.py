@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jetbot_mjx.compiler import llvm_codegen
+from jetbot_mjx.compiler.backends import require_backend
 from jetbot_mjx.compiler.kernel import Kernel, as_map
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
@@ -36,6 +37,7 @@ from jetbot_mjx.envs.camera.pixel import (
     strengths,
 )
 from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
+from jetbot_mjx.errors import UserError
 
 _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 
@@ -61,8 +63,10 @@ class Camera:
           robot: the name of the body that carries the camera.
 
         Raises:
-          UserError: the scene has something that cannot be rendered, or the lens is none.
+          UserError: the scene has something that cannot be rendered, the lens is none, or the
+            requested kernel back end is not available.
         """
+        require_backend(config.impl, "camera.impl")
         self.config = config
         self.scene: Scene = read_scene(model, robot)
         self._grid = pixel_grid(config)
@@ -130,7 +134,12 @@ class Camera:
         try:
             program = scalarize(self._pixel, *arguments)
             llvm_codegen.require(program)
-        except UnsupportedError:
+        except UnsupportedError as error:
+            if self.config.impl != "auto":
+                raise UserError(
+                    f"camera.impl = {self.config.impl}: one kernel cannot do {error};"
+                    " choose xla or auto"
+                ) from None
             return None
         return Kernel(
             program,
@@ -138,6 +147,7 @@ class Camera:
             steps=1,
             fallback=self._fallback,
             impl=self.config.impl,
+            setting="camera.impl",
             table=self._table,
         )
 

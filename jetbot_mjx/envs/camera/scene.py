@@ -89,8 +89,8 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
       robot: the name of the robot's body.
 
     Raises:
-      UserError: a visible geom is a mesh, a height field or an SDF, moves by joints, or a light has
-        a position.
+      UserError: a visible geom is a mesh, a height field or an SDF, moves by joints, or a light
+        that is on has a position.
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
@@ -108,7 +108,7 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
         tuple(geoms),
         ambient=_rgb(headlight.ambient * active + model.light_active @ model.light_ambient),
         headlight=_rgb(headlight.diffuse * active),
-        lights=tuple(_read_light(model, light) for light in range(model.nlight)),
+        lights=tuple(_read_light(model, i) for i in np.flatnonzero(model.light_active).tolist()),
         horizon=horizon,
         zenith=zenith,
     )
@@ -228,8 +228,7 @@ def _read_light(model: mujoco.MjModel, light: int) -> Light:
             f" {model.light(light).name or light!r} has a position: set its type to directional"
         )
     direction = model.light_dir[light] / np.linalg.norm(model.light_dir[light])
-    active = float(model.light_active[light])
-    return Light(direction.astype(np.float32), _rgb(model.light_diffuse[light] * active))
+    return Light(direction.astype(np.float32), _rgb(model.light_diffuse[light]))
 
 
 def _read_sky(model: mujoco.MjModel) -> tuple[Rgb, Rgb]:

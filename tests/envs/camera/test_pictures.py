@@ -233,3 +233,23 @@ def test_the_kernel_draws_what_xla_draws(change):
     ours, theirs = images(one), images(other)
     assert np.abs(ours - theirs).max() <= 1 or (np.abs(ours - theirs) > 1).mean() < 1e-3
     assert ours.std() > 10
+
+
+def test_a_plane_that_is_infinite_one_way_only_ends_the_other_way():
+    strip = '<geom type="plane" size="0.3 0 0.1" rgba="1 0 0 1"/>'
+    scenes = Scenes(
+        make_model([], strip, ""), width=16, height=16, fovy=FOVY, samples=1, impl="xla"
+    )
+    pose = scenes.camera.pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0]))
+    image = np.asarray(scenes.camera.render(pose, {}))
+    _, found = scenes.camera.trace(pose, {})
+    is_seen = np.asarray(found) >= 0
+    assert 0 < is_seen.sum() < 112  # of 128 below the horizon
+    assert ((image[..., 0] > 0) == is_seen).all()
+
+
+def test_a_light_that_is_off_may_have_a_position():
+    lamp = '<light type="spot" pos="0 0 1" active="{}"/>'
+    assert Scenes(make_model([], lamp.format("false"))).camera.scene.lights == ()
+    with pytest.raises(UserError, match="has a position"):
+        Scenes(make_model([], lamp.format("true")))
