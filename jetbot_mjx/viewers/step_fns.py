@@ -119,8 +119,11 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
         goal = env.task.move_goal(state.goal, position_w)
         obs = env.blind().observe(robot_state(state.pipeline_state), goal)
         info = {**state.info, "steps": jnp.zeros(())}
-        state = state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
-        return state if env.camera is None else see(env.camera, env.task, state)
+        seen, state = state.obs, state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
+        if env.camera is None:
+            return state
+        # The episode goes on, so the images before stay in the stack.
+        return see(env.camera, env.task, state, seen[PIXELS], begins=False)
 
     def reset(keys: UInt32[Array, "robots 2"]) -> tuple[State, Snapshot]:
         states = jax.vmap(episode_env.reset)(keys)

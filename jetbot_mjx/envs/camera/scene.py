@@ -94,6 +94,8 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
     """
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    mujoco.mj_camlight(model, data)
     robot_id = model.body(robot).id
     geoms = []
     for geom in range(model.ngeom):
@@ -108,7 +110,9 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
         tuple(geoms),
         ambient=_rgb(headlight.ambient * active + model.light_active @ model.light_ambient),
         headlight=_rgb(headlight.diffuse * active),
-        lights=tuple(_read_light(model, i) for i in np.flatnonzero(model.light_active).tolist()),
+        lights=tuple(
+            _read_light(model, data, i) for i in np.flatnonzero(model.light_active).tolist()
+        ),
         horizon=horizon,
         zenith=zenith,
     )
@@ -221,13 +225,13 @@ def _read_checker(
     )
 
 
-def _read_light(model: mujoco.MjModel, light: int) -> Light:
+def _read_light(model: mujoco.MjModel, data: mujoco.MjData, light: int) -> Light:
     if model.light_type[light] != mujoco.mjtLightType.mjLIGHT_DIRECTIONAL:
         raise UserError(
             f"task.observation: the camera knows directional lights only, and light"
             f" {model.light(light).name or light!r} has a position: set its type to directional"
         )
-    direction = model.light_dir[light] / np.linalg.norm(model.light_dir[light])
+    direction = data.light_xdir[light] / np.linalg.norm(data.light_xdir[light])
     return Light(direction.astype(np.float32), _rgb(model.light_diffuse[light]))
 
 

@@ -4,6 +4,7 @@ import importlib
 from unittest import mock
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -240,7 +241,7 @@ def test_a_plane_that_is_infinite_one_way_only_ends_the_other_way():
     scenes = Scenes(
         make_model([], strip, ""), width=16, height=16, fovy=FOVY, samples=1, impl="xla"
     )
-    pose = scenes.camera.pose(np.array([0.0, 0.0, 0.1]), np.array([1.0, 0.0, 0.0, 0.0]))
+    pose = scenes.camera.pose(jnp.array([0.0, 0.0, 0.1]), jnp.array([1.0, 0.0, 0.0, 0.0]))
     image = np.asarray(scenes.camera.render(pose, {}))
     _, found = scenes.camera.trace(pose, {})
     is_seen = np.asarray(found) >= 0
