@@ -24,6 +24,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
 from benchmarks.harness.timing import available_cores
 from jetbot_mjx.config import CameraConfig, Config
 from jetbot_mjx.envs.camera.render import Camera

@@ -107,6 +107,7 @@ def test_what_it_cannot_do_names_the_remedy(step):
         step(state, jnp.float64(1))
 
 
+@pytest.mark.slow
 def test_the_remedy_helps():
     settings = {"impl": "xla", "iterations": 1}
     env = make_env(parse_config({"physics": settings}))

@@ -87,7 +87,7 @@ def test_the_egocentric_observation_is_the_same_wherever_the_robot_stands():
     np.testing.assert_allclose(here, there, atol=1e-5)
 
 
-@pytest.mark.parametrize("name", list(LAYOUTS))
+@pytest.mark.parametrize("name", [name for name in LAYOUTS if name])
 def test_sizes_and_tables_follow_the_layout(name):
     task = GoalTask(TaskConfig(observation=name))
     obs = task.observe(robot_at(), goal_at(1.0, 0.0))

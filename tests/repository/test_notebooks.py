@@ -122,6 +122,7 @@ def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, tra
     assert "scripted" in text(notebook)
 
 
+@pytest.mark.slow
 def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, gliding_profile):
     notebook = execute("04_own_task", gliding_profile)
     assert images(notebook) == ["image/png", "image/gif"]

@@ -179,8 +179,8 @@ def test_images_too_small_for_the_network_are_refused_before_a_run_begins(config
     assert not run_dir.exists()
 
 
-def test_the_adapters_refuse_images_in_one_line(config_file):
-    with pytest.raises(UserError, match="the adapters observe numbers only") as error:
+def test_one_robot_in_mujoco_refuses_images_in_one_line(config_file):
+    with pytest.raises(UserError, match="one robot in C MuJoCo observes numbers only") as error:
         JetBotGymEnv(config=parse_config(SETTINGS))
     assert "\n" not in str(error.value)
 

@@ -211,6 +211,7 @@ def test_they_end_with_the_bits_of_one_process_on_two_devices(alone, finished):
 # One process by itself: nothing to wait for, and mistakes that cost one line.
 
 
+@pytest.mark.slow
 def test_a_process_without_the_task_and_the_run_trains_the_source_of_the_first(
     tmp_path, unused_port
 ):

@@ -166,6 +166,7 @@ def test_a_full_disk_costs_one_line_and_no_checkpoint(recorder, events, tmp_path
     assert checkpoint_steps(tmp_path / "seed-0") == [0]
 
 
+@pytest.mark.slow
 def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
     root, smoke_run, tmp_path, monkeypatch
 ):
