@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.training import acting
-from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, PyTree
 
@@ -29,7 +28,7 @@ from benchmarks.harness.timing import (
     random_actions,
     sum_per_env,
 )
-from jetbot_mjx.agents.networks import make_networks
+from jetbot_mjx.agents.networks import init_normalizer, make_networks
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -273,15 +272,13 @@ def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -
 
 def _exploring_policy(config: Config, env: JetBotEnv) -> Callable[..., Any]:
     """Return Brax's sampling policy, as its trainer builds it, with untrained networks."""
-    networks = make_networks(
+    networks: Any = make_networks(
         config.ppo.network,
         env.observation_size,
         env.action_size,
         normalize=config.ppo.normalize_observations,
     )
-    normalizer = running_statistics.init_state(
-        specs.Array((env.observation_size,), np.dtype("float32"))
-    )
+    normalizer = init_normalizer(env.observation_size)
     weights = networks.policy_network.init(jax.random.PRNGKey(0))
     return ppo_networks.make_inference_fn(networks)((normalizer, weights))
 

@@ -159,7 +159,7 @@ def mjx_warp(model: mujoco.MjModel, size: int, poses: Poses) -> tuple[float, flo
       ImportError: there is no `warp`.
     """
     import mujoco.mjx.third_party.mujoco_warp as mjwarp
-    import warp as wp
+    import warp as wp  # pyright: ignore[reportMissingImports]
 
     count = len(poses.quat)
     _mount(model)
@@ -284,7 +284,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     default = 65_536 if jax.default_backend() == "gpu" else 1024
     parser.add_argument("--num-envs", type=int, default=default, help="images at once")
     parser.add_argument("--sizes", type=int, nargs="+", default=[32, 64], help="[pixels]")
