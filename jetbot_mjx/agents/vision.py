@@ -132,19 +132,12 @@ def make_vision_networks(
             return {_POLICY: for_policy, _VALUE: for_policy}
         return {_POLICY: for_policy, _VALUE: encode_one(normalizer, params.value, obs)}
 
-    def head_of(
-        name: str, head: brax_networks.FeedForwardNetwork, encodes: bool
-    ) -> brax_networks.FeedForwardNetwork:
-        return brax_networks.FeedForwardNetwork(
-            init=init(head, encodes),
-            apply=lambda _, params, encoded: head.apply(None, params[_HEAD], encoded[name]),
-        )
-
+    policy, value = brax_heads.policy_network, brax_heads.value_network
     # Pyright does not follow flax's dataclasses.
     networks: Any = ppo_networks.PPONetworks
     heads = networks(
-        head_of(_POLICY, brax_heads.policy_network, True),
-        head_of(_VALUE, brax_heads.value_network, not config.shared_cnn),
+        _on_features(_POLICY, policy, init(policy, True)),
+        _on_features(_VALUE, value, init(value, not config.shared_cnn)),
         brax_heads.parametric_action_distribution,
     )
 
@@ -160,6 +153,22 @@ def make_vision_networks(
         parametric_action_distribution=heads.parametric_action_distribution,
         heads=heads,
         encode=encode,
+    )
+
+
+def _on_features(
+    name: str, head: brax_networks.FeedForwardNetwork, init: Callable[[Any], Any]
+) -> brax_networks.FeedForwardNetwork:
+    """Return one of Brax's networks as a network of an encoded observation.
+
+    Args:
+      name: the part of the encoded observation that the network takes.
+      head: Brax's network of features.
+      init: initialises the parameters, with those of the encoder if the network owns it.
+    """
+    return brax_networks.FeedForwardNetwork(
+        init=init,
+        apply=lambda _, params, encoded: head.apply(None, params[_HEAD], encoded[name]),
     )
 
 

@@ -92,11 +92,9 @@ def map_text(program: ScalarProgram, *, lanes: int, items: int) -> str:
     vector = emitter.type("f")
     *shared, row = [array.size for array in program.inputs]
     # Load what the items share, and compute what follows from it alone.
-    arguments = []
-    for i, size in enumerate(shared):
-        for j in range(size):
-            address = emitter.do(f"getelementptr float, ptr %in{i}, i64 {j}")
-            arguments.append(emitter.splat(emitter.do(f"load float, ptr {address}")))
+    arguments = [
+        emitter.load_shared(f"%in{i}", j) for i, size in enumerate(shared) for j in range(size)
+    ]
     columns = [f"%column{j}" for j in range(row)]
     rest = emitter.hoist([*arguments, *columns], row)
     before, emitter.lines = emitter.lines, []
@@ -215,8 +213,10 @@ class LlvmEmitter:
         self._block(Block(items=list(rest)))
         return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
 
-    def splat(self, name: str) -> str:
-        """Return a scalar in all lanes."""
+    def load_shared(self, array: str, place: int) -> str:
+        """Load one float of an array into all lanes, and return its name."""
+        address = self.do(f"getelementptr float, ptr {array}, i64 {place}")
+        name = self.do(f"load float, ptr {address}")
         if self._lanes == 1:
             return name
         vector = self.type("f")
