@@ -283,6 +283,27 @@ def _program_key(config: Config, env: JetBotEnv, ranges: RandomizationConfig) ->
     )
 
 
+def _add_other_robots(
+    report: Report,
+    checkpoint: Checkpoint,
+    env: JetBotEnv,
+    evaluators: _Evaluators,
+    options: _Options,
+) -> Report:
+    """Return a report with the optional evaluations on other robots and in another simulator."""
+    params, keys = checkpoint.params, report_keys(options.episodes)
+    if options.robustness:
+        sweep_keys = report_keys(min(options.episodes, SWEEP_GOALS))
+        sweeper = Sweeper(env, checkpoint.networks, sweep_keys)
+        report = report._replace(robustness=sweeper.run(params))
+    if evaluators.randomized:
+        on_others = summarize(evaluators.randomized.run(params, keys), env.dt)
+        report = report._replace(randomized=on_others)
+    if evaluators.mujoco:
+        report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
+    return report
+
+
 def _write_reports(
     checkpoints: Sequence[Checkpoint],
     options: _Options,
@@ -339,15 +360,7 @@ def _write_reports(
             best_known=best_known,
             best_known_missing=missing,
         )
-        # Add the optional evaluations on other robots and in the other simulator.
-        if robustness:
-            sweeper = Sweeper(env, checkpoint.networks, report_keys(min(episodes, SWEEP_GOALS)))
-            report = report._replace(robustness=sweeper.run(params))
-        if evaluators.randomized:
-            on_others = summarize(evaluators.randomized.run(params, keys), env.dt)
-            report = report._replace(randomized=on_others)
-        if evaluators.mujoco:
-            report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
+        report = _add_other_robots(report, checkpoint, env, evaluators, options)
         if fuller is None:
             with stage("writing the report"):
                 write_report(report)
