@@ -30,7 +30,7 @@ of robots.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
@@ -41,7 +41,6 @@ from jetbot_mjx.compiler.indexing import (
     RULES,
     ScalarArray,
     constant_array,
-    constant_values,
     full_array,
     scalar_array,
     shape_of,
@@ -119,7 +118,7 @@ class _JaxprLowering:
     """A `_JaxprLowering` records the operations of a jaxpr on scalars.
 
     The lowering rule of the JAX primitive `name` is `RULES[name]` or the method `_name`: a function
-    of the equation, its parameters and its operands that returns the results.
+    of the equation and its operands that returns the results.
     """
 
     def __init__(self, graph: ExprGraph) -> None:
@@ -153,7 +152,7 @@ class _JaxprLowering:
         rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
         if rule is None:
             raise UnsupportedError(f"the operation {name}")
-        result = rule(equation, equation.params, *operands)
+        result = rule(equation, *operands)
         return result if isinstance(result, list) else [result]
 
     def _elementwise(self, op: str, *operands: ScalarArray) -> ScalarArray:
@@ -176,18 +175,16 @@ class _JaxprLowering:
 
     # Rules of primitives that call functions: jit, scan, while, cond.
 
-    def _jit(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        return self.lower(params["jaxpr"], operands)
+    def _jit(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        return self.lower(equation.params["jaxpr"], operands)
 
     _pjit = _jit
 
-    def _custom_jvp_call(
-        self, equation: Any, params: Any, *operands: ScalarArray
-    ) -> list[ScalarArray]:
-        return self.lower(params["call_jaxpr"], operands)
+    def _custom_jvp_call(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        return self.lower(equation.params["call_jaxpr"], operands)
 
-    def _scan(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        body, length = params["jaxpr"], params["length"]
+    def _scan(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        body, length = equation.params["jaxpr"], equation.params["length"]
         # Split the operands into constants, carry and sequences, which have one axis less inside.
         scanned, stacked = (
             sum(len(shape_of(a)) != len(shape_of(b)) for a, b in zip(outer, inner, strict=True))
@@ -207,7 +204,7 @@ class _JaxprLowering:
                 return rolled
         order = range(length)
         rows: dict[int, list[ScalarArray]] = {}
-        for i in reversed(order) if params["reverse"] else order:
+        for i in reversed(order) if equation.params["reverse"] else order:
             slices = [_at(sequence, i) for sequence in sequences]
             results = self.lower(body, [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
@@ -240,22 +237,21 @@ class _JaxprLowering:
         # For example, an index depends on the loop counter, which is constant once unrolled.
         return None
 
-    def _while(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        first = params["cond_nconsts"]
-        second = first + params["body_nconsts"]
+    def _while(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        first = equation.params["cond_nconsts"]
+        second = first + equation.params["body_nconsts"]
         cond_consts, body_consts = operands[:first], operands[first:second]
 
         def row_conditions(state: list[ScalarArray]) -> ScalarArray:
-            return self.lower(params["cond_jaxpr"], [*cond_consts, *state])[0]
+            return self.lower(equation.params["cond_jaxpr"], [*cond_consts, *state])[0]
 
         def condition(state: list[ScalarArray]) -> Scalar:
             # A loop under `jax.vmap` has a condition for each row, and runs while any is true.
-            rows = row_conditions(state)
-            return self._reduce_or(None, {"axes": range(rows.ndim)}, rows).item()
+            return self._fold("or", np.bool_(False), row_conditions(state).ravel())
 
         def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
             rows = row_conditions(state)
-            updated = self.lower(params["body_jaxpr"], [*body_consts, *state])
+            updated = self.lower(equation.params["body_jaxpr"], [*body_consts, *state])
             pairs = zip(state, updated, strict=True)
             return [self._where(rows, *pair) for pair in pairs] if rows.ndim else updated
 
@@ -359,10 +355,8 @@ class _JaxprLowering:
         end = [results[k] if k in carried else x for k, x in enumerate(initial)]
         return _unflatten(state, end)
 
-    def _cond(
-        self, equation: Any, params: Any, index: ScalarArray, *operands: ScalarArray
-    ) -> list[ScalarArray]:
-        branches, selected = params["branches"], index.item()
+    def _cond(self, equation: Any, index: ScalarArray, *operands: ScalarArray) -> list[ScalarArray]:
+        branches, selected = equation.params["branches"], index.item()
         if is_constant(selected):
             return self.lower(branches[min(max(int(selected), 0), len(branches) - 1)], operands)
         count_before = self._graph.count
@@ -381,10 +375,9 @@ class _JaxprLowering:
 
     # Rules of primitives whose indices may depend on the state.
 
-    def _dynamic_slice(
-        self, equation: Any, params: Any, x: ScalarArray, *starts: ScalarArray
-    ) -> ScalarArray:
-        for axis, (start, size) in enumerate(zip(starts, params["slice_sizes"], strict=True)):
+    def _dynamic_slice(self, equation: Any, x: ScalarArray, *starts: ScalarArray) -> ScalarArray:
+        sizes = equation.params["slice_sizes"]
+        for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
             last = x.shape[axis] - size
             cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
             at = start.item()
@@ -400,26 +393,17 @@ class _JaxprLowering:
     def _scatter(
         self,
         equation: Any,
-        params: Any,
         x: ScalarArray,
         indices: ScalarArray,
         updates: ScalarArray,
         op: str | None = None,
     ) -> ScalarArray:
-        dims = params["dimension_numbers"]
-        fixed = (*dims.inserted_window_dims, *dims.operand_batching_dims)
-        window = iter(updates.shape[axis] for axis in dims.update_window_dims)
-        places = windows(
-            x.shape,
-            constant_values(indices, np.int64),
-            offset_dims=dims.update_window_dims,
-            collapsed=dims.inserted_window_dims,
-            index_map=dims.scatter_dims_to_operand_dims,
-            batching=dims.operand_batching_dims,
-            indices_batching=dims.scatter_indices_batching_dims,
-            sizes=[1 if axis in fixed else next(window) for axis in range(x.ndim)],
-            clip="CLIP" in str(params["mode"]),
-        )
+        # The dimension numbers of a scatter are those of the gather that reads the same windows.
+        dims = jax.lax.GatherDimensionNumbers(*equation.params["dimension_numbers"])
+        fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
+        window = iter(updates.shape[axis] for axis in dims.offset_dims)
+        sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
+        places = windows(x.shape, indices, dims, sizes, clip="CLIP" in str(equation.params["mode"]))
         result = x.flatten()
         for place, update in zip(places.ravel(), updates.ravel(), strict=True):
             if place >= 0:
@@ -432,13 +416,11 @@ class _JaxprLowering:
 
     # Rules of primitives with arithmetic on more than single elements.
 
-    def _convert_element_type(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        dtype = np.dtype(params["new_dtype"])
+    def _convert_element_type(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        dtype = np.dtype(equation.params["new_dtype"])
         return scalar_array((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
-    def _select_n(
-        self, equation: Any, params: Any, which: ScalarArray, *cases: ScalarArray
-    ) -> ScalarArray:
+    def _select_n(self, equation: Any, which: ScalarArray, *cases: ScalarArray) -> ScalarArray:
         result = cases[-1]
         for i in reversed(range(len(cases) - 1)):
             # The index of a case is a bool or an integer.
@@ -450,59 +432,55 @@ class _JaxprLowering:
         return result
 
     def _clamp(
-        self, equation: Any, params: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
+        self, equation: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
     ) -> ScalarArray:
         return self._elementwise("min", self._elementwise("max", x, low), high)
 
-    def _square(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+    def _square(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("mul", x, x)
 
-    def _integer_pow(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+    def _integer_pow(self, equation: Any, x: ScalarArray) -> ScalarArray:
         one = constant_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
         result = one
-        for _ in range(abs(params["y"])):
+        for _ in range(abs(equation.params["y"])):
             result = self._elementwise("mul", result, x)
-        return result if params["y"] >= 0 else self._elementwise("div", one, result)
+        return result if equation.params["y"] >= 0 else self._elementwise("div", one, result)
 
-    def _rsqrt(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+    def _rsqrt(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
-    def _reduce(
-        self, op: str, initial: Scalar, equation: Any, params: Any, x: ScalarArray
-    ) -> ScalarArray:
-        axes = tuple(params["axes"])
-        free = [axis for axis in range(x.ndim) if axis not in axes]
-        shape = [x.shape[axis] for axis in free]
-        results = full_array(shape, lambda: initial)
-        x = x.transpose(*free, *axes)
-        for place in np.ndindex(*shape):
-            for scalar in x[place].ravel() if axes else [x[place]]:
-                results[place] = self._graph.apply(op, results[place], scalar)
-        return results
+    def _reduce(self, op: str, initial: Scalar, equation: Any, x: ScalarArray) -> ScalarArray:
+        (groups,) = _group_axes(x, (), equation.params["axes"])
+        scalars = (self._fold(op, initial, group) for group in groups)
+        return scalar_array(scalars, shape_of(equation.outvars[0]))
 
-    def _reduce_sum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, params, x)
+    def _fold(self, op: str, initial: Scalar, scalars: Iterable[Scalar]) -> Scalar:
+        """Combine scalars by an operation, one after the other."""
+        return functools.reduce(functools.partial(self._graph.apply, op), scalars, initial)
+
+    def _reduce_sum(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, x)
 
     _reduce_and = functools.partialmethod(_reduce, "and", np.bool_(True))
     _reduce_or = functools.partialmethod(_reduce, "or", np.bool_(False))
 
-    def _reduce_max(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("max", _lowest(equation), equation, params, x)
+    def _reduce_max(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("max", _lowest(equation), equation, x)
 
-    def _reduce_min(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("min", -_lowest(equation), equation, params, x)
+    def _reduce_min(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("min", -_lowest(equation), equation, x)
 
-    def _cumsum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        result = np.moveaxis(x.copy(), params["axis"], 0)
+    def _cumsum(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        result = np.moveaxis(x.copy(), equation.params["axis"], 0)
         order = range(1, len(result))
-        for i in [len(result) - 1 - i for i in order] if params["reverse"] else order:
-            previous = _at(result, i + 1 if params["reverse"] else i - 1)
+        for i in [len(result) - 1 - i for i in order] if equation.params["reverse"] else order:
+            previous = _at(result, i + 1 if equation.params["reverse"] else i - 1)
             # Assign to a slice: assigned to an element, the array would become a nested object.
             result[i : i + 1] = self._elementwise("add", previous, _at(result, i))[None]
-        return np.moveaxis(result, 0, params["axis"])
+        return np.moveaxis(result, 0, equation.params["axis"])
 
-    def _arg_extreme(self, better: str, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        (axis,) = params["axes"]
+    def _arg_extreme(self, better: str, equation: Any, x: ScalarArray) -> ScalarArray:
+        (axis,) = equation.params["axes"]
         kind = equation.outvars[0].aval.dtype.type
         x = np.moveaxis(x, axis, -1)
         places = full_array(x.shape[:-1], lambda: kind(0))
@@ -517,10 +495,8 @@ class _JaxprLowering:
     _argmin = functools.partialmethod(_arg_extreme, "lt")
     _argmax = functools.partialmethod(_arg_extreme, "gt")
 
-    def _dot_general(
-        self, equation: Any, params: Any, a: ScalarArray, b: ScalarArray
-    ) -> ScalarArray:
-        (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
+    def _dot_general(self, equation: Any, a: ScalarArray, b: ScalarArray) -> ScalarArray:
+        (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
         rows = _group_axes(a, batch_a, sum_a)
         columns = _group_axes(b, batch_b, sum_b)
         dtype = np.dtype(equation.outvars[0].aval.dtype)
