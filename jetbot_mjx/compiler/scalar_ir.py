@@ -278,10 +278,31 @@ def _equals(x: Scalar, number: float) -> bool:
     return is_constant(x) and x == number
 
 
-def _simplify_add(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if _equals(x, 0):
-        return y
-    return x if _equals(y, 0) else None
+_NEUTRAL = {"add": 0, "and": True, "mul": 1, "or": False, "xor": False}
+"""The constant that leaves the other operand of an operation as it is."""
+
+_ABSORBING = {"and": False, "mul": 0, "or": True}
+"""The constant that is the result, whatever the other operand is."""
+
+_INVERTING = {"mul": (-1, "neg"), "xor": (True, "not")}
+"""The constant that inverts the other operand, and the operation that does so."""
+
+
+def _simplify_commutative(
+    graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar, *, op: str
+) -> Scalar | None:
+    if x is y and op in ("and", "or", "max", "min"):
+        return x
+    if op in ("and", "or", "xor") and dtype != _BOOL:
+        return None
+    for one, other in ((x, y), (y, x)):
+        if op in _ABSORBING and _equals(one, _ABSORBING[op]):
+            return dtype.type(_ABSORBING[op])
+        if op in _NEUTRAL and _equals(one, _NEUTRAL[op]):
+            return other
+        if op in _INVERTING and _equals(one, _INVERTING[op][0]):
+            return graph.apply(_INVERTING[op][1], other)
+    return None
 
 
 def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -290,17 +311,6 @@ def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
     if _equals(x, 0):
         return graph.apply("neg", y)
     return x if _equals(y, 0) else None
-
-
-def _simplify_mul(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    for one, other in ((x, y), (y, x)):
-        if _equals(one, 0):
-            return dtype.type(0)
-        if _equals(one, 1):
-            return other
-        if _equals(one, -1):
-            return graph.apply("neg", other)
-    return None
 
 
 def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -316,31 +326,6 @@ def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 def _simplify_inverse(op: str) -> Callable[..., Scalar | None]:
     """Return the simplification of an operation that is its own inverse."""
     return lambda graph, dtype, x: x.operands[0] if x.op == op else None
-
-
-def _simplify_logic(absorbing: bool) -> Callable[..., Scalar | None]:
-    """Return the simplification of `and` or `or`, whose result is `absorbing` if an operand is."""
-
-    def simplify(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-        if x is y:
-            return x
-        for one, other in ((x, y), (y, x)):
-            if dtype == _BOOL and is_constant(one):
-                return np.bool_(absorbing) if one == absorbing else other
-        return None
-
-    return simplify
-
-
-def _simplify_xor(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    for one, other in ((x, y), (y, x)):
-        if dtype == _BOOL and is_constant(one):
-            return graph.apply("not", other) if one else other
-    return None
-
-
-def _simplify_extreme(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    return x if x is y else None
 
 
 def _simplify_pow(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -407,20 +392,14 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
 
 
 _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
-    "add": _simplify_add,
-    "and": _simplify_logic(absorbing=False),
+    **{op: functools.partial(_simplify_commutative, op=op) for op in _COMMUTATIVE},
     "cos": functools.partial(_simplify_sine, ahead=1),
     "div": _simplify_div,
-    "max": _simplify_extreme,
-    "min": _simplify_extreme,
-    "mul": _simplify_mul,
     "neg": _simplify_inverse("neg"),
     "not": _simplify_inverse("not"),
-    "or": _simplify_logic(absorbing=True),
     "pow": _simplify_pow,
     "sign": _simplify_sign,
     "sin": _simplify_sine,
     "sub": _simplify_sub,
-    "xor": _simplify_xor,
 }
 """Functions that return an equal but simpler scalar; None: there is none."""
