@@ -85,7 +85,9 @@ class CheckpointStore:
           run_dir: the run folder, which must exist.
           keep: the number of latest checkpoints to keep, besides the first and the best.
         """
-        self._success = {step: _success_rate(run_dir, step) for step in checkpoint_steps(run_dir)}
+        self._success = {
+            step: stored_success_rate(run_dir, step) for step in checkpoint_steps(run_dir)
+        }
         options = ocp.CheckpointManagerOptions(
             create=False,
             multiprocessing_options=_single_process_options(),
@@ -338,7 +340,7 @@ def digest(tree: Any) -> str:
     return total.hexdigest()
 
 
-def _success_rate(run_dir: Path, env_steps: int) -> float:
+def stored_success_rate(run_dir: Path, env_steps: int) -> float:
     """Return a checkpoint's success rate, or -1 if it was not evaluated or is damaged."""
     try:
         rate = read_about(checkpoint_path(run_dir, env_steps)).get(_SUCCESS)

@@ -58,12 +58,7 @@ def build_ppo(config: Config, env: JetBotEnv) -> PPO:
     Returns:
       PPO; its `networks` are the only ones of the training.
     """
-    networks = make_networks(
-        config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=config.ppo.normalize_observations,
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     wrapped = wrap_for_training(env, config.task.episode_length)
     return PPO(config.ppo, wrapped, networks, axis_name=_AXIS, device_count=jax.device_count())
 

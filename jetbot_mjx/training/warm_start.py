@@ -223,12 +223,7 @@ def _measure(
     Running statistics have one count for all fields. It becomes that of the measurement, so that
     training changes all of them from there on, and the sums of squares are scaled with it.
     """
-    networks = make_networks(
-        config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=config.ppo.normalize_observations,
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     batched: Any = wrap_for_training(env, config.task.episode_length)
     policy = make_policy(networks, params)
 

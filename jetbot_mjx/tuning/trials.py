@@ -61,12 +61,7 @@ class Trials:
         self._names = tuple(names)
         env = make_env(config)
         self._env = wrap_for_training(env, config.task.episode_length)
-        self._networks = make_networks(
-            config.ppo.network,
-            env.observation_size,
-            env.action_size,
-            normalize=config.ppo.normalize_observations,
-        )
+        self._networks = make_networks(config.ppo, env.observation_size, env.action_size)
         episodes = rollout_fn(
             maybe_randomize(env), [policy_controller(self._networks)], config.task.episode_length
         )

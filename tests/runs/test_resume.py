@@ -74,9 +74,7 @@ def program(config, smoke_run):
         def init(self):
             return self.put(first())
 
-    networks = make_networks(
-        config.ppo.network, env.observation_size, env.action_size, normalize=True
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluator = Evaluator(env, networks, ProgramCache(compiler_options(config)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ppo_trainer, "CompiledTrainer", Program)
