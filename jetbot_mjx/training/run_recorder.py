@@ -22,7 +22,6 @@ from jetbot_mjx.runs.metrics import (
     JsonlSink,
     MetricValues,
     Sink,
-    Sinks,
     TensorBoardSink,
     process_seconds,
 )
@@ -80,7 +79,7 @@ def open_sinks(
     history: Sequence[History],
     say: Callable[[str], None],
     seeds: int,
-) -> Sinks:
+) -> list[Sink]:
     """Open the logs of one seed.
 
     Args:
@@ -91,7 +90,7 @@ def open_sinks(
       seeds: number of seeds of the training.
 
     Returns:
-      The logs.
+      The logs, which receive the metrics in this order.
 
     Raises:
       UserError: the folder cannot be written.
@@ -103,7 +102,7 @@ def open_sinks(
             sinks.append(TensorBoardSink(folder, history, aliases(config.ppo), config))
         if config.wandb is not None:
             sinks.append(WandbSink(config, run_dir, history, say, seeds))
-    return Sinks(sinks)
+    return sinks
 
 
 class RunRecorder(TrainerCallback):
@@ -309,7 +308,7 @@ class SeedRecorder:
         self,
         config: Config,
         run_dir: Path,
-        sinks: Sinks,
+        sinks: Sequence[Sink],
         about: Mapping[str, Any],
         standing: Standing,
         fingerprint: str,
@@ -348,7 +347,8 @@ class SeedRecorder:
         if standing.best is None or summary.success_rate >= standing.best.success_rate:
             standing.best_steps, standing.best = progress.env_steps, summary
         with writing_to(self._run_dir):
-            self._sinks.write(progress.env_steps, metrics)
+            for sink in self._sinks:
+                sink.write(progress.env_steps, metrics)
         self.save(progress, summary._asdict(), wall_seconds)
         self.fingerprint = digest(progress.params)
 
@@ -376,7 +376,8 @@ class SeedRecorder:
         make_folder(path.parent)
         with writing_to(path):
             video.write(path, progress.params, progress.env_steps)
-            self._sinks.write_video(progress.env_steps, path)
+            for sink in self._sinks:
+                sink.write_video(progress.env_steps, path)
 
     def save_nan_dump(self, env_steps: int, nan_dump: NanDump) -> Path | None:
         """Save a dump; return its path, or None if the run holds enough of them."""
@@ -387,5 +388,6 @@ class SeedRecorder:
         """Wait until the logs and checkpoints are written."""
         with contextlib.ExitStack() as stack:
             stack.enter_context(writing_to(self._run_dir))
-            stack.callback(self._sinks.close)
+            for sink in self._sinks:
+                stack.callback(sink.close)
             stack.enter_context(self._store)
