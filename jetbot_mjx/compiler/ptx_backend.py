@@ -15,7 +15,6 @@ from string import Template
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -71,19 +70,16 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     robots = leaves[0].shape[0]
     threads = threads_in_block(robots)
     blocks = math.ceil(robots / threads)
-    arguments = list(leaves)
     if kernel.table is not None:
         # A block computes all items of a robot.
-        arguments.append(jnp.asarray(kernel.table))
         threads, blocks = _ITEM_THREADS, robots
     architecture = _architecture()
     text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
-    dtype = kernel.result_dtype
-    results = [jax.ShapeDtypeStruct((robots, *x), dtype) for x in kernel.result_shapes]
+    results = kernel.results(robots)
     call = jax.ffi.ffi_call(_TARGET, results)
     return list(
         call(
-            *arguments,
+            *leaves,
             name=_NAME,
             kernel_type="ptx",
             kernel_data=text.replace(_ROBOTS, str(robots)),
@@ -94,7 +90,7 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
             block_y=np.int64(1),
             block_z=np.int64(1),
             shared_mem_bytes=np.int64(0),
-            output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
+            output_indices=tuple(range(len(leaves), len(leaves) + len(results))),
         )
     )
 
