@@ -21,6 +21,7 @@ Protocol:
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, Self
 
 import jax
@@ -146,7 +147,7 @@ class CompiledTrainer:
         """Copy the state from the devices to the host, and return that of each seed."""
         if jax.process_count() > 1:
             # A process cannot read the devices of another: replicate everything first.
-            state = jax.jit(_identity, out_shardings=self._replicated)(state)
+            state = jax.jit(lambda state: state, out_shardings=self._replicated)(state)
         host = jax.device_get(state)
         return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
 
@@ -212,7 +213,7 @@ def train(
       resumes: whether these states were reported before.
     """
     # Compile in the background while the initial policy is evaluated.
-    compiling = _Background(trainer.compile)
+    compiling = _in_background(trainer.compile)
     state = trainer.init() if states is None else trainer.put(states)
     done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step if states else 0
     if not resumes and not _report(trainer, recorder, state, 0.0):
@@ -220,7 +221,8 @@ def train(
     # Wait until every process has compiled; leave if one of them was asked to stop.
     running = True
     while running:
-        gathered = distributed.all_gather_ints(preemption.wait(_POLL_SECONDS), compiling.running)
+        stopped = preemption.wait(_POLL_SECONDS)
+        gathered = distributed.all_gather_ints(stopped, not compiling.done())
         if gathered[:, 0].any():
             return
         running = gathered[:, 1].any()
@@ -271,7 +273,8 @@ def _train_loop(
         seconds, restart = 0.0, True
     # Save what was trained since the last report.
     if seconds > 0:
-        _save_preempted(trainer, recorder, state, seconds)
+        progress = _progress(trainer, state, seconds, restart=False)
+        distributed.run_on_primary(lambda: recorder.on_preempt(progress))
 
 
 def _report(
@@ -284,18 +287,6 @@ def _report(
     """
     progress = _progress(trainer, state, seconds, restart=True)
     return bool(distributed.run_on_primary(lambda: recorder.on_interval(progress)))
-
-
-def _save_preempted(
-    trainer: CompiledTrainer, recorder: TrainerCallback, state: TrainState, seconds: float
-) -> None:
-    progress = _progress(trainer, state, seconds, restart=False)
-
-    def save() -> int:
-        recorder.on_preempt(progress)
-        return 0
-
-    distributed.run_on_primary(save)
 
 
 def _progress(
@@ -316,10 +307,6 @@ def _progress(
         saved = one.replace(tally=jax.tree.map(np.zeros_like, one.tally)) if restart else one
         progress.append(Progress(env_steps(one), one.policy_params, metrics, seconds, saved))
     return progress
-
-
-def _identity(state: TrainState) -> TrainState:
-    return state
 
 
 class ChunkSizer:
@@ -344,30 +331,18 @@ class ChunkSizer:
         self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
 
 
-class _Background:
-    """A `_Background` computes a function's result in a thread."""
+def _in_background(function: Callable[[], Any]) -> Future[Any]:
+    """Compute a function's result in a thread, for which the process does not wait at its end."""
+    future: Future[Any] = Future()
 
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self._outcome: list[Any] = []
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, args=[function], daemon=True)
-        self._thread.start()
-
-    @property
-    def running(self) -> bool:
-        return self._thread.is_alive()
-
-    def result(self) -> Any:
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._outcome[0]
-
-    def _run(self, function: Callable[[], Any]) -> None:
+    def run() -> None:
         try:
-            self._outcome.append(function())
+            future.set_result(function())
         except BaseException as error:  # `result` raises it in the caller's thread.
-            self._error = error
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future
 
 
 def env_steps(state: TrainState) -> int:

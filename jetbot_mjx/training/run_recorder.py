@@ -31,14 +31,7 @@ from jetbot_mjx.runs.run_dir import make_folder, writing_to
 from jetbot_mjx.runs.sb3_tags import aliases
 from jetbot_mjx.runs.wandb_sink import WandbSink
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
-from jetbot_mjx.training.console import (
-    COMPILING,
-    EVALUATING,
-    RENDERING,
-    SAVING,
-    TRAINING,
-    Terminal,
-)
+from jetbot_mjx.training.console import Phase, Terminal
 from jetbot_mjx.viewers.offscreen import find_backend
 from jetbot_mjx.viewers.video import EvaluationVideo
 
@@ -110,36 +103,29 @@ class RunRecorder(TrainerCallback):
 
     def __init__(
         self,
+        config: Config,
         seeds: Sequence["SeedRecorder"],
         evaluate: Callable[[PolicyParams], Summary],
         video: EvaluationVideo | None,
         terminal: Terminal,
         clock: CompileClock,
-        *,
-        total_steps: int,
-        stop_at_success: float | None,
-        only_last_video: bool = False,
     ) -> None:
         """Prepare to record.
 
         Args:
+          config: the configuration of the run, which says when it is complete.
           seeds: the recorder of each seed.
           evaluate: a function that evaluates a policy on the fixed goals of training.
           video: renders a policy after an evaluation; None: no videos.
           terminal: shows the progress.
           clock: measures the time that is spent on compilation.
-          total_steps: environment steps of the whole training.
-          stop_at_success: the success rate at which the training ends early; None: it does not.
-          only_last_video: whether only the policy at the end of the training is rendered.
         """
+        self._config = config
         self._seeds = seeds
         self._evaluate = evaluate
         self._video = video
         self._terminal = terminal
         self._clock = clock
-        self._total_steps = total_steps
-        self._stop_at_success = stop_at_success
-        self._only_last_video = only_last_video
         self._earlier_seconds = seeds[0].standing.wall_seconds
         self._compiled = False
         self._compile_seconds = 0.0
@@ -160,9 +146,9 @@ class RunRecorder(TrainerCallback):
     @property
     def complete(self) -> bool:
         """Return whether every seed has made all its steps, or reached `stop_at_success`."""
-        target = self._stop_at_success
+        ppo, target = self._config.ppo, self._config.stop_at_success
         return all(
-            one.env_steps >= self._total_steps
+            one.env_steps >= ppo.training_steps * ppo.steps_per_training_step
             or (target is not None and one.last is not None and one.last.success_rate >= target)
             for one in self.standings
         )
@@ -185,14 +171,14 @@ class RunRecorder(TrainerCallback):
     def on_interval(self, progress: Sequence[Progress]) -> bool:
         """Evaluate, log and save every seed; return whether to go on."""
         # Evaluate the policy of every seed.
-        self._set_phase(EVALUATING)
+        self._set_phase("evaluating")
         # What Brax's trainer compiles while it trains is part of the time that it reports.
         compiling = self._lap()
         began = time.perf_counter()
         summaries = [self._evaluate(one.params) for one in progress]
         evaluating = time.perf_counter() - began
         # Log the metrics, and save a checkpoint.
-        self._set_phase(SAVING)
+        self._set_phase("saving")
         self._lap()
         compiled, self._unlogged_compile_seconds = self._unlogged_compile_seconds, 0.0
         logged = []
@@ -218,12 +204,12 @@ class RunRecorder(TrainerCallback):
         self._recording_seconds = time.perf_counter() - began - evaluating
         if progress[0].env_steps > 0:
             self._compiled = True
-        self._set_phase(TRAINING)
+        self._set_phase("training")
         return not self.complete
 
     def on_preempt(self, progress: Sequence[Progress]) -> None:
         """Save every seed without an evaluation."""
-        self._terminal.phase(SAVING)
+        self._terminal.phase("saving")
         for seed, one in zip(self._seeds, progress, strict=True):
             seed.save(one, {}, self.wall_seconds)
 
@@ -245,14 +231,15 @@ class RunRecorder(TrainerCallback):
     def on_compiled(self) -> None:
         """Show that training begins; the first step reports the time until then."""
         self._compiled = True
-        self._set_phase(TRAINING)
+        self._set_phase("training")
         self._awaiting_first_step = True
 
     def _render_videos(self, progress: Sequence[Progress]) -> None:
         """Render a video of every seed, last: an error leaves the log and checkpoints complete."""
-        if self._video is None or (self._only_last_video and not self.complete):
+        only_last = self._config.evaluation.video == "last"
+        if self._video is None or (only_last and not self.complete):
             return
-        self._set_phase(RENDERING)
+        self._set_phase("rendering")
         try:
             find_backend()
         except UserError as error:
@@ -264,9 +251,9 @@ class RunRecorder(TrainerCallback):
         # Leave the video's compilation out of the trainer's time.
         self._lap()
 
-    def _set_phase(self, phase: str) -> None:
+    def _set_phase(self, phase: Phase) -> None:
         """Show the phase; before the first training step most of the time is compilation."""
-        self._terminal.phase(phase if self._compiled else COMPILING)
+        self._terminal.phase(phase if self._compiled else "compiling")
 
     def _report_first_step(self) -> None:
         """Print after the first training step how long the start took."""
@@ -294,7 +281,7 @@ class RunRecorder(TrainerCallback):
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all files are written."""
-        self._terminal.phase(SAVING)
+        self._terminal.phase("saving")
         with contextlib.ExitStack() as stack:
             stack.callback(self._terminal.close)
             for seed in self._seeds:

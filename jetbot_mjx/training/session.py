@@ -7,6 +7,7 @@ modules receive what they need as required arguments.
 
 import contextlib
 import importlib.util
+import pickle
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -200,7 +201,7 @@ def _send_task_code(name: str, run_dir: Path | None) -> None:
 
     def source() -> bytes:
         code = read_task_code(run_dir) if run_dir else collect_task_code(name)
-        return code.to_bytes() if code else b""
+        return pickle.dumps(code) if code else b""
 
     if jax.process_count() > 1:
         distributed.broadcast_bytes(source)
@@ -212,7 +213,7 @@ def _sent_task_class(name: str) -> type[Any] | None:
     if not content:
         return None
     with tempfile.TemporaryDirectory() as folder:
-        write_task_code(Path(folder), TaskCode.from_bytes(content))
+        write_task_code(Path(folder), pickle.loads(content))
         return stored_task_class(Path(folder), name, silent=True)
 
 
@@ -330,16 +331,7 @@ def open_recorder(
         standing = Standing.from_json(resumed.progress[index])
         fingerprint = digest(resumed.states[index].policy_params) if resumption else ""
         seeds.append(SeedRecorder(seed_config, folder, sinks, about, standing, fingerprint))
-    return RunRecorder(
-        seeds,
-        evaluate,
-        video,
-        terminal,
-        clock,
-        total_steps=total_steps,
-        stop_at_success=config.stop_at_success,
-        only_last_video=config.evaluation.video == "last",
-    )
+    return RunRecorder(config, seeds, evaluate, video, terminal, clock)
 
 
 def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
