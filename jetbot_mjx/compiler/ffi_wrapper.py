@@ -87,11 +87,13 @@ def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
         "addresses": "\n  ".join(_address(i) for i in range(len(sizes) + carried)),
         "alignment": 4 * lanes,
         "lanes": lanes,
-        "reads": "\n  ".join(_reads(sizes, lanes)),
+        "reads": _copies("%r{i} = mul i64 %robot, {size}", _READ, sizes, lanes),
         "rows": max(1, sum(sizes)),
         "step": STEP,
         "steps": kernel.steps,
-        "writes": "\n  ".join(_writes(sizes[:carried], len(sizes), lanes)),
+        "writes": _copies(
+            "%w{i} = mul i64 %to, {size}", _WRITE, sizes[:carried], lanes, first=len(sizes)
+        ),
     }
     step = step_text(kernel.program, carried=carried, lanes=lanes)
     return step + _template("xla_step.ll").substitute(values)
@@ -140,35 +142,37 @@ def _pointer(i: int, arguments: int) -> str:
     )
 
 
-def _reads(sizes: Sequence[int], lanes: int) -> list[str]:
-    """Return the lines that copy one robot's arguments into its lane of the tile."""
-    lines, row = [], 0
-    for i, size in enumerate(sizes):
-        lines.append(f"%r{i} = mul i64 %robot, {size}")
-        for j in range(size):
-            lines += [
-                f"%ri{i}.{j} = add i64 %r{i}, {j}",
-                f"%rp{i}.{j} = getelementptr float, ptr %a{i}, i64 %ri{i}.{j}",
-                f"%rv{i}.{j} = load float, ptr %rp{i}.{j}",
-                f"%rt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %lane",
-                f"store float %rv{i}.{j}, ptr %rt{i}.{j}",
-            ]
-            row += 1
-    return lines
+_READ = """\
+%ri{i}.{j} = add i64 %r{i}, {j}
+  %rp{i}.{j} = getelementptr float, ptr %a{i}, i64 %ri{i}.{j}
+  %rv{i}.{j} = load float, ptr %rp{i}.{j}
+  %rt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %lane
+  store float %rv{i}.{j}, ptr %rt{i}.{j}"""
+"""Lines that copy one scalar of a robot's arguments into its lane of the tile."""
+
+_WRITE = """\
+%wt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %out
+  %wv{i}.{j} = load float, ptr %wt{i}.{j}
+  %wi{i}.{j} = add i64 %w{i}, {j}
+  %wp{i}.{j} = getelementptr float, ptr %a{i}, i64 %wi{i}.{j}
+  store float %wv{i}.{j}, ptr %wp{i}.{j}"""
+"""Lines that copy one scalar of a robot's results from its lane of the tile."""
 
 
-def _writes(sizes: Sequence[int], first: int, lanes: int) -> list[str]:
-    """Return the lines that copy one robot's results from its lane of the tile."""
+def _copies(start: str, copy: str, sizes: Sequence[int], lanes: int, first: int = 0) -> str:
+    """Return the lines that copy arrays, the first of which has the number `first`.
+
+    Args:
+      start: the line that computes where a robot's row of an array begins.
+      copy: the lines that copy one scalar.
+      sizes: the number of scalars per robot in each array.
+      lanes: the number of robots in a block.
+      first: the number of the first array.
+    """
     lines, row = [], 0
     for i, size in enumerate(sizes, start=first):
-        lines.append(f"%w{i} = mul i64 %to, {size}")
+        lines.append(start.format(i=i, size=size))
         for j in range(size):
-            lines += [
-                f"%wt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %out",
-                f"%wv{i}.{j} = load float, ptr %wt{i}.{j}",
-                f"%wi{i}.{j} = add i64 %w{i}, {j}",
-                f"%wp{i}.{j} = getelementptr float, ptr %a{i}, i64 %wi{i}.{j}",
-                f"store float %wv{i}.{j}, ptr %wp{i}.{j}",
-            ]
+            lines.append(copy.format(i=i, j=j, row=row, lanes=lanes))
             row += 1
-    return lines
+    return "\n  ".join(lines)

@@ -35,7 +35,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal
 
 from jetbot_mjx.compiler.indexing import (
     RULES,
@@ -125,12 +125,7 @@ class _JaxprLowering:
         self._graph = graph
 
     def lower(self, closed: ClosedJaxpr, arguments: Sequence[ScalarArray]) -> list[ScalarArray]:
-        constants = [constant_array(constant) for constant in closed.consts]
-        return self._lower_jaxpr(closed.jaxpr, constants, arguments)
-
-    def _lower_jaxpr(
-        self, jaxpr: Jaxpr, constants: Sequence[ScalarArray], arguments: Sequence[ScalarArray]
-    ) -> list[ScalarArray]:
+        jaxpr, constants = closed.jaxpr, map(constant_array, closed.consts)
         env: dict[Any, ScalarArray] = dict(zip(jaxpr.constvars, constants, strict=True))
         env |= dict(zip(jaxpr.invars, arguments, strict=True))
 

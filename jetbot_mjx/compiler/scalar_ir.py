@@ -143,11 +143,12 @@ class ExprGraph:
     def __init__(self) -> None:
         """Start with an empty graph."""
         self._values: dict[tuple[Any, ...], Expr] = {}
-        self._count = 0
+        self.count = 0
+        """Number of recorded operations."""
 
     def input(self, dtype: np.dtype) -> Expr:
         """Add an input of the program."""
-        return self._record("input", (np.int32(self._count),), np.dtype(dtype))
+        return self._record("input", (np.int32(self.count),), np.dtype(dtype))
 
     def apply(self, op: str, *operands: Scalar) -> Scalar:
         """Record one operation, or return its result if all operands are constants.
@@ -236,11 +237,6 @@ class ExprGraph:
             for place, (a, b) in enumerate(zip(if_false, if_true, strict=True))
         ]
 
-    @property
-    def count(self) -> int:
-        """Return the number of recorded operations."""
-        return self._count
-
     def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Expr:
         names = [_identity(x) for x in operands]
         # The key ignores the order of commutative operands, but the operation keeps the order in
@@ -254,10 +250,10 @@ class ExprGraph:
         return Expr(op, operands, dtype, self._next(), *owner)
 
     def _next(self) -> int:
-        if self._count >= MAX_OPERATIONS:
+        if self.count >= MAX_OPERATIONS:
             raise UnsupportedError(f"more than {MAX_OPERATIONS:,} operations")
-        self._count += 1
-        return self._count - 1
+        self.count += 1
+        return self.count - 1
 
 
 def is_same(x: Scalar, y: Scalar) -> bool:
