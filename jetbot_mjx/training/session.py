@@ -11,7 +11,7 @@ import pickle
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -182,39 +182,23 @@ def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, Task
     A run that has checkpoints continues with the task that it was begun with. Of several processes,
     all train the task of the first one, which sends its source to those that lack it.
     """
-    name = config.task.name
-    task_class = None
-    if not distributed.is_primary():
-        task_class = _sent_task_class(name)
-    else:
-        resumes = _has_checkpoints(run_dirs)
-        _send_task_code(name, run_dirs[0] if resumes else None)
-        task_class = stored_task_class(run_dirs[0], name) if resumes else None
+    name, primary = config.task.name, distributed.is_primary()
+    resumes = primary and _has_checkpoints(run_dirs)
+
+    def source() -> bytes:
+        code = read_task_code(run_dirs[0]) if resumes else collect_task_code(name)
+        return pickle.dumps(code) if code else b""
+
+    sent = distributed.broadcast_bytes(source) if jax.process_count() > 1 else b""
+    task_class = stored_task_class(run_dirs[0], name) if resumes else None
+    if sent and not primary:
+        with tempfile.TemporaryDirectory() as folder:
+            write_task_code(Path(folder), pickle.loads(sent))
+            task_class = stored_task_class(Path(folder), name, silent=True)
     env = make_env(config, task_class)
     if name not in TRUSTED:
         require_trainable(env.task, config)
     return env, None if task_class else collect_task_code(name)
-
-
-def _send_task_code(name: str, run_dir: Path | None) -> None:
-    """Send the source of a task to the other processes: the stored one, or that of a new run."""
-
-    def source() -> bytes:
-        code = read_task_code(run_dir) if run_dir else collect_task_code(name)
-        return pickle.dumps(code) if code else b""
-
-    if jax.process_count() > 1:
-        distributed.broadcast_bytes(source)
-
-
-def _sent_task_class(name: str) -> type[Any] | None:
-    """Return the class of the task that the first process has sent; None: import it by its name."""
-    content = distributed.broadcast_bytes(bytes)
-    if not content:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        write_task_code(Path(folder), pickle.loads(content))
-        return stored_task_class(Path(folder), name, silent=True)
 
 
 def _store_run(training: Training) -> None:
