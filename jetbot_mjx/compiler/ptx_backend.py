@@ -183,7 +183,8 @@ def map_kernel_text(kernel: Kernel) -> str:
     """
     emitter = LlvmEmitter(kernel.program, lanes=1, label="items", approximate=True)
     *sizes, row = [array.size for array in kernel.program.inputs]
-    items = np.shape(kernel.table)[1]
+    assert kernel.table is not None
+    items = kernel.table.shape[1]
     shared = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
     columns = [f"%column{j}" for j in range(row)]
     rest = emitter.hoist([*shared, *columns], row)

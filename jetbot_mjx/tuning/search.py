@@ -301,6 +301,6 @@ class Search:
         return {name: drawn.get(name, value) for name, value in given.items()}
 
 
-def completed_trials(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
+def completed_trials(study: optuna.Study) -> list[Any]:
     """Return the trials that were trained to their end."""
     return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
