@@ -17,8 +17,8 @@ Protocol, in the order in which a function passes through the package:
    - A value that a loop carries is first assumed to be constant. Values that prove to change are
      carried in the next round, until a round finds no more of them.
    - A carried value that is the same function of other carried values before the loop and after
-     each iteration is not carried, but computed at the start of the iteration (`_Derivation`). In a
-     solver that prepares the next iteration at the end of each one, this saves the last one.
+     each iteration is not carried, but computed at the start of the iteration (`_find_derived`). In
+     a solver that prepares the next iteration at the end of each one, this saves the last one.
 
 4. `schedule` places the operations in blocks, and `llvm_codegen` writes the blocks as LLVM IR.
 
@@ -339,7 +339,7 @@ class _JaxprLowering:
                 break
             carried.update(changed)
         # Compute derived values from the other carried values at the start of an iteration.
-        derived = _Derivation(self._graph, loop, carried).derived()
+        derived = _find_derived(self._graph, loop, carried)
         if derived:
             start = [derived.get(k, x) for k, x in enumerate(start)]
             loop.updated = _flatten(next_state(_unflatten(state, start)))
@@ -509,64 +509,60 @@ class _JaxprLowering:
         return scalar_array(sums, shape_of(equation.outvars[0]))
 
 
-class _Derivation:
-    """A `_Derivation` finds carried values of a loop that are functions of other carried values.
+def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, Scalar]:
+    """Find carried values of a loop that are functions of other carried values.
 
     A carried value is derived if it is the same function of the others before the first iteration
     and after every iteration. The two expressions are compared operation by operation.
+
+    Returns:
+      How each derived value is computed from the others, by its place.
     """
+    derived: dict[int, Scalar] = {}
+    known: dict[Any, Scalar] = {}
+    # Begin with the values that were recorded first, because others may be derived from them.
+    for place in sorted(carried, key=lambda k: _index(loop.updated[k])):
+        pair = loop.initial[place], loop.updated[place]
+        found = known.get(_pair_key(pair))
+        if found is None:
+            found = _matched(graph, known, *pair)
+        if found is not None:
+            derived[place] = found
+        known[_pair_key(pair)] = loop.carries[place] if found is None else found
+    return derived
 
-    def __init__(self, graph: ExprGraph, loop: Loop, carried: set[int]) -> None:
-        self._graph = graph
-        self._loop = loop
-        # Begin with the values that were recorded first, because others may be derived from them.
-        self._places = sorted(carried, key=lambda k: _index(loop.updated[k]))
-        self._known: dict[Any, Scalar] = {}
 
-    def derived(self) -> dict[int, Scalar]:
-        """Return which carried values are derived, and how each is computed from the others."""
-        result: dict[int, Scalar] = {}
-        for place in self._places:
-            pair = self._loop.initial[place], self._loop.updated[place]
-            derived = self._known.get(_pair_key(pair))
-            if derived is None:
-                derived = self._matched(*pair)
-            if derived is not None:
-                result[place] = derived
-            self._known[_pair_key(pair)] = self._loop.carries[place] if derived is None else derived
-        return result
-
-    def _matched(self, before: Scalar, after: Scalar) -> Scalar | None:
-        """Return one expression for both `before` and `after`; None if there is none."""
-        pending = [(before, after)]
-        found: dict[Any, Scalar | None] = {}
-        while pending:
-            pair = pending[-1]
-            key = _pair_key(pair)
-            if key in self._known or key in found:
-                pending.pop()
-                continue
-            parts = _parts(*pair)
-            if parts is None:
-                # The two have no common operation, so the expressions that contain them differ.
-                return None
-            missing = [
-                part
-                for part in parts
-                if not is_same(*part) and _pair_key(part) not in self._known.keys() | found.keys()
-            ]
-            if missing:
-                pending += missing
-                continue
-            operands = [
-                a
-                if is_same(a, b)
-                else self._known.get(_pair_key((a, b)), found.get(_pair_key((a, b))))
-                for a, b in parts
-            ]
-            found[key] = self._graph.repeat(pair[1], operands)
+def _matched(
+    graph: ExprGraph, known: dict[Any, Scalar], before: Scalar, after: Scalar
+) -> Scalar | None:
+    """Return one expression for both `before` and `after`; None if there is none."""
+    pending = [(before, after)]
+    found: dict[Any, Scalar | None] = {}
+    while pending:
+        pair = pending[-1]
+        key = _pair_key(pair)
+        if key in known or key in found:
             pending.pop()
-        return found[_pair_key((before, after))]
+            continue
+        parts = _parts(*pair)
+        if parts is None:
+            # The two have no common operation, so the expressions that contain them differ.
+            return None
+        missing = [
+            part
+            for part in parts
+            if not is_same(*part) and _pair_key(part) not in known.keys() | found.keys()
+        ]
+        if missing:
+            pending += missing
+            continue
+        operands = [
+            a if is_same(a, b) else known.get(_pair_key((a, b)), found.get(_pair_key((a, b))))
+            for a, b in parts
+        ]
+        found[key] = graph.repeat(pair[1], operands)
+        pending.pop()
+    return found[_pair_key((before, after))]
 
 
 def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:

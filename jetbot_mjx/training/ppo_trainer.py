@@ -6,7 +6,7 @@ that was stopped anywhere must continue with bit-identical results.
 Protocol:
   Chunked calls. The compiled program `advance(state, steps, restart)` runs `steps` training steps
     in one call. The number is an argument, so that one program serves calls of any length;
-    `ChunkSizer` chooses it such that a call takes about one second. Between two calls the loop
+    `next_chunk` chooses it such that a call takes about one second. Between two calls the loop
     checks for signals and reports progress. The metrics are summed inside the state, so neither the
     results nor the logged metrics depend on how the steps were divided into calls.
   Exact resume. `TrainState` holds everything that the next step depends on. At the end of every
@@ -244,12 +244,12 @@ def _train_loop(
     config = trainer.ppo.config
     size = config.steps_per_training_step
     interval = -(-checkpoint_interval // size)
-    sizer = ChunkSizer(min(_MAX_CALL_SECONDS, preemption.notice / _CALLS_PER_NOTICE))
-    seconds, restart = 0.0, False
+    call_seconds = min(_MAX_CALL_SECONDS, preemption.notice / _CALLS_PER_NOTICE)
+    chunk, seconds, restart = 1, 0.0, False
     while done < config.training_steps:
         # Agree with the other processes on whether to go on, and on the length of the call.
         goal = min(config.training_steps, (done // interval + 1) * interval)
-        gathered = distributed.all_gather_ints(preemption.requested, min(sizer.steps, goal - done))
+        gathered = distributed.all_gather_ints(preemption.requested, min(chunk, goal - done))
         if gathered[:, 0].any():
             break
         count = int(gathered[0, 1])
@@ -258,7 +258,7 @@ def _train_loop(
         state, nan_dumps = advance(state, count, restart)
         found = np.asarray(nan_dumps.found)
         elapsed = time.perf_counter() - began
-        sizer.update(count, elapsed)
+        chunk = next_chunk(count, elapsed, call_seconds)
         done, seconds, restart = done + count, seconds + elapsed, False
         for device, seed in np.argwhere(found):
             nan_dump = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
@@ -309,26 +309,15 @@ def _progress(
     return progress
 
 
-class ChunkSizer:
-    """A `ChunkSizer` chooses how many training steps one call runs, by how long the last took."""
+def next_chunk(steps: int, seconds: float, wanted: float) -> int:
+    """Return how many training steps the next call runs.
 
-    def __init__(self, seconds: float) -> None:
-        """Begin with one step.
-
-        Args:
-          seconds: the desired duration of a call [s].
-        """
-        self._seconds = seconds
-        self.steps = 1
-
-    def update(self, steps: int, seconds: float) -> None:
-        """Set the number of steps of the next call.
-
-        Args:
-          steps: the steps of the last call.
-          seconds: the duration of the last call [s].
-        """
-        self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
+    Args:
+      steps: the steps of the last call.
+      seconds: the duration of the last call [s].
+      wanted: the desired duration of a call [s].
+    """
+    return max(1, int(steps * wanted / max(seconds, 1e-6)))
 
 
 def _in_background(function: Callable[[], Any]) -> Future[Any]:

@@ -370,8 +370,13 @@ def _open_folders(
     for folder in dict.fromkeys([run_dir, *run_dirs]):
         stack.enter_context(occupied(folder))
     resumption = resume(run_dirs, configs, template)
-    # Compare the versions before those of this process replace the stored ones.
-    messages = _resume_messages(run_dir, resumption) if resumption else []
+    messages = []
+    if resumption:
+        messages += [f"skipped: {reason}" for reason in resumption.skipped]
+        # Compare the versions before those of this process replace the stored ones.
+        if changes := changed_versions(run_dir):
+            messages.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
+        messages.append(f"resuming after {resumption.env_steps:,} steps")
     _store_run(training)
     return resumption, messages
 
@@ -385,14 +390,6 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
         finished=finished,
         wall_seconds=recorder.wall_seconds if recorder else 0.0,
     )
-
-
-def _resume_messages(run_dir: Path, resumption: Resumption) -> list[str]:
-    lines = [f"skipped: {reason}" for reason in resumption.skipped]
-    if changes := changed_versions(run_dir):
-        lines.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
-    lines.append(f"resuming after {resumption.env_steps:,} steps")
-    return lines
 
 
 def _complete_message(config: Config, standings: Sequence[Standing]) -> str:

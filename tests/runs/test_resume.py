@@ -203,11 +203,10 @@ class StopAfter:
 @pytest.fixture
 def stop_after(monkeypatch):
     """Makes the next trainings stop after so many training steps, each a call of its own."""
-    pace = types.SimpleNamespace(steps=1, update=lambda steps, seconds: None)
 
     def stop_after(training_steps):
         monkeypatch.setattr(session, "Preemption", lambda notice: StopAfter(training_steps))
-        monkeypatch.setattr(ppo_trainer, "ChunkSizer", lambda seconds: pace)
+        monkeypatch.setattr(ppo_trainer, "next_chunk", lambda steps, seconds, wanted: 1)
 
     return stop_after
 
