@@ -5,7 +5,7 @@ which no robot here has, and prints two lines if its optional Warp part is absen
 for an engine that is not used here, and tensorboardX loads a logging service that is not used. On a
 slow machine these imports take almost two seconds at every start of a command. A training also
 needs no OpenGL, so that a command must be able to import MuJoCo even if the backend that
-`MUJOCO_GL` names is unavailable.
+`MUJOCO_GL` names is unavailable. The versions of all libraries are told here, too.
 """
 
 import ast
@@ -22,6 +22,21 @@ from pathlib import Path
 from typing import Any
 
 _Around = Callable[[], contextlib.AbstractContextManager[None]]
+
+
+LIBRARIES = ("brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx", "numpy", "optax")
+"""Libraries of whose releases the results of a training depend."""
+
+
+def installed_version(library: str) -> str | None:
+    """Return the version of a library, or None if it is not installed."""
+    # Commands that store no versions start without it.
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def load_lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:

@@ -28,7 +28,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     options = parser.parse_args(arguments)
     with exit_on_interrupt():
-        from jetbot_mjx.runs.pretrained_runs import copy_pretrained
+        from jetbot_mjx.runs.find_run import copy_pretrained
 
     runs = copy_pretrained(options.out)
     for path in runs:

@@ -219,7 +219,7 @@ def trained(tmp_path_factory):
     """A run folder with two checkpoints, untrained."""
     network = {"policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}
     config = parse_config({"ppo": {"network": network}})
-    networks = make_networks(config.ppo.network, 16, 2, normalize=True)
+    networks = make_networks(config.ppo, 16, 2)
     key = jax.random.PRNGKey(0)
     params = PolicyParams(
         running_statistics.init_state(specs.Array((16,), np.dtype("float32"))),

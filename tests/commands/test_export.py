@@ -66,9 +66,7 @@ def checkpoint_of(settings, tmp_path):
     config = parse_config(settings)
     env = make_env(config)
     size = env.observation_size
-    networks = make_networks(
-        config.ppo.network, size, 2, normalize=config.ppo.normalize_observations
-    )
+    networks = make_networks(config.ppo, size, 2)
     key = jax.random.PRNGKey(3)
     normalizer = running_statistics.init_state(specs.Array((size,), np.dtype("float32")))
     normalizer = normalizer.replace(
