@@ -5,10 +5,9 @@ scene once for each robot. Robots that are only a few pixels long are drawn by t
 enlarged.
 """
 
+import contextlib
 import copy
-import itertools
 import math
-from typing import Self
 
 import mujoco
 import numpy as np
@@ -16,7 +15,7 @@ from jaxtyping import Float
 
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.viewers.offscreen import open_renderer, overview, reduce_image
+from jetbot_mjx.viewers.offscreen import add_lines, open_renderer, overview, reduce_image
 from jetbot_mjx.viewers.pose import set_pose
 from jetbot_mjx.viewers.robot_grid import WIDEST_CELL, RobotGrid
 from jetbot_mjx.viewers.video import Frame
@@ -34,7 +33,7 @@ _REACHED = np.array((0.20, 0.85, 0.30, 1.0), np.float32)
 _START_DISTANCE, _START_AZIMUTH, _START_ELEVATION = 0.85, 25.0, -30.0  # of the camera [m, degrees]
 
 
-class GridRenderer:
+class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
     """A `GridRenderer` renders a `RobotGrid`; it is a context manager that frees OpenGL."""
 
     def __init__(
@@ -138,7 +137,6 @@ class GridRenderer:
         for index, step in enumerate(steps.tolist()):
             places = {name: place[index] for name, place in grid.markers.items()}
             set_pose(model, self._data, grid.qpos[index, step], places)
-            mujoco.mj_kinematics(model, self._data)
             self._add_trail(grid.qpos[index, : step + 1, :2])
             if detailed[index]:
                 self._add_detailed(reached=bool(reached[index]))
@@ -186,20 +184,11 @@ class GridRenderer:
 
     def _add_trail(self, path_w: Float[np.ndarray, "time 2"]) -> None:
         """Add lines along the path of a robot, up to its current position."""
-        scene, kind = self._renderer.scene, mujoco.mjtGeom.mjGEOM_LINE
         last = len(path_w) - 1
         points = np.full((-(-last // self._steps) + 1, 3), _TRAIL_HEIGHT)
         points[:-1, :2], points[-1, :2] = path_w[: last : self._steps], path_w[last]
         width = self._trail_width * self._renderer.height / self._size[1]
-        for start, end in itertools.pairwise(points):
-            geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), _TRAIL)
-            mujoco.mjv_connector(geom, kind, width, start, end)
-            scene.ngeom += 1
-
-    def __enter__(self) -> Self:
-        """Return the renderer."""
-        return self
+        add_lines(self._renderer.scene, points, width, _TRAIL)
 
     def __exit__(self, *exception: object) -> None:
         """Free the OpenGL context."""

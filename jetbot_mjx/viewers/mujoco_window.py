@@ -1,12 +1,13 @@
 """Show a player in MuJoCo's own window, on machines with a display."""
 
+import contextlib
 import queue
 import sys
 import time
 import types
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -45,7 +46,7 @@ def require_window(remedy: str = _REMEDY) -> types.ModuleType:
     return mujoco.viewer
 
 
-class Window:
+class Window(contextlib.AbstractContextManager["Window"]):
     """A window that shows a model; a context manager that closes it."""
 
     def __init__(
@@ -102,17 +103,9 @@ class Window:
             self._viewer.set_texts((None, None, *texts))
         self._viewer.sync()
 
-    def close(self) -> None:
-        """Close the window."""
-        self._viewer.close()
-
-    def __enter__(self) -> Self:
-        """Return the window."""
-        return self
-
     def __exit__(self, *exception: object) -> None:
         """Close the window."""
-        self.close()
+        self._viewer.close()
 
 
 def run(player: Player) -> None:

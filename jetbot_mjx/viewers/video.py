@@ -10,7 +10,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import imageio.v3 as iio
 import jax
@@ -112,7 +112,7 @@ def split_trajectories(
     ]
 
 
-class VideoRenderer:
+class VideoRenderer(contextlib.AbstractContextManager["VideoRenderer"]):
     """A `VideoRenderer` renders trajectories; it is a context manager that frees its cameras."""
 
     def __init__(self, env: JetBotEnv, side: int = VIEW, fps: float = FPS) -> None:
@@ -143,15 +143,10 @@ class VideoRenderer:
         Args:
           trajectory: the episode.
 
-        Yields:
+        Returns:
           Frames, two views wide.
         """
-        last_step, frame = -1, np.empty(0)
-        for seconds in self._frame_times([trajectory]):
-            step = trajectory.step_at(seconds)
-            if step != last_step:
-                last_step, frame = step, self._episode_frame(trajectory, step)
-            yield frame
+        return self._frames([trajectory], [functools.partial(self._episode_frame, trajectory)])
 
     def render_side_by_side(self, episodes: Sequence[tuple[str, Trajectory]]) -> Iterator[Frame]:
         """Render several episodes side by side in the same time; finished robots stand still.
@@ -162,20 +157,28 @@ class VideoRenderer:
         Args:
           episodes: a heading and a trajectory for each view, from left to right.
 
-        Yields:
+        Returns:
           Frames, one view wide per episode.
         """
-        extent = np.vstack([_extent(trajectory) for _, trajectory in episodes])
-        camera = overview(extent, self._fovy, **_FILLED)
-        last_steps = [-1] * len(episodes)
-        views = [np.empty(0)] * len(episodes)
-        for seconds in self._frame_times([trajectory for _, trajectory in episodes]):
-            for index, (heading, trajectory) in enumerate(episodes):
-                step = trajectory.step_at(seconds)
-                if step != last_steps[index]:
-                    last_steps[index] = step
-                    views[index] = self._episode_view(heading, trajectory, step, camera)
-            yield np.hstack(views)
+        trajectories = [trajectory for _, trajectory in episodes]
+        camera = overview(np.vstack([*map(_extent, trajectories)]), self._fovy, **_FILLED)
+        draws = [functools.partial(self._episode_view, *one, camera=camera) for one in episodes]
+        return self._frames(trajectories, draws)
+
+    def _frames(
+        self, trajectories: Sequence[Trajectory], draws: Sequence[Callable[[int], Frame]]
+    ) -> Iterator[Frame]:
+        """Render trajectories side by side, up to a pause after the longest.
+
+        Args:
+          trajectories: the episodes, from left to right.
+          draws: for each of them a function that renders the index of a state.
+        """
+        # A view is rendered again only if its robot has made a step.
+        draws = [functools.lru_cache(1)(draw) for draw in draws]
+        for frame in range(self.frame_count(trajectories)):
+            steps = [trajectory.step_at(frame / self._fps) for trajectory in trajectories]
+            yield np.hstack([draw(step) for draw, step in zip(draws, steps, strict=True)])
 
     def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
         chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
@@ -199,10 +202,6 @@ class VideoRenderer:
     ) -> Frame:
         qpos, trail_w = trajectory.qpos[step], trajectory.trail_w(step)
         return self._view.frame(qpos, trajectory.markers, camera, shadows=False, trail_w=trail_w)
-
-    def _frame_times(self, trajectories: Sequence[Trajectory]) -> Iterator[float]:
-        """Return the times of the frames [s], up to a pause after the longest episode."""
-        return (frame / self._fps for frame in range(self.frame_count(trajectories)))
 
     def _episode_view(
         self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
@@ -272,10 +271,6 @@ class VideoRenderer:
                 position, spaced, colour, _font(size), stroke_width=size / 10, stroke_fill="white"
             )
         return np.asarray(image)
-
-    def __enter__(self) -> Self:
-        """Return the renderer."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Free the cameras."""

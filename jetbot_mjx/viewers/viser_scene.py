@@ -119,7 +119,6 @@ class Scene:
         for robot, cell_w in enumerate(self._cells_w):
             markers = {name: places[robot] for name, places in crowd.markers.items()}
             set_pose(self._model, self._data, np.asarray(crowd.qpos[robot]), markers)
-            mujoco.mj_kinematics(self._model, self._data)
             positions[robot] = self._data.xpos + cell_w
             quats[robot] = self._data.xquat
         return positions, quats
@@ -258,7 +257,7 @@ class Scene:
         positions, quats = self._poses()
         parts = []
         for number, ((body, smooth, rgba), same) in enumerate(itertools.groupby(geoms, look)):
-            mesh: Any = trimesh.util.concatenate([geom.mesh_b() for geom in same])
+            mesh: Any = trimesh.util.concatenate([geom.mesh for geom in same])
             name = self._model.body(body).name or f"body {body}"
             rgb = _page_rgb(255 * np.array(rgba[:3]))
             node = self._server.scene.add_batched_meshes_simple(

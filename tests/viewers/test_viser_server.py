@@ -241,9 +241,8 @@ def test_every_visual_geom_stands_where_mujoco_puts_it(browser, player):
         wanted = []
         for geom in visible_geoms(model):
             if geom.body == body:
-                index = model.geom(geom.name).id
-                wanted.append(geom.mesh.vertices @ data.geom_xmat[index].reshape(3, 3).T)
-                wanted[-1] += data.geom_xpos[index]
+                wanted.append(geom.mesh.vertices @ data.xmat[body].reshape(3, 3).T)
+                wanted[-1] += data.xpos[body]
                 seen += 1
         wanted = np.vstack(wanted)
         assert len(shown) == len(wanted)
