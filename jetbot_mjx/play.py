@@ -79,7 +79,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.run is None:
         name = f"{_DEFAULT_POLICY}.yaml"
         print(f"no run is named: this policy comes with the package, trained by {name}")
-    played = live.play_live(
+    successes, episodes = live.play_live(
         PRETRAINED / _DEFAULT_POLICY if options.run is None else options.run,
         viewer=options.viewer,
         agent=options.agent,
@@ -91,7 +91,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         allow=options.allow_origin,
         tell=lambda line: print(line, flush=True),
     )
-    print(f"{played.successes} of {played.episodes} goals reached")
+    print(f"{successes} of {episodes} goals reached")
     return 0
 
 

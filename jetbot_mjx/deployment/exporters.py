@@ -6,7 +6,6 @@ Orbax than this package, and installs a model viewer and a hub client.
 """
 
 import base64
-import importlib
 import json
 import re
 import types
@@ -20,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jetbot_mjx.deployment.numpy_policy import Outputs, PortablePolicy
-from jetbot_mjx.errors import MissingPackageError
 
 _TEXT_WIDTH = 96
 
@@ -50,25 +48,6 @@ class Format(NamedTuple):
     """Load the file as its user would, without this package."""
     needs: tuple[str, ...] = ()
     """Packages of the extra `export` that the format needs."""
-
-
-def require(name: str) -> None:
-    """Check that a format can be written and verified on this machine.
-
-    Args:
-      name: A key of `FORMATS`.
-
-    Raises:
-      UserError: A package is missing.
-    """
-    for package in FORMATS[name].needs:
-        try:
-            importlib.import_module(package)
-        except ImportError:
-            raise MissingPackageError(
-                f"--format {name} needs {package}, which is not installed:"
-                " pip install 'jetbot_mjx[export]'"
-            ) from None
 
 
 def _write_numpy(source: Source, path: Path) -> None:

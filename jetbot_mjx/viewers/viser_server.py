@@ -20,7 +20,7 @@ import socket
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Self
+from typing import Any
 
 import rich
 import viser
@@ -46,7 +46,7 @@ class _Server(viser.ViserServer):
         del verbose
 
 
-class ViserViewer:
+class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
     """A `ViserViewer` serves one player to any number of clients.
 
     It is a context manager that stops the server.
@@ -55,9 +55,9 @@ class ViserViewer:
     def __init__(
         self,
         player: Player,
-        *,
         host: str,
         port: int,
+        *,
         allow: Sequence[str] = (),
         tell: Callable[[str], None],
     ) -> None:
@@ -114,10 +114,6 @@ class ViserViewer:
         """Stop the server."""
         with _quiet():
             self.server.stop()
-
-    def __enter__(self) -> Self:
-        """Return the viewer."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Stop the server."""
