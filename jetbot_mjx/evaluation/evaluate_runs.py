@@ -14,7 +14,13 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
-from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, Summary, report_keys, summarize
+from jetbot_mjx.evaluation.evaluator import (
+    BASELINES,
+    REPORT_GOALS,
+    Evaluator,
+    report_keys,
+    summarize,
+)
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
 from jetbot_mjx.evaluation.report import (
     Report,
@@ -69,7 +75,7 @@ def evaluate_run(
       UserError: there is no usable checkpoint, or the folder cannot be written.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    options = _Options(episodes, robustness, simulator, _read_ranges(ranges), ranges)
+    options = _Options(episodes, robustness, simulator, ranges)
     return next(_write_reports([checkpoint], options, None if output is None else Path(output)))
 
 
@@ -138,7 +144,7 @@ def compare_runs(
     check_comparable({name: entry.first.config for name, entry in entries.items()})
     # Evaluate each policy and write its report.
     checkpoints = [one for entry in entries.values() for one in entry.seeds.values()]
-    options = _Options(episodes, robustness, simulator, _read_ranges(ranges), ranges)
+    options = _Options(episodes, robustness, simulator, ranges)
     first = next(iter(entries.values())).folder
     name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
     folder = first / _FOLDER / name if output is None else Path(output)
@@ -178,9 +184,8 @@ class _Options(NamedTuple):
     episodes: int
     robustness: bool
     simulator: Simulator | None
-    ranges: RandomizationConfig | None
-    """The ranges of `--ranges`; None: those of each run."""
-    ranges_file: str | Path | None
+    ranges: str | Path | None
+    """The file of `--ranges`; None: the ranges of each run."""
 
 
 class RunEntry(NamedTuple):
@@ -231,42 +236,29 @@ def _names(entries: Sequence[RunEntry]) -> list[str]:
     return names
 
 
-class _Evaluators(NamedTuple):
-    """An `_Evaluators` tuple holds compiled evaluators, and the baselines of their task."""
+class _Evaluators:
+    """An `_Evaluators` object holds compiled evaluators, and the baselines of their task."""
 
-    key: tuple[Any, ...]
-    """The parts of configuration and ranges that the compiled programs depend on."""
-    nominal: Evaluator
-    randomized: Evaluator | None
-    """For robots sampled from the ranges; None if there are no ranges."""
-    mujoco: MujocoEvaluator | None
-    baselines: Mapping[str, Summary]
-
-    @classmethod
-    def build(
-        cls,
+    def __init__(
+        self,
         checkpoint: Checkpoint,
         env: JetBotEnv,
         keys: Any,
         ranges: RandomizationConfig,
         *,
         in_mujoco: bool,
-    ) -> "_Evaluators":
-        networks = checkpoint.networks
+    ) -> None:
+        params, networks = checkpoint.params, checkpoint.networks
         programs = ProgramCache(compiler_options(checkpoint.config))
-        nominal = Evaluator(env, networks, programs, baselines=True, record=True)
-        baselines = nominal.run_baselines(checkpoint.params, keys)
-        randomized = None
+        self.nominal = Evaluator(env, networks, programs, baselines=True, record=True)
+        self.baselines = {
+            name: summarize(self.nominal.run(params, keys, name), env.dt) for name in BASELINES
+        }
+        self.randomized = None
         if ranges.drawn:
             varied = DomainRandomizationWrapper(env, ranges=ranges)
-            randomized = Evaluator(varied, networks, programs)
-        return cls(
-            key=_program_key(checkpoint.config, env, ranges),
-            nominal=nominal,
-            randomized=randomized,
-            mujoco=MujocoEvaluator(env, networks, ranges) if in_mujoco else None,
-            baselines={name: summarize(each, env.dt) for name, each in baselines.items()},
-        )
+            self.randomized = Evaluator(varied, networks, programs)
+        self.mujoco = MujocoEvaluator(env, networks, ranges) if in_mujoco else None
 
 
 def _program_key(config: Config, env: JetBotEnv, ranges: RandomizationConfig) -> tuple[Any, ...]:
@@ -319,14 +311,14 @@ def _write_reports(
       output: the folder of the report; None: the one that `report_folder` chooses.
       again: whether to write a report also where there is one that is at least as full.
     """
-    episodes, robustness, simulator, given_ranges, ranges_file = options
-    in_mujoco = robustness or simulator is not None
+    episodes, robustness, simulator, ranges_file = options
+    in_mujoco, given_ranges = robustness or simulator is not None, _read_ranges(ranges_file)
     for checkpoint in checkpoints:
         check_writable(output or checkpoint.results_dir / _FOLDER)
     keys, used_versions = report_keys(episodes), versions()
     # Build all environments first, so that an unsuitable policy is rejected before any writing.
     envs = [checkpoint.make_env() for checkpoint in checkpoints]
-    evaluators = None
+    evaluators, built_for = None, None
     for checkpoint, env in zip(checkpoints, envs, strict=True):
         config, params = checkpoint.config, checkpoint.params
         ranges = given_ranges or config.randomization
@@ -335,8 +327,10 @@ def _write_reports(
         has = frozenset(name for name, wanted in parts.items() if wanted)
         wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, episodes, has
         fuller = None if again else find_report(*wanted)
-        if evaluators is None or evaluators.key != _program_key(config, env, ranges):
-            evaluators = _Evaluators.build(checkpoint, env, keys, ranges, in_mujoco=in_mujoco)
+        program_key = _program_key(config, env, ranges)
+        if evaluators is None or built_for != program_key:
+            evaluators = _Evaluators(checkpoint, env, keys, ranges, in_mujoco=in_mujoco)
+            built_for = program_key
         # Run the fixed goals, which most parts of the report are computed from.
         finished = jax.device_get(evaluators.nominal.run(params, keys))
         best_known, missing = compare_with_best_known(config, finished)

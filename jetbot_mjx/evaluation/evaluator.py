@@ -191,55 +191,38 @@ class Evaluator:
           env: one unwrapped environment, or one with domain randomization.
           networks: the networks of the policies to evaluate.
           programs: the cache of compiled programs for the environment's configuration.
-          baselines: whether `run_baselines` will be called.
+          baselines: whether `run` can also run the controllers of `BASELINES`.
           record: whether to record trajectories.
         """
         self._env = env
-        self._names = ["policy", *(BASELINES if baselines else ())]
-        controllers = [policy_controller(networks)]
+        controllers = {"policy": policy_controller(networks)}
         if baselines:
-            controllers += [make(env) for make in BASELINES.values()]
+            controllers |= {name: make(env) for name, make in BASELINES.items()}
+        self._names = list(controllers)
         length = env.config.task.episode_length
-        self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
+        self._run = jax.jit(rollout_fn(env, [*controllers.values()], length, record=record))
         drawn = ", drawn" if isinstance(env, DomainRandomizationWrapper) else ""
         self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
         self._robots = " on drawn robots" if drawn else ""
         self._programs = programs
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
-    def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
-        """Run deterministic episodes of a policy.
+    def run(
+        self, params: PolicyParams, keys: UInt32[Array, "n 2"], controller: str = "policy"
+    ) -> Episodes:
+        """Run deterministic episodes of a policy, or episodes of a baseline.
 
         Args:
-          params: parameters of the policy.
+          params: parameters of the policy, or of any policy for a baseline.
           keys: one reset key for each episode.
+          controller: `policy`, or one of `BASELINES`.
 
         Returns:
           The episodes.
         """
-        return self._episodes(0, params, keys)
-
-    def run_baselines(
-        self, params: PolicyParams, keys: UInt32[Array, "n 2"]
-    ) -> dict[str, Episodes]:
-        """Run the same episodes under each baseline.
-
-        Args:
-          params: parameters of any policy, which the program needs but the baselines do not use.
-          keys: one reset key for each episode.
-
-        Returns:
-          The episodes by the name of the baseline.
-        """
-        return {
-            name: self._episodes(index, params, keys)
-            for index, name in enumerate(self._names)
-            if index > 0
-        }
-
-    def _episodes(self, index: int, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
         # Move the parameters to the host: those from a trainer carry its sharding, and a compiled
         # program accepts only the sharding that it was compiled for.
+        index = self._names.index(controller)
         arguments = np.int32(index), jax.device_get(params), np.asarray(keys)
         count = len(keys)
         if count not in self._compiled:
@@ -247,7 +230,7 @@ class Evaluator:
                 self._compiled[count] = self._programs.compile(
                     f"{count} {self._name}", lambda: self._run.trace(*arguments)
                 )
-        with stage(f"episodes, {self._names[index]}{self._robots}", count):
+        with stage(f"episodes, {controller}{self._robots}", count):
             return jax.block_until_ready(self._compiled[count](*arguments))
 
 

@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 
-from jetbot_mjx.evaluation.comparison import Aggregate, BandPoint, Comparison
+from jetbot_mjx.evaluation.comparison import Aggregate, Comparison
 from jetbot_mjx.evaluation.plots import plot_rates
-from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.report import CurvePoint, Report
 
 
 def plot_learning_curve(report: Report) -> Figure:
@@ -59,7 +59,7 @@ def plot_learning_curves(comparison: Comparison) -> Figure:
     figure = Figure(figsize=(10.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
     # Draw the curve once for two checkpoints of the same run.
-    named: dict[tuple[BandPoint, ...], list[str]] = {}
+    named: dict[tuple[CurvePoint, ...], list[str]] = {}
     for run in comparison.runs:
         seeds = f", {len(run.seeds)} seeds" if len(run.seeds) > 1 else ""
         named.setdefault(run.learning_curve, []).append(run.name + seeds)
