@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 BELOW_TARGET = 1
 """Exit code if a success rate is below `--min-success`."""
@@ -63,7 +62,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0, or 1 if a success rate is below `--min-success`.
     """
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.evaluation import evaluate_runs, tables
         from jetbot_mjx.evaluation.evaluator import MOST_GOALS, REPORT_GOALS
         from jetbot_mjx.runs.run_dir import seed_folders

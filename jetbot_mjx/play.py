@@ -8,7 +8,6 @@ import urllib.parse
 from collections.abc import Sequence
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 _LARGEST_PORT = 65_535
 _DEFAULT_POLICY = "jetbot_egocentric"
@@ -70,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.runs.checkpoint import PRETRAINED
         from jetbot_mjx.viewers import live
         from jetbot_mjx.viewers.step_fns import AGENTS
