@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jetbot_mjx.deployment.exporters import FORMATS, Source
+from jetbot_mjx.deployment.exporters import FORMATS
 from jetbot_mjx.deployment.numpy_policy import (
     TOLERANCE,
     Recording,
@@ -70,8 +70,7 @@ def export_policy(
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
     env = checkpoint.make_env()
-    policy = portable_policy(checkpoint)
-    source = Source(policy, as_jax(checkpoint, env))
+    policy, reference = portable_policy(checkpoint), as_jax(checkpoint, env)
     with writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():
             raise UserError(f"{folder} is there and no export: give --out a folder that is not")
@@ -82,7 +81,7 @@ def export_policy(
         for name in formats:
             path = unfinished / FORMATS[name].file
             with stage(f"writing and checking {path.name}"):
-                FORMATS[name].write(source, path)
+                FORMATS[name].write(policy, reference, path)
                 outputs = FORMATS[name].read(path)(recording.obs)
                 found = difference(recording, outputs, policy.controller)
             if not found < TOLERANCE:
