@@ -24,7 +24,7 @@ from mujoco.rendering.classic import gl_context
 from PIL import Image
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.viewers.camera import Slopes, camera_axes, eye_that_sees
+from jetbot_mjx.viewers.camera import camera_axes, eye_that_sees
 from jetbot_mjx.viewers.pose import set_pose
 
 _BACKENDS = ("egl", "osmesa", "glfw")
@@ -191,7 +191,7 @@ def overview(
     angle = math.radians(_ELEVATION)
     axes_w = camera_axes(np.array([math.cos(angle), 0.0, math.sin(angle)]))
     slopes = math.tan(math.radians(fovy) / 2) * np.array([sides, sides, below, above])
-    eye_w = eye_that_sees(points_w, axes_w, Slopes(*slopes), _NEAREST)
+    eye_w = eye_that_sees(points_w, axes_w, slopes, _NEAREST)
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.azimuth, camera.elevation = 0.0, _ELEVATION

@@ -184,12 +184,10 @@ class VideoRenderer(contextlib.AbstractContextManager["VideoRenderer"]):
         chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
         top = self._frame_with_trail(trajectory, step, "top")
         inset = self._inset_image(trajectory, step, _SEEN)
-        if self._policy_image is None:
-            # In the lower corner the inset hides a goal only while the robot drives away from it.
-            chase = self._with_inset(chase, inset, top=False, left=False)
-            return np.hstack([self._with_text(chase, trajectory, step), top])
-        chase = self._with_inset(chase, inset, top=True, left=True)
-        beside = round(_MARGIN * self._side) + inset.shape[1]
+        # In the lower corner the inset hides a goal only while the robot drives away from it.
+        sees = self._policy_image is not None
+        chase = self._with_inset(chase, inset, top=sees, left=sees)
+        beside = round(_MARGIN * self._side) + inset.shape[1] if sees else 0
         return np.hstack([self._with_text(chase, trajectory, step, beside=beside), top])
 
     def frame_count(self, trajectories: Sequence[Trajectory]) -> int:

@@ -195,19 +195,11 @@ class _OriginCheck:
         try:
             parts = urllib.parse.urlsplit(origin.lower())
             name = parts.hostname or ""
+            if parts.scheme not in ("http", "https") or parts.netloc != host.lower():
+                return False
+            return name in self._names or bool(ipaddress.ip_address(name))
         except ValueError:
             return False
-        if parts.scheme not in ("http", "https") or parts.netloc != host.lower():
-            return False
-        return name in self._names or _is_address(name)
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def free_port(host: str, port: int | None) -> int:
@@ -229,10 +221,9 @@ def free_port(host: str, port: int | None) -> int:
                     # Ignore closed connections of an earlier server on this port.
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                     probe.bind(address[4])
-        except socket.gaierror as error:
-            raise UserError(f"--host {host!r} is no address: {error.strerror}") from None
-        except UnicodeError as error:
-            raise UserError(f"--host {host!r} is no address: {error}") from None
+        except (socket.gaierror, UnicodeError) as error:
+            reason = getattr(error, "strerror", error)
+            raise UserError(f"--host {host!r} is no address: {reason}") from None
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise UserError(f"--host {host!r} is no address of this machine") from None
