@@ -124,17 +124,8 @@ def run(player: Player) -> None:
             while not pressed.empty():
                 player.nudge(*_ARROWS.get(pressed.get(), (0, 0)))
             player.advance()
-            window.show(np.asarray(player.snapshot.qpos), player.snapshot.markers, _texts(player))
+            texts = {**player.describe(), "Agent": player.agent}
+            columns = "\n".join(texts), "\n".join(texts.values())
+            window.show(np.asarray(player.snapshot.qpos), player.snapshot.markers, columns)
             player.frames.count(time.monotonic())
             time.sleep(player.wait())
-
-
-def _texts(player: Player) -> tuple[str, str]:
-    """Return labels and values, line by line."""
-    values = {
-        "goals": f"{player.successes} of {player.episodes} reached",
-        "episode": f"{player.time:.1f} of {player.time_limit:.1f} s",
-        "distance": f"{player.distance:.2f} m",
-        "agent": player.agent,
-    }
-    return "\n".join(values), "\n".join(values.values())

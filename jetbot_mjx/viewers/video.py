@@ -16,12 +16,11 @@ import imageio.v3 as iio
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
@@ -112,7 +111,7 @@ def split_trajectories(
     ]
 
 
-class VideoRenderer(contextlib.AbstractContextManager["VideoRenderer"]):
+class VideoRenderer(contextlib.ExitStack):
     """A `VideoRenderer` renders trajectories; it is a context manager that frees its cameras."""
 
     def __init__(self, env: JetBotEnv, side: int = VIEW, fps: float = FPS) -> None:
@@ -126,14 +125,19 @@ class VideoRenderer(contextlib.AbstractContextManager["VideoRenderer"]):
         Raises:
           UserError: this machine has no OpenGL that works without a display.
         """
+        super().__init__()
         self._fovy = float(env.mj_model.vis.global_.fovy)
         self._side, self._fps = side, fps
         width, height = (round(share * side) for share in _INSET)
-        self._policy_image = None if env.camera is None else _image_fn(env.camera)
-        with contextlib.ExitStack() as stack:
-            self._view = stack.enter_context(Renderer(env.mj_model, width=side, height=side))
-            self._inset = stack.enter_context(Renderer(env.mj_model, width=width, height=height))
-            self._stack = stack.pop_all()
+        self._policy_image = None
+        if (camera := env.camera) is not None:
+            self._policy_image = jax.jit(
+                lambda qpos, markers: camera.render(
+                    camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), markers
+                )
+            )
+        self._view = self.enter_context(Renderer(env.mj_model, width=side, height=side))
+        self._inset = self.enter_context(Renderer(env.mj_model, width=width, height=height))
 
     def render_episode(self, trajectory: Trajectory) -> Iterator[Frame]:
         """Render one episode: chase camera with the onboard camera as inset, and the top view.
@@ -270,22 +274,6 @@ class VideoRenderer(contextlib.AbstractContextManager["VideoRenderer"]):
             )
         return np.asarray(image)
 
-    def __exit__(self, *exception: object) -> None:
-        """Free the cameras."""
-        self._stack.close()
-
-
-def _image_fn(camera: Camera) -> Callable[..., UInt8[Array, "h w c"]]:
-    """Return a compiled function of `qpos` and markers: the image of a robot's camera."""
-
-    @jax.jit
-    def image(
-        qpos: Float[Array, " nq"], markers: Mapping[str, Float[Array, "3"]]
-    ) -> UInt8[Array, "h w c"]:
-        return camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), markers)
-
-    return image
-
 
 @functools.cache
 def _font(size: float) -> Any:
@@ -351,9 +339,7 @@ def resize_frame(frame: Frame, factor: float) -> Frame:
       frame: the frame, RGB.
       factor: the factor on width and height, below 1.
     """
-    image = Image.fromarray(frame)
-    size = (round(image.width * factor), round(image.height * factor))
-    return np.asarray(image.resize(size, Image.Resampling.BOX))
+    return np.asarray(ImageOps.scale(Image.fromarray(frame), factor, Image.Resampling.BOX))
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:

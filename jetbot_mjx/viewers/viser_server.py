@@ -21,6 +21,7 @@ import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
+from unittest import mock
 
 import rich
 import viser
@@ -145,8 +146,7 @@ class _OriginCheck:
     @contextlib.contextmanager
     def install(self) -> Iterator[None]:
         """Add the check to a server that viser starts inside; viser has no option for this."""
-        module = websockets.asyncio.server
-        serve = module.serve
+        serve = websockets.asyncio.server.serve
 
         def serve_with_check(*arguments: Any, process_request: Any, **options: Any) -> Any:
             def check(connection: Any, request: Any) -> Any:
@@ -156,11 +156,8 @@ class _OriginCheck:
             self.installed = True
             return serve(*arguments, process_request=check, **options)
 
-        module.serve = serve_with_check
-        try:
+        with mock.patch.object(websockets.asyncio.server, "serve", serve_with_check):
             yield
-        finally:
-            module.serve = serve
 
     def _refusal(self, connection: Any, request: Any) -> Any:
         """Return the HTTP response that refuses a request; None if the request is accepted."""
@@ -234,12 +231,6 @@ def free_port(host: str, port: int | None) -> int:
     raise UserError(f"{which} cannot be had at --host {host} ({reason}): name another port")
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> contextlib.AbstractContextManager[Any]:
     """Suppress the messages that viser prints when it starts and stops."""
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
+    return mock.patch.object(rich.get_console(), "quiet", True)

@@ -508,7 +508,7 @@ def test_a_click_moves_the_goal_of_the_nearest_robot_and_chooses_it(crowd):
     browser.panel.robot.value = 2
     answer(browser)
     assert player.robot == 2
-    assert browser.panel.distance.value == f"{np.linalg.norm(before[2, :2]):.2f} m"
+    assert browser.panel.texts["Distance"].value == f"{np.linalg.norm(before[2, :2]):.2f} m"
 
 
 # The panel.
@@ -520,14 +520,14 @@ def test_the_panel_reads_what_the_player_does(browser, player):
     player.move_goal(0.3, 0.4)
     player.tick()
     answer(browser)
-    assert panel.goals.value == "2 of 3 reached"
-    assert panel.episode.value == "0.0 of 4.3 s"
-    assert panel.distance.value == "0.50 m"
-    assert "steps/s" in panel.pace.value
+    assert panel.texts["Goals"].value == "2 of 3 reached"
+    assert panel.texts["Episode"].value == "0.0 of 4.3 s"
+    assert panel.texts["Distance"].value == "0.50 m"
+    assert "steps/s" in panel.texts["Pace"].value
     assert "progress +0." in panel.rewards.content
-    player.snapshot = player.snapshot._replace(done=np.float32(1))
+    player.crowd = player.crowd._replace(done=np.ones(1, np.float32))
     panel.update()
-    assert panel.episode.value == "0.0 of 4.3 s, reached"
+    assert panel.texts["Episode"].value == "0.0 of 4.3 s, reached"
 
 
 def test_the_terms_of_the_reward_are_bars_relative_to_their_largest(browser, player, monkeypatch):
