@@ -7,7 +7,7 @@ import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, PercentFormatter
 
 from jetbot_mjx.evaluation.comparison import Aggregate, Comparison
 from jetbot_mjx.evaluation.plots import plot_rates
@@ -79,17 +79,10 @@ def _curve(axes: Axes, points: Sequence[Any], colour: str, label: str) -> None:
 def _label_curves(axes: Axes) -> None:
     axes.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.02, 1.04))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: _short(steps)))
+    axes.xaxis.set_major_formatter(EngFormatter())
     axes.grid()
     axes.set_axisbelow(True)
     axes.legend(loc="best", fontsize="small")
-
-
-def _short(count: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(count) >= size:
-            return f"{count / size:g} {letter}"
-    return f"{count:g}"
 
 
 def plot_runs(comparison: Comparison) -> Figure:

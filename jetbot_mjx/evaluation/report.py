@@ -230,8 +230,20 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
     for r in range(len(edges) - 1):
         for s in range(SECTORS):
             here = (ring == r) & (sector == s)
-            limits = (edges[r], edges[r + 1], *_sector_limits(s))
-            bins.append(_goal_bin(limits, won[here], seconds[here]))
+            count, wins = int(here.sum()), int(won[here].sum())
+            low, high = wilson_interval(wins, count) if count else (None, None)
+            goal_bin = GoalBin(
+                edges[r],
+                edges[r + 1],
+                *_sector_limits(s),
+                episodes=count,
+                successes=wins,
+                success_rate=wins / count if count else None,
+                success_low=low,
+                success_high=high,
+                time_to_goal_median=float(np.median(seconds[here & won])) if wins else None,
+            )
+            bins.append(goal_bin)
     return tuple(bins)
 
 
@@ -285,22 +297,6 @@ def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
     return [
         round(float(edge), 4) for edge in np.linspace(low, max(high, low + _EDGE_STEP), rings + 1)
     ]
-
-
-def _goal_bin(
-    limits: tuple[float, float, float, float], won: np.ndarray, seconds: Float[np.ndarray, " n"]
-) -> GoalBin:
-    count, wins = won.size, int(won.sum())
-    low, high = wilson_interval(wins, count) if count else (None, None)
-    return GoalBin(
-        *limits,
-        episodes=count,
-        successes=wins,
-        success_rate=wins / count if count else None,
-        success_low=low,
-        success_high=high,
-        time_to_goal_median=float(np.median(seconds[won])) if wins else None,
-    )
 
 
 def find_failures(episodes: Episodes, run: Path, env_steps: int) -> tuple[Failure, ...]:
