@@ -534,9 +534,9 @@ def test_the_terms_of_the_reward_are_bars_relative_to_their_largest(browser, pla
     rewards = {"progress": 0.02, "<b>": -0.5}
     monkeypatch.setattr(browser.panel, "_largest", dict.fromkeys(rewards, 1e-9))
     for scale, width in ((1.0, 50.0), (0.5, 25.0)):
-        player.snapshot = player.snapshot._replace(
-            rewards={name: scale * value for name, value in rewards.items()},
-            returns=dict.fromkeys(rewards, 0.25),
+        player.crowd = player.crowd._replace(
+            rewards={name: np.array([scale * value]) for name, value in rewards.items()},
+            returns=dict.fromkeys(rewards, np.array([0.25])),
         )
         bars = browser.panel._reward_bars()
         assert bars.count(f"width:{width:.1f}%") == 2
