@@ -230,18 +230,14 @@ class PhysicsConfig(_Section):
     @model_validator(mode="after")
     def _whole_substeps(self) -> Self:
         ratio = self.ctrl_dt / self.sim_dt
+        problem = f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}"
         if ratio > _MAX_SUBSTEPS:
-            raise ValueError(
-                f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
-                f" make it at most {_MAX_SUBSTEPS} times"
-            )
+            raise ValueError(f"{problem}: make it at most {_MAX_SUBSTEPS} times")
         # A decimal in YAML cannot represent 1/120 exactly: accept a ratio that is nearly whole.
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-3 * ratio:
             nearest = self.ctrl_dt / max(1, round(ratio))
-            raise ValueError(
-                f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
-                f" make the sub-steps whole, for example sim_dt = {nearest:.9g}"
-            )
+            remedy = f"make the sub-steps whole, for example sim_dt = {nearest:.9g}"
+            raise ValueError(f"{problem}: {remedy}")
         return self
 
 
