@@ -21,8 +21,8 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.bootstrap import (
     Estimate,
     bootstrap,
+    bootstrap_interval,
     interquartile_mean,
-    mean_band,
     mean_difference,
     median_estimate,
     probability_of_improvement,
@@ -247,7 +247,7 @@ def _band(curves: Sequence[Sequence[CurvePoint]]) -> tuple[CurvePoint, ...]:
     if not common:
         return ()
     rates = np.array([[curve[step] for step in common] for curve in by_steps])
-    lows, highs = mean_band(rates)
+    lows, highs = bootstrap_interval(np.mean, [rates], axis=0)
     columns = (common, rates.mean(axis=0), lows, highs)
     return tuple(
         CurvePoint(int(step), float(mean), float(low), float(high), None)

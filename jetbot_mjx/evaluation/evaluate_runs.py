@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import jax
 
@@ -40,8 +40,6 @@ Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
 
 _FOLDER = "evaluations"
-
-SIMULATORS: tuple[Simulator, ...] = get_args(Simulator)
 
 
 def evaluate_run(

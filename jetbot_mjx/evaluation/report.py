@@ -21,7 +21,7 @@ from jetbot_mjx.evaluation.evaluator import (
     Summary,
     final_distances,
     json_values,
-    wilson_interval,
+    success_and_time,
 )
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -230,20 +230,8 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
     for r in range(len(edges) - 1):
         for s in range(SECTORS):
             here = (ring == r) & (sector == s)
-            count, wins = int(here.sum()), int(won[here].sum())
-            low, high = wilson_interval(wins, count) if count else (None, None)
-            goal_bin = GoalBin(
-                edges[r],
-                edges[r + 1],
-                *_sector_limits(s),
-                episodes=count,
-                successes=wins,
-                success_rate=wins / count if count else None,
-                success_low=low,
-                success_high=high,
-                time_to_goal_median=float(np.median(seconds[here & won])) if wins else None,
-            )
-            bins.append(goal_bin)
+            limits = (edges[r], edges[r + 1], *_sector_limits(s))
+            bins.append(GoalBin(*limits, **success_and_time(won[here], seconds[here])))
     return tuple(bins)
 
 
