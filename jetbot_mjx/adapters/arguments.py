@@ -65,11 +65,9 @@ def _read(config: Source) -> Config:
     match config:
         case Config():
             return config
-        case None:
-            return Config()
         case Mapping():
             return parse_config(config)
-        case str() | Path():
+        case None | str() | Path():
             return load_config(config)
     raise UserError(f"config = {config!r} is wrong: give a YAML file, a mapping or a Config")
 

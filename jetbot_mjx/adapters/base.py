@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from jetbot_mjx.adapters.arguments import Source, resolve
-from jetbot_mjx.adapters.batched_env import unwrap_single
+from jetbot_mjx.adapters.batched_env import BatchedEnv, unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
 from jetbot_mjx.agents.vision import is_image
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
@@ -50,6 +50,7 @@ class AdapterBase:
     config: Config
     """The configuration that the environment is built from."""
     render_mode: str | None
+    batch: BatchedEnv
     _renderer: FrameRenderer | None
     _is_begun = False
     """Whether there was a `reset`; the subclass sets it."""
@@ -90,8 +91,8 @@ class AdapterBase:
         return observation_space(env.observation_size), spaces.Box(-1.0, 1.0, (env.action_size,))
 
     def _poses(self) -> list[Pose]:
-        """Return the pose of every robot."""
-        raise NotImplementedError
+        """Return the pose of every robot of `batch`; an adapter without one overrides this."""
+        return self.batch.poses()
 
     def _require_reset(self, method: str) -> None:
         if not self._is_begun:

@@ -134,12 +134,8 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         return [Pose(self.robot.data.qpos, self.robot.goal, now)]
 
 
-def _register() -> None:
-    gymnasium.register(
-        ENV_ID,
-        entry_point=f"{__name__}:{JetBotGymEnv.__name__}",
-        vector_entry_point="jetbot_mjx.adapters.vector:JetBotVectorEnv",
-    )
-
-
-_register()
+gymnasium.register(
+    ENV_ID,
+    entry_point=f"{__name__}:{JetBotGymEnv.__name__}",
+    vector_entry_point="jetbot_mjx.adapters.vector:JetBotVectorEnv",
+)

@@ -9,7 +9,6 @@ from jaxtyping import Float, UInt8
 from jetbot_mjx.adapters.arguments import Source
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
-from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.errors import UserError, requires_extra
 
 with requires_extra("sb3", "the adapter"):
@@ -196,6 +195,3 @@ class JetBotVecEnv(AdapterBase, VecEnv):
     def close(self) -> None:
         """Close the renderer; the base class of Stable-Baselines3 has nothing to close."""
         self._close_renderer()
-
-    def _poses(self) -> list[Pose]:
-        return self.batch.poses()

@@ -8,7 +8,7 @@ from jaxtyping import Float, UInt8
 from jetbot_mjx.adapters.arguments import Seed, Source
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
-from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
+from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.errors import requires_extra
 
 with requires_extra("gymnasium", "the adapter"):
@@ -132,6 +132,3 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
           UserError: This machine has no OpenGL that works without a screen.
         """
         return tuple(self._frames()) if self.render_mode == "rgb_array" else None
-
-    def _poses(self) -> list[Pose]:
-        return self.batch.poses()

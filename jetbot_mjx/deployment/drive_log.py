@@ -77,7 +77,6 @@ def read_log(path: Path) -> DriveLog:
       UserError: The file is missing, is not a log, or has fewer than two poses.
     """
     lines = _read_lines(path)
-
     # Parse the header and one line per control period; the number tells where a log is wrong.
     times, motors, latencies = [], [], []
     poses: dict[float, tuple[float, ...]] = {}

@@ -145,13 +145,8 @@ def _read_onnx(path: Path) -> Act:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-
-    def act(obs: Float[np.ndarray, "n obs"]) -> Outputs:
-        action, wheel_speeds = session.run(["action", "wheel_speeds"], {"obs": obs})
-        return np.asarray(action), np.asarray(wheel_speeds)
-
-    return act
+    session: Any = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    return lambda obs: tuple(session.run(["action", "wheel_speeds"], {"obs": obs}))
 
 
 FORMATS = {
