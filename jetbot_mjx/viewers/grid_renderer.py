@@ -94,8 +94,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
             _show_groups(groups) for groups in ((0,), (1,), (1, 2))
         )
         # The floor is darker than the robots.
-        model.geom_rgba[floor] = _FLOOR
-        model.mat_rgba[model.geom_matid[floor]] = _FLOOR
+        model.geom_rgba[floor] = model.mat_rgba[model.geom_matid[floor]] = _FLOOR
         self.fovy = float(model.vis.global_.fovy)
         """Field of view of the camera in height [degrees]."""
 

@@ -83,9 +83,7 @@ class Player:
         self._key, key = self._put(tuple(jax.random.split(jax.random.PRNGKey(seed))))
         # The first robot's goals do not depend on the number of robots.
         keys = [key, *(jax.random.fold_in(key, robot) for robot in range(1, robots))]
-        self._count = 0
-        self._rate = Rate()
-        self._speed = 1.0
+        self._count, self._rate, self._speed = 0, Rate(), 1.0
         self.drive(0.0, 0.0)
         self._use(checkpoint)
         self._hold = np.zeros(robots, int)

@@ -77,8 +77,7 @@ class Scene:
         self._lines_scale = 1 if self._few else _COARSE_LINES
         self.cameras = Cameras(server, "robot and goal" if player.robots == 1 else "overview")
         """The cameras of all clients."""
-        self._add_floor()
-        self._add_lights()
+        self._add_surroundings()
         self._parts = self._add_bodies()
         server.scene.on_click()(self._on_click)
         robots_w = self._robots_w()
@@ -213,7 +212,8 @@ class Scene:
             self._plane.visible = cast
             self._lines.visible = not cast
 
-    def _add_floor(self) -> None:
+    def _add_surroundings(self) -> None:
+        """Add the floor and the lights."""
         scene = self._server.scene
         # Without a GPU in the browser, a plane that fills the page takes half of the render time.
         # Therefore the floor is lines on the white page, and the plane is shown only with shadows.
@@ -233,9 +233,6 @@ class Scene:
         self._lines = scene.add_glb(
             "/lines", _lines(self._edge, self._lines_scale), cast_shadow=False, receive_shadow=False
         )
-
-    def _add_lights(self) -> None:
-        scene = self._server.scene
         # viser's default lights cast shadows and reflect; without a GPU, that gives two frames per
         # second.
         scene.configure_environment_map(None)
