@@ -60,6 +60,13 @@ def _wandb_project(name: str) -> str:
     return name
 
 
+def _float32(value: float) -> float:
+    """Reject a value that would be infinite in float32."""
+    if value > _LARGEST_FLOAT32:
+        raise ValueError(f"{value:g} is too large: make it at most {_LARGEST_FLOAT32:.2g}")
+    return value
+
+
 def _utf8(text: str) -> str:
     """Reject text that cannot be written as UTF-8, such as half of a surrogate pair."""
     text.encode()
@@ -74,8 +81,8 @@ _Scalar = bool | int | Annotated[float, Field(allow_inf_nan=False)] | Text
 Count = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**31)]
 Steps = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**53)]
 Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
-Positive = Annotated[float, Field(gt=0, le=_LARGEST_FLOAT32, allow_inf_nan=False)]
-NonNegative = Annotated[float, Field(ge=0, le=_LARGEST_FLOAT32, allow_inf_nan=False)]
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_float32)]
+NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_float32)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
 
 

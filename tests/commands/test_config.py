@@ -237,11 +237,7 @@ BAD_VALUES = {
         "seeds = 2",
         "seed at most 4294967294",
     ),
-    "more than 32 bits": (
-        "task: {max_speed: 1e39}",
-        "task.max_speed = 1e+39",
-        "or equal to 3.4e+38",
-    ),
+    "more than 32 bits": ("task: {max_speed: 1e39}", "task.max_speed: 1e+39", "at most 3.4e+38"),
     "goals out of sight": ("task: {goal_distance_min: 1e4}", "goal_distance_min = 10000.0", "1000"),
     "nan in free options": (
         "task: {options: {a: .nan}}",
