@@ -146,21 +146,17 @@ def without_warp_lines() -> Iterator[None]:
         sys.stdout.writelines(line for line in lines if not line.startswith("Failed to import "))
 
 
-@contextlib.contextmanager
-def _opengl() -> Iterator[None]:
-    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `offscreen.find_backend` reports
-    # the reason if images are needed. PyOpenGL raises an AttributeError if the library is missing.
-    with contextlib.suppress(ImportError, AttributeError, OSError, RuntimeError):
-        yield
-
-
 _COMET = types.ModuleType("tensorboardX.comet_utils")
 _COMET.CometLogger = None  # pyright: ignore[reportAttributeAccessIssue]
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
-    "mujoco.rendering.classic.gl_context": _opengl,
+    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `offscreen.find_backend` reports
+    # the reason if images are needed. PyOpenGL raises an AttributeError if the library is missing.
+    "mujoco.rendering.classic.gl_context": lambda: contextlib.suppress(
+        ImportError, AttributeError, OSError, RuntimeError
+    ),
     # Stand in for a logging service of tensorboardX's own writer, which is not used.
     "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _COMET),
 }

@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 FOLDER = Path("runs/pretrained")
 
@@ -27,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--out", type=Path, default=FOLDER, metavar="DIR", help=f"the folder (default: {FOLDER})"
     )
     options = parser.parse_args(arguments)
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.runs.find_run import copy_pretrained
 
     runs = copy_pretrained(options.out)

@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 NOT_REPRODUCED = 1
 """Exit code if the state stays finite."""
@@ -22,7 +21,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = cli.Parser(prog="jetbot-mjx replay", description=__doc__)
     parser.add_argument("file", type=Path, help="a file in a run's nan_dumps/")
     options = parser.parse_args(arguments)
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.envs.jetbot_env import make_env
         from jetbot_mjx.runs import nan_dump
     cli.prepare_device()

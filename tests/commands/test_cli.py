@@ -277,9 +277,9 @@ def test_a_mistaken_command_line_is_refused(refused, command, arguments, said):
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        ("2", "2 is not between 0 and 1"),
-        ("-0.1", "-0.1 is not between 0 and 1"),
-        ("nan", "nan is not between 0 and 1"),
+        ("2", "2 is too large: give at most 1"),
+        ("-0.1", "-0.1 is too small: give at least 0"),
+        ("nan", "nan is too small: give at least 0"),
         ("95%", "'95%' is no number"),
     ],
 )
