@@ -34,7 +34,9 @@ Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of the parts of an observation, by name."""
 
 _POLICY, _VALUE = "policy", "value"
-_ENCODER, _HEAD = "encoder", "head"
+
+ENCODER, HEAD = "encoder", "head"
+"""Keys of the parts of a network's parameters."""
 
 
 class _Layers(NamedTuple):
@@ -53,11 +55,12 @@ class _Layers(NamedTuple):
         return size
 
 
-_CNNS = {
+CNNS = {
     "nature": _Layers(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),
     "small": _Layers(((16, 4, 2), (32, 4, 2), (32, 3, 1)), 128),
     "tiny": _Layers(((16, 4, 4), (32, 4, 2)), 64),
 }
+"""Encoders by the name that `ppo.network.cnn` takes."""
 
 
 class VisionNetworks(NamedTuple):
@@ -102,7 +105,7 @@ def make_vision_networks(
     Raises:
       InvalidError: the images are too small for the convolutions.
     """
-    layers = _CNNS[config.cnn]
+    layers = CNNS[config.cnn]
     _check_size(config.cnn, shapes)
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
     images = [name for name in sorted(shapes) if is_image(name)]
@@ -114,14 +117,14 @@ def make_vision_networks(
         def init_network(key: Any) -> Any:
             encoder_key, head_key = jax.random.split(key)
             pixels = _joined({name: jnp.zeros((1, *shapes[name]), jnp.uint8) for name in images})
-            own = {_ENCODER: encoder.init(encoder_key, pixels)} if encodes else {}
-            return {_HEAD: head.init(head_key), **own}
+            own = {ENCODER: encoder.init(encoder_key, pixels)} if encodes else {}
+            return {HEAD: head.init(head_key), **own}
 
         return init_network
 
     def encode_one(normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
         features: Any = encoder.apply(
-            params[_ENCODER], _joined({name: obs[name] for name in images})
+            params[ENCODER], _joined({name: obs[name] for name in images})
         )
         values = normalize({name: obs[name] for name in numbers}, normalizer)
         return jnp.concatenate([features, *(values[name] for name in sorted(numbers))], axis=-1)
@@ -168,7 +171,7 @@ def _on_features(
     """
     return brax_networks.FeedForwardNetwork(
         init=init,
-        apply=lambda _, params, encoded: head.apply(None, params[_HEAD], encoded[name]),
+        apply=lambda _, params, encoded: head.apply(None, params[HEAD], encoded[name]),
     )
 
 
@@ -179,7 +182,7 @@ def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
       config: the layers, and whether policy and value function share them.
       shapes: the shapes of the observation's parts.
     """
-    layers = _CNNS[config.cnn]
+    layers = CNNS[config.cnn]
     images = [shape for name, shape in shapes.items() if is_image(name)]
     height, width, _ = images[0]
     channels = sum(shape[2] for shape in images)
@@ -195,8 +198,8 @@ def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
 def _check_size(cnn: str, shapes: Shapes) -> None:
     """Raise an error if an image is too small for convolutions."""
     for height, width, _ in (shape for name, shape in shapes.items() if is_image(name)):
-        if min(height, width) < _CNNS[cnn].smallest:
-            sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in _CNNS.items())
+        if min(height, width) < CNNS[cnn].smallest:
+            sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in CNNS.items())
             raise InvalidError(
                 f"camera.width = {width} and camera.height = {height} are too small for"
                 f" ppo.network.cnn = {cnn!r}: make both at least that of the network ({sizes})"
