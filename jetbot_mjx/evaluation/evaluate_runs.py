@@ -22,6 +22,7 @@ from jetbot_mjx.evaluation.evaluator import (
     summarize,
 )
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
+from jetbot_mjx.evaluation.moments import MomentFinder
 from jetbot_mjx.evaluation.report import (
     Report,
     by_goal,
@@ -275,6 +276,7 @@ class _Reporter:
             varied = DomainRandomizationWrapper(env, ranges=ranges)
             self._randomized = Evaluator(varied, networks, programs)
         self._mujoco = MujocoEvaluator(env, networks, ranges) if self._in_mujoco else None
+        self._moments = MomentFinder(env, networks, programs) if env.camera else None
         self._built_for = parts
 
     def _on_other_robots(self, checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
@@ -338,6 +340,9 @@ class _Reporter:
             ranges_file=None if self._ranges_file is None else Path(self._ranges_file),
             best_known=best_known,
             best_known_missing=missing,
+            seen=self._moments.find(checkpoint.params, self._keys, finished)
+            if self._moments
+            else (),
             **self._on_other_robots(checkpoint, env),
         )
         if fuller is None:

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 
 from jetbot_mjx.evaluation import learning_curves, plots
 from jetbot_mjx.evaluation.comparison import Comparison
+from jetbot_mjx.evaluation.moments import plot_moments
 from jetbot_mjx.evaluation.report import Report, replay_command
 from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, write_text, writing_to
 
@@ -25,7 +26,10 @@ LISTED_FAILURES = 50
 
 _MAX_REPLAYED = 8
 
-_OPTIONAL_FIGURES = {"report": {"learning_curve", "robustness"}, "comparison": {"learning_curves"}}
+_OPTIONAL_FIGURES = {
+    "report": {"learning_curve", "robustness", "seen"},
+    "comparison": {"learning_curves"},
+}
 """Names of the figures that a page may lack."""
 
 _FORMS = {
@@ -42,6 +46,7 @@ _FORMS = {
     "signed percent": "{:+.2%}",
     "signed seconds": "{:+.3f} s",
     "p": "{:.2g}",
+    "change": "{:.2f}",
 }
 
 _PAGES = jinja2.Environment(
@@ -84,6 +89,8 @@ def write_report(report: Report) -> Path:
         figures["learning_curve"] = lambda: learning_curves.plot_learning_curve(report)
     if report.robustness:
         figures["robustness"] = lambda: plots.plot_robustness(report.robustness)
+    if report.seen:
+        figures["seen"] = lambda: plot_moments(report.seen)
     # Write them with the commands that reproduce the report and show its failures.
     goals = [failure.goal for failure in report.failures if failure.replay][:_MAX_REPLAYED]
     return _write(

@@ -18,6 +18,10 @@ from jetbot_mjx.agents.networks import Policy
 from jetbot_mjx.envs.camera.wrapper import PIXELS
 from jetbot_mjx.errors import InvalidError
 
+_GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
+_DIMMED = 0.6  # brightness of the image below a heat map
+_HOT = np.array([[255, 60, 0], [255, 235, 60]])  # colours of half and of full heat
+
 _SQUARES = 8  # squares side by side on the shorter side of an image, by default
 
 
@@ -72,6 +76,24 @@ def occlusion_map(
     # Average over the squares that cover a pixel.
     total = rows.T.astype(np.float32) @ changes.reshape(len(rows), len(columns)) @ columns
     return total / np.outer(rows.sum(axis=0), columns.sum(axis=0))
+
+
+def overlay_heat(
+    image: UInt8[np.ndarray, "h w c"], heat: Float[np.ndarray, "h w"], largest: float
+) -> UInt8[np.ndarray, "h w 3"]:
+    """Return an image in grey below a heat map, from clear over red to yellow.
+
+    Args:
+      image: the image, in RGB or of one channel of grey.
+      heat: the heat of each pixel, from 0 on.
+      largest: the heat that is drawn in yellow.
+    """
+    grey = image @ np.array(_GREY) if image.shape[2] == 3 else image[..., 0]
+    share = np.clip(heat / max(largest, 1e-9), 0.0, 1.0)[..., None]
+    red, yellow = _HOT
+    colour = red + (yellow - red) * np.clip(2 * share - 1, 0.0, 1.0)
+    opacity = np.clip(2 * share, 0.0, 1.0)
+    return np.round((1 - opacity) * _DIMMED * grey[..., None] + opacity * colour).astype(np.uint8)
 
 
 def _covered(length: int, side: int, stride: int) -> Bool[np.ndarray, "squares length"]:

@@ -23,6 +23,7 @@ from jetbot_mjx.evaluation.evaluator import (
     json_values,
     success_and_time,
 )
+from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
 
@@ -157,6 +158,8 @@ class Report(NamedTuple):
     """Best-known times; None if there are none for these goals and settings."""
     best_known_missing: str | None = None
     """Why there are no best-known times."""
+    seen: tuple[SeenEpisode, ...] = ()
+    """What the policy saw in some episodes; empty if it does not see."""
 
     @property
     def name(self) -> str:
@@ -176,7 +179,7 @@ class Report(NamedTuple):
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything except the episodes as JSON values."""
+        """Return everything except the episodes and images as JSON values."""
         apart = ("folder", "config", "goal_bins", "episodes", "ranges_file")
         fields = {name: value for name, value in self._asdict().items() if name not in apart}
         converted = {
@@ -190,6 +193,7 @@ class Report(NamedTuple):
             "cells": self.goal_bins,
             "robustness": as_json(self.robustness) if self.robustness else None,
             "ranges": self.ranges.drawn if self.ranges else None,
+            "seen": moments_as_json(self.seen) if self.seen else None,
         }
         return json_values({"goal_set_version": GOAL_SET_VERSION, **fields, **converted})
 

@@ -1,11 +1,7 @@
-"""Draw what a policy sees and which parts of it the policy looks at."""
+"""Make what a policy sees large enough for a video or a page."""
 
 import numpy as np
-from jaxtyping import Float, UInt8
-
-_GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
-_DIMMED = 0.6  # brightness of the image below a heat map
-_HOT = np.array([[255, 60, 0], [255, 235, 60]])  # colours of half and of full heat
+from jaxtyping import UInt8
 
 
 def resize_nearest(
@@ -24,21 +20,3 @@ def resize_nearest(
     image = image[::every, ::every]
     rgb = np.broadcast_to(image, (*image.shape[:2], 3))
     return rgb.repeat(factor, axis=0).repeat(factor, axis=1)
-
-
-def overlay_heat(
-    image: UInt8[np.ndarray, "h w c"], heat: Float[np.ndarray, "h w"], largest: float
-) -> UInt8[np.ndarray, "h w 3"]:
-    """Return an image in grey below a heat map, from clear over red to yellow.
-
-    Args:
-      image: the image, in RGB or of one channel of grey.
-      heat: the heat of each pixel, from 0 on.
-      largest: the heat that is drawn in yellow.
-    """
-    grey = image @ np.array(_GREY) if image.shape[2] == 3 else image[..., 0]
-    share = np.clip(heat / max(largest, 1e-9), 0.0, 1.0)[..., None]
-    red, yellow = _HOT
-    colour = red + (yellow - red) * np.clip(2 * share - 1, 0.0, 1.0)
-    opacity = np.clip(2 * share, 0.0, 1.0)
-    return np.round((1 - opacity) * _DIMMED * grey[..., None] + opacity * colour).astype(np.uint8)

@@ -6,8 +6,9 @@ import numpy as np
 import viser
 from jaxtyping import UInt8
 
+from jetbot_mjx.evaluation.occlusion import overlay_heat
 from jetbot_mjx.viewers.player import Player
-from jetbot_mjx.viewers.policy_view import overlay_heat, resize_nearest
+from jetbot_mjx.viewers.policy_view import resize_nearest
 from jetbot_mjx.viewers.realtime import Clock
 
 _SIDE, _SIDE_OF_TWO = 200, 140  # [pixels] longer side of one image, and of two side by side

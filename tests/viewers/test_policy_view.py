@@ -12,11 +12,11 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.camera.wrapper import PIXELS
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
-from jetbot_mjx.evaluation.occlusion import occlusion_map
+from jetbot_mjx.evaluation.occlusion import occlusion_map, overlay_heat
 from jetbot_mjx.runs.checkpoint import Checkpoint, about_policy
 from jetbot_mjx.viewers import player as player_module
 from jetbot_mjx.viewers.player import Player
-from jetbot_mjx.viewers.policy_view import overlay_heat, resize_nearest
+from jetbot_mjx.viewers.policy_view import resize_nearest
 
 SEEING = {
     "task": {"observation": "camera"},
