@@ -325,6 +325,8 @@ def test_numbers_beside_an_image_are_a_dictionary():
     assert both.observation_space.contains(seen)
 
 
-@pytest.mark.parametrize("observation", ["camera", "camera+egocentric"])
+@pytest.mark.parametrize(
+    "observation", ["camera", pytest.param("camera+egocentric", marks=pytest.mark.slow)]
+)
 def test_its_checker_passes_with_images(observation):
     check_env(JetBotGymEnv(config={**SEES, "task": {"observation": observation}}))
