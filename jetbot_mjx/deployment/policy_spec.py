@@ -60,18 +60,7 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
             {"name": "drive", "index": 0, "unit": "1", "low": -1.0, "high": 1.0},
             {"name": "turn", "index": 1, "unit": "1", "low": -1.0, "high": 1.0},
         ],
-        "wheel_speeds": {
-            "order": ["left", "right"],
-            "unit": "rad/s",
-            "formula": [
-                "v = (drive + 1)/2 * max_speed",
-                "w = turn * max_yaw_rate",
-                "left = (v - w * wheel_separation/2) / wheel_radius",
-                "right = (v + w * wheel_separation/2) / wheel_radius",
-            ],
-            **policy.controller._asdict(),
-            "limit_in_training": env.robot.max_wheel_speed,
-        },
+        "wheel_speeds": _wheel_speeds(policy, env.robot.max_wheel_speed),
         "inside": [
             *(["pixels / 255", "convolutions"] if encoder else []),
             *(["normaliser"] if policy.mean.size else []),
@@ -95,6 +84,22 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "episode_seconds": config.task.episode_length * env.dt,
         "evaluation": _evaluation(checkpoint),
         "versions": versions(),
+    }
+
+
+def _wheel_speeds(policy: PortablePolicy, limit: float | None) -> dict[str, Any]:
+    """Return how wheel speeds follow from an action; `limit` is that of training [rad/s]."""
+    return {
+        "order": ["left", "right"],
+        "unit": "rad/s",
+        "formula": [
+            "v = (drive + 1)/2 * max_speed",
+            "w = turn * max_yaw_rate",
+            "left = (v - w * wheel_separation/2) / wheel_radius",
+            "right = (v + w * wheel_separation/2) / wheel_radius",
+        ],
+        **policy.controller._asdict(),
+        "limit_in_training": limit,
     }
 
 
