@@ -1,8 +1,9 @@
 """Randomize the robot and what it sees: fixed parameters, or drawn anew in every episode.
 
-The drawn parameters and the states of actuators, sensors and camera are data in `State.episode_params`:
-`NewEpisodeWrapper` replaces them where a new episode begins, and checkpoints store them. `step`
-makes the physics model from them, so one compiled program serves all robots.
+The drawn parameters and the states of actuators, sensors and camera are data in
+`State.episode_params`: `NewEpisodeWrapper` replaces them where a new episode begins, and
+checkpoints store them. `step` makes the physics model from them, so one compiled program serves
+all robots.
 """
 
 import math
@@ -83,8 +84,8 @@ class DomainRandomizationWrapper(Wrapper):
     """A wrapper that varies the robot: its model, actuators, sensors, start pose, and what it sees.
 
     Like the environment inside, it sees one robot without a batch axis. It observes numbers only:
-    `with_camera` renders outside of it, with the looks that the state holds. A step is: wheel speed targets of the action, actuator
-    model, physics with the varied model, sensor model, observation.
+    `with_camera` renders outside of it, with the looks that the state holds. A step is: wheel speed
+    targets of the action, actuator model, physics with the varied model, sensor model, observation.
     """
 
     env: JetBotEnv

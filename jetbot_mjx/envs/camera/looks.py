@@ -35,6 +35,10 @@ class Appearance(NamedTuple):
     surroundings: Surroundings = Surroundings()
 
 
+PLAIN = Appearance()
+"""The plain scene."""
+
+
 def styled(scene: Scene, params: LookParams) -> Scene:
     """Return a scene with other colours and lights, which may be traced; itself if none differs.
 

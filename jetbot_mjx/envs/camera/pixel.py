@@ -117,6 +117,11 @@ class _Slopes(NamedTuple):
         """Return the larger one."""
         return self.ground if self.wall is None else jnp.maximum(self.ground, self.wall)
 
+    @property
+    def is_wall(self) -> Any:
+        """Return whether the nearest one is a wall."""
+        return self.wall > jnp.maximum(self.ground, 0.0)
+
 
 def pixel_colour(
     scene: Scene, frame: Frame, samples: Sequence[Rays], footprint: Footprint
@@ -138,7 +143,7 @@ def pixel_colour(
         seen = sum((slope.nearest > 0).astype(jnp.float32) for slope in slopes)
         if frame.room is None:
             return _Sums(zero, zero, zero, seen, len(samples) - seen, None)
-        wall = sum((slope.wall > slope.ground).astype(jnp.float32) for slope in slopes)
+        wall = sum(slope.is_wall.astype(jnp.float32) for slope in slopes)
         return _Sums(zero, zero, zero, seen - wall, len(samples) - seen, wall)
 
     def with_geoms(near: Sequence[Any]) -> _Sums:
@@ -284,7 +289,7 @@ def _sum(found: Sequence[_Sample], slopes: Sequence[_Slopes]) -> _Sums:
         is_behind = (slope.nearest > 0) & (sample.depth * slope.nearest > 1.0)
         seen = [is_behind, is_free & ~is_behind]
         if slope.wall is not None:
-            is_wall = is_behind & (slope.wall > slope.ground)
+            is_wall = is_behind & slope.is_wall
             seen = [is_behind & ~is_wall, is_free & ~is_behind, is_wall]
         shown = [jnp.where(is_behind, 0.0, x) for x in (sample.red, sample.green, sample.blue)]
         counts = [x.astype(jnp.float32) for x in seen]

@@ -27,6 +27,16 @@ from jetbot_mjx.config import CameraConfig
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.camera.geometry import Vector
 from jetbot_mjx.envs.camera.lens import pixel_grid
+from jetbot_mjx.envs.camera.looks import (
+    PLAIN,
+    Appearance,
+    bend_rays,
+    developed,
+    pixel_values,
+    squared_length,
+    styled,
+    turned,
+)
 from jetbot_mjx.envs.camera.pixel import (
     HITS,
     Axes,
@@ -35,15 +45,6 @@ from jetbot_mjx.envs.camera.pixel import (
     directions,
     pixel_colour,
     strengths,
-)
-from jetbot_mjx.envs.camera.looks import (
-    Appearance,
-    bend_rays,
-    developed,
-    pixel_values,
-    squared_length,
-    styled,
-    turned,
 )
 from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, with_clutter
@@ -109,7 +110,7 @@ class Camera:
         self,
         position_w: Float[Array, "3"],
         quat: Float[Array, "4"],
-        params: LookParams = LookParams(),
+        params: LookParams = PLAIN.params,
     ) -> Pose:
         """Return the camera's pose on a robot.
 
@@ -128,7 +129,7 @@ class Camera:
         self,
         pose: Pose,
         mocap_positions: Mapping[str, Float[Array, "3"]],
-        appearance: Appearance = Appearance(),
+        appearance: Appearance = PLAIN,
     ) -> UInt8[Array, "h w c"]:
         """Return the image, without noise.
 
@@ -146,10 +147,7 @@ class Camera:
         leaves, structure = jax.tree.flatten(self._frame(pose, mocap_positions, appearance))
         shared = jnp.stack(leaves)
         kernel = self._kernel(structure)
-        if kernel is None:
-            values = self._fallback(structure, shared)[0]
-        else:
-            values = as_map(kernel)(shared)
+        values = self._fallback(structure, shared)[0] if kernel is None else as_map(kernel)(shared)
         return values.reshape(self.shape)
 
     def _kernel(self, structure: Any) -> Kernel | None:
@@ -236,7 +234,7 @@ class Camera:
           The depth along the optical axis [m], infinite where there is nothing, and the geom's
           index in the model, -1 where there is none.
         """
-        frame = self._frame(pose, mocap_positions, Appearance())
+        frame = self._frame(pose, mocap_positions, PLAIN)
         nearest = jnp.full(self.shape[:2], jnp.inf)
         found = jnp.full(self.shape[:2], -1)
         _, footprint = self._grid.expand(self._grid.columns)

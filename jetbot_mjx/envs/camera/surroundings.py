@@ -1,5 +1,6 @@
 """Draw and place what stands around in one episode: four walls and objects that are no goal."""
 
+import functools
 import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -141,7 +142,6 @@ def with_clutter(scene: Scene, colours: Sequence[Any]) -> Scene:
     for index, rgb in enumerate(colours):
         kind, size = _SHAPES[index % len(_SHAPES)]
         height = size[1] if kind == "cylinder" else size[2]
-        rotation = _turned(0.7 * index) if kind == "box" else np.eye(3)
         geoms.append(
             SceneGeom(
                 geom_id=-1,
@@ -152,7 +152,7 @@ def with_clutter(scene: Scene, colours: Sequence[Any]) -> Scene:
                 checker=None,
                 mocap=_clutter_name(index),
                 position=np.array([0.0, 0.0, height], np.float32),
-                rotation=np.asarray(rotation, np.float32),
+                rotation=np.eye(3, dtype=np.float32),
             )
         )
     return scene._replace(geoms=(*scene.geoms, *geoms))
@@ -169,24 +169,14 @@ def make_room(
       position: the optical centre [m], world frame.
       rotation: right, down and forward of the image, as columns, world frame.
     """
-    near = jnp.asarray(near)
-    sides = []
-    for index in range(4):
-        angle = walls[0] + 0.5 * math.pi * index
-        x, y = jnp.cos(angle), jnp.sin(angle)
-        # 1/depth = n·d / (D - n·p) = w n·d / (1 - w n·p), where w = 1/D.
-        gap = jnp.maximum(1.0 - near * (x * position[0] + y * position[1]), _WALL_GAP * near)
-        scale = near / gap
-        a, b, c = (scale * (x * rotation[0, k] + y * rotation[1, k]) for k in range(3))
-        sides.append((a, b, c))
+    angle = walls[0] + 0.5 * math.pi * np.arange(4)
+    normals = jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1)
+    # 1/depth = n·d / (D - n·p) = w n·d / (1 - w n·p), where w = 1/D.
+    dot = functools.partial(jnp.dot, precision=jax.lax.Precision.HIGHEST)
+    gaps = jnp.maximum(1.0 - near * dot(normals, position[:2]), _WALL_GAP * near)
+    sides = (near / gaps)[:, None] * dot(normals, rotation[:2])
     colours = [(walls[i], walls[i + 1], walls[i + 2]) for i in range(2, 14, 3)]
-    return Room(sides, walls[1] - position[2], colours)
-
-
-def _turned(yaw: float) -> np.ndarray:
-    """Return axes turned about the vertical [rad]."""
-    cosine, sine = math.cos(yaw), math.sin(yaw)
-    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    return Room([(x, y, z) for x, y, z in sides], walls[1] - position[2], colours)
 
 
 def wall_slope(room: Room, up: Vector, rays: Rays) -> Any:

@@ -17,7 +17,7 @@ from jetbot_mjx.envs.look_params import LookParams
 
 
 class SeenPose(NamedTuple):
-    """A `SeenPose` holds everything that an image depends on, and that changes from step to step."""
+    """A `SeenPose` holds what an image depends on and what changes from step to step."""
 
     position_w: Float[Array, "3"]
     """Position of the axle midpoint [m], world frame."""
