@@ -148,8 +148,8 @@ def test_contrast_is_about_the_mean_of_the_two_colours(eye, plain):
 @pytest.mark.parametrize("texture", range(4))
 def test_a_texture_has_its_pattern(texture):
     """Seen from far above: how many colours there are, and in which directions they change."""
-    eye = make_eye(pitch=90.0, position=(0.26, 0.26, 12.0), samples=1)
-    image = eye.see(floor_texture=texture, floor_contrast=3.0, cube=(0, 0, -5.0))
+    eye = make_eye(pitch=90.0, position=(0.26, 0.26, 2.5), samples=1)
+    image = eye.see(floor_texture=texture, floor_contrast=1.5, cube=(0, 0, -5.0))
     image = image[..., 0].astype(int)
     dark = (image < 0.5 * (image.min() + image.max())).mean()
     between = ((image > image.min() + 9) & (image < image.max() - 9)).mean()
@@ -157,8 +157,8 @@ def test_a_texture_has_its_pattern(texture):
     forward, aside = (np.abs(np.diff(image, axis=axis)).sum() for axis in (0, 1))
     assert forward > 0
     assert (aside == 0) == (texture == 1)
-    assert dark == pytest.approx(0.5, abs=0.06) if texture != 2 else dark < 0.1
-    assert (between > 0.5) == (texture == 3)
+    assert dark == pytest.approx(0.5, abs=0.12) if texture != 2 else dark > 0.6
+    assert (between > 0.6) == (texture == 3)
 
 
 def test_scale_and_yaw_change_the_pattern_as_the_world_does():
