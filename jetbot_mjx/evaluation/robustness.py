@@ -72,7 +72,9 @@ class Sweep(NamedTuple):
     @property
     def nominal(self) -> float:
         """Return the preset's value."""
-        return getattr(RobotParams() if self.name in RobotParams._fields else LookParams(), self.name)
+        return getattr(
+            RobotParams() if self.name in RobotParams._fields else LookParams(), self.name
+        )
 
     @property
     def is_look(self) -> bool:

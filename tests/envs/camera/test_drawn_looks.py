@@ -216,3 +216,27 @@ def test_a_training_resumes_to_the_bit_with_all_looks_drawn(ranges, tmp_path):
     sums = [read_about(checkpoint_path(run_dir, 128))["sha256"] for run_dir in (whole, stopped)]
     assert sums[0] == sums[1]
     assert sums[0] != read_about(checkpoint_path(stopped, 64))["sha256"]
+
+
+@pytest.mark.parametrize("name", LookParams._fields)
+def test_the_page_tells_what_the_configuration_draws(root, ranges, name):
+    page = (root / "docs" / "camera.md").read_text("utf-8")
+    (row,) = (line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
+    span = ranges.drawn.get(name)
+    if span is None:
+        shown = "-"
+    elif span[1] > 3.14:
+        shown = "-π, π"
+    else:
+        shown = "{:g}, {:g}".format(*span)
+    assert f"| {shown} |" in row
+
+
+def test_the_robot_is_drawn_as_by_the_configuration_that_does_not_see(root, ranges):
+    """But for what a policy that sees does not observe, and for longer control steps."""
+    blind = load_config(root / "configs" / "real_jetbot.yaml").randomization
+    own = {"action_delay", "position_noise", "yaw_noise", "speed_noise", "yaw_rate_noise"}
+    own |= {"observation_delay"}
+    for name, span in blind.drawn.items():
+        assert getattr(ranges, name) == span or name in own, name
+    assert set(ranges.drawn) - set(ranges.looks) <= set(blind.drawn)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.config import CameraConfig, Config
-from jetbot_mjx.envs.camera.looks import Appearance, add_noise
+from jetbot_mjx.envs.camera.looks import PLAIN, Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.scene import GOAL
-from jetbot_mjx.envs.camera.surroundings import Surroundings, draw_surroundings
+from jetbot_mjx.envs.camera.surroundings import draw_surroundings
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.look_params import LookParams
 
@@ -23,14 +23,38 @@ CUBE = np.array([0.5, 0.0, 0.05])
 LATE = ("camera_delay", "camera_interval", "frame_drop")
 PLACED = ("walls", "clutter")  # need surroundings to show anything
 TOGETHER = LookParams(
-    **{"cube_brightness": 0.8, "cube_red": 1.1, "cube_blue": 1.7, "cube_yaw": 0.5},
-    **{"floor_brightness": 0.6, "floor_red": 1.2, "floor_blue": 0.8, "floor_contrast": 2.0},
-    **{"floor_texture": 2, "floor_scale": 0.4, "floor_yaw": 0.3, "sky_brightness": 0.7},
-    **{"sky_red": 1.1, "sky_blue": 0.8, "walls": 0.4, "clutter": 4, "ambient": 0.8, "light": 1.2},
-    **{"light_x": 0.5, "light_y": -0.5, "exposure": 1.2, "red_gain": 0.9, "blue_gain": 1.1},
-    **{"blur": 0.7, "camera_x": 0.004, "camera_y": 0.003, "camera_z": -0.004},
-    **{"camera_pitch": 0.05, "camera_roll": 0.05, "camera_yaw": 0.05, "focal_length": 1.1},
-    **{"distortion": 0.1},
+    cube_brightness=0.8,
+    cube_red=1.1,
+    cube_blue=1.7,
+    cube_yaw=0.5,
+    floor_brightness=0.6,
+    floor_red=1.2,
+    floor_blue=0.8,
+    floor_contrast=2.0,
+    floor_texture=2,
+    floor_scale=0.4,
+    floor_yaw=0.3,
+    sky_brightness=0.7,
+    sky_red=1.1,
+    sky_blue=0.8,
+    walls=0.4,
+    clutter=4,
+    ambient=0.8,
+    light=1.2,
+    light_x=0.5,
+    light_y=-0.5,
+    exposure=1.2,
+    red_gain=0.9,
+    blue_gain=1.1,
+    blur=0.7,
+    camera_x=0.004,
+    camera_y=0.003,
+    camera_z=-0.004,
+    camera_pitch=0.05,
+    camera_roll=0.05,
+    camera_yaw=0.05,
+    focal_length=1.1,
+    distortion=0.1,
 )
 
 
@@ -40,7 +64,7 @@ class Eye:
 
     camera: Camera
 
-    def see(self, surroundings=Surroundings(), *, cube=CUBE, **looks):
+    def see(self, surroundings=PLAIN.surroundings, *, cube=CUBE, **looks):
         params = LookParams(**looks)
         return self.see_all(Appearance(params, surroundings), cube)
 
@@ -87,7 +111,7 @@ PLACES = {"cube": CUBE_PLACE, "floor": FLOOR, "sky": SKY}
 
 def test_plain_looks_are_the_plain_image_to_the_bit_and_its_kernel(eye):
     kernels = set(eye.camera._kernels)
-    np.testing.assert_array_equal(eye.see_all(Appearance(LookParams(), Surroundings())), eye.see())
+    np.testing.assert_array_equal(eye.see_all(PLAIN), eye.see())
     assert len(set(eye.camera._kernels) | kernels) == 1
 
 
@@ -199,9 +223,7 @@ def test_the_mount_moves_the_cube_in_the_image(eye, plain):
     x, y = middle(plain)
     face = 0.45 - 0.018  # [m] from the camera to the cube's face
     angle, shift = 0.2, 0.03
-    assert middle(eye.see(camera_yaw=angle))[0] - x == pytest.approx(
-        FOCAL * np.tan(angle), abs=0.6
-    )
+    assert middle(eye.see(camera_yaw=angle))[0] - x == pytest.approx(FOCAL * np.tan(angle), abs=0.6)
     assert middle(eye.see(camera_y=shift))[0] - x == pytest.approx(FOCAL * shift / face, abs=0.5)
     assert middle(eye.see(camera_z=shift))[1] - y == pytest.approx(FOCAL * shift / face, abs=0.8)
     nearer = eye.see(camera_x=0.05)
