@@ -9,45 +9,34 @@ import runpy
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from jetbot_mjx import __version__, cli
 
-
-class Command(NamedTuple):
-    """A `Command` says where a subcommand is implemented and what it does."""
-
-    module: str
-    """Name of the module in this package; it may be in a subpackage, such as `viewers.window`."""
-    help: str
-    """Description for the list of commands, in one line."""
-
-
-COMMANDS: Mapping[str, Command] = {
-    "pretrained": Command("pretrained", "copy the policies that come with the package"),
-    "train": Command("train", "train a policy into a run folder"),
-    "configs": Command("training.configs", "list the configurations that come with the package"),
-    "runs": Command("runs.command", "list the runs there are"),
-    "tune": Command("tuning.command", "search for hyperparameters, many trials at once"),
-    "plan": Command("plan", "predict the memory that a training needs"),
-    "evaluate": Command("evaluate", "evaluate policies on fixed goals, and compare them"),
-    "render": Command("render", "write videos and plots of a policy that drives"),
-    "play": Command("play", "watch a policy live in the browser, and interact with it"),
-    "export": Command("export", "write a policy to files that run without this package"),
-    "sim2real": Command("sim2real", "compare the log of a real drive with the simulator"),
-    "replay": Command("replay", "replay the steps that led to a non-finite state"),
-    "new_task": Command("new_task", "write a task to start from"),
-    "check_env": Command("check_env", "check a task before it is trained"),
+COMMANDS: Mapping[str, tuple[str, str]] = {
+    "pretrained": ("pretrained", "copy the policies that come with the package"),
+    "train": ("train", "train a policy into a run folder"),
+    "configs": ("training.configs", "list the configurations that come with the package"),
+    "runs": ("runs.command", "list the runs there are"),
+    "tune": ("tuning.command", "search for hyperparameters, many trials at once"),
+    "plan": ("plan", "predict the memory that a training needs"),
+    "evaluate": ("evaluate", "evaluate policies on fixed goals, and compare them"),
+    "render": ("render", "write videos and plots of a policy that drives"),
+    "play": ("play", "watch a policy live in the browser, and interact with it"),
+    "export": ("export", "write a policy to files that run without this package"),
+    "sim2real": ("sim2real", "compare the log of a real drive with the simulator"),
+    "replay": ("replay", "replay the steps that led to a non-finite state"),
+    "new_task": ("new_task", "write a task to start from"),
+    "check_env": ("check_env", "check a task before it is trained"),
 }
-"""The commands by name, in the order in which a user needs them."""
+"""The commands by name, in the order in which a user needs them: the module, and what it does."""
 
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog=cli.PROGRAM, description="Train a JetBot to drive to goals.")
     parser.add_argument("--version", action="version", version=f"jetbot_mjx {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND [--help]")
-    for name, command in COMMANDS.items():
-        commands.add_parser(name, help=command.help, add_help=False)
+    for name, (_, text) in COMMANDS.items():
+        commands.add_parser(name, help=text, add_help=False)
     return parser
 
 
@@ -63,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     words = sys.argv[1:] if arguments is None else list(arguments)
     if words and words[0] in COMMANDS:
         sys.argv[1:] = words[1:]
-        module = f"jetbot_mjx.{COMMANDS[words[0]].module}"
+        module = f"jetbot_mjx.{COMMANDS[words[0]][0]}"
         runpy.run_module(module, run_name="__main__", alter_sys=True)
     parser = _parser()
     if words and not words[0].startswith("-"):

@@ -7,7 +7,6 @@ class alone, such as `GoalTask`. `--config my_task.yaml` checks a task with the 
 from collections.abc import Sequence
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 BROKEN = 1
 """Exit code for a task that has an error."""
@@ -35,7 +34,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("name a task as package.module:Class, or a --config that does")
     name = options.task if ":" in (options.task or "") else f"{_BUILT_IN}:{options.task}"
     config = cli.config_of(options, *([f"task.name={name}"] if options.task else []))
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.envs.checks.runner import CHECKS, check_task
     cli.prepare_device()
     # Check, and print each result as soon as it is known.

@@ -11,6 +11,7 @@ installed the lazy imports. For the same reason this module imports JAX only whe
 import argparse
 import contextlib
 import difflib
+import functools
 import io
 import os
 import sys
@@ -192,10 +193,11 @@ def wake_device() -> None:
 _LARGEST = 2**31 - 1
 
 
-def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
-    """Return an argument type for integers within bounds.
+def number(kind: type, least: float, most: float = _LARGEST) -> Callable[[str], Any]:
+    """Return an argument type for numbers within bounds.
 
     Args:
+      kind: `int` or `float`.
       least: the smallest accepted value.
       most: the largest accepted value.
 
@@ -203,42 +205,25 @@ def whole_number(least: int, most: int = _LARGEST) -> Callable[[str], int]:
       A function to pass as `type` to an argument parser.
     """
 
-    def parse(text: str) -> int:
-        value = int(_number(text, int))
-        if value < least:
-            raise argparse.ArgumentTypeError(f"{value} is too small: give at least {least}")
+    def parse(text: str) -> Any:
+        try:
+            value = kind(text)
+        except ValueError:
+            what = "whole number" if kind is int else "number"
+            raise argparse.ArgumentTypeError(f"{text!r} is no {what}") from None
+        # A comparison with NaN is false.
+        if not value >= least:
+            raise argparse.ArgumentTypeError(f"{text} is too small: give at least {least}")
         if value > most:
-            raise argparse.ArgumentTypeError(f"{value} is too large: give at most {most}")
+            raise argparse.ArgumentTypeError(f"{text} is too large: give at most {most}")
         return value
 
     return parse
 
 
+whole_number = functools.partial(number, int)
 positive_int = whole_number(1)
-
-
-def _number(text: str, kind: type[int] | type[float] = float) -> float:
-    try:
-        return kind(text)
-    except ValueError:
-        what = "whole number" if kind is int else "number"
-        raise argparse.ArgumentTypeError(f"{text!r} is no {what}") from None
-
-
-def fraction(text: str) -> float:
-    """Parse an argument between 0 and 1."""
-    value = _number(text)
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"{text} is not between 0 and 1")
-    return value
-
-
-def positive_float(text: str) -> float:
-    """Parse an argument above 0."""
-    value = _number(text)
-    if not 0 < value <= _LARGEST:
-        raise argparse.ArgumentTypeError(f"{text} is not above 0 and at most {_LARGEST}")
-    return value
+fraction = number(float, 0, 1)
 
 
 def which_checkpoint(text: str) -> Literal["best", "last"] | int:
@@ -304,7 +289,6 @@ def add_config_arguments(
     *,
     required: bool = False,
     positional: bool = True,
-    default: Path | None = None,
 ) -> None:
     """Add the arguments `CONFIG`, `--config` and `--set`, which select a configuration.
 
@@ -313,13 +297,11 @@ def add_config_arguments(
       group: The mutually exclusive group that both belong to, or None for one of their own.
       required: Whether a configuration must be given.
       positional: Whether the name alone is accepted, without `--config` before it.
-      default: The file that is used without one, or None for the defaults of `Config`.
     """
-    suffix = f" (default: {default.parent.name}/{default.name})" if default else ""
     group = group or parser.add_mutually_exclusive_group(required=required)
     what = "YAML file, or the name of a configuration that comes with the package"
-    text = f"{what}; `{PROGRAM} configs` lists them{suffix}"
-    group.add_argument("--config", type=Path, default=default, metavar="CONFIG", help=text)
+    text = f"{what}; `{PROGRAM} configs` lists them"
+    group.add_argument("--config", type=Path, metavar="CONFIG", help=text)
     if positional:
         group.add_argument(
             "config", type=Path, nargs="?", action=_KeepIfAbsent, metavar="CONFIG", help="the same"

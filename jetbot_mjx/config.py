@@ -10,6 +10,7 @@ is a number, and rejects a key that is given twice.
 """
 
 import difflib
+import functools
 import io
 import math
 import os
@@ -236,18 +237,14 @@ class PhysicsConfig(_Section):
     @model_validator(mode="after")
     def _whole_substeps(self) -> Self:
         ratio = self.ctrl_dt / self.sim_dt
+        problem = f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}"
         if ratio > _MAX_SUBSTEPS:
-            raise ValueError(
-                f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
-                f" make it at most {_MAX_SUBSTEPS} times"
-            )
+            raise ValueError(f"{problem}: make it at most {_MAX_SUBSTEPS} times")
         # A decimal in YAML cannot represent 1/120 exactly: accept a ratio that is nearly whole.
         if round(ratio) < 1 or abs(ratio - round(ratio)) > 1e-3 * ratio:
             nearest = self.ctrl_dt / max(1, round(ratio))
-            raise ValueError(
-                f"sim_dt = {self.sim_dt:g} goes {ratio:g} times into ctrl_dt = {self.ctrl_dt:g}:"
-                f" make the sub-steps whole, for example sim_dt = {nearest:.9g}"
-            )
+            remedy = f"make the sub-steps whole, for example sim_dt = {nearest:.9g}"
+            raise ValueError(f"{problem}: {remedy}")
         return self
 
 
@@ -571,32 +568,35 @@ class Config(_Section):
     evaluation: EvaluationConfig = EvaluationConfig()
 
     @model_validator(mode="after")
-    def _seeds_fit(self) -> Self:
-        if self.seed + self.seeds > 2**32:
-            raise ValueError(
+    def _settings_fit(self) -> Self:
+        step = self.ppo.steps_per_training_step
+        unseen = None if self.task.sees else next(iter(self.randomization.looks), None)
+        for is_wrong, message in (
+            (
+                self.seed + self.seeds > 2**32,
                 f"seeds = {self.seeds} from seed = {self.seed} on go beyond {2**32 - 1}:"
-                f" make seed at most {2**32 - self.seeds}"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _looks_are_seen(self) -> Self:
-        if not self.task.sees and (name := next(iter(self.randomization.looks), None)):
-            span = list(self.randomization.drawn[name])
-            raise ValueError(
-                f"randomization.{name} = {span} changes an image, and task.observation ="
-                f" {self.task.observation!r} sees none: set task.observation: camera, or leave it"
-                " out"
-            )
-        return self
-
-    @model_validator(mode="after")
-    def _camera_begins_anew(self) -> Self:
-        if self.task.sees and self.init_from is not None:
-            raise ValueError(
+                f" make seed at most {2**32 - self.seeds}",
+            ),
+            (
+                unseen is not None,
+                f"randomization.{unseen} = {list(self.randomization.drawn.get(str(unseen), ()))}"
+                f" changes an image, and task.observation = {self.task.observation!r} sees none:"
+                " set task.observation: camera, or leave it out",
+            ),
+            (
+                self.task.sees and self.init_from is not None,
                 f"init_from = {self.init_from!r}: a policy with task.observation ="
-                f" {self.task.observation!r} cannot begin with another's: leave it out"
-            )
+                f" {self.task.observation!r} cannot begin with another's: leave it out",
+            ),
+            (
+                self.checkpoint_interval < step,
+                f"checkpoint_interval = {self.checkpoint_interval} is shorter than one training"
+                f" step of {step} environment steps (ppo.batch_size * ppo.num_minibatches *"
+                f" ppo.unroll_length): make it at least {step}",
+            ),
+        ):
+            if is_wrong:
+                raise ValueError(message)
         return self
 
     @model_validator(mode="after")
@@ -616,17 +616,6 @@ class Config(_Section):
                     f"{setting} is not known to trainer = 'brax': take trainer = 'resumable'"
                     f"{other_remedy}"
                 )
-        return self
-
-    @model_validator(mode="after")
-    def _checkpoints_fit(self) -> Self:
-        step = self.ppo.steps_per_training_step
-        if self.checkpoint_interval < step:
-            raise ValueError(
-                f"checkpoint_interval = {self.checkpoint_interval} is shorter than one training"
-                f" step of {step} environment steps (ppo.batch_size * ppo.num_minibatches *"
-                f" ppo.unroll_length): make it at least {step}"
-            )
         return self
 
     def for_any_device(self) -> "Config":
@@ -824,7 +813,9 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, Any]:
         raise ConfigNotFoundError(message) from None
     except (OSError, UnicodeDecodeError) as error:
         if path.is_dir():
-            raise ConfigError(f"{what} {path} is a folder: {_of_folder(path, what)}") from None
+            is_run = what == "config" and (path / "config.yaml").is_file()
+            remedy = f"to continue that run, give --resume {path}" if is_run else "give a YAML file"
+            raise ConfigError(f"{what} {path} is a folder: {remedy}") from None
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError(f"{what} {path} cannot be read: {reason}") from None
     values = _parse_yaml(text, f"{what} {path}")
@@ -833,12 +824,6 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, Any]:
     if not isinstance(values, dict):
         raise ConfigError(f"{what} {path} holds {values!r}: write `key: value` lines")
     return values
-
-
-def _of_folder(path: Path, what: str) -> str:
-    """Return the remedy for a folder in the place of a file."""
-    is_run = what == "config" and (path / "config.yaml").is_file()
-    return f"to continue that run, give --resume {path}" if is_run else "give a YAML file"
 
 
 _YAML_PROBLEMS = {
@@ -933,19 +918,9 @@ def _likely_key(location: Sequence[str]) -> str:
         return f"write `{last}` below `{section}:`, indented"
     # A key may be that of another section, such as learning_rate without `ppo.`.
     elsewhere = [name for name in ALL_KEYS if name.rpartition(".")[2] == key]
-    known = _known_keys(sections)
+    known = list(type(functools.reduce(getattr, sections, Config())).model_fields)
     likely = elsewhere or difflib.get_close_matches(key, known, n=1)
     return f"did you mean {likely[0]}?" if likely else f"known are {', '.join(known)}"
-
-
-def _known_keys(location: Sequence[str]) -> list[str]:
-    model: type[BaseModel] = Config
-    for part in location:
-        annotation = model.model_fields[part].annotation
-        if not (isinstance(annotation, type) and issubclass(annotation, BaseModel)):
-            return []
-        model = annotation
-    return list(model.model_fields)
 
 
 ALL_KEYS = tuple(Config().flat())

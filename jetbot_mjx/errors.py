@@ -1,5 +1,8 @@
 """Define exceptions for errors that the user can correct, each with a message of one line."""
 
+import contextlib
+from collections.abc import Iterator
+
 
 class UserError(Exception):
     """Raised when the user can correct the error; its one-line message needs no traceback."""
@@ -19,6 +22,26 @@ class NotFoundError(UserError, FileNotFoundError):
 
 class MissingPackageError(UserError, ImportError):
     """Raised when an optional package is missing; callers may also catch an `ImportError`."""
+
+
+@contextlib.contextmanager
+def requires_extra(extra: str, what: str) -> Iterator[None]:
+    """Replace a failing import by one line that says how to install the package.
+
+    Args:
+      extra: the extra of this project that installs what the block imports.
+      what: what needs the package, for the message.
+
+    Raises:
+      MissingPackageError: a package is not installed.
+    """
+    try:
+        yield
+    except ImportError as error:
+        raise MissingPackageError(
+            f"{what} needs {error.name}, which is not installed: pip install"
+            f" 'jetbot_mjx[{extra}]', from a checkout '.[{extra}]'"
+        ) from None
 
 
 def ran_out(error: Exception) -> bool:

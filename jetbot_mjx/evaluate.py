@@ -7,13 +7,12 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 BELOW_TARGET = 1
 """Exit code if a success rate is below `--min-success`."""
 
 
-def _parser(default: int, most: int, simulators: Sequence[str]) -> cli.Parser:
+def _parser(default: int, most: int) -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx evaluate", description=__doc__)
     cli.add_checkpoint_arguments(parser, several=True)
     parser.add_argument(
@@ -37,7 +36,7 @@ def _parser(default: int, most: int, simulators: Sequence[str]) -> cli.Parser:
     )
     parser.add_argument(
         "--simulator",
-        choices=simulators,
+        choices=("mujoco",),
         help="evaluate in another simulator too: mujoco is C MuJoCo, with other numerics than in"
         " training",
     )
@@ -63,11 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0, or 1 if a success rate is below `--min-success`.
     """
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.evaluation import evaluate_runs, tables
         from jetbot_mjx.evaluation.evaluator import MOST_GOALS, REPORT_GOALS
         from jetbot_mjx.runs.run_dir import seed_folders
-    options = _parser(REPORT_GOALS, MOST_GOALS, evaluate_runs.SIMULATORS).parse_args(arguments)
+    options = _parser(REPORT_GOALS, MOST_GOALS).parse_args(arguments)
     cli.prepare_device()
     settings = {
         "episodes": options.episodes,

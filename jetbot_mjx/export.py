@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -23,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.deployment.exporters import FORMATS
         from jetbot_mjx.deployment.policy_export import FOLDER, export_policy, summarize_export
 

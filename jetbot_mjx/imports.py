@@ -5,7 +5,7 @@ which no robot here has, and prints two lines if its optional Warp part is absen
 for an engine that is not used here, and tensorboardX loads a logging service that is not used. On a
 slow machine these imports take almost two seconds at every start of a command. A training also
 needs no OpenGL, so that a command must be able to import MuJoCo even if the backend that
-`MUJOCO_GL` names is unavailable.
+`MUJOCO_GL` names is unavailable. The versions of all libraries are told here, too.
 """
 
 import ast
@@ -22,6 +22,21 @@ from pathlib import Path
 from typing import Any
 
 _Around = Callable[[], contextlib.AbstractContextManager[None]]
+
+
+LIBRARIES = ("brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx", "numpy", "optax")
+"""Libraries of whose releases the results of a training depend."""
+
+
+def installed_version(library: str) -> str | None:
+    """Return the version of a library, or None if it is not installed."""
+    # Commands that store no versions start without it.
+    import importlib.metadata
+
+    try:
+        return importlib.metadata.version(library)
+    except importlib.metadata.PackageNotFoundError:
+        return None
 
 
 def load_lazily(package: str) -> tuple[Callable[[str], Any], Callable[[], list[str]]]:
@@ -131,21 +146,17 @@ def without_warp_lines() -> Iterator[None]:
         sys.stdout.writelines(line for line in lines if not line.startswith("Failed to import "))
 
 
-@contextlib.contextmanager
-def _opengl() -> Iterator[None]:
-    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `offscreen.find_backend` reports
-    # the reason if images are needed. PyOpenGL raises an AttributeError if the library is missing.
-    with contextlib.suppress(ImportError, AttributeError, OSError, RuntimeError):
-        yield
-
-
 _COMET = types.ModuleType("tensorboardX.comet_utils")
 _COMET.CometLogger = None  # pyright: ignore[reportAttributeAccessIssue]
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
-    "mujoco.rendering.classic.gl_context": _opengl,
+    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `offscreen.find_backend` reports
+    # the reason if images are needed. PyOpenGL raises an AttributeError if the library is missing.
+    "mujoco.rendering.classic.gl_context": lambda: contextlib.suppress(
+        ImportError, AttributeError, OSError, RuntimeError
+    ),
     # Stand in for a logging service of tensorboardX's own writer, which is not used.
     "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _COMET),
 }

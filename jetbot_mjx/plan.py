@@ -7,7 +7,6 @@ shapes alone: nothing is compiled and nothing is trained.
 from collections.abc import Sequence
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 TOO_LARGE = 1
 """Exit code if the configuration does not fit."""
@@ -25,11 +24,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = cli.Parser(prog="jetbot-mjx plan", description=__doc__)
     cli.add_config_arguments(parser, required=True)
     parser.add_argument(
-        "--memory", type=cli.positive_float, metavar="GIB", help="default: what the device has"
+        "--memory",
+        type=cli.number(float, 0.001),
+        metavar="GIB",
+        help="default: what the device has",
     )
     options = parser.parse_args(arguments)
     config = cli.config_of(options)
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.training.memory_plan import memory_table, plan_memory
     cli.prepare_device()
     plan = plan_memory(config, options.memory)

@@ -8,7 +8,6 @@ import urllib.parse
 from collections.abc import Sequence
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 _LARGEST_PORT = 65_535
 _DEFAULT_POLICY = "jetbot_egocentric"
@@ -70,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.runs.checkpoint import PRETRAINED
         from jetbot_mjx.viewers import live
         from jetbot_mjx.viewers.step_fns import AGENTS
@@ -79,7 +78,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if options.run is None:
         name = f"{_DEFAULT_POLICY}.yaml"
         print(f"no run is named: this policy comes with the package, trained by {name}")
-    played = live.play_live(
+    successes, episodes = live.play_live(
         PRETRAINED / _DEFAULT_POLICY if options.run is None else options.run,
         viewer=options.viewer,
         agent=options.agent,
@@ -91,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         allow=options.allow_origin,
         tell=lambda line: print(line, flush=True),
     )
-    print(f"{played.successes} of {played.episodes} goals reached")
+    print(f"{successes} of {episodes} goals reached")
     return 0
 
 

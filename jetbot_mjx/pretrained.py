@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 FOLDER = Path("runs/pretrained")
 
@@ -27,8 +26,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--out", type=Path, default=FOLDER, metavar="DIR", help=f"the folder (default: {FOLDER})"
     )
     options = parser.parse_args(arguments)
-    with exit_on_interrupt():
-        from jetbot_mjx.runs.pretrained_runs import copy_pretrained
+    with cli.exit_on_interrupt():
+        from jetbot_mjx.runs.find_run import copy_pretrained
 
     runs = copy_pretrained(options.out)
     for path in runs:

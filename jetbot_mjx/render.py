@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 
 def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
@@ -72,7 +71,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.evaluation.evaluator import REPORT_GOALS
         from jetbot_mjx.viewers import gallery, many
     parser = _parser(REPORT_GOALS, gallery.parse_goals)

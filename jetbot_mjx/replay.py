@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 NOT_REPRODUCED = 1
 """Exit code if the state stays finite."""
@@ -22,20 +21,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = cli.Parser(prog="jetbot-mjx replay", description=__doc__)
     parser.add_argument("file", type=Path, help="a file in a run's nan_dumps/")
     options = parser.parse_args(arguments)
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.envs.jetbot_env import make_env
-        from jetbot_mjx.runs.nan_dump import load_nan_dump
-        from jetbot_mjx.runs.nan_replay import HEADER, format_step, replay_nan_dump
+        from jetbot_mjx.runs import nan_dump
     cli.prepare_device()
-    stored = load_nan_dump(options.file)
+    stored = nan_dump.load_nan_dump(options.file)
     print(
         f"the state became non-finite before step {stored.env_steps:,} of the training; the unroll"
-        f" up to there:\n{HEADER}"
+        f" up to there:\n{nan_dump.HEADER}"
     )
     nonfinite: list[str] = []
     env = make_env(stored.config.for_any_device(), stored.task_class)
-    for index, step in enumerate(replay_nan_dump(stored, env)):
-        print(format_step(index, step))
+    for index, step in enumerate(nan_dump.replay_nan_dump(stored, env)):
+        print(nan_dump.format_step(index, step))
         nonfinite = step.nonfinite
     if not nonfinite:
         print("the state stayed finite here: other devices and versions round differently")

@@ -9,11 +9,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
-
-
-def _seconds(text: str) -> float:
-    return 0.0 if text == "0" else cli.positive_float(text)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -27,17 +22,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx sim2real", description=__doc__)
     parser.add_argument("log", type=Path, help="a file of deploy/drive.py --log")
+    seconds = cli.number(float, 0)
     parser.add_argument(
-        "--delay", type=_seconds, default=0.0, metavar="S", help="of the motors (default: 0)"
+        "--delay", type=seconds, default=0.0, metavar="S", help="of the motors (default: 0)"
     )
     parser.add_argument(
-        "--lag", type=_seconds, metavar="S", help="of the motors (default: the calibration's)"
+        "--lag", type=seconds, metavar="S", help="of the motors (default: the calibration's)"
     )
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="the folder (default: that of the log)"
     )
     options = parser.parse_args(arguments)
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.deployment.drive_comparison import compare_drive, summarize_drive
 
     with cli.show_progress():

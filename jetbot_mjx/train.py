@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jetbot_mjx import cli
-from jetbot_mjx.interrupts import exit_on_interrupt
 
 if TYPE_CHECKING:
     from jetbot_mjx.config import Config
@@ -41,7 +40,7 @@ def _parser() -> cli.Parser:
 
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.runs.find_run import find_run_config
         from jetbot_mjx.runs.run_dir import default_run_dir
     if options.resume:
@@ -69,19 +68,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
     config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.training import distributed, preemption
     if options.distributed:
         distributed.check(config)
         distributed.join()
     cli.wake_device()
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.envs.program_key import open_program_cache
         from jetbot_mjx.training import ppo_trainer  # noqa: F401
     cli.prepare_device()
     programs = open_program_cache(config)
     programs.prefetch("advance", "init")
-    with exit_on_interrupt():
+    with cli.exit_on_interrupt():
         from jetbot_mjx.training import session
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():

@@ -63,6 +63,18 @@ def pytest_runtest_setup(item):
         pytest.skip(f"of programs for CPUs; the default device is a {jax.default_backend()}")
 
 
+@pytest.fixture(autouse=True)
+def forget_modules(tmp_path_factory):
+    """Forgets the modules that a test imported from a temporary folder: the next may have another
+    of that name."""
+    before = set(sys.modules)
+    yield
+    temporary = str(tmp_path_factory.getbasetemp())
+    for name in set(sys.modules) - before:
+        if (getattr(sys.modules[name], "__file__", None) or "").startswith(temporary):
+            del sys.modules[name]
+
+
 @pytest.fixture(scope="session")
 def root() -> Path:
     return ROOT

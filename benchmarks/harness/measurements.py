@@ -272,12 +272,7 @@ def training_config(config: Config, num_envs: int, sizes: Sizes, trainer: str) -
 
 def _exploring_policy(config: Config, env: JetBotEnv) -> Callable[..., Any]:
     """Return Brax's sampling policy, as its trainer builds it, with untrained networks."""
-    networks: Any = make_networks(
-        config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=config.ppo.normalize_observations,
-    )
+    networks: Any = make_networks(config.ppo, env.observation_size, env.action_size)
     normalizer = init_normalizer(env.observation_size)
     weights = networks.policy_network.init(jax.random.PRNGKey(0))
     return ppo_networks.make_inference_fn(networks)((normalizer, weights))

@@ -230,12 +230,7 @@ def run(config: Config, env: JetBotEnv, seeds: int, episodes: int) -> list[Curve
     Returns:
       The learning curves.
     """
-    networks = make_networks(
-        config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=config.ppo.normalize_observations,
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluator, keys = (
         Evaluator(env, networks, ProgramCache(compiler_options(config))),
         report_keys(episodes),

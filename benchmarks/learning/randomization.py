@@ -54,12 +54,7 @@ class PolicyEvaluator:
         """
         env = make_env(config)
         self._dt, self._keys = env.dt, report_keys(episodes)
-        networks = make_networks(
-            config.ppo.network,
-            env.observation_size,
-            env.action_size,
-            normalize=config.ppo.normalize_observations,
-        )
+        networks = make_networks(config.ppo, env.observation_size, env.action_size)
         programs = ProgramCache(compiler_options(config))
         self._evaluators = {
             "preset": Evaluator(env, networks, programs),

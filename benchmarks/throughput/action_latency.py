@@ -17,9 +17,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jetbot_mjx.deployment.exporters import FORMATS, Act, require
+from jetbot_mjx.deployment.exporters import FORMATS, Act
 from jetbot_mjx.deployment.policy_spec import FILE
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, requires_extra
 
 CALLS = 2000
 _WARM_UP = 100
@@ -77,8 +77,8 @@ def run(folder: Path, calls: int = CALLS) -> Iterator[Latency]:
     except (OSError, ValueError, LookupError) as error:
         raise UserError(f"{folder} is not an export: {error}") from None
     for name, file in files.items():
-        require(name)
-        act = FORMATS[name].read(folder / file["file"])
+        with requires_extra("export", f"--format {name}"):
+            act = FORMATS[name].read(folder / file["file"])
         yield measure(name, act, observations, calls)
 
 

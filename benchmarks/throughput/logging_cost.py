@@ -32,7 +32,7 @@ from jetbot_mjx.runs.run_dir import write_json
 from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
-from jetbot_mjx.training.run_recorder import RunRecorder, SeedRecorder
+from jetbot_mjx.training.run_recorder import RunRecorder
 
 _NO_EVALUATION = Summary(1, 0, 0.0, 0.0, 1.0, None, None, None, 0.0, 1.0, 0)
 
@@ -61,9 +61,9 @@ class _Timed(TrainerCallback):
 class _LogsAndCheckpoints(RunRecorder):
     """A recorder that runs no evaluations."""
 
-    def __init__(self, seeds: Sequence[SeedRecorder], *arguments: Any, **options: Any) -> None:
-        super().__init__(seeds, *arguments, **options)
-        self._evaluate = lambda params: _NO_EVALUATION
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.evaluate = lambda params: _NO_EVALUATION
 
 
 def _save_nothing(*_: Any, **__: Any) -> None:
@@ -73,9 +73,9 @@ def _save_nothing(*_: Any, **__: Any) -> None:
 class _LogsOnly(_LogsAndCheckpoints):
     """A recorder that runs no evaluations and saves no checkpoints."""
 
-    def __init__(self, seeds: Sequence[SeedRecorder], *arguments: Any, **options: Any) -> None:
-        super().__init__(seeds, *arguments, **options)
-        for seed in seeds:
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for seed in self.seeds:
             seed.save = _save_nothing
 
 

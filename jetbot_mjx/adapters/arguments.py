@@ -1,9 +1,8 @@
 """Check the adapters' arguments, seeds, actions and optional packages before anything is built."""
 
-import contextlib
 import math
 import numbers
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,30 +11,11 @@ from jaxtyping import Float, UInt32
 
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.config import Config, load_config, parse_config
-from jetbot_mjx.errors import MissingPackageError, UserError
+from jetbot_mjx.errors import UserError
 
 Seed = int | Sequence[int | None] | None
 Source = Config | Mapping[str, Any] | str | Path | None
 """A configuration, nested settings, a YAML file, or None for the tutorial's configuration."""
-
-
-@contextlib.contextmanager
-def requires_extra(extra: str) -> Iterator[None]:
-    """Replace a failing import by one line that says how to install the package.
-
-    Args:
-      extra: The extra of this project that installs what the block imports.
-
-    Raises:
-      UserError: A package is not installed.
-    """
-    try:
-        yield
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(
-            f"{error.name} is missing: pip install 'jetbot_mjx[{extra}]', from a checkout"
-            f" '.[{extra}]'"
-        ) from None
 
 
 def resolve(
@@ -85,11 +65,9 @@ def _read(config: Source) -> Config:
     match config:
         case Config():
             return config
-        case None:
-            return Config()
         case Mapping():
             return parse_config(config)
-        case str() | Path():
+        case None | str() | Path():
             return load_config(config)
     raise UserError(f"config = {config!r} is wrong: give a YAML file, a mapping or a Config")
 

@@ -1,29 +1,23 @@
 """The construction and the rendering that all adapters share."""
 
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol, TypeVar
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from jetbot_mjx.adapters.arguments import Source, requires_extra, resolve
-from jetbot_mjx.adapters.batched_env import unwrap_single
+from jetbot_mjx.adapters.arguments import Source, resolve
+from jetbot_mjx.adapters.batched_env import BatchedEnv, unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
 from jetbot_mjx.agents.vision import is_image
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.errors import requires_extra
 
-with requires_extra("gymnasium"):
+with requires_extra("gymnasium", "the adapter"):
     import gymnasium
     from gymnasium import spaces
-
-
-class _HasEnv(Protocol):
-    env: JetBotEnv
-
-
-Simulation = TypeVar("Simulation", bound=_HasEnv)
 
 
 def observation_space(size: int | Mapping[str, tuple[int, ...]]) -> "spaces.Space[Any]":
@@ -47,50 +41,58 @@ def observation_space(size: int | Mapping[str, tuple[int, ...]]) -> "spaces.Spac
 
 
 class AdapterBase:
-    """The base of the adapters. A subclass builds its simulation by `_construct`."""
+    """The base of the adapters.
+
+    A constructor calls `_configure`, builds its simulation from `config`, and calls `_prepare`.
+    """
 
     metadata: dict[str, Any]
     config: Config
     """The configuration that the environment is built from."""
     render_mode: str | None
+    batch: BatchedEnv
     _renderer: FrameRenderer | None
     _is_begun = False
     """Whether there was a `reset`; the subclass sets it."""
 
-    def _construct(
-        self, simulate: Callable[[Config], Simulation], config: Source, *given: Any
-    ) -> tuple[Simulation, spaces.Space[Any], spaces.Box]:
-        """Build the simulation and the renderer, and set `config`, `render_mode` and `metadata`.
+    def _configure(self, config: Source, *given: Any) -> None:
+        """Set `config` and `render_mode`.
 
         Args:
-          simulate: Builds the simulation from a configuration.
           config: The constructor's `config`.
           given: The constructor's other arguments, in the order of `arguments.resolve`.
 
-        Returns:
-          The simulation, and the observation and action space of one robot.
-
         Raises:
-          UserError: An argument or setting is wrong, or there is no display for a window.
+          UserError: An argument or setting is wrong.
         """
-        self.config, mode, rendering_dt = resolve(config, *given)
-        self.render_mode = mode
+        self.config, self.render_mode, self._rendering_dt = resolve(config, *given)
         # A script that imports an adapter has no other reason to set up JAX's cache.
         use_compilation_cache()
-        simulation = simulate(self.config)
-        env = simulation.env
-        self._renderer = FrameRenderer(env, mode, rendering_dt) if mode else None
+
+    def _prepare(self, env: JetBotEnv) -> tuple["spaces.Space[Any]", spaces.Box]:
+        """Build the renderer, and set `metadata`.
+
+        Args:
+          env: The environment of the simulation.
+
+        Returns:
+          The observation and action space of one robot.
+
+        Raises:
+          UserError: There is no display for a window.
+        """
+        mode = self.render_mode
+        self._renderer = FrameRenderer(env, mode, self._rendering_dt) if mode else None
         self.metadata = {
             **getattr(type(self), "metadata", {}),
             "render_modes": [one for one in RENDER_MODES if one == mode or is_available(one)],
             "render_fps": max(1, round(1 / self.config.physics.ctrl_dt)),
         }
-        observations = observation_space(env.observation_size)
-        return simulation, observations, spaces.Box(-1.0, 1.0, (env.action_size,))
+        return observation_space(env.observation_size), spaces.Box(-1.0, 1.0, (env.action_size,))
 
     def _poses(self) -> list[Pose]:
-        """Return the pose of every robot."""
-        raise NotImplementedError
+        """Return the pose of every robot of `batch`; an adapter without one overrides this."""
+        return self.batch.poses()
 
     def _require_reset(self, method: str) -> None:
         if not self._is_begun:

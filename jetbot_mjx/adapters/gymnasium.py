@@ -5,14 +5,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions, requires_extra
+from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
-from jetbot_mjx.config import Config
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, requires_extra
 
-with requires_extra("gymnasium"):
+with requires_extra("gymnasium", "the adapter"):
     import gymnasium
 
 ENV_ID = "JetBot-v0"
@@ -64,9 +63,14 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
             there is no display for a window.
         """
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self.robot, self.observation_space, self.action_space = self._construct(
-            _single_robot, config, *given
-        )
+        self._configure(config, *given)
+        if drawn := ", ".join(self.config.randomization.drawn):
+            raise UserError(
+                f"randomization.{drawn}: the single robot is the preset's; take JetBotVectorEnv, of"
+                " one robot if need be"
+            )
+        self.robot = MujocoJetBot(self.config)
+        self.observation_space, self.action_space = self._prepare(self.robot.env)
         self._reset_keys = ResetKeys(seed, 1)
         self._next_key = None
         self._steps = 0
@@ -130,21 +134,8 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         return [Pose(self.robot.data.qpos, self.robot.goal, now)]
 
 
-def _single_robot(config: Config) -> MujocoJetBot:
-    if drawn := ", ".join(config.randomization.drawn):
-        raise UserError(
-            f"randomization.{drawn}: the single robot is the preset's; take JetBotVectorEnv, of"
-            " one robot if need be"
-        )
-    return MujocoJetBot(config)
-
-
-def _register() -> None:
-    gymnasium.register(
-        ENV_ID,
-        entry_point=f"{__name__}:{JetBotGymEnv.__name__}",
-        vector_entry_point="jetbot_mjx.adapters.vector:JetBotVectorEnv",
-    )
-
-
-_register()
+gymnasium.register(
+    ENV_ID,
+    entry_point=f"{__name__}:{JetBotGymEnv.__name__}",
+    vector_entry_point="jetbot_mjx.adapters.vector:JetBotVectorEnv",
+)

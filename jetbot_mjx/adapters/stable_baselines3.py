@@ -6,13 +6,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Source, requires_extra
+from jetbot_mjx.adapters.arguments import Source
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
-from jetbot_mjx.adapters.renderer import Pose
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, requires_extra
 
-with requires_extra("sb3"):
+with requires_extra("sb3", "the adapter"):
     from stable_baselines3.common.vec_env import VecEnv  # pyright: ignore[reportMissingImports]
 
 Indices = None | int | Iterable[int]
@@ -58,9 +57,9 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         """
         self._attributes: dict[str, list[Any]] = {}
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self.batch, *spaces = self._construct(
-            lambda config: BatchedEnv(config, num_envs, seed), config, *given
-        )
+        self._configure(config, *given)
+        self.batch = BatchedEnv(self.config, num_envs, seed)
+        spaces = self._prepare(self.batch.env)
         metadata = self.metadata
         super().__init__(self.batch.num_envs, *spaces)
         # `VecEnv` leaves nothing but the render mode in it.
@@ -196,6 +195,3 @@ class JetBotVecEnv(AdapterBase, VecEnv):
     def close(self) -> None:
         """Close the renderer; the base class of Stable-Baselines3 has nothing to close."""
         self._close_renderer()
-
-    def _poses(self) -> list[Pose]:
-        return self.batch.poses()

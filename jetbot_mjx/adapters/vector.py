@@ -5,12 +5,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Seed, Source, requires_extra
+from jetbot_mjx.adapters.arguments import Seed, Source
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
-from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
+from jetbot_mjx.adapters.renderer import RENDER_MODES
+from jetbot_mjx.errors import requires_extra
 
-with requires_extra("gymnasium"):
+with requires_extra("gymnasium", "the adapter"):
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
@@ -59,9 +60,10 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self.batch, self.single_observation_space, self.single_action_space = self._construct(
-            lambda config: BatchedEnv(config, num_envs, seed), config, *given
-        )
+        self._configure(config, *given)
+        self.batch = BatchedEnv(self.config, num_envs, seed)
+        spaces = self._prepare(self.batch.env)
+        self.single_observation_space, self.single_action_space = spaces
         self.num_envs = self.batch.num_envs
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
@@ -130,6 +132,3 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
           UserError: This machine has no OpenGL that works without a screen.
         """
         return tuple(self._frames()) if self.render_mode == "rgb_array" else None
-
-    def _poses(self) -> list[Pose]:
-        return self.batch.poses()

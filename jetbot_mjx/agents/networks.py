@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, UInt32
 
 from jetbot_mjx.agents.vision import VisionNetworks, is_image, make_vision_networks
 from jetbot_mjx.compiler.xla_options import default_device_cpu
-from jetbot_mjx.config import NetworkConfig
+from jetbot_mjx.config import NetworkConfig, PPOConfig
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "tanh": nn.tanh,
@@ -75,32 +75,32 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
 
 
 def make_networks(
-    config: NetworkConfig,
-    observation_size: int | Mapping[str, Sequence[int]],
-    action_size: int,
-    *,
-    normalize: bool,
+    config: PPOConfig, observation_size: int | Mapping[str, Sequence[int]], action_size: int
 ) -> Networks:
     """Build the policy and value networks: Brax's, behind an encoder if there are images.
 
     Args:
-      config: the layer sizes, the activation and the action distribution.
+      config: the settings of PPO, of which `network` and `normalize_observations` are used: with
+        the latter, the networks normalise numbers by running statistics.
       observation_size: the length of the observation, or the shapes of its parts.
       action_size: the length of the action.
-      normalize: whether the networks normalise numbers by running statistics.
 
     Returns:
       Brax's `PPONetworks`, or `VisionNetworks`.
     """
-    preprocess = running_statistics.normalize if normalize else identity_observation_preprocessor
+    preprocess = (
+        running_statistics.normalize
+        if config.normalize_observations
+        else identity_observation_preprocessor
+    )
     # Brax's networks hold an observation of zeros, which need not be on the GPU.
     with jax.ensure_compile_time_eval(), default_device_cpu():
-        make_heads = network_factory(config)
+        make_heads = network_factory(config.network)
         if isinstance(observation_size, int):
             return make_heads(observation_size, action_size, preprocess_observations_fn=preprocess)
         shapes = {name: tuple(shape) for name, shape in observation_size.items()}
         return make_vision_networks(
-            config, shapes, action_size, make_heads=make_heads, normalize=preprocess
+            config.network, shapes, action_size, make_heads=make_heads, normalize=preprocess
         )
 
 

@@ -43,7 +43,7 @@ google/brax v0.14.2, brax/training/agents/ppo.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -127,15 +127,6 @@ class NanDump(struct.PyTreeNode):
     """Index of the action that led to the non-finite state."""
 
 
-class StepOutput(NamedTuple):
-    """A `StepOutput` holds the metrics of one training step."""
-
-    metrics: dict[str, Float[Array, ""]]
-    """Means over the minibatches, and sums over the episodes that ended during collection."""
-    nan_dump: NanDump
-    """The first non-finite state of this shard."""
-
-
 class PPO:
     """A `PPO` object trains one configuration in one environment; it holds no training state."""
 
@@ -145,7 +136,6 @@ class PPO:
         env: Env,
         networks: Networks,
         *,
-        num_envs: int | None = None,
         axis_name: str | None = None,
         device_count: int = 1,
     ) -> None:
@@ -156,12 +146,10 @@ class PPO:
           env: the environment from `wrap_for_training`, which is batched, resets itself and reports
             `episode_metrics`.
           networks: the policy and value networks, from `make_networks`.
-          num_envs: the number of environments over all devices; None: `config.num_envs`.
           axis_name: the mesh axis over which the environments are sharded; None: no sharding.
           device_count: the size of that axis.
         """
         self.config = config
-        self.num_envs = num_envs or config.num_envs
         self._env: Any = env
         self._axis = axis_name
         self._device_count = device_count
@@ -204,7 +192,7 @@ class PPO:
             params=params,
             optimizer_state=self._optimizer.init(params),
             normalizer=self._with_floor(init_normalizer(self._env.observation_size)),
-            env_state=self._env.reset(jax.random.split(env_key, self.num_envs)),
+            env_state=self._env.reset(jax.random.split(env_key, self.config.num_envs)),
             key=jax.random.split(epoch_key, 1)[0],
             env_steps=_UInt64(hi=0, lo=0),
             tally=dict.fromkeys(TALLIED, jnp.zeros(())),
@@ -229,10 +217,12 @@ class PPO:
 
         def body(_: Array, carry: tuple[TrainState, NanDump]) -> tuple[TrainState, NanDump]:
             before, nan_dump = carry
-            state, output = self.train_step(before)
-            metrics = {**output.metrics, "training_steps": jnp.ones(())}
+            state, metrics, found = self.train_step(before)
+            metrics["training_steps"] = jnp.ones(())
             tally = {name: total + metrics[name] for name, total in before.tally.items()}
-            nan_dump = _first_found(nan_dump, output.nan_dump)
+            nan_dump = jax.tree.map(
+                lambda one, other: jnp.where(nan_dump.found, one, other), nan_dump, found
+            )
             return state.replace(tally=tally), nan_dump
 
         none = NanDump(
@@ -243,14 +233,17 @@ class PPO:
         )
         return jax.lax.fori_loop(0, num_steps, body, (state.replace(tally=tally), none))
 
-    def train_step(self, state: TrainState) -> tuple[TrainState, StepOutput]:
+    def train_step(
+        self, state: TrainState
+    ) -> tuple[TrainState, dict[str, Float[Array, ""]], NanDump]:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
           state: the training state of this shard.
 
         Returns:
-          The next state, and the metrics and first non-finite state of the step.
+          The next state; the metrics of the step, which are means over the minibatches and sums
+          over the episodes that ended during collection; and the first non-finite state.
         """
         # Each device draws its own keys, and all devices continue from the same one.
         update_key, rollout_key, next_key = jax.random.split(state.key, 3)
@@ -270,7 +263,6 @@ class PPO:
         params, optimizer_state, metrics = self.update(
             state.params, state.optimizer_state, normalizer, data, update_key
         )
-        metrics = {**metrics, **self._episode_sums(data)}
         state = state.replace(
             params=params,
             optimizer_state=optimizer_state,
@@ -279,7 +271,7 @@ class PPO:
             key=next_key,
             env_steps=state.env_steps + self.config.steps_per_training_step,
         )
-        return state, StepOutput(metrics, nan_dump)
+        return state, {**metrics, **self._episode_sums(data)}, nan_dump
 
     def _with_floor(
         self, normalizer: running_statistics.RunningStatisticsState
@@ -328,7 +320,7 @@ class PPO:
             return (after, next_key), (data, nan_dump)
 
         # Run the unrolls one after the other, and return the first non-finite state of all.
-        count = self.config.batch_size * self.config.num_minibatches // self.num_envs
+        count = self.config.batch_size * self.config.num_minibatches // self.config.num_envs
         (env_state, _), (data, nan_dumps) = jax.lax.scan(
             unroll, (state.env_state, key), length=count
         )
@@ -536,8 +528,3 @@ def _find_nan_dump(start: PyTree, data: Transition) -> NanDump:
         actions=data.action[:, env_index],
         step=step,
     )
-
-
-def _first_found(one: NanDump, other: NanDump) -> NanDump:
-    """Return the first of two dumps if it holds a non-finite state, otherwise the second."""
-    return jax.tree.map(lambda a, b: jnp.where(one.found, a, b), one, other)

@@ -9,11 +9,13 @@ The offsets are those of XLA's C header `xla/ffi/api/c_api.h`, version 0.3. Ever
 its size, and the function returns without a result if a size differs from the expected one.
 """
 
+import math
 from collections.abc import Sequence
 from importlib import resources
 from string import Template
 
-from jetbot_mjx.compiler.llvm_codegen import STEP
+from jetbot_mjx.compiler.kernel import Kernel
+from jetbot_mjx.compiler.llvm_codegen import STEP, map_text, step_text
 
 VERSION = (0, 3)
 """Version of XLA's foreign function interface."""
@@ -36,88 +38,32 @@ TEXT = _ASSETS.joinpath("xla_call.ll").read_text("utf-8")
 """Template of all kernels."""
 
 
-def kernel_text(
-    step: str,
-    sizes: Sequence[int],
-    *,
-    carried: int,
-    lanes: int,
-    steps: int,
-    name: str,
-    machine: str,
-) -> str:
+def kernel_text(kernel: Kernel, *, lanes: int, name: str, machine: str) -> str:
     """Write the LLVM module whose function XLA calls.
 
-    The function takes float32 arrays of shape (robots, ...) and returns the carried ones.
+    The function takes float32 arrays of shape (robots, ...) and returns the carried ones. With a
+    table, it takes these arrays and the table, and returns the bytes of all robots, of shape
+    (robots, items x results).
 
     Args:
-      step: the text of a function that makes one step of `lanes` robots.
-      sizes: the number of scalars per robot in each argument.
-      carried: the number of arguments that are carried from step to step and returned.
-      lanes: the number of robots in a block.
-      steps: the number of steps.
+      kernel: the kernel.
+      lanes: the number of robots that make a step side by side; with a table, that of items.
       name: the name of the function, a C identifier.
       machine: the processor, one of `MACHINES`.
 
     Returns:
       The text of an LLVM module.
+
+    Raises:
+      UnsupportedError: the program has an operation that has no LLVM instruction.
     """
-    block = {
-        "addresses": "\n  ".join(_address(i) for i in range(len(sizes) + carried)),
-        "alignment": 4 * lanes,
-        "lanes": lanes,
-        "reads": "\n  ".join(_reads(sizes, lanes)),
-        "rows": max(1, sum(sizes)),
-        "step": STEP,
-        "steps": steps,
-        "writes": "\n  ".join(_writes(sizes[:carried], len(sizes), lanes)),
-    }
-    text = step + _template("xla_step.ll").substitute(block)
-    return _call(text, len(sizes), carried, name=name, machine=machine, robots=lanes)
-
-
-def map_kernel_text(
-    function: str, sizes: Sequence[int], *, items: int, results: int, name: str, machine: str
-) -> str:
-    """Write the LLVM module whose function XLA calls for a kernel with a table.
-
-    The function takes float32 arrays of shape (robots, ...) and the table, and returns the bytes of
-    all robots, of shape (robots, items x results).
-
-    Args:
-      function: the text of the function from `llvm_codegen.map_text`.
-      sizes: the number of scalars per robot in each argument.
-      items: the number of items of a robot.
-      results: the number of bytes of an item.
-      name: the name of the function, a C identifier.
-      machine: the processor, one of `MACHINES`.
-
-    Returns:
-      The text of an LLVM module.
-    """
-    # The address of a robot's row is that of its array, plus the row; all share the table.
-    rows = [*(4 * size for size in sizes), 0, items * results]
-    block = {
-        "addresses": "\n  ".join(
-            f"{_address(i)}\n"
-            f"  %row{i} = mul i64 %index, {size}\n"
-            f"  %p{i} = getelementptr i8, ptr %a{i}, i64 %row{i}"
-            for i, size in enumerate(rows)
-        ),
-        "pointers": ", ".join(f"ptr %p{i}" for i in range(len(rows))),
-        "step": STEP,
-    }
-    text = function + _template("xla_map.ll").substitute(block)
-    return _call(text, len(sizes) + 1, 1, name=name, machine=machine, robots=1)
-
-
-def _template(file: str) -> Template:
-    return Template(_ASSETS.joinpath(file).read_text("utf-8"))
-
-
-def _call(block: str, arguments: int, results: int, *, name: str, machine: str, robots: int) -> str:
-    """Write the function that XLA calls, around the `block` of so many robots."""
-    arrays = arguments + results
+    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
+    if kernel.table is None:
+        block, robots = _step_block(kernel, sizes, lanes), lanes
+        arguments, arrays = len(sizes), len(sizes) + kernel.carried
+    else:
+        block, robots = _map_block(kernel, sizes, kernel.table.shape[1], lanes), 1
+        arguments, arrays = len(sizes) + 1, len(sizes) + 2
     values = {
         "arrays": arrays,
         "block": block,
@@ -132,6 +78,47 @@ def _call(block: str, arguments: int, results: int, *, name: str, machine: str, 
     }
     processor = _ASSETS.joinpath(f"xla_call.{machine}.ll").read_text("utf-8")
     return processor + Template(TEXT).substitute(values)
+
+
+def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
+    """Write the function that takes a block of robots through all steps."""
+    carried = kernel.carried
+    values = {
+        "addresses": "\n  ".join(_address(i) for i in range(len(sizes) + carried)),
+        "alignment": 4 * lanes,
+        "lanes": lanes,
+        "reads": _copies("%r{i} = mul i64 %robot, {size}", _READ, sizes, lanes),
+        "rows": max(1, sum(sizes)),
+        "step": STEP,
+        "steps": kernel.steps,
+        "writes": _copies(
+            "%w{i} = mul i64 %to, {size}", _WRITE, sizes[:carried], lanes, first=len(sizes)
+        ),
+    }
+    step = step_text(kernel.program, carried=carried, lanes=lanes)
+    return step + _template("xla_step.ll").substitute(values)
+
+
+def _map_block(kernel: Kernel, sizes: Sequence[int], items: int, lanes: int) -> str:
+    """Write the function that computes all items of a robot."""
+    # The address of a robot's row is that of its array, plus the row; all share the table.
+    rows = [*(4 * size for size in sizes), 0, items * len(kernel.program.outputs)]
+    values = {
+        "addresses": "\n  ".join(
+            f"{_address(i)}\n"
+            f"  %row{i} = mul i64 %index, {size}\n"
+            f"  %p{i} = getelementptr i8, ptr %a{i}, i64 %row{i}"
+            for i, size in enumerate(rows)
+        ),
+        "pointers": ", ".join(f"ptr %p{i}" for i in range(len(rows))),
+        "step": STEP,
+    }
+    function = map_text(kernel.program, lanes=lanes, items=items)
+    return function + _template("xla_map.ll").substitute(values)
+
+
+def _template(file: str) -> Template:
+    return Template(_ASSETS.joinpath(file).read_text("utf-8"))
 
 
 def _address(i: int) -> str:
@@ -155,35 +142,37 @@ def _pointer(i: int, arguments: int) -> str:
     )
 
 
-def _reads(sizes: Sequence[int], lanes: int) -> list[str]:
-    """Return the lines that copy one robot's arguments into its lane of the tile."""
-    lines, row = [], 0
-    for i, size in enumerate(sizes):
-        lines.append(f"%r{i} = mul i64 %robot, {size}")
-        for j in range(size):
-            lines += [
-                f"%ri{i}.{j} = add i64 %r{i}, {j}",
-                f"%rp{i}.{j} = getelementptr float, ptr %a{i}, i64 %ri{i}.{j}",
-                f"%rv{i}.{j} = load float, ptr %rp{i}.{j}",
-                f"%rt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %lane",
-                f"store float %rv{i}.{j}, ptr %rt{i}.{j}",
-            ]
-            row += 1
-    return lines
+_READ = """\
+%ri{i}.{j} = add i64 %r{i}, {j}
+  %rp{i}.{j} = getelementptr float, ptr %a{i}, i64 %ri{i}.{j}
+  %rv{i}.{j} = load float, ptr %rp{i}.{j}
+  %rt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %lane
+  store float %rv{i}.{j}, ptr %rt{i}.{j}"""
+"""Lines that copy one scalar of a robot's arguments into its lane of the tile."""
+
+_WRITE = """\
+%wt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %out
+  %wv{i}.{j} = load float, ptr %wt{i}.{j}
+  %wi{i}.{j} = add i64 %w{i}, {j}
+  %wp{i}.{j} = getelementptr float, ptr %a{i}, i64 %wi{i}.{j}
+  store float %wv{i}.{j}, ptr %wp{i}.{j}"""
+"""Lines that copy one scalar of a robot's results from its lane of the tile."""
 
 
-def _writes(sizes: Sequence[int], first: int, lanes: int) -> list[str]:
-    """Return the lines that copy one robot's results from its lane of the tile."""
+def _copies(start: str, copy: str, sizes: Sequence[int], lanes: int, first: int = 0) -> str:
+    """Return the lines that copy arrays, the first of which has the number `first`.
+
+    Args:
+      start: the line that computes where a robot's row of an array begins.
+      copy: the lines that copy one scalar.
+      sizes: the number of scalars per robot in each array.
+      lanes: the number of robots in a block.
+      first: the number of the first array.
+    """
     lines, row = [], 0
     for i, size in enumerate(sizes, start=first):
-        lines.append(f"%w{i} = mul i64 %to, {size}")
+        lines.append(start.format(i=i, size=size))
         for j in range(size):
-            lines += [
-                f"%wt{i}.{j} = getelementptr <{lanes} x float>, ptr %tile, i64 {row}, i64 %out",
-                f"%wv{i}.{j} = load float, ptr %wt{i}.{j}",
-                f"%wi{i}.{j} = add i64 %w{i}, {j}",
-                f"%wp{i}.{j} = getelementptr float, ptr %a{i}, i64 %wi{i}.{j}",
-                f"store float %wv{i}.{j}, ptr %wp{i}.{j}",
-            ]
+            lines.append(copy.format(i=i, j=j, row=row, lanes=lanes))
             row += 1
-    return lines
+    return "\n  ".join(lines)

@@ -90,17 +90,13 @@ class Kernel:
         shapes = [array.shape for array in self.program.inputs]
         return shapes if self.table is None else shapes[:-1]
 
-    @property
-    def result_shapes(self) -> list[tuple[int, ...]]:
-        """Return the shapes of the results of one robot."""
-        if self.table is None:
-            return self.argument_shapes[: self.carried]
-        return [(self.table.shape[1] * len(self.program.outputs),)]
-
-    @property
-    def result_dtype(self) -> Any:
-        """Return the dtype of the results."""
-        return np.dtype(np.float32 if self.table is None else np.uint8)
+    def results(self, *batch: int) -> list[jax.ShapeDtypeStruct]:
+        """Return the shapes, behind the given batch axes, and dtypes of the results."""
+        if self.table is not None:
+            size = self.table.shape[1] * len(self.program.outputs)
+            return [jax.ShapeDtypeStruct((*batch, size), np.uint8)]
+        shapes = self.argument_shapes[: self.carried]
+        return [jax.ShapeDtypeStruct((*batch, *shape), np.float32) for shape in shapes]
 
 
 class Backend(Protocol):
@@ -122,10 +118,10 @@ class Backend(Protocol):
 
         Args:
           kernel: the kernel.
-          leaves: its arguments, float32 arrays of shape (robots, ...).
+          leaves: its arguments, float32 arrays of shape (robots, ...), and its table if it has one.
 
         Returns:
-          The results, of shapes (robots, ...) as in `Kernel.result_shapes`.
+          The results, as in `Kernel.results(robots)`.
         """
         ...
 
@@ -188,7 +184,7 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
 @_kernel_p.def_abstract_eval
 def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
     batch = _batch_shape(kernel, leaves)
-    return [ShapedArray((*batch, *shape), kernel.result_dtype) for shape in kernel.result_shapes]
+    return [ShapedArray(result.shape, result.dtype) for result in kernel.results(*batch)]
 
 
 @_kernel_p.def_impl
@@ -267,7 +263,8 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
         ]
         if backend and kernel.impl in ("auto", backend.IMPL) and backend.is_available():
-            results = backend.launch(kernel, flat)
+            table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
+            results = backend.launch(kernel, [*flat, *table])
         elif kernel.impl == "auto":
             results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
         else:
@@ -275,8 +272,8 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
                 f"{kernel.setting} = {kernel.impl}: this program is for"
                 f" {backend.PLATFORM if backend else 'another platform'}: choose xla or auto"
             )
-        shapes = kernel.result_shapes
-        return [x.reshape(*batch, *shape) for x, shape in zip(results, shapes, strict=True)]
+        wanted = kernel.results(*batch)
+        return [x.reshape(like.shape) for x, like in zip(results, wanted, strict=True)]
 
     return lowered
 

@@ -9,17 +9,15 @@ import ctypes
 import functools
 import hashlib
 import importlib
-import math
 import re
 import threading
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 from jaxtyping import Array
 
-from jetbot_mjx.compiler import ffi_wrapper, llvm_codegen
+from jetbot_mjx.compiler import ffi_wrapper
 from jetbot_mjx.compiler.kernel import Kernel, cached_bytes, runs_correctly
 
 IMPL: str = "llvm"
@@ -78,36 +76,14 @@ def kernel_text(kernel: Kernel) -> str:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     host = _host()
-    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
-    if kernel.table is not None:
-        items = kernel.table.shape[1]
-        return ffi_wrapper.map_kernel_text(
-            llvm_codegen.map_text(kernel.program, lanes=host.lanes, items=items),
-            sizes,
-            items=items,
-            results=len(kernel.program.outputs),
-            name=_NAME,
-            machine=host.machine,
-        )
-    return ffi_wrapper.kernel_text(
-        llvm_codegen.step_text(kernel.program, carried=kernel.carried, lanes=host.lanes),
-        sizes,
-        carried=kernel.carried,
-        lanes=host.lanes,
-        steps=kernel.steps,
-        name=_NAME,
-        machine=host.machine,
-    )
+    return ffi_wrapper.kernel_text(kernel, lanes=host.lanes, name=_NAME, machine=host.machine)
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     text = kernel.text(IMPL, lambda: kernel_text(kernel))
-    robots = leaves[0].shape[0]
-    dtype = kernel.result_dtype
-    shapes = [jax.ShapeDtypeStruct((robots, *x), dtype) for x in kernel.result_shapes]
-    table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
-    return list(jax.ffi.ffi_call(_registered(text), shapes)(*leaves, *table))
+    results = kernel.results(leaves[0].shape[0])
+    return list(jax.ffi.ffi_call(_registered(text), results)(*leaves))
 
 
 def _registered(text: str) -> str:

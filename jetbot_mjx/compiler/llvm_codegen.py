@@ -179,10 +179,7 @@ class LlvmEmitter:
         Returns:
           The names of the scalars of the program's results.
         """
-        inputs = [x for array in self._program.inputs for x in array.ravel()]
-        self._names = {x.index: name for x, name in zip(inputs, arguments, strict=True)}
-        self._block(self._program.block)
-        return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
+        return self.finish(self.hoist(arguments, varying=len(arguments)))
 
     def hoist(self, arguments: Sequence[str], varying: int) -> list[Item]:
         """Write the operations that do not depend on the last arguments.

@@ -17,8 +17,8 @@ Protocol, in the order in which a function passes through the package:
    - A value that a loop carries is first assumed to be constant. Values that prove to change are
      carried in the next round, until a round finds no more of them.
    - A carried value that is the same function of other carried values before the loop and after
-     each iteration is not carried, but computed at the start of the iteration (`_Derivation`). In a
-     solver that prepares the next iteration at the end of each one, this saves the last one.
+     each iteration is not carried, but computed at the start of the iteration (`_find_derived`). In
+     a solver that prepares the next iteration at the end of each one, this saves the last one.
 
 4. `schedule` places the operations in blocks, and `llvm_codegen` writes the blocks as LLVM IR.
 
@@ -30,18 +30,17 @@ of robots.
 import contextlib
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr, Literal
+from jax.extend.core import ClosedJaxpr, Literal
 
 from jetbot_mjx.compiler.indexing import (
     RULES,
     ScalarArray,
     constant_array,
-    constant_values,
     full_array,
     scalar_array,
     shape_of,
@@ -119,19 +118,14 @@ class _JaxprLowering:
     """A `_JaxprLowering` records the operations of a jaxpr on scalars.
 
     The lowering rule of the JAX primitive `name` is `RULES[name]` or the method `_name`: a function
-    of the equation, its parameters and its operands that returns the results.
+    of the equation and its operands that returns the results.
     """
 
     def __init__(self, graph: ExprGraph) -> None:
         self._graph = graph
 
     def lower(self, closed: ClosedJaxpr, arguments: Sequence[ScalarArray]) -> list[ScalarArray]:
-        constants = [constant_array(constant) for constant in closed.consts]
-        return self._lower_jaxpr(closed.jaxpr, constants, arguments)
-
-    def _lower_jaxpr(
-        self, jaxpr: Jaxpr, constants: Sequence[ScalarArray], arguments: Sequence[ScalarArray]
-    ) -> list[ScalarArray]:
+        jaxpr, constants = closed.jaxpr, map(constant_array, closed.consts)
         env: dict[Any, ScalarArray] = dict(zip(jaxpr.constvars, constants, strict=True))
         env |= dict(zip(jaxpr.invars, arguments, strict=True))
 
@@ -153,7 +147,7 @@ class _JaxprLowering:
         rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
         if rule is None:
             raise UnsupportedError(f"the operation {name}")
-        result = rule(equation, equation.params, *operands)
+        result = rule(equation, *operands)
         return result if isinstance(result, list) else [result]
 
     def _elementwise(self, op: str, *operands: ScalarArray) -> ScalarArray:
@@ -176,18 +170,16 @@ class _JaxprLowering:
 
     # Rules of primitives that call functions: jit, scan, while, cond.
 
-    def _jit(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        return self.lower(params["jaxpr"], operands)
+    def _jit(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        return self.lower(equation.params["jaxpr"], operands)
 
     _pjit = _jit
 
-    def _custom_jvp_call(
-        self, equation: Any, params: Any, *operands: ScalarArray
-    ) -> list[ScalarArray]:
-        return self.lower(params["call_jaxpr"], operands)
+    def _custom_jvp_call(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        return self.lower(equation.params["call_jaxpr"], operands)
 
-    def _scan(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        body, length = params["jaxpr"], params["length"]
+    def _scan(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        body, length = equation.params["jaxpr"], equation.params["length"]
         # Split the operands into constants, carry and sequences, which have one axis less inside.
         scanned, stacked = (
             sum(len(shape_of(a)) != len(shape_of(b)) for a, b in zip(outer, inner, strict=True))
@@ -207,7 +199,7 @@ class _JaxprLowering:
                 return rolled
         order = range(length)
         rows: dict[int, list[ScalarArray]] = {}
-        for i in reversed(order) if params["reverse"] else order:
+        for i in reversed(order) if equation.params["reverse"] else order:
             slices = [_at(sequence, i) for sequence in sequences]
             results = self.lower(body, [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
@@ -240,22 +232,21 @@ class _JaxprLowering:
         # For example, an index depends on the loop counter, which is constant once unrolled.
         return None
 
-    def _while(self, equation: Any, params: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        first = params["cond_nconsts"]
-        second = first + params["body_nconsts"]
+    def _while(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        first = equation.params["cond_nconsts"]
+        second = first + equation.params["body_nconsts"]
         cond_consts, body_consts = operands[:first], operands[first:second]
 
         def row_conditions(state: list[ScalarArray]) -> ScalarArray:
-            return self.lower(params["cond_jaxpr"], [*cond_consts, *state])[0]
+            return self.lower(equation.params["cond_jaxpr"], [*cond_consts, *state])[0]
 
         def condition(state: list[ScalarArray]) -> Scalar:
             # A loop under `jax.vmap` has a condition for each row, and runs while any is true.
-            rows = row_conditions(state)
-            return self._reduce_or(None, {"axes": range(rows.ndim)}, rows).item()
+            return self._fold("or", np.bool_(False), row_conditions(state).ravel())
 
         def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
             rows = row_conditions(state)
-            updated = self.lower(params["body_jaxpr"], [*body_consts, *state])
+            updated = self.lower(equation.params["body_jaxpr"], [*body_consts, *state])
             pairs = zip(state, updated, strict=True)
             return [self._where(rows, *pair) for pair in pairs] if rows.ndim else updated
 
@@ -348,7 +339,7 @@ class _JaxprLowering:
                 break
             carried.update(changed)
         # Compute derived values from the other carried values at the start of an iteration.
-        derived = _Derivation(self._graph, loop, carried).derived()
+        derived = _find_derived(self._graph, loop, carried)
         if derived:
             start = [derived.get(k, x) for k, x in enumerate(start)]
             loop.updated = _flatten(next_state(_unflatten(state, start)))
@@ -359,10 +350,8 @@ class _JaxprLowering:
         end = [results[k] if k in carried else x for k, x in enumerate(initial)]
         return _unflatten(state, end)
 
-    def _cond(
-        self, equation: Any, params: Any, index: ScalarArray, *operands: ScalarArray
-    ) -> list[ScalarArray]:
-        branches, selected = params["branches"], index.item()
+    def _cond(self, equation: Any, index: ScalarArray, *operands: ScalarArray) -> list[ScalarArray]:
+        branches, selected = equation.params["branches"], index.item()
         if is_constant(selected):
             return self.lower(branches[min(max(int(selected), 0), len(branches) - 1)], operands)
         count_before = self._graph.count
@@ -381,10 +370,9 @@ class _JaxprLowering:
 
     # Rules of primitives whose indices may depend on the state.
 
-    def _dynamic_slice(
-        self, equation: Any, params: Any, x: ScalarArray, *starts: ScalarArray
-    ) -> ScalarArray:
-        for axis, (start, size) in enumerate(zip(starts, params["slice_sizes"], strict=True)):
+    def _dynamic_slice(self, equation: Any, x: ScalarArray, *starts: ScalarArray) -> ScalarArray:
+        sizes = equation.params["slice_sizes"]
+        for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
             last = x.shape[axis] - size
             cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
             at = start.item()
@@ -400,26 +388,17 @@ class _JaxprLowering:
     def _scatter(
         self,
         equation: Any,
-        params: Any,
         x: ScalarArray,
         indices: ScalarArray,
         updates: ScalarArray,
         op: str | None = None,
     ) -> ScalarArray:
-        dims = params["dimension_numbers"]
-        fixed = (*dims.inserted_window_dims, *dims.operand_batching_dims)
-        window = iter(updates.shape[axis] for axis in dims.update_window_dims)
-        places = windows(
-            x.shape,
-            constant_values(indices, np.int64),
-            offset_dims=dims.update_window_dims,
-            collapsed=dims.inserted_window_dims,
-            index_map=dims.scatter_dims_to_operand_dims,
-            batching=dims.operand_batching_dims,
-            indices_batching=dims.scatter_indices_batching_dims,
-            sizes=[1 if axis in fixed else next(window) for axis in range(x.ndim)],
-            clip="CLIP" in str(params["mode"]),
-        )
+        # The dimension numbers of a scatter are those of the gather that reads the same windows.
+        dims = jax.lax.GatherDimensionNumbers(*equation.params["dimension_numbers"])
+        fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
+        window = iter(updates.shape[axis] for axis in dims.offset_dims)
+        sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
+        places = windows(x.shape, indices, dims, sizes, clip="CLIP" in str(equation.params["mode"]))
         result = x.flatten()
         for place, update in zip(places.ravel(), updates.ravel(), strict=True):
             if place >= 0:
@@ -432,13 +411,11 @@ class _JaxprLowering:
 
     # Rules of primitives with arithmetic on more than single elements.
 
-    def _convert_element_type(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        dtype = np.dtype(params["new_dtype"])
+    def _convert_element_type(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        dtype = np.dtype(equation.params["new_dtype"])
         return scalar_array((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
-    def _select_n(
-        self, equation: Any, params: Any, which: ScalarArray, *cases: ScalarArray
-    ) -> ScalarArray:
+    def _select_n(self, equation: Any, which: ScalarArray, *cases: ScalarArray) -> ScalarArray:
         result = cases[-1]
         for i in reversed(range(len(cases) - 1)):
             # The index of a case is a bool or an integer.
@@ -450,59 +427,55 @@ class _JaxprLowering:
         return result
 
     def _clamp(
-        self, equation: Any, params: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
+        self, equation: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
     ) -> ScalarArray:
         return self._elementwise("min", self._elementwise("max", x, low), high)
 
-    def _square(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+    def _square(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("mul", x, x)
 
-    def _integer_pow(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+    def _integer_pow(self, equation: Any, x: ScalarArray) -> ScalarArray:
         one = constant_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
         result = one
-        for _ in range(abs(params["y"])):
+        for _ in range(abs(equation.params["y"])):
             result = self._elementwise("mul", result, x)
-        return result if params["y"] >= 0 else self._elementwise("div", one, result)
+        return result if equation.params["y"] >= 0 else self._elementwise("div", one, result)
 
-    def _rsqrt(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
+    def _rsqrt(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
-    def _reduce(
-        self, op: str, initial: Scalar, equation: Any, params: Any, x: ScalarArray
-    ) -> ScalarArray:
-        axes = tuple(params["axes"])
-        free = [axis for axis in range(x.ndim) if axis not in axes]
-        shape = [x.shape[axis] for axis in free]
-        results = full_array(shape, lambda: initial)
-        x = x.transpose(*free, *axes)
-        for place in np.ndindex(*shape):
-            for scalar in x[place].ravel() if axes else [x[place]]:
-                results[place] = self._graph.apply(op, results[place], scalar)
-        return results
+    def _reduce(self, op: str, initial: Scalar, equation: Any, x: ScalarArray) -> ScalarArray:
+        (groups,) = _group_axes(x, (), equation.params["axes"])
+        scalars = (self._fold(op, initial, group) for group in groups)
+        return scalar_array(scalars, shape_of(equation.outvars[0]))
 
-    def _reduce_sum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, params, x)
+    def _fold(self, op: str, initial: Scalar, scalars: Iterable[Scalar]) -> Scalar:
+        """Combine scalars by an operation, one after the other."""
+        return functools.reduce(functools.partial(self._graph.apply, op), scalars, initial)
+
+    def _reduce_sum(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, x)
 
     _reduce_and = functools.partialmethod(_reduce, "and", np.bool_(True))
     _reduce_or = functools.partialmethod(_reduce, "or", np.bool_(False))
 
-    def _reduce_max(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("max", _lowest(equation), equation, params, x)
+    def _reduce_max(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("max", _lowest(equation), equation, x)
 
-    def _reduce_min(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("min", -_lowest(equation), equation, params, x)
+    def _reduce_min(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("min", -_lowest(equation), equation, x)
 
-    def _cumsum(self, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        result = np.moveaxis(x.copy(), params["axis"], 0)
+    def _cumsum(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        result = np.moveaxis(x.copy(), equation.params["axis"], 0)
         order = range(1, len(result))
-        for i in [len(result) - 1 - i for i in order] if params["reverse"] else order:
-            previous = _at(result, i + 1 if params["reverse"] else i - 1)
+        for i in [len(result) - 1 - i for i in order] if equation.params["reverse"] else order:
+            previous = _at(result, i + 1 if equation.params["reverse"] else i - 1)
             # Assign to a slice: assigned to an element, the array would become a nested object.
             result[i : i + 1] = self._elementwise("add", previous, _at(result, i))[None]
-        return np.moveaxis(result, 0, params["axis"])
+        return np.moveaxis(result, 0, equation.params["axis"])
 
-    def _arg_extreme(self, better: str, equation: Any, params: Any, x: ScalarArray) -> ScalarArray:
-        (axis,) = params["axes"]
+    def _arg_extreme(self, better: str, equation: Any, x: ScalarArray) -> ScalarArray:
+        (axis,) = equation.params["axes"]
         kind = equation.outvars[0].aval.dtype.type
         x = np.moveaxis(x, axis, -1)
         places = full_array(x.shape[:-1], lambda: kind(0))
@@ -517,10 +490,8 @@ class _JaxprLowering:
     _argmin = functools.partialmethod(_arg_extreme, "lt")
     _argmax = functools.partialmethod(_arg_extreme, "gt")
 
-    def _dot_general(
-        self, equation: Any, params: Any, a: ScalarArray, b: ScalarArray
-    ) -> ScalarArray:
-        (sum_a, sum_b), (batch_a, batch_b) = params["dimension_numbers"]
+    def _dot_general(self, equation: Any, a: ScalarArray, b: ScalarArray) -> ScalarArray:
+        (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
         rows = _group_axes(a, batch_a, sum_a)
         columns = _group_axes(b, batch_b, sum_b)
         dtype = np.dtype(equation.outvars[0].aval.dtype)
@@ -538,64 +509,60 @@ class _JaxprLowering:
         return scalar_array(sums, shape_of(equation.outvars[0]))
 
 
-class _Derivation:
-    """A `_Derivation` finds carried values of a loop that are functions of other carried values.
+def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, Scalar]:
+    """Find carried values of a loop that are functions of other carried values.
 
     A carried value is derived if it is the same function of the others before the first iteration
     and after every iteration. The two expressions are compared operation by operation.
+
+    Returns:
+      How each derived value is computed from the others, by its place.
     """
+    derived: dict[int, Scalar] = {}
+    known: dict[Any, Scalar] = {}
+    # Begin with the values that were recorded first, because others may be derived from them.
+    for place in sorted(carried, key=lambda k: _index(loop.updated[k])):
+        pair = loop.initial[place], loop.updated[place]
+        found = known.get(_pair_key(pair))
+        if found is None:
+            found = _matched(graph, known, *pair)
+        if found is not None:
+            derived[place] = found
+        known[_pair_key(pair)] = loop.carries[place] if found is None else found
+    return derived
 
-    def __init__(self, graph: ExprGraph, loop: Loop, carried: set[int]) -> None:
-        self._graph = graph
-        self._loop = loop
-        # Begin with the values that were recorded first, because others may be derived from them.
-        self._places = sorted(carried, key=lambda k: _index(loop.updated[k]))
-        self._known: dict[Any, Scalar] = {}
 
-    def derived(self) -> dict[int, Scalar]:
-        """Return which carried values are derived, and how each is computed from the others."""
-        result: dict[int, Scalar] = {}
-        for place in self._places:
-            pair = self._loop.initial[place], self._loop.updated[place]
-            derived = self._known.get(_pair_key(pair))
-            if derived is None:
-                derived = self._matched(*pair)
-            if derived is not None:
-                result[place] = derived
-            self._known[_pair_key(pair)] = self._loop.carries[place] if derived is None else derived
-        return result
-
-    def _matched(self, before: Scalar, after: Scalar) -> Scalar | None:
-        """Return one expression for both `before` and `after`; None if there is none."""
-        pending = [(before, after)]
-        found: dict[Any, Scalar | None] = {}
-        while pending:
-            pair = pending[-1]
-            key = _pair_key(pair)
-            if key in self._known or key in found:
-                pending.pop()
-                continue
-            parts = _parts(*pair)
-            if parts is None:
-                # The two have no common operation, so the expressions that contain them differ.
-                return None
-            missing = [
-                part
-                for part in parts
-                if not is_same(*part) and _pair_key(part) not in self._known.keys() | found.keys()
-            ]
-            if missing:
-                pending += missing
-                continue
-            operands = [
-                a
-                if is_same(a, b)
-                else self._known.get(_pair_key((a, b)), found.get(_pair_key((a, b))))
-                for a, b in parts
-            ]
-            found[key] = self._graph.repeat(pair[1], operands)
+def _matched(
+    graph: ExprGraph, known: dict[Any, Scalar], before: Scalar, after: Scalar
+) -> Scalar | None:
+    """Return one expression for both `before` and `after`; None if there is none."""
+    pending = [(before, after)]
+    found: dict[Any, Scalar | None] = {}
+    while pending:
+        pair = pending[-1]
+        key = _pair_key(pair)
+        if key in known or key in found:
             pending.pop()
-        return found[_pair_key((before, after))]
+            continue
+        parts = _parts(*pair)
+        if parts is None:
+            # The two have no common operation, so the expressions that contain them differ.
+            return None
+        missing = [
+            part
+            for part in parts
+            if not is_same(*part) and _pair_key(part) not in known.keys() | found.keys()
+        ]
+        if missing:
+            pending += missing
+            continue
+        operands = [
+            a if is_same(a, b) else known.get(_pair_key((a, b)), found.get(_pair_key((a, b))))
+            for a, b in parts
+        ]
+        found[key] = graph.repeat(pair[1], operands)
+        pending.pop()
+    return found[_pair_key((before, after))]
 
 
 def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:

@@ -15,13 +15,11 @@ from string import Template
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
-from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 
 IMPL: str = "ptx"
 PLATFORM: str = "cuda"
@@ -71,19 +69,16 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     robots = leaves[0].shape[0]
     threads = threads_in_block(robots)
     blocks = math.ceil(robots / threads)
-    arguments = list(leaves)
     if kernel.table is not None:
         # A block computes all items of a robot.
-        arguments.append(jnp.asarray(kernel.table))
         threads, blocks = _ITEM_THREADS, robots
     architecture = _architecture()
     text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
-    dtype = kernel.result_dtype
-    results = [jax.ShapeDtypeStruct((robots, *x), dtype) for x in kernel.result_shapes]
+    results = kernel.results(robots)
     call = jax.ffi.ffi_call(_TARGET, results)
     return list(
         call(
-            *arguments,
+            *leaves,
             name=_NAME,
             kernel_type="ptx",
             kernel_data=text.replace(_ROBOTS, str(robots)),
@@ -94,7 +89,7 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
             block_y=np.int64(1),
             block_z=np.int64(1),
             shared_mem_bytes=np.int64(0),
-            output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
+            output_indices=tuple(range(len(leaves), len(leaves) + len(results))),
         )
     )
 
@@ -119,11 +114,8 @@ def compiled(kernel: Kernel, architecture: int) -> str:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
     binding = _binding()
-    if kernel.table is None:
-        text = kernel_text(kernel.program, carried=kernel.carried, steps=kernel.steps)
-    else:
-        text = map_kernel_text(kernel.program, items=kernel.table.shape[1])
-    module = binding.parse_assembly(text, binding.create_context())
+    write = kernel_text if kernel.table is None else map_kernel_text
+    module = binding.parse_assembly(write(kernel), binding.create_context())
     module.triple = _TRIPLE
     target = binding.Target.from_triple(_TRIPLE)
     machine = target.create_target_machine(
@@ -132,21 +124,20 @@ def compiled(kernel: Kernel, architecture: int) -> str:
     return machine.emit_assembly(module)
 
 
-def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
-    """Write a kernel as LLVM IR.
+def kernel_text(kernel: Kernel) -> str:
+    """Write a kernel that steps as LLVM IR.
 
     Its parameters are the addresses of all argument leaves, followed by the addresses of all result
     leaves. Each is a float32 array of shape (robots, ...).
 
     Args:
-      program: the step; its results have the shapes of its first `carried` arguments.
-      carried: the number of argument leaves that are carried from step to step.
-      steps: the number of steps.
+      kernel: the kernel.
 
     Returns:
       The text of an LLVM module.
     """
     # Write one step, which reads the carried values as %now and the others as %in.
+    program, carried = kernel.program, kernel.carried
     emitter = LlvmEmitter(program, lanes=1, label="steps")
     sizes = [array.size for array in program.inputs]
     arguments = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
@@ -169,13 +160,13 @@ def kernel_text(program: ScalarProgram, *, carried: int, steps: int) -> str:
         "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(len(sizes) + carried)),
         "robots": _ROBOTS,
         "step": "\n  ".join(emitter.lines),
-        "steps": steps,
+        "steps": kernel.steps,
         "stores": "\n  ".join(_transfers(sizes[:carried], "store", len(sizes), results)),
     }
     return Template(_TEXT).substitute(values)
 
 
-def map_kernel_text(program: ScalarProgram, *, items: int) -> str:
+def map_kernel_text(kernel: Kernel) -> str:
     """Write a kernel with a table as LLVM IR.
 
     Its parameters are the addresses of all arguments, float32 arrays of shape (robots, ...), of the
@@ -185,15 +176,15 @@ def map_kernel_text(program: ScalarProgram, *, items: int) -> str:
     block.
 
     Args:
-      program: the function of (arguments of a robot ..., a column of the table), with scalar
-        results.
-      items: the number of items.
+      kernel: the kernel.
 
     Returns:
       The text of an LLVM module.
     """
-    emitter = LlvmEmitter(program, lanes=1, label="items", approximate=True)
-    *sizes, row = [array.size for array in program.inputs]
+    emitter = LlvmEmitter(kernel.program, lanes=1, label="items", approximate=True)
+    *sizes, row = [array.size for array in kernel.program.inputs]
+    assert kernel.table is not None
+    items = kernel.table.shape[1]
     shared = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
     columns = [f"%column{j}" for j in range(row)]
     rest = emitter.hoist([*shared, *columns], row)

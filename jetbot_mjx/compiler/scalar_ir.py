@@ -143,11 +143,12 @@ class ExprGraph:
     def __init__(self) -> None:
         """Start with an empty graph."""
         self._values: dict[tuple[Any, ...], Expr] = {}
-        self._count = 0
+        self.count = 0
+        """Number of recorded operations."""
 
     def input(self, dtype: np.dtype) -> Expr:
         """Add an input of the program."""
-        return self._record("input", (np.int32(self._count),), np.dtype(dtype))
+        return self._record("input", (np.int32(self.count),), np.dtype(dtype))
 
     def apply(self, op: str, *operands: Scalar) -> Scalar:
         """Record one operation, or return its result if all operands are constants.
@@ -236,11 +237,6 @@ class ExprGraph:
             for place, (a, b) in enumerate(zip(if_false, if_true, strict=True))
         ]
 
-    @property
-    def count(self) -> int:
-        """Return the number of recorded operations."""
-        return self._count
-
     def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Expr:
         names = [_identity(x) for x in operands]
         # The key ignores the order of commutative operands, but the operation keeps the order in
@@ -254,10 +250,10 @@ class ExprGraph:
         return Expr(op, operands, dtype, self._next(), *owner)
 
     def _next(self) -> int:
-        if self._count >= MAX_OPERATIONS:
+        if self.count >= MAX_OPERATIONS:
             raise UnsupportedError(f"more than {MAX_OPERATIONS:,} operations")
-        self._count += 1
-        return self._count - 1
+        self.count += 1
+        return self.count - 1
 
 
 def is_same(x: Scalar, y: Scalar) -> bool:
@@ -278,10 +274,31 @@ def _equals(x: Scalar, number: float) -> bool:
     return is_constant(x) and x == number
 
 
-def _simplify_add(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if _equals(x, 0):
-        return y
-    return x if _equals(y, 0) else None
+_NEUTRAL = {"add": 0, "and": True, "mul": 1, "or": False, "xor": False}
+"""The constant that leaves the other operand of an operation as it is."""
+
+_ABSORBING = {"and": False, "mul": 0, "or": True}
+"""The constant that is the result, whatever the other operand is."""
+
+_INVERTING = {"mul": (-1, "neg"), "xor": (True, "not")}
+"""The constant that inverts the other operand, and the operation that does so."""
+
+
+def _simplify_commutative(
+    graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar, *, op: str
+) -> Scalar | None:
+    if x is y and op in ("and", "or", "max", "min"):
+        return x
+    if op in ("and", "or", "xor") and dtype != _BOOL:
+        return None
+    for one, other in ((x, y), (y, x)):
+        if op in _ABSORBING and _equals(one, _ABSORBING[op]):
+            return dtype.type(_ABSORBING[op])
+        if op in _NEUTRAL and _equals(one, _NEUTRAL[op]):
+            return other
+        if op in _INVERTING and _equals(one, _INVERTING[op][0]):
+            return graph.apply(_INVERTING[op][1], other)
+    return None
 
 
 def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -290,17 +307,6 @@ def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
     if _equals(x, 0):
         return graph.apply("neg", y)
     return x if _equals(y, 0) else None
-
-
-def _simplify_mul(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    for one, other in ((x, y), (y, x)):
-        if _equals(one, 0):
-            return dtype.type(0)
-        if _equals(one, 1):
-            return other
-        if _equals(one, -1):
-            return graph.apply("neg", other)
-    return None
 
 
 def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -316,31 +322,6 @@ def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 def _simplify_inverse(op: str) -> Callable[..., Scalar | None]:
     """Return the simplification of an operation that is its own inverse."""
     return lambda graph, dtype, x: x.operands[0] if x.op == op else None
-
-
-def _simplify_logic(absorbing: bool) -> Callable[..., Scalar | None]:
-    """Return the simplification of `and` or `or`, whose result is `absorbing` if an operand is."""
-
-    def simplify(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-        if x is y:
-            return x
-        for one, other in ((x, y), (y, x)):
-            if dtype == _BOOL and is_constant(one):
-                return np.bool_(absorbing) if one == absorbing else other
-        return None
-
-    return simplify
-
-
-def _simplify_xor(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    for one, other in ((x, y), (y, x)):
-        if dtype == _BOOL and is_constant(one):
-            return graph.apply("not", other) if one else other
-    return None
-
-
-def _simplify_extreme(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    return x if x is y else None
 
 
 def _simplify_pow(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
@@ -407,20 +388,14 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
 
 
 _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
-    "add": _simplify_add,
-    "and": _simplify_logic(absorbing=False),
+    **{op: functools.partial(_simplify_commutative, op=op) for op in _COMMUTATIVE},
     "cos": functools.partial(_simplify_sine, ahead=1),
     "div": _simplify_div,
-    "max": _simplify_extreme,
-    "min": _simplify_extreme,
-    "mul": _simplify_mul,
     "neg": _simplify_inverse("neg"),
     "not": _simplify_inverse("not"),
-    "or": _simplify_logic(absorbing=True),
     "pow": _simplify_pow,
     "sign": _simplify_sign,
     "sin": _simplify_sine,
     "sub": _simplify_sub,
-    "xor": _simplify_xor,
 }
 """Functions that return an equal but simpler scalar; None: there is none."""

@@ -18,24 +18,14 @@ FORMAT = "jetbot_mjx-drive/1"
 _LEAST_POSES = 2
 
 
-class Calibration(NamedTuple):
-    """The motor calibration that the driver assumed, as pairs (left, right)."""
-
-    dead_band: tuple[float, float]
-    """Motor value up to which a wheel does not turn."""
-    full_speed: tuple[float, float]
-    """Speed of the wheel's rim at a motor value of 1 [m/s]."""
-    lag: float
-    """Time constant of the motors [s]."""
-
-
 class DriveLog(NamedTuple):
     """A `DriveLog` holds the log of one drive."""
 
     path: Path
     header: Mapping[str, Any]
     """Policy, goal and pose source."""
-    calibration: Calibration
+    calibration: MotorModel
+    """The motors that the driver assumed, without a delay."""
     goal_w: tuple[float, float]
     """Position of the goal in the frame of the poses [m]."""
     outcome: str
@@ -87,10 +77,10 @@ def read_log(path: Path) -> DriveLog:
       UserError: The file is missing, is not a log, or has fewer than two poses.
     """
     lines = _read_lines(path)
-
     # Parse the header and one line per control period; the number tells where a log is wrong.
-    periods: list[_Period] = []
-    number = 1
+    times, motors, latencies = [], [], []
+    poses: dict[float, tuple[float, ...]] = {}
+    outcome, stale_ticks, number = "interrupted", 0, 1
     try:
         header = json.loads(lines[0])
         calibration = _parse_calibration(header)
@@ -98,22 +88,27 @@ def read_log(path: Path) -> DriveLog:
         for number, text in enumerate(lines[1:], start=2):
             if number == len(lines) and not text.endswith("}"):
                 break  # The drive ended while this line was written.
-            periods.append(_parse_period(json.loads(text)))
+            period = json.loads(text)
+            left, right = map(float, period["motors"])
+            times.append(float(period["t"]))
+            motors.append((left, right))
+            stale_ticks += not period["fresh"]
+            outcome = period.get("outcome") or outcome
+            if "x" in period:
+                # A period that saw no new pose repeats the last.
+                pose_time = round(times[-1] - float(period["pose_age"]), 6)
+                pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
+                poses.setdefault(pose_time, pose)
+            if "latency" in period:
+                latencies.append(float(period["latency"]))
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
         raise UserError(
             f"{path} is not a log of deploy/drive.py: line {number}: {reason}"
         ) from None
 
-    # Collect the poses; a period that saw no new one repeats the last.
-    poses: dict[float, tuple[float, float, float]] = {}
-    for period in periods:
-        if period.pose is not None:
-            poses.setdefault(period.pose_time, period.pose)
     if len(poses) < _LEAST_POSES:
         raise UserError(f"{path} has {len(poses)} poses: there is nothing to compare")
-    times = np.array([period.time for period in periods])
-    motors = np.array([period.motors for period in periods])
     if not np.isfinite(motors).all() or not np.isfinite(times).all() or np.any(np.diff(times) < 0):
         raise UserError(f"{path} is not a log of deploy/drive.py: its times do not ascend")
     return DriveLog(
@@ -121,13 +116,13 @@ def read_log(path: Path) -> DriveLog:
         header=header,
         calibration=calibration,
         goal_w=(x, y),
-        outcome=next((one.outcome for one in reversed(periods) if one.outcome), "interrupted"),
-        times=times,
-        motors=motors,
+        outcome=outcome,
+        times=np.array(times),
+        motors=np.array(motors),
         pose_times=np.array(list(poses)),
         poses=np.array(list(poses.values())),
-        latencies=np.array([one.latency for one in periods if one.latency is not None]),
-        stale_ticks=sum(not one.fresh for one in periods),
+        latencies=np.array(latencies),
+        stale_ticks=stale_ticks,
     )
 
 
@@ -140,43 +135,23 @@ def _read_lines(path: Path) -> list[str]:
         raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
 
 
-class _Period(NamedTuple):
-    """One line of a log: one control period."""
-
-    time: float
-    motors: tuple[float, float]
-    fresh: bool
-    pose_time: float = 0.0
-    pose: tuple[float, float, float] | None = None
-    latency: float | None = None
-    outcome: str | None = None
-
-
-def _parse_calibration(header: Any) -> Calibration:
+def _parse_calibration(header: Any) -> MotorModel:
     if header["format"] != FORMAT:
         raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
     left, right = (header["calibration"][side] for side in ("left", "right"))
-    calibration = Calibration(
+    calibration = MotorModel(
         dead_band=(float(left["dead_band"]), float(right["dead_band"])),
-        full_speed=(float(left["full_speed"]), float(right["full_speed"])),
+        # The log has the speed of a wheel's rim [m/s].
+        full_speed=(
+            float(left["full_speed"]) / ROLLING_RADIUS,
+            float(right["full_speed"]) / ROLLING_RADIUS,
+        ),
         lag=float(header["calibration"]["lag"]),
+        delay=0.0,
     )
     if not max(calibration.dead_band) < 1:
         raise ValueError(f"a dead-band of {max(calibration.dead_band):g} leaves no speed")
     return calibration
-
-
-def _parse_period(line: Any) -> _Period:
-    left, right = map(float, line["motors"])
-    period = _Period(float(line["t"]), (left, right), line["fresh"], outcome=line.get("outcome"))
-    if "x" in line:
-        period = period._replace(
-            pose_time=round(period.time - float(line["pose_age"]), 6),
-            pose=(float(line["x"]), float(line["y"]), float(line["yaw"])),
-        )
-    if "latency" in line:
-        period = period._replace(latency=float(line["latency"]))
-    return period
 
 
 def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Replay:
@@ -190,14 +165,8 @@ def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Re
     Returns:
       The logged and the simulated drive.
     """
-    calibration = log.calibration
-    left, right = calibration.full_speed
-    motors = MotorModel(
-        dead_band=calibration.dead_band,
-        full_speed=(left / ROLLING_RADIUS, right / ROLLING_RADIUS),
-        lag=calibration.lag if lag is None else lag,
-        delay=delay,
-    )
+    lag = log.calibration.lag if lag is None else lag
+    motors = log.calibration._replace(lag=lag, delay=delay)
     path = replayed(motors, Pose(*log.poses[0]), log.times.tolist(), log.motors)
     # The first yaw may lie some turns away from that of the log.
     path[:, 2] += 2.0 * np.pi * np.round((log.poses[0, 2] - path[0, 2]) / (2.0 * np.pi))

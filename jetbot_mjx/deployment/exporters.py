@@ -6,7 +6,6 @@ Orbax than this package, and installs a model viewer and a hub client.
 """
 
 import base64
-import importlib
 import json
 import re
 import types
@@ -20,7 +19,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jetbot_mjx.deployment.numpy_policy import Outputs, PortablePolicy
-from jetbot_mjx.errors import MissingPackageError
 
 _TEXT_WIDTH = 96
 
@@ -33,46 +31,22 @@ _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 Act = Callable[[Float[np.ndarray, "n obs"]], Outputs]
 """A function from a batch of observations to actions and wheel speeds."""
 
-
-class Source(NamedTuple):
-    """A `Source` holds everything that is exported."""
-
-    policy: PortablePolicy
-    as_jax: Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]
+AsJax = Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]
+"""The same as a function of JAX."""
 
 
 class Format(NamedTuple):
     """A `Format` describes one kind of exported file."""
 
     file: str
-    write: Callable[[Source, Path], None]
+    write: Callable[[PortablePolicy, AsJax, Path], None]
     read: Callable[[Path], Act]
     """Load the file as its user would, without this package."""
     needs: tuple[str, ...] = ()
     """Packages of the extra `export` that the format needs."""
 
 
-def require(name: str) -> None:
-    """Check that a format can be written and verified on this machine.
-
-    Args:
-      name: A key of `FORMATS`.
-
-    Raises:
-      UserError: A package is missing.
-    """
-    for package in FORMATS[name].needs:
-        try:
-            importlib.import_module(package)
-        except ImportError:
-            raise MissingPackageError(
-                f"--format {name} needs {package}, which is not installed:"
-                " pip install 'jetbot_mjx[export]'"
-            ) from None
-
-
-def _write_numpy(source: Source, path: Path) -> None:
-    policy = source.policy
+def _write_numpy(policy: PortablePolicy, _: AsJax, path: Path) -> None:
     arrays = [policy.mean, policy.std, *(array for layer in policy.layers for array in layer)]
     about = {
         "shapes": [list(array.shape) for array in arrays],
@@ -95,28 +69,26 @@ def _read_numpy(path: Path) -> Act:
     return module.act
 
 
-def _write_stablehlo(source: Source, path: Path) -> None:
+def _write_stablehlo(policy: PortablePolicy, as_jax: AsJax, path: Path) -> None:
     from jax import export
 
-    size = source.policy.mean.size
     (batch,) = export.symbolic_shape("batch")
-    obs = jax.ShapeDtypeStruct((batch, size), np.float32)
-    exported = export.export(jax.jit(source.as_jax), platforms=_PLATFORMS)(obs)
+    obs = jax.ShapeDtypeStruct((batch, policy.mean.size), np.float32)
+    exported = export.export(jax.jit(as_jax), platforms=_PLATFORMS)(obs)
     path.write_bytes(exported.serialize())
 
 
 def _read_stablehlo(path: Path) -> Act:
     from jax import export
 
-    act = jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
-    return lambda obs: act(obs)
+    return jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
 
 
-def _write_onnx(source: Source, path: Path) -> None:
+def _write_onnx(policy: PortablePolicy, _: AsJax, path: Path) -> None:
     import onnx
     from onnx import TensorProto, helper, numpy_helper
 
-    policy, nodes, constants = source.policy, [], []
+    nodes, constants = [], []
 
     def constant(name: str, value: Any) -> str:
         constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
@@ -173,13 +145,8 @@ def _read_onnx(path: Path) -> Act:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-
-    def act(obs: Float[np.ndarray, "n obs"]) -> Outputs:
-        action, wheel_speeds = session.run(["action", "wheel_speeds"], {"obs": obs})
-        return np.asarray(action), np.asarray(wheel_speeds)
-
-    return act
+    session: Any = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    return lambda obs: tuple(session.run(["action", "wheel_speeds"], {"obs": obs}))
 
 
 FORMATS = {

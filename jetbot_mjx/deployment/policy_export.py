@@ -1,12 +1,13 @@
 """Export one policy: write its files, and check each of them against JAX."""
 
+import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from jetbot_mjx.deployment.exporters import FORMATS, Source, require
+from jetbot_mjx.deployment.exporters import FORMATS
 from jetbot_mjx.deployment.numpy_policy import (
     TOLERANCE,
     Recording,
@@ -16,7 +17,7 @@ from jetbot_mjx.deployment.numpy_policy import (
     record,
 )
 from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, requires_extra
 from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
 from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import atomic_folder, write_json, writing_to
@@ -62,13 +63,14 @@ def export_policy(
         else or cannot be written, or the output of a file differs from JAX by too much.
     """
     for name in formats:
-        require(name)
+        with requires_extra("export", f"--format {name}"):
+            for package in FORMATS[name].needs:
+                importlib.import_module(package)
     # Load the policy.
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     folder = checkpoint.run_dir / FOLDER if output is None else Path(output)
     env = checkpoint.make_env()
-    policy = portable_policy(checkpoint)
-    source = Source(policy, as_jax(checkpoint, env))
+    policy, reference = portable_policy(checkpoint), as_jax(checkpoint, env)
     with writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():
             raise UserError(f"{folder} is there and no export: give --out a folder that is not")
@@ -79,7 +81,7 @@ def export_policy(
         for name in formats:
             path = unfinished / FORMATS[name].file
             with stage(f"writing and checking {path.name}"):
-                FORMATS[name].write(source, path)
+                FORMATS[name].write(policy, reference, path)
                 outputs = FORMATS[name].read(path)(recording.obs)
                 found = difference(recording, outputs, policy.controller)
             if not found < TOLERANCE:

@@ -21,15 +21,8 @@ FRAMES = {
     "body": "moves with the robot: axle midpoint, x forward, y left, z up",
 }
 
-_COMPONENTS = {
-    ("quaternion", 4): ["w", "x", "y", "z"],
-    ("position", 3): ["x", "y", "z"],
-    ("linear_velocity", 3): ["x", "y", "z"],
-    ("angular_velocity", 3): ["x", "y", "z"],
-    ("goal_position", 3): ["x", "y", "z"],
-    ("goal_position", 2): ["x", "y"],
-    ("goal_direction", 2): ["x", "y"],
-}
+_VECTORS = ("position", "linear_velocity", "angular_velocity", "goal_position", "goal_direction")
+_COMPONENTS = {"quaternion": "wxyz", **dict.fromkeys(_VECTORS, "xyz")}
 
 
 def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> dict[str, Any]:
@@ -91,12 +84,12 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
 def _observations(layout: Layout) -> list[dict[str, Any]]:
     found, start = [], 0
     for field in layout:
-        components = _COMPONENTS.get((field.name, field.size))
+        components = list(_COMPONENTS.get(field.name, "")[: field.size])
         found.append(
             {
                 "name": field.name,
                 "index": list(range(start, start + field.size)),
-                **({"components": components} if components else {}),
+                **({"components": components} if len(components) == field.size else {}),
                 "unit": field.unit,
                 "frame": field.frame,
             }

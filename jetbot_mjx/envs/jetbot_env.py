@@ -6,6 +6,7 @@ rebuilt inside `step`.
 """
 
 import copy
+import functools
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -86,14 +87,12 @@ class JetBotEnv(brax.envs.Env):
         self.config = config
         self.task: Task = make_task(config.task, task_class)
         self.robot = ROBOTS[config.robot.preset]
+        make_model = functools.partial(
+            make_mj_model, self.robot, config.physics, build_scene=self.task.build_scene
+        )
         try:
-            self.mj_model: mujoco.MjModel = make_mj_model(
-                self.robot, config.physics, build_scene=self.task.build_scene
-            )
-            physics_model = make_mj_model(
-                self.robot, config.physics, build_scene=self.task.build_scene, visual=False
-            )
-            self.physics = Physics(physics_model, config.physics)
+            self.mj_model: mujoco.MjModel = make_model()
+            self.physics = Physics(make_model(visual=False), config.physics)
             self.camera = Camera(config.camera, self.mj_model) if config.task.sees else None
             # MJX may not support a custom scene: build its model now, to fail before a run begins.
             # The model of a built-in task is built later, when a program is compiled.

@@ -4,6 +4,7 @@ The model is the one that MJX gets. Everything but physics (goals, positions of 
 observation, reward, termination) is the code of `JetBotEnv`, compiled by JAX for the CPU.
 """
 
+import copy
 import functools
 import math
 from typing import Any, NamedTuple
@@ -17,12 +18,7 @@ from jaxtyping import Array, Float, UInt32
 from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
-from jetbot_mjx.envs.robot_model import (
-    CONTROLLER_WHEEL_RADIUS,
-    CONTROLLER_WHEEL_SEPARATION,
-    ROBOTS,
-    make_mj_model,
-)
+from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
 from jetbot_mjx.envs.state import PhysicsState, robot_state
 from jetbot_mjx.envs.task import AdvancesGoal, Goal, RobotState, layout_size
 from jetbot_mjx.errors import UserError
@@ -182,13 +178,9 @@ def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
     """
     config = Config.model_validate_json(settings)
     env = make_env(config, task_class)
-    model = make_mj_model(
-        ROBOTS[config.robot.preset],
-        config.physics,
-        build_scene=env.task.build_scene,
-        visual=False,
-        autoreset=False,
-    )
+    # Leave non-finite states to `MujocoJetBot`, which counts them.
+    model = copy.copy(env.physics.mj_model)
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     nq, size = model.nq, model.nq + model.nv
 
     def reset(key: UInt32[Array, "2"]) -> tuple[Any, ...]:

@@ -113,10 +113,9 @@ def make_model(env: JetBotEnv, numerics: Numerics) -> mujoco.MjModel:
         for texture in spec.textures:
             spec.delete(texture)
 
-    model = make_mj_model(
-        env.robot, env.config.physics, build_scene=build_scene, visual=False, autoreset=False
-    )
+    model = make_mj_model(env.robot, env.config.physics, build_scene=build_scene, visual=False)
     option = model.opt
+    option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     option.timestep = env.dt / numerics.substeps
     option.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{numerics.integrator.upper()}")
     option.cone = getattr(mujoco.mjtCone, f"mjCONE_{numerics.cone.upper()}")
@@ -141,15 +140,14 @@ class MujocoPhysics(Physics):
           numerics: the solver settings of C MuJoCo.
           threads: the number of threads, at least 1.
         """
-        self._c_model = make_model(env, numerics)
-        super().__init__(self._c_model, env.config.physics)
+        super().__init__(make_model(env, numerics), env.config.physics)
         self.model = self._base = env.mjx_model
         self._env_dt = env.dt
         self._substeps = numerics.substeps
         self._changed: dict[str, Array] = {}
         """Model arrays that differ from robot to robot, by their names in `MjModel`."""
-        self._model_cache = _ModelCache(self._c_model)
-        self._thread_data = [mujoco.MjData(self._c_model) for _ in range(threads)]
+        self._model_cache = _ModelCache(self.mj_model)
+        self._thread_data = [mujoco.MjData(self.mj_model) for _ in range(threads)]
         # 0 means that `rollout` uses the calling thread.
         self._pool = mujoco.rollout.Rollout(nthread=threads if threads > 1 else 0)
 
@@ -169,7 +167,7 @@ class MujocoPhysics(Physics):
             if new is old:
                 continue
             name = jax.tree_util.keystr(path).lstrip(".")
-            array = getattr(self._c_model, name, None)
+            array = getattr(self.mj_model, name, None)
             if not isinstance(array, np.ndarray) or array.shape != new.shape:
                 raise UserError(
                     f"the model's {name} differs from robot to robot: C MuJoCo's model has no such"
@@ -224,7 +222,7 @@ class MujocoPhysics(Physics):
     ) -> tuple[Float[np.ndarray, "*n nq"], Float[np.ndarray, "*n nv"]]:
         """Step all robots; non-finite ones stay non-finite and are not passed to MuJoCo."""
         # Flatten the batch axes.
-        batch, model = np.shape(qpos)[:-1], self._c_model
+        batch, model = np.shape(qpos)[:-1], self.mj_model
         count = int(np.prod(batch))
         mocap = model.body_pos[model.body_mocapid >= 0] if mocap_pos is None else mocap_pos
         mocap = np.broadcast_to(mocap, (*batch, model.nmocap, 3)).reshape(count, -1)
@@ -248,7 +246,7 @@ class MujocoPhysics(Physics):
         inputs: Float[np.ndarray, "n inputs"],
     ) -> Float[np.ndarray, "n nq+nv"]:
         """Step finite robots with `mujoco.rollout`; a result that diverges becomes NaN."""
-        model, count = self._c_model, len(qpos_qvel)
+        model, count = self.mj_model, len(qpos_qvel)
         # A full state begins with the time, followed by positions and velocities.
         columns = slice(1, 1 + model.nq + model.nv)
         states = np.zeros((count, mujoco.mj_stateSize(model, _WHOLE_STATE)))

@@ -43,7 +43,7 @@ class Physics:
         """
         if jax.config.values["jax_enable_x64"]:
             raise UserError("physics is float32, and JAX_ENABLE_X64 is set: unset it")
-        self._mj_model = mj_model
+        self.mj_model = mj_model
         self._config = config
         self._traced_leaves: tuple[int, ...] = ()
         """Indices of the model's leaves that are traced: they may differ from robot to robot."""
@@ -54,12 +54,12 @@ class Physics:
     @functools.cached_property
     def model(self) -> mjx.Model:
         """Return the MJX model that is stepped."""
-        return mjx.put_model(self._mj_model)
+        return mjx.put_model(self.mj_model)
 
     @functools.cached_property
     def _data(self) -> mjx.Data:
         """Template of the simulation data; a step replaces the fields of `PhysicsState`."""
-        return mjx.make_data(self._mj_model)
+        return mjx.make_data(self.mj_model)
 
     def with_model(self, model: mjx.Model) -> "Physics":
         """Return a copy of this object with another model.
@@ -87,7 +87,7 @@ class Physics:
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
         """Return the names of the solid mocap bodies, which a task places, in MuJoCo's order."""
-        model = self._mj_model
+        model = self.mj_model
         bodies = [model.body(i) for i in range(model.nbody)]
         mocap = sorted((body for body in bodies if body.mocapid[0] >= 0), key=lambda b: b.mocapid)
         return tuple(body.name for body in mocap)
@@ -111,7 +111,7 @@ class Physics:
         """
         leaves = jax.tree.leaves(self.model)
         arrays = [leaves[index] for index in self._traced_leaves]
-        if self._mj_model.nmocap:
+        if self.mj_model.nmocap:
             positions = self._data.mocap_pos if mocap_pos is None else mocap_pos
             arrays.append(jnp.asarray(positions, self._data.mocap_pos.dtype))
         consts = jnp.asarray(ctrl, state.qpos.dtype), arrays
@@ -195,7 +195,7 @@ class Physics:
         def array(*shape: int) -> Any:
             return jax.ShapeDtypeStruct(shape, jnp.float32)
 
-        model = self._mj_model
+        model = self.mj_model
         state = PhysicsState(array(model.nq), array(model.nv), array(model.nv), array())
         leaves = jax.tree.leaves(self.model)
         traced = [

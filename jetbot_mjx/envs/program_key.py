@@ -7,7 +7,6 @@ holds only for the tasks of this package, because the dependencies of any other 
 
 import functools
 import hashlib
-import importlib.metadata
 import json
 import os
 import sys
@@ -19,6 +18,7 @@ import numpy as np
 from jetbot_mjx.compiler.program_cache import ProgramCache, processor
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
+from jetbot_mjx.imports import LIBRARIES, installed_version
 
 _ROOT = Path(__file__).parents[1]
 """Folder of the package, whose complete source is part of the key."""
@@ -28,8 +28,6 @@ TRUSTED = frozenset({f"{_ROOT.name}:GoalTask"})
 
 SOURCES = {".ll", ".py", ".xml"}
 """Suffixes of the files from which programs are made."""
-
-_LIBRARIES = ["brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx", "numpy", "optax"]
 
 
 def open_program_cache(config: Config) -> ProgramCache:
@@ -58,7 +56,7 @@ def open_program_cache(config: Config) -> ProgramCache:
         _own_source(),
         _model(config),
         sys.version,
-        [_version(name) for name in _LIBRARIES],
+        [installed_version(name) for name in LIBRARIES],
         settings,
         os.environ.get("XLA_FLAGS"),
         processor(),
@@ -66,13 +64,6 @@ def open_program_cache(config: Config) -> ProgramCache:
         [device.device_kind for device in devices],
     ]
     return ProgramCache(options, Path(folder), json.dumps(cache_key, sort_keys=True))
-
-
-def _version(library: str) -> str | None:
-    try:
-        return importlib.metadata.version(library)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _model(config: Config) -> str:

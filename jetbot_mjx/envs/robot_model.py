@@ -139,7 +139,6 @@ def make_mj_model(
     *,
     build_scene: Callable[[mujoco.MjSpec], None] = lambda spec: None,
     visual: bool = True,
-    autoreset: bool = True,
 ) -> mujoco.MjModel:
     """Compile the robot and its scene.
 
@@ -148,8 +147,6 @@ def make_mj_model(
       physics: the physics section of the configuration: time step and solver settings.
       build_scene: a function that adds a task's bodies to the scene.
       visual: whether to include visual elements. They do not change physics, but cost kernels.
-      autoreset: whether C MuJoCo resets non-finite states by itself. False leaves them to the
-        caller, who can then count them.
 
     Returns:
       The C model. Its `qpos` is (x, y, z, w, x, y, z, left, right), and in its initial pose,
@@ -169,10 +166,7 @@ def make_mj_model(
     if not visual:
         _remove_visuals(spec)
     _settle(spec)
-    model = spec.compile()
-    if not autoreset:
-        model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
-    return model
+    return spec.compile()
 
 
 def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:

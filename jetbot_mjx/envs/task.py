@@ -284,7 +284,6 @@ class GoalTask:
         self, before: RobotState, after: RobotState, goal: Goal, action: Float[Array, "2"]
     ) -> tuple[Float[Array, ""], Mapping[str, Float[Array, ""]]]:
         """Return the progress towards the goal in this step [m], d(t-1) - d(t)."""
-        del action
         progress = self.distance(before, goal) - self.distance(after, goal)
         return progress, {"progress": progress}
 
@@ -305,7 +304,6 @@ class GoalTask:
 
         A task whose goal has other parts must override this method.
         """
-        del goal
         return position_w
 
     def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]:
@@ -314,7 +312,6 @@ class GoalTask:
 
     def build_scene(self, spec: mujoco.MjSpec) -> None:
         """Add nothing: the cube is part of the base scene."""
-        del spec
 
     def distance(self, robot: RobotState, goal: Goal) -> Float[Array, ""]:
         """Return the 3-D distance from the axle midpoint to the goal [m]."""
@@ -380,14 +377,5 @@ def _check_members(name: str, task: object, members: Sequence[str]) -> None:
         raise InvalidError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
 
 
-METHODS = (
-    "sample",
-    "observe",
-    "reward",
-    "terminated",
-    "success",
-    "goal_position",
-    "markers",
-    "build_scene",
-)
+METHODS = tuple(name for name in vars(Task) if name[0] != "_" and callable(getattr(Task, name)))
 """Methods that every task must have."""

@@ -8,7 +8,7 @@ times for any other task, robot or time step.
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -38,22 +38,13 @@ SETTINGS = (
 _GOAL_TOLERANCE = 1.5e-3  # [m] The file holds whole millimetres.
 
 
-class BestKnownSteps(NamedTuple):
-    """A `BestKnownSteps` holds the best-known times to a report's goals, or why there are none."""
-
-    steps: Float[np.ndarray, " n"] | None
-    """Number of environment steps to each goal."""
-    missing: str | None
-    """The reason why there are no times, in one line."""
-
-
 def settings_of(config: Config) -> dict[str, Any]:
     """Return the settings of a configuration that the times depend on, by key."""
     flat = config.flat()
     return {name: flat[name] for name in SETTINGS}
 
 
-def find(config: Config, episodes: Episodes) -> BestKnownSteps:
+def find(config: Config, episodes: Episodes) -> Float[np.ndarray, " n"] | str:
     """Find the best-known times to the goals on which a policy was evaluated.
 
     Args:
@@ -61,7 +52,7 @@ def find(config: Config, episodes: Episodes) -> BestKnownSteps:
       episodes: the policy's episodes on the first goals of the report, with arrays on the host.
 
     Returns:
-      The times, or the reason why there are none.
+      The number of environment steps to each goal, or in one line why there are no times.
     """
     # Choose the search whose settings differ least from this configuration's.
     searches = [
@@ -70,7 +61,7 @@ def find(config: Config, episodes: Episodes) -> BestKnownSteps:
         if one["goal_set_version"] == GOAL_SET_VERSION
     ]
     if not searches:
-        return BestKnownSteps(None, "no search was made for these goals")
+        return "no search was made for these goals"
     ours = settings_of(config)
     differing = [
         [name for name in SETTINGS if one["settings"][name] != ours[name]] for one in searches
@@ -80,12 +71,12 @@ def find(config: Config, episodes: Episodes) -> BestKnownSteps:
     if names:
         stated = ", ".join(f"{name} = {search['settings'][name]}" for name in names)
         own = ", ".join(str(ours[name]) for name in names)
-        return BestKnownSteps(None, f"the search was made for {stated}, and this run has {own}")
+        return f"the search was made for {stated}, and this run has {own}"
     # Check that the search covers exactly these goals.
     count = episodes.steps.size
     goals, steps = np.asarray(search["goals"], float) / 1e3, np.asarray(search["steps"], float)
     if len(steps) < count:
-        return BestKnownSteps(None, f"the search covers {len(steps):,} of these {count:,} goals")
+        return f"the search covers {len(steps):,} of these {count:,} goals"
     if np.abs(goals[:count] - episodes.goal_w[:, :2]).max() > _GOAL_TOLERANCE:
-        return BestKnownSteps(None, "the search was made for goals at other positions")
-    return BestKnownSteps(steps[:count], None)
+        return "the search was made for goals at other positions"
+    return steps[:count]

@@ -87,26 +87,23 @@ def bootstrap(statistic: Callable[..., Any], *samples: Sequence[float]) -> Estim
     value = float(statistic(*arrays))
     if any(array.size < 2 for array in arrays):
         return Estimate(value)
-    low, high = _interval(statistic, arrays, -1)
+    low, high = bootstrap_interval(statistic, arrays)
     return Estimate(value, float(low), float(high))
 
 
-def mean_band(
-    values: Float[np.ndarray, "seeds n"],
-) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
-    """Compute the intervals of the means over at least two seeds, for each of n quantities.
+def bootstrap_interval(
+    statistic: Callable[..., Any], samples: Sequence[np.ndarray], axis: int = -1
+) -> Any:
+    """Compute the percentile interval of a statistic, for each of n quantities.
 
     Args:
-      values: the quantities of every seed.
+      statistic: a function of the samples and an axis.
+      samples: samples with at least two seeds along the axis.
+      axis: the axis of the seeds.
 
     Returns:
       The lower and the upper ends.
     """
-    low, high = _interval(np.mean, [values], 0)
-    return low, high
-
-
-def _interval(statistic: Callable[..., Any], samples: Sequence[np.ndarray], axis: int) -> Any:
     return scipy.stats.bootstrap(
         samples,
         statistic,

@@ -21,14 +21,14 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.bootstrap import (
     Estimate,
     bootstrap,
+    bootstrap_interval,
     interquartile_mean,
-    mean_band,
     mean_difference,
     median_estimate,
     probability_of_improvement,
 )
 from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary, json_values
-from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.report import CurvePoint, Report
 
 
 class Aggregate(NamedTuple):
@@ -44,16 +44,6 @@ class Aggregate(NamedTuple):
     """Interquartile mean over seeds, without the best and the worst quarter; none for one seed."""
 
 
-class BandPoint(NamedTuple):
-    """A `BandPoint` holds one evaluation during the training of all seeds of a run."""
-
-    env_steps: int
-    success_rate: float
-    """Mean over seeds."""
-    success_low: float
-    success_high: float
-
-
 class Run(NamedTuple):
     """A `Run` holds the results of all seeds of one training."""
 
@@ -62,10 +52,10 @@ class Run(NamedTuple):
     success_rate: Aggregate
     time_to_goal: Aggregate
     """[s] Aggregate of the medians of the seeds."""
-    learning_curve: tuple[BandPoint, ...]
+    learning_curve: tuple[CurvePoint, ...]
     """Evaluations at the steps at which every seed was evaluated.
 
-    The band is over seeds if there are at least two.
+    Rates are means over the seeds; the interval is over seeds if there are at least two.
     """
 
 
@@ -248,19 +238,19 @@ def _over_seeds(values: Sequence[float]) -> Aggregate:
     )
 
 
-def _band(curves: Sequence[Sequence[Any]]) -> tuple[BandPoint, ...]:
+def _band(curves: Sequence[Sequence[CurvePoint]]) -> tuple[CurvePoint, ...]:
     """Return the learning curve over seeds, at the steps that the curves of all seeds share."""
     if len(curves) == 1:
-        return tuple(BandPoint(*point[:4]) for point in curves[0])
+        return tuple(curves[0])
     by_steps = [{point.env_steps: point.success_rate for point in curve} for curve in curves]
     common = sorted(set.intersection(*(set(curve) for curve in by_steps)))
     if not common:
         return ()
     rates = np.array([[curve[step] for step in common] for curve in by_steps])
-    lows, highs = mean_band(rates)
+    lows, highs = bootstrap_interval(np.mean, [rates], axis=0)
     columns = (common, rates.mean(axis=0), lows, highs)
     return tuple(
-        BandPoint(int(step), float(mean), float(low), float(high))
+        CurvePoint(int(step), float(mean), float(low), float(high), None)
         for step, mean, low, high in zip(*columns, strict=True)
     )
 

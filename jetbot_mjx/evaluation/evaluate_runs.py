@@ -1,20 +1,26 @@
 """Evaluate the policies of runs on fixed goals, write their reports, and compare the runs."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple
 
 import jax
 
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.config import Config, RandomizationConfig, load_config
+from jetbot_mjx.config import RandomizationConfig, load_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
-from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, Summary, report_keys, summarize
+from jetbot_mjx.evaluation.evaluator import (
+    BASELINES,
+    REPORT_GOALS,
+    Evaluator,
+    report_keys,
+    summarize,
+)
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
 from jetbot_mjx.evaluation.report import (
     Report,
@@ -34,8 +40,6 @@ Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
 
 _FOLDER = "evaluations"
-
-SIMULATORS: tuple[Simulator, ...] = get_args(Simulator)
 
 
 def evaluate_run(
@@ -69,8 +73,9 @@ def evaluate_run(
       UserError: there is no usable checkpoint, or the folder cannot be written.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
-    options = _Options(episodes, robustness, simulator, _read_ranges(ranges), ranges)
-    return next(_write_reports([checkpoint], options, None if output is None else Path(output)))
+    check_writable(Path(output or checkpoint.results_dir / _FOLDER))
+    reporter = _Reporter(episodes, robustness, ranges, simulator)
+    return reporter.write(checkpoint, checkpoint.make_env(), output)
 
 
 def evaluate_in_mujoco(
@@ -136,22 +141,26 @@ def compare_runs(
     # Load all policies and check that they can be compared.
     entries = _load_runs([Path(path) for path in runs], which)
     check_comparable({name: entry.first.config for name, entry in entries.items()})
-    # Evaluate each policy and write its report.
-    checkpoints = [one for entry in entries.values() for one in entry.seeds.values()]
-    options = _Options(episodes, robustness, simulator, _read_ranges(ranges), ranges)
     first = next(iter(entries.values())).folder
     name = name_with_count("comparison", episodes, REPORT_GOALS, "-goals")
     folder = first / _FOLDER / name if output is None else Path(output)
-    check_writable(folder)
-    reports = _write_reports(checkpoints, options, again=False)
+    # Build all environments first, so that an unsuitable policy is rejected before any writing.
+    policies = [
+        (name, seed, checkpoint, checkpoint.make_env())
+        for name, entry in entries.items()
+        for seed, checkpoint in entry.seeds.items()
+    ]
+    for path in (folder, *(checkpoint.results_dir / _FOLDER for _, _, checkpoint, _ in policies)):
+        check_writable(path)
+    # Evaluate each policy and write its report.
+    reporter = _Reporter(episodes, robustness, ranges, simulator)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
-    with stage("policies", len(checkpoints)) as advance:
-        for name, entry in entries.items():
-            for seed in entry.seeds:
-                report = next(reports)
-                # Drop the trajectories, which are large and already plotted.
-                by_run[name][seed] = report._replace(episodes=report.episodes._replace(qpos=None))
-                advance(1)
+    with stage("policies", len(policies)) as advance:
+        for name, seed, checkpoint, env in policies:
+            report = reporter.write(checkpoint, env, again=False)
+            # Drop the trajectories, which are large and already plotted.
+            by_run[name][seed] = report._replace(episodes=report.episodes._replace(qpos=None))
+            advance(1)
     # Compare the reports and write the comparison.
     comparison = compare(folder.absolute(), by_run)
     with stage("writing the comparison"):
@@ -170,17 +179,6 @@ def _read_ranges(path: str | Path | None) -> RandomizationConfig | None:
             " `randomization`, such as configs/real_jetbot.yaml"
         )
     return ranges
-
-
-class _Options(NamedTuple):
-    """An `_Options` holds what every policy of one command is evaluated on."""
-
-    episodes: int
-    robustness: bool
-    simulator: Simulator | None
-    ranges: RandomizationConfig | None
-    """The ranges of `--ranges`; None: those of each run."""
-    ranges_file: str | Path | None
 
 
 class RunEntry(NamedTuple):
@@ -231,137 +229,118 @@ def _names(entries: Sequence[RunEntry]) -> list[str]:
     return names
 
 
-class _Evaluators(NamedTuple):
-    """An `_Evaluators` tuple holds compiled evaluators, and the baselines of their task."""
+class _Reporter:
+    """A `_Reporter` evaluates policies and writes their reports.
 
-    key: tuple[Any, ...]
-    """The parts of configuration and ranges that the compiled programs depend on."""
-    nominal: Evaluator
-    randomized: Evaluator | None
-    """For robots sampled from the ranges; None if there are no ranges."""
-    mujoco: MujocoEvaluator | None
-    baselines: Mapping[str, Summary]
+    It keeps the compiled evaluators, and the baselines' metrics, as long as they fit the policies.
+    """
 
-    @classmethod
-    def build(
-        cls,
-        checkpoint: Checkpoint,
-        env: JetBotEnv,
-        keys: Any,
-        ranges: RandomizationConfig,
-        *,
-        in_mujoco: bool,
-    ) -> "_Evaluators":
-        networks = checkpoint.networks
-        programs = ProgramCache(compiler_options(checkpoint.config))
-        nominal = Evaluator(env, networks, programs, baselines=True, record=True)
-        baselines = nominal.run_baselines(checkpoint.params, keys)
-        randomized = None
+    def __init__(
+        self,
+        episodes: int,
+        robustness: bool,
+        ranges: str | Path | None,
+        simulator: Simulator | None,
+    ) -> None:
+        """Take the options of `evaluate_run`."""
+        self._keys, self._versions = report_keys(episodes), versions()
+        self._robustness, self._in_mujoco = robustness, robustness or simulator is not None
+        self._ranges, self._ranges_file = _read_ranges(ranges), ranges
+        self._built_for: tuple[Any, ...] = ()
+
+    def _build(self, checkpoint: Checkpoint, env: JetBotEnv, ranges: RandomizationConfig) -> None:
+        """Build the evaluators and evaluate the baselines, unless those that there are fit."""
+        config, params, networks = checkpoint.config, checkpoint.params, checkpoint.networks
+        # The parts of a configuration that the compiled episodes depend on.
+        parts = (
+            config.task,
+            type(env.task),
+            config.robot,
+            config.physics,
+            config.deterministic,
+            config.ppo.network,
+            config.ppo.normalize_observations,
+            ranges,
+        )
+        if parts == self._built_for:
+            return
+        programs = ProgramCache(compiler_options(config))
+        self._nominal = Evaluator(env, networks, programs, baselines=True, record=True)
+        self._baselines = {
+            name: summarize(self._nominal.run(params, self._keys, name), env.dt)
+            for name in BASELINES
+        }
+        self._randomized = None
         if ranges.drawn:
             varied = DomainRandomizationWrapper(env, ranges=ranges)
-            randomized = Evaluator(varied, networks, programs)
-        return cls(
-            key=_program_key(checkpoint.config, env, ranges),
-            nominal=nominal,
-            randomized=randomized,
-            mujoco=MujocoEvaluator(env, networks, ranges) if in_mujoco else None,
-            baselines={name: summarize(each, env.dt) for name, each in baselines.items()},
-        )
+            self._randomized = Evaluator(varied, networks, programs)
+        self._mujoco = MujocoEvaluator(env, networks, ranges) if self._in_mujoco else None
+        self._built_for = parts
 
+    def _on_other_robots(self, checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
+        """Return the fields of a report about other robots and another simulator."""
+        params, keys, found = checkpoint.params, self._keys, {}
+        if self._robustness:
+            sweeper = Sweeper(env, checkpoint.networks, keys[:SWEEP_GOALS])
+            found["robustness"] = sweeper.run(params)
+        if self._randomized:
+            found["randomized"] = summarize(self._randomized.run(params, keys), env.dt)
+        if self._mujoco:
+            found["mujoco"] = self._mujoco.run(params, keys)
+        return found
 
-def _program_key(config: Config, env: JetBotEnv, ranges: RandomizationConfig) -> tuple[Any, ...]:
-    """Return the parts of a configuration that the compiled episodes depend on."""
-    return (
-        config.task,
-        type(env.task),
-        config.robot,
-        config.physics,
-        config.deterministic,
-        config.ppo.network,
-        config.ppo.normalize_observations,
-        ranges,
-    )
+    def write(
+        self,
+        checkpoint: Checkpoint,
+        env: JetBotEnv,
+        output: str | Path | None = None,
+        *,
+        again: bool = True,
+    ) -> Report:
+        """Evaluate a policy and write its report.
 
-
-def _add_other_robots(
-    report: Report,
-    checkpoint: Checkpoint,
-    env: JetBotEnv,
-    evaluators: _Evaluators,
-    options: _Options,
-) -> Report:
-    """Return a report with the optional evaluations on other robots and in another simulator."""
-    params, keys = checkpoint.params, report_keys(options.episodes)
-    if options.robustness:
-        sweep_keys = report_keys(min(options.episodes, SWEEP_GOALS))
-        sweeper = Sweeper(env, checkpoint.networks, sweep_keys)
-        report = report._replace(robustness=sweeper.run(params))
-    if evaluators.randomized:
-        on_others = summarize(evaluators.randomized.run(params, keys), env.dt)
-        report = report._replace(randomized=on_others)
-    if evaluators.mujoco:
-        report = report._replace(mujoco=evaluators.mujoco.run(params, keys))
-    return report
-
-
-def _write_reports(
-    checkpoints: Sequence[Checkpoint],
-    options: _Options,
-    output: Path | None = None,
-    *,
-    again: bool = True,
-) -> Iterator[Report]:
-    """Evaluate policies and write their reports, reusing compiled programs where they fit.
-
-    Args:
-      checkpoints: the policies.
-      options: what they are evaluated on.
-      output: the folder of the report; None: the one that `report_folder` chooses.
-      again: whether to write a report also where there is one that is at least as full.
-    """
-    episodes, robustness, simulator, given_ranges, ranges_file = options
-    in_mujoco = robustness or simulator is not None
-    for checkpoint in checkpoints:
-        check_writable(output or checkpoint.results_dir / _FOLDER)
-    keys, used_versions = report_keys(episodes), versions()
-    # Build all environments first, so that an unsuitable policy is rejected before any writing.
-    envs = [checkpoint.make_env() for checkpoint in checkpoints]
-    evaluators = None
-    for checkpoint, env in zip(checkpoints, envs, strict=True):
-        config, params = checkpoint.config, checkpoint.params
-        ranges = given_ranges or config.randomization
+        Args:
+          checkpoint: the policy.
+          env: its environment.
+          output: the folder of the report; None: the one that `report_folder` chooses.
+          again: whether to write a report also where there is one that is at least as full.
+        """
+        config, ranges = checkpoint.config, self._ranges or checkpoint.config.randomization
         # Choose the folder of the report.
-        parts = {"robustness": robustness, "mujoco": in_mujoco, "randomized": bool(ranges.drawn)}
+        parts = {
+            "robustness": self._robustness,
+            "mujoco": self._in_mujoco,
+            "randomized": bool(ranges.drawn),
+        }
         has = frozenset(name for name, wanted in parts.items() if wanted)
-        wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, episodes, has
+        wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, len(self._keys), has
         fuller = None if again else find_report(*wanted)
-        if evaluators is None or evaluators.key != _program_key(config, env, ranges):
-            evaluators = _Evaluators.build(checkpoint, env, keys, ranges, in_mujoco=in_mujoco)
         # Run the fixed goals, which most parts of the report are computed from.
-        finished = jax.device_get(evaluators.nominal.run(params, keys))
+        self._build(checkpoint, env, ranges)
+        finished = jax.device_get(self._nominal.run(checkpoint.params, self._keys))
         best_known, missing = compare_with_best_known(config, finished)
         run_dir = shortened(checkpoint.run_dir)
         history = read_history(checkpoint.run_dir / METRICS)
         report = Report(
-            folder=output or fuller or report_folder(*wanted),
+            folder=Path(output or fuller or report_folder(*wanted)),
             run=run_dir,
             checkpoint=checkpoint.path,
             env_steps=checkpoint.env_steps,
             config=config,
             policy=summarize(finished, env.dt),
-            baselines=evaluators.baselines,
+            baselines=self._baselines,
             goal_bins=by_goal(finished, env.dt),
             failures=find_failures(finished, run_dir, checkpoint.env_steps),
             learning_curve=learning_curve((one.env_steps, one.metrics) for one in history),
             episodes=finished,
-            versions=used_versions,
+            versions=self._versions,
             ranges=ranges if ranges.drawn else None,
-            ranges_file=None if ranges_file is None else Path(ranges_file),
+            ranges_file=None if self._ranges_file is None else Path(self._ranges_file),
             best_known=best_known,
             best_known_missing=missing,
+            **self._on_other_robots(checkpoint, env),
         )
-        report = _add_other_robots(report, checkpoint, env, evaluators, options)
         if fuller is None:
             with stage("writing the report"):
                 write_report(report)
-        yield report
+        return report

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Bool, Float, UInt32
 
 from jetbot_mjx.agents.networks import Networks, PolicyParams, make_policy
 from jetbot_mjx.compiler.program_cache import ProgramCache
@@ -89,22 +89,39 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
     """
     host = jax.device_get(episodes._replace(qpos=None, goal=None))
     won = host.success > 0
-    count, wins = won.size, int(won.sum())
-    low, high = wilson_interval(wins, count)
-    seconds = host.steps[won] * ctrl_dt
+    seconds = host.steps * ctrl_dt
     return Summary(
-        episodes=count,
-        successes=wins,
-        success_rate=wins / count,
-        success_low=low,
-        success_high=high,
-        time_to_goal_median=float(np.median(seconds)) if wins else None,
-        time_to_goal_p95=float(np.percentile(seconds, 95)) if wins else None,
-        path_efficiency=float(path_efficiencies(host)[won].mean()) if wins else None,
+        **success_and_time(won, seconds),
+        time_to_goal_p95=float(np.percentile(seconds[won], 95)) if won.any() else None,
+        path_efficiency=float(path_efficiencies(host)[won].mean()) if won.any() else None,
         episode_return=float(host.episode_return.mean()),
         final_distance_median=float(np.median(final_distances(host))),
         nonfinite_envs=int(host.nonfinite.sum()),
     )
+
+
+def success_and_time(
+    won: Bool[np.ndarray, " n"], seconds: Float[np.ndarray, " n"]
+) -> dict[str, Any]:
+    """Compute the fields that a `Summary` shares with the results in a range of goals.
+
+    Args:
+      won: whether each episode succeeded.
+      seconds: the duration of each episode [s].
+
+    Returns:
+      The fields by name; None where there is no episode, or no success.
+    """
+    count, wins = won.size, int(won.sum())
+    low, high = wilson_interval(wins, count) if count else (None, None)
+    return {
+        "episodes": count,
+        "successes": wins,
+        "success_rate": wins / count if count else None,
+        "success_low": low,
+        "success_high": high,
+        "time_to_goal_median": float(np.median(seconds[won])) if wins else None,
+    }
 
 
 def json_values(value: Any) -> Any:
@@ -166,11 +183,7 @@ def policy_controller(networks: Networks) -> Controller:
     Returns:
       The controller.
     """
-
-    def act(params: PolicyParams, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        return make_policy(networks, params)(state.obs)
-
-    return act
+    return lambda params, state, key: make_policy(networks, params)(state.obs)
 
 
 class Evaluator:
@@ -191,55 +204,38 @@ class Evaluator:
           env: one unwrapped environment, or one with domain randomization.
           networks: the networks of the policies to evaluate.
           programs: the cache of compiled programs for the environment's configuration.
-          baselines: whether `run_baselines` will be called.
+          baselines: whether `run` can also run the controllers of `BASELINES`.
           record: whether to record trajectories.
         """
         self._env = env
-        self._names = ["policy", *(BASELINES if baselines else ())]
-        controllers = [policy_controller(networks)]
+        controllers = {"policy": policy_controller(networks)}
         if baselines:
-            controllers += [make(env) for make in BASELINES.values()]
+            controllers |= {name: make(env) for name, make in BASELINES.items()}
+        self._names = list(controllers)
         length = env.config.task.episode_length
-        self._run = jax.jit(rollout_fn(env, controllers, length, record=record))
+        self._run = jax.jit(rollout_fn(env, [*controllers.values()], length, record=record))
         drawn = ", drawn" if isinstance(env, DomainRandomizationWrapper) else ""
         self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
         self._robots = " on drawn robots" if drawn else ""
         self._programs = programs
         self._compiled: dict[int, jax.stages.Compiled] = {}
 
-    def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
-        """Run deterministic episodes of a policy.
+    def run(
+        self, params: PolicyParams, keys: UInt32[Array, "n 2"], controller: str = "policy"
+    ) -> Episodes:
+        """Run deterministic episodes of a policy, or episodes of a baseline.
 
         Args:
-          params: parameters of the policy.
+          params: parameters of the policy, or of any policy for a baseline.
           keys: one reset key for each episode.
+          controller: `policy`, or one of `BASELINES`.
 
         Returns:
           The episodes.
         """
-        return self._episodes(0, params, keys)
-
-    def run_baselines(
-        self, params: PolicyParams, keys: UInt32[Array, "n 2"]
-    ) -> dict[str, Episodes]:
-        """Run the same episodes under each baseline.
-
-        Args:
-          params: parameters of any policy, which the program needs but the baselines do not use.
-          keys: one reset key for each episode.
-
-        Returns:
-          The episodes by the name of the baseline.
-        """
-        return {
-            name: self._episodes(index, params, keys)
-            for index, name in enumerate(self._names)
-            if index > 0
-        }
-
-    def _episodes(self, index: int, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> Episodes:
         # Move the parameters to the host: those from a trainer carry its sharding, and a compiled
         # program accepts only the sharding that it was compiled for.
+        index = self._names.index(controller)
         arguments = np.int32(index), jax.device_get(params), np.asarray(keys)
         count = len(keys)
         if count not in self._compiled:
@@ -247,24 +243,18 @@ class Evaluator:
                 self._compiled[count] = self._programs.compile(
                     f"{count} {self._name}", lambda: self._run.trace(*arguments)
                 )
-        with stage(f"episodes, {self._names[index]}{self._robots}", count):
+        with stage(f"episodes, {controller}{self._robots}", count):
             return jax.block_until_ready(self._compiled[count](*arguments))
 
 
 def _random(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
-    def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        return jax.random.uniform(key, (env.action_size,), minval=-1.0, maxval=1.0)
-
-    return act
+    shape = (env.action_size,)
+    return lambda params, state, key: jax.random.uniform(key, shape, minval=-1.0, maxval=1.0)
 
 
 def _constant(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     """Return a controller that holds the middle of the action range: half speed straight ahead."""
-
-    def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        return jnp.zeros(env.action_size)
-
-    return act
+    return lambda params, state, key: jnp.zeros(env.action_size)
 
 
 def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:

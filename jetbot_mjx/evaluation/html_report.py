@@ -9,7 +9,7 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jinja2
 from markupsafe import Markup
@@ -57,14 +57,6 @@ _PAGES = jinja2.Environment(
 
 # Escape vertical bars, which would start the next cell of a Markdown table.
 _PAGES.filters["cell"] = lambda text: text.replace("|", "\\|")
-
-
-class _Image(NamedTuple):
-    """An `_Image` holds one figure of a page: its file and data URIs of both themes."""
-
-    file: str
-    light: str
-    dark: str
 
 
 def write_report(report: Report) -> Path:
@@ -140,10 +132,10 @@ def _write(
     more: Mapping[str, Any],
 ) -> Path:
     """Draw all figures and render all pages, then write the files, the HTML page last."""
-    pngs_by_figure = {figure: _draw(draw) for figure, draw in figures.items()}
+    drawn = {figure: _draw(draw) for figure, draw in figures.items()}
     images = {
-        figure: _Image(f"{figure}.png", *(_data_uri(png) for png in pngs))
-        for figure, pngs in pngs_by_figure.items()
+        figure: {"file": f"{figure}.png", **{name: _data_uri(png) for name, png in pngs.items()}}
+        for figure, pngs in drawn.items()
     }
     pages = {
         suffix: _PAGES.get_template(f"{name}{suffix}").render(
@@ -154,22 +146,22 @@ def _write(
     make_folder(folder)
     with writing_to(folder):
         # Remove figures of an earlier report that this one does not have.
-        for figure in sorted(_OPTIONAL_FIGURES[name] - pngs_by_figure.keys()):
+        for figure in sorted(_OPTIONAL_FIGURES[name] - drawn.keys()):
             (folder / f"{figure}.png").unlink(missing_ok=True)
-        for figure, (light, _) in pngs_by_figure.items():
-            write_bytes(folder / f"{figure}.png", light)
+        for figure, pngs in drawn.items():
+            write_bytes(folder / f"{figure}.png", pngs["light"])
         write_json(folder / f"{name}.json", values)
         for suffix, text in pages.items():
             write_text(folder / f"{name}{suffix}", text)
     return folder / f"{name}.html"
 
 
-def _draw(draw: Callable[[], Figure]) -> list[bytes]:
-    """Draw a figure in every theme and return the PNG files."""
-    pngs = []
+def _draw(draw: Callable[[], Figure]) -> dict[str, bytes]:
+    """Draw a figure in every theme and return the PNG files, by the name of the theme."""
+    pngs = {}
     for name in plots.THEMES:
         with plots.theme(name):
-            pngs.append(plots.to_png(draw()))
+            pngs[name] = plots.to_png(draw())
     return pngs
 
 
@@ -181,7 +173,9 @@ def _numbers(values: Mapping[str, Any], suffix: str) -> Callable[[str, str], str
     """Return a function that formats a JSON value by its path, such as `policy.success_rate`."""
 
     def number(place: str, form: str) -> str:
-        value = _look_up(values, place)
+        value: Any = values
+        for key in place.split("."):
+            value = value[int(key)] if isinstance(value, list) else value[key]
         text = "-" if value is None else _FORMS[form].format(value)
         if suffix != ".html":
             return text
@@ -189,9 +183,3 @@ def _numbers(values: Mapping[str, Any], suffix: str) -> Callable[[str, str], str
         return Markup('<data value="{}" data-json="{}">{}</data>').format(exact, place, text)
 
     return number
-
-
-def _look_up(values: Any, place: str) -> Any:
-    for key in place.split("."):
-        values = values[int(key)] if isinstance(values, list) else values[key]
-    return values

@@ -1,17 +1,15 @@
 """Plot the learning curves of trainings and the results that several of them reach."""
 
 from collections.abc import Sequence
-from typing import Any
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, PercentFormatter
+from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from jetbot_mjx.evaluation.comparison import Aggregate, BandPoint, Comparison
+from jetbot_mjx.evaluation.comparison import Aggregate, Comparison
 from jetbot_mjx.evaluation.plots import plot_rates
-from jetbot_mjx.evaluation.report import Report
+from jetbot_mjx.evaluation.report import CurvePoint, Report
 
 
 def plot_learning_curve(report: Report) -> Figure:
@@ -25,24 +23,14 @@ def plot_learning_curve(report: Report) -> Figure:
     """
     figure = Figure(figsize=(10.4, 3.6), layout="constrained")
     axes = figure.add_subplot()
-    _curve(axes, report.learning_curve, "C0", "during the training, its own goals")
-    policy = report.policy
-    error = [
-        [policy.success_rate - policy.success_low],
-        [policy.success_high - policy.success_rate],
-    ]
-    axes.axvline(report.env_steps, color=matplotlib.rcParams["grid.color"], lw=1, zorder=0)
-    axes.errorbar(
-        [report.env_steps],
-        [policy.success_rate],
-        np.abs(error),
-        fmt="D",
-        color="C1",
-        markersize=5,
-        capsize=4,
-        label="this report, the report's goals",
-        zorder=3,
-    )
+    steps = [point.env_steps for point in report.learning_curve]
+    label = "during the training, its own goals"
+    plot_rates(axes, steps, report.learning_curve, color="C0", label=label)
+    policy, x = report.policy, report.env_steps
+    interval, label = [policy.success_low, policy.success_high], "this report, the report's goals"
+    axes.axvline(x, color=matplotlib.rcParams["grid.color"], lw=1, zorder=0)
+    axes.plot(x, policy.success_rate, "D", color="C1", markersize=5, label=label, zorder=3)
+    axes.plot([x, x], interval, color="C1", marker="_", markersize=8, zorder=3)
     _label_curves(axes)
     return figure
 
@@ -59,37 +47,26 @@ def plot_learning_curves(comparison: Comparison) -> Figure:
     figure = Figure(figsize=(10.4, 4.0), layout="constrained")
     axes = figure.add_subplot()
     # Draw the curve once for two checkpoints of the same run.
-    named: dict[tuple[BandPoint, ...], list[str]] = {}
+    named: dict[tuple[CurvePoint, ...], list[str]] = {}
     for run in comparison.runs:
         seeds = f", {len(run.seeds)} seeds" if len(run.seeds) > 1 else ""
         named.setdefault(run.learning_curve, []).append(run.name + seeds)
     colours = {run.learning_curve: f"C{index}" for index, run in enumerate(comparison.runs)}
     for points, names in named.items():
         if points:
-            _curve(axes, points, colours[points], "; ".join(names))
+            steps = [point.env_steps for point in points]
+            plot_rates(axes, steps, points, color=colours[points], label="; ".join(names))
     _label_curves(axes)
     return figure
-
-
-def _curve(axes: Axes, points: Sequence[Any], colour: str, label: str) -> None:
-    steps = [point.env_steps for point in points]
-    plot_rates(axes, steps, points, color=colour, label=label, alpha=0.2, markersize=3)
 
 
 def _label_curves(axes: Axes) -> None:
     axes.set(xlabel="environment steps", ylabel="success rate", ylim=(-0.02, 1.04))
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda steps, _: _short(steps)))
+    axes.xaxis.set_major_formatter(EngFormatter())
     axes.grid()
     axes.set_axisbelow(True)
     axes.legend(loc="best", fontsize="small")
-
-
-def _short(count: float) -> str:
-    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
-        if abs(count) >= size:
-            return f"{count / size:g} {letter}"
-    return f"{count:g}"
 
 
 def plot_runs(comparison: Comparison) -> Figure:

@@ -319,8 +319,6 @@ def plot_rates(
     *,
     color: str,
     label: str,
-    alpha: float = 0.25,
-    markersize: float = 4,
 ) -> None:
     """Plot success rates over x, with their intervals as a band.
 
@@ -330,11 +328,9 @@ def plot_rates(
       points: objects with a success rate and the ends of its interval.
       color: the colour of line and band.
       label: the label of the line.
-      alpha: the opacity of the band.
-      markersize: the size of the points.
     """
     low = [point.success_low for point in points]
     high = [point.success_high for point in points]
-    axes.fill_between(x, low, high, color=color, alpha=alpha, lw=0)
+    axes.fill_between(x, low, high, color=color, alpha=0.25, lw=0)
     rates = [point.success_rate for point in points]
-    axes.plot(x, rates, color=color, marker="o", markersize=markersize, label=label)
+    axes.plot(x, rates, color=color, marker="o", markersize=4, label=label)

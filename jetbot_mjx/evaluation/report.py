@@ -21,7 +21,7 @@ from jetbot_mjx.evaluation.evaluator import (
     Summary,
     final_distances,
     json_values,
-    wilson_interval,
+    success_and_time,
 )
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -94,6 +94,7 @@ class CurvePoint(NamedTuple):
     success_low: float
     success_high: float
     time_to_goal_median: float | None
+    """[s] Median over the successes; None without a success, and in a curve over several seeds."""
 
 
 class TimeGap(NamedTuple):
@@ -176,30 +177,21 @@ class Report(NamedTuple):
 
     def to_json(self) -> dict[str, Any]:
         """Return everything except the episodes as JSON values."""
-        values = {
-            "goal_set_version": GOAL_SET_VERSION,
+        apart = ("folder", "config", "goal_bins", "episodes", "ranges_file")
+        fields = {name: value for name, value in self._asdict().items() if name not in apart}
+        converted = {
             "run": self.name,
             "checkpoint": self.checkpoint.name,
-            "env_steps": self.env_steps,
             "settings": {
                 key: value
                 for key, value in self.config.flat().items()
                 if key in _SETTINGS or key.startswith("task.")
             },
-            "policy": self.policy,
-            "baselines": self.baselines,
-            "best_known": self.best_known,
-            "best_known_missing": self.best_known_missing,
             "cells": self.goal_bins,
-            "failures": self.failures,
-            "learning_curve": self.learning_curve,
             "robustness": as_json(self.robustness) if self.robustness else None,
-            "randomized": self.randomized,
             "ranges": self.ranges.drawn if self.ranges else None,
-            "mujoco": self.mujoco,
-            "versions": self.versions,
         }
-        return json_values(values)
+        return json_values({"goal_set_version": GOAL_SET_VERSION, **fields, **converted})
 
 
 def goal_positions(episodes: Episodes) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
@@ -239,7 +231,7 @@ def by_goal(episodes: Episodes, ctrl_dt: float) -> tuple[GoalBin, ...]:
         for s in range(SECTORS):
             here = (ring == r) & (sector == s)
             limits = (edges[r], edges[r + 1], *_sector_limits(s))
-            bins.append(_goal_bin(limits, won[here], seconds[here]))
+            bins.append(GoalBin(*limits, **success_and_time(won[here], seconds[here])))
     return tuple(bins)
 
 
@@ -266,10 +258,10 @@ def compare_with_best_known(
     Returns:
       The comparison and None, or None and the reason why there is no comparison.
     """
-    known = best_known.find(config, episodes)
-    if known.steps is None:
-        return None, known.missing
-    best = known.steps * config.physics.ctrl_dt
+    steps = best_known.find(config, episodes)
+    if isinstance(steps, str):
+        return None, steps
+    best = steps * config.physics.ctrl_dt
     seconds = np.asarray(episodes.steps, float) * config.physics.ctrl_dt
     won, sector = np.asarray(episodes.success) > 0, _sectors(goal_positions(episodes)[1])
 
@@ -293,22 +285,6 @@ def _ring_edges(distance: Float[np.ndarray, " n"]) -> list[float]:
     return [
         round(float(edge), 4) for edge in np.linspace(low, max(high, low + _EDGE_STEP), rings + 1)
     ]
-
-
-def _goal_bin(
-    limits: tuple[float, float, float, float], won: np.ndarray, seconds: Float[np.ndarray, " n"]
-) -> GoalBin:
-    count, wins = won.size, int(won.sum())
-    low, high = wilson_interval(wins, count) if count else (None, None)
-    return GoalBin(
-        *limits,
-        episodes=count,
-        successes=wins,
-        success_rate=wins / count if count else None,
-        success_low=low,
-        success_high=high,
-        time_to_goal_median=float(np.median(seconds[won])) if wins else None,
-    )
 
 
 def find_failures(episodes: Episodes, run: Path, env_steps: int) -> tuple[Failure, ...]:

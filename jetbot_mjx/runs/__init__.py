@@ -8,7 +8,7 @@ if TYPE_CHECKING:
     from jetbot_mjx.runs.checkpoint import PRETRAINED as PRETRAINED
     from jetbot_mjx.runs.checkpoint import load_checkpoint as load_checkpoint
     from jetbot_mjx.runs.checkpoint import load_policy as load_policy
-    from jetbot_mjx.runs.nan_replay import replay_nan_dump as replay_nan_dump
-    from jetbot_mjx.runs.pretrained_runs import copy_pretrained as copy_pretrained
+    from jetbot_mjx.runs.find_run import copy_pretrained as copy_pretrained
+    from jetbot_mjx.runs.nan_dump import replay_nan_dump as replay_nan_dump
 
 __getattr__, __dir__ = load_lazily(__name__)

@@ -29,6 +29,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     checkpoint_steps,
     read_about,
     read_tree,
+    stored_success_rate,
 )
 from jetbot_mjx.runs.find_run import PRETRAINED as PRETRAINED
 from jetbot_mjx.runs.find_run import ROOT, find_run, list_runs, suggest_run
@@ -121,13 +122,16 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
     about = explanation(folder)
     try:
         config = parse_config(about["config"], source="stored config")
-        networks = make_networks(
-            config.ppo.network,
-            about["observation_size"],
-            about["action_size"],
-            normalize=config.ppo.normalize_observations,
+        size = about["observation_size"]
+        networks = make_networks(config.ppo, size, about["action_size"])
+        template = jax.eval_shape(
+            lambda key: PolicyParams(
+                init_normalizer(size),
+                networks.policy_network.init(key),
+                networks.value_network.init(key),
+            ),
+            jax.random.PRNGKey(0),
         )
-        template = policy_template(networks, about["observation_size"])
     except (KeyError, TypeError, ConfigError) as error:
         raise CheckpointError(f"checkpoint {folder} has unusable metadata: {error}") from None
     return Checkpoint(
@@ -273,7 +277,7 @@ def _find(path: Path, which: Which) -> Path:
         step = steps[-1]
     elif which == "best":
         # Prefer the later of equally good ones, because it was trained for longer.
-        step = max(steps, key=lambda step: (_success_rate(checkpoint_path(path, step)), step))
+        step = max(steps, key=lambda step: (stored_success_rate(path, step), step))
     elif which in steps:
         step = which
     else:
@@ -282,25 +286,3 @@ def _find(path: Path, which: Which) -> Path:
             f"no checkpoint at {which} steps in {path}: there are {known}"
         )
     return checkpoint_path(path, step)
-
-
-def _success_rate(folder: Path) -> float:
-    """Return a checkpoint's success rate, or -1 if it was not evaluated or cannot be read."""
-    try:
-        return float(explanation(folder)["metrics"].get("success_rate", -1.0))
-    except CheckpointError:
-        return -1.0
-
-
-def policy_template(networks: Any, observation_size: int | dict[str, list[int]]) -> PolicyParams:
-    """Return the shapes and dtypes of a policy's parameters, without any values."""
-
-    def init() -> PolicyParams:
-        key = jax.random.PRNGKey(0)
-        return PolicyParams(
-            normalizer=init_normalizer(observation_size),
-            policy=networks.policy_network.init(key),
-            value=networks.value_network.init(key),
-        )
-
-    return jax.eval_shape(init)

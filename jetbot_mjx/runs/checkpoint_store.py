@@ -85,7 +85,9 @@ class CheckpointStore:
           run_dir: the run folder, which must exist.
           keep: the number of latest checkpoints to keep, besides the first and the best.
         """
-        self._success = {step: _success_rate(run_dir, step) for step in checkpoint_steps(run_dir)}
+        self._success = {
+            step: stored_success_rate(run_dir, step) for step in checkpoint_steps(run_dir)
+        }
         options = ocp.CheckpointManagerOptions(
             create=False,
             multiprocessing_options=_single_process_options(),
@@ -308,8 +310,8 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
     wanted = flatten(template)
     try:
         flat = _read_arrays(path / name, wanted)
-    except _OtherArraysError as error:
-        raise CheckpointError(f"checkpoint {path} cannot be read: {error}") from None
+    except CheckpointError:
+        raise
     # TensorStore reports a damaged folder by many kinds of exception.
     except Exception as error:
         raise CheckpointError(
@@ -338,7 +340,7 @@ def digest(tree: Any) -> str:
     return total.hexdigest()
 
 
-def _success_rate(run_dir: Path, env_steps: int) -> float:
+def stored_success_rate(run_dir: Path, env_steps: int) -> float:
     """Return a checkpoint's success rate, or -1 if it was not evaluated or is damaged."""
     try:
         rate = read_about(checkpoint_path(run_dir, env_steps)).get(_SUCCESS)
@@ -352,10 +354,6 @@ def _digest_json(values: Mapping[str, Any]) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-class _OtherArraysError(Exception):
-    """Raised when a checkpoint holds other arrays than are wanted."""
-
-
 def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarray]:
     """Read the arrays that Orbax wrote, one after the other, and raise at the first wrong one.
 
@@ -363,7 +361,9 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
     caller cannot catch.
     """
     if not folder.is_dir():
-        raise _OtherArraysError(f"{folder.name} is missing")
+        raise CheckpointError(
+            f"checkpoint {folder.parent} cannot be read: {folder.name} is missing"
+        )
     # TensorStore refuses a path with `..` in it.
     files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
     keys = [key.decode() for key in ts.KvStore.open(files).result().list().result()]
@@ -372,16 +372,15 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
     for name in names:
         place = {**files, "path": f"{name}/"}
         stored[name] = ts.open({"driver": "zarr", "kvstore": place}, read=True).result()
-    _check_arrays(wanted, stored)
-    return {name: array.read().result() for name, array in stored.items()}
-
-
-def _check_arrays(wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
-    """Raise an error if names, shapes or dtypes of the stored arrays are not as wanted."""
+    # Compare names, shapes and dtypes before anything is read.
     for name in sorted(wanted.keys() | stored.keys()):
         ours, theirs = (_describe(arrays.get(name)) for arrays in (wanted, stored))
         if ours != theirs:
-            raise _OtherArraysError(f"{name} is {theirs}, and should be {ours}")
+            raise CheckpointError(
+                f"checkpoint {folder.parent} cannot be read: {name} is {theirs}, and should be"
+                f" {ours}"
+            )
+    return {name: array.read().result() for name, array in stored.items()}
 
 
 def _reason(error: Exception) -> str:

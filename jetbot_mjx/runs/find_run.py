@@ -1,4 +1,4 @@
-"""Find runs by name, and list them.
+"""Find runs by name, list them, and copy those that come with the package.
 
 A run may be named by its path, by its folder's name in `runs/`, as `latest`, or, if it comes with
 the package, as `pretrained:NAME`.
@@ -6,6 +6,7 @@ the package, as `pretrained:NAME`.
 
 import difflib
 import os
+import shutil
 import time
 from pathlib import Path
 from typing import NamedTuple
@@ -13,7 +14,7 @@ from typing import NamedTuple
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import NotFoundError, UserError
 from jetbot_mjx.runs.metrics import METRICS, read_history
-from jetbot_mjx.runs.run_dir import CONFIG, stored_config
+from jetbot_mjx.runs.run_dir import CONFIG, atomic_folder, stored_config
 from jetbot_mjx.runs.text_table import text_table
 
 ROOT = Path("runs")
@@ -154,6 +155,28 @@ def _find_pretrained(name: str) -> Path:
     raise NotFoundError(
         f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}"
     )
+
+
+def copy_pretrained(folder: Path) -> tuple[Path, ...]:
+    """Copy the runs that come with the package, without overwriting anything.
+
+    Args:
+      folder: The folder in which each run gets a folder of its own.
+
+    Returns:
+      The run folders, named after their configurations. Each is complete or absent.
+
+    Raises:
+      UserError: one of them exists already, or cannot be written.
+    """
+    runs = {path: folder / path.name for path in sorted(PRETRAINED.iterdir())}
+    for target in runs.values():
+        if target.exists():
+            raise UserError(f"{target} is there already: give --out another folder")
+    for source, target in runs.items():
+        with atomic_folder(target) as unfinished:
+            shutil.copytree(source, unfinished, dirs_exist_ok=True)
+    return tuple(runs.values())
 
 
 def suggest_run(path: Path, root: Path = ROOT) -> str:

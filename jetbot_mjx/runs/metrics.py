@@ -69,50 +69,12 @@ class Sink(Protocol):
 
     def write(self, env_steps: int, metrics: MetricValues) -> None:
         """Write the metrics at one environment step; a metric without a value is None."""
-        ...
 
     def write_video(self, env_steps: int, mp4: Path) -> None:
         """Write the video of an evaluation, beside which there is a GIF of the same name."""
-        ...
 
     def close(self) -> None:
         """Write what is still buffered, and close."""
-        ...
-
-
-class Sinks:
-    """A `Sinks` object combines several sinks, and as a context manager closes them all."""
-
-    def __init__(self, sinks: Sequence[Sink]) -> None:
-        """Combine sinks.
-
-        Args:
-          sinks: the sinks, which receive the metrics in this order.
-        """
-        self._sinks = sinks
-
-    def write(self, env_steps: int, metrics: MetricValues) -> None:
-        """Write the metrics to every sink."""
-        for sink in self._sinks:
-            sink.write(env_steps, metrics)
-
-    def write_video(self, env_steps: int, mp4: Path) -> None:
-        """Write the video to every sink."""
-        for sink in self._sinks:
-            sink.write_video(env_steps, mp4)
-
-    def close(self) -> None:
-        """Close every sink."""
-        for sink in self._sinks:
-            sink.close()
-
-    def __enter__(self) -> Self:
-        """Return the object itself."""
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Close every sink."""
-        self.close()
 
 
 def mean_of(metrics: Sequence[MetricValues]) -> MetricValues:

@@ -9,7 +9,6 @@ for each of them, with all of that inside.
 import contextlib
 import datetime
 import errno
-import importlib.metadata
 import json
 import os
 import platform
@@ -24,26 +23,12 @@ import jax
 
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.imports import LIBRARIES, installed_version
 
 try:
     import fcntl
 except ModuleNotFoundError:  # on Windows
     fcntl = None
-
-_PACKAGES = (
-    "jetbot_mjx",
-    "jax",
-    "jaxlib",
-    "llvmlite",
-    "mujoco",
-    "mujoco-mjx",
-    "brax",
-    "flax",
-    "optax",
-    "orbax-checkpoint",
-    "numpy",
-)
-
 
 CONFIG = "config.yaml"
 """Name of the file in a run folder that holds the resolved configuration."""
@@ -246,10 +231,11 @@ def shortened(path: Path) -> Path:
 def versions() -> dict[str, Any]:
     """Return the versions of packages and Python, the machine, the devices and the git state."""
     devices = jax.devices()
+    packages = ("jetbot_mjx", *LIBRARIES, "orbax-checkpoint")
     return {
         "python": platform.python_version(),
         "platform": f"{platform.system()} {platform.machine()}",
-        "packages": {name: _version(name) for name in _PACKAGES},
+        "packages": {name: installed_version(name) for name in packages},
         "device": devices[0].device_kind,
         "device_platform": devices[0].platform,
         "device_count": len(devices),
@@ -275,13 +261,6 @@ def write_bytes(path: Path, content: bytes) -> None:
         unfinished.replace(path)
     finally:
         unfinished.unlink(missing_ok=True)
-
-
-def _version(name: str) -> str | None:
-    try:
-        return importlib.metadata.version(name)
-    except importlib.metadata.PackageNotFoundError:
-        return None
 
 
 def _git_state() -> dict[str, Any] | None:

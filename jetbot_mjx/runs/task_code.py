@@ -46,18 +46,6 @@ class TaskCode(NamedTuple):
     files: tuple[tuple[str, bytes], ...]
     """Path and content of each file; paths are relative to the folder that imports begin in."""
 
-    def to_bytes(self) -> bytes:
-        """Return the source as bytes, to be sent to another process."""
-        files = {path: content.decode("latin-1") for path, content in self.files}
-        return json.dumps({"module": self.module, "files": files}).encode()
-
-    @classmethod
-    def from_bytes(cls, content: bytes) -> "TaskCode":
-        """Return the source that another process has sent."""
-        sent = json.loads(content)
-        files = ((path, text.encode("latin-1")) for path, text in sent["files"].items())
-        return cls(sent["module"], tuple(files))
-
 
 def collect_task_code(name: str) -> TaskCode | None:
     """Read the source files that a task consists of.
@@ -197,7 +185,8 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type
     else:
         _say(f"running the task's code stored in {shortened(main)}", code)
     try:
-        found = _stored_modules(run_dir / FOLDER, code).load(module)
+        importer = _importers.setdefault(code, _StoredModules(run_dir / FOLDER, code))
+        found = importer.load(module)
     except ModuleNotFoundError as error:
         raise UserError(
             f"{shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
@@ -290,7 +279,7 @@ class _StoredModules(importlib.abc.MetaPathFinder):
             for length in range(1, name.count(".") + 2)
         }
         self._modules: dict[str, ModuleType] = {}
-        self._lock, self._depth = threading.RLock(), 0
+        self._lock = threading.RLock()
 
     def load(self, name: str) -> ModuleType:
         """Import a stored module."""
@@ -324,12 +313,9 @@ class _StoredModules(importlib.abc.MetaPathFinder):
     def _active(self) -> Iterator[None]:
         """Replace other modules of the stored names by the stored ones, and restore them."""
         with self._lock:
-            self._depth += 1
-            if self._depth > 1:
-                try:
-                    yield
-                finally:
-                    self._depth -= 1
+            if self in sys.meta_path:
+                # A module that is being imported imports another one.
+                yield
                 return
             others = {name: sys.modules.pop(name, None) for name in self._names}
             sys.modules.update(self._modules)
@@ -337,7 +323,6 @@ class _StoredModules(importlib.abc.MetaPathFinder):
             try:
                 yield
             finally:
-                self._depth -= 1
                 sys.meta_path.remove(self)
                 for name, other in others.items():
                     if name in sys.modules:
@@ -366,8 +351,4 @@ class _StoredLoader(importlib.abc.SourceLoader):
 
 
 _importers: dict[TaskCode, _StoredModules] = {}
-
-
-def _stored_modules(folder: Path, code: TaskCode) -> _StoredModules:
-    """Return the importer of a source; runs that stored the same source share it."""
-    return _importers.setdefault(code, _StoredModules(folder, code))
+"""The importer of each source; runs that stored the same source share it."""

@@ -45,7 +45,6 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
 
     # Brax calls back twice in an epoch: first with the parameters, then with the metrics.
     def on_params(env_steps: int, make_policy: object, params: tuple[Any, Any, Any]) -> None:
-        del make_policy
         latest["params"] = PolicyParams(*params)
         if env_steps == 0:
             report(0, {}, 0.0)

@@ -34,7 +34,6 @@ class TrainerCallback:
         Returns:
           Whether the training goes on.
         """
-        del progress
         return True
 
     def on_preempt(self, progress: Sequence[Progress]) -> None:

@@ -4,15 +4,11 @@ import math
 import sys
 import time
 from collections.abc import Sequence
-from typing import TextIO
+from typing import Literal, TextIO
 
 from jetbot_mjx.runs.metrics import MetricValues, mean_of, process_seconds
 
-COMPILING = "compiling"
-TRAINING = "training"
-EVALUATING = "evaluating"
-SAVING = "saving"
-RENDERING = "rendering"
+Phase = Literal["compiling", "training", "evaluating", "saving", "rendering"]
 
 _SECONDS_BETWEEN_LINES = 10.0
 
@@ -35,8 +31,8 @@ class Terminal:
         """Show that compilation has begun, after which nothing else happens for a while."""
         self.say("compiling ...")
 
-    def phase(self, name: str) -> None:
-        """Show that a phase such as `TRAINING` begins; plain lines do not show it."""
+    def phase(self, name: Phase) -> None:
+        """Show that a phase begins; plain lines do not show it."""
 
     def write(self, env_steps: int, metrics: Sequence[MetricValues]) -> None:
         """Show the end of an interval.

@@ -25,7 +25,7 @@ from rich.text import Text
 
 from jetbot_mjx.runs.metrics import History, MetricValues, process_seconds
 from jetbot_mjx.runs.progress import in_foreground, is_watched
-from jetbot_mjx.training.console import COMPILING, Terminal
+from jetbot_mjx.training.console import Phase, Terminal
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _MAX_ROWS = 8
@@ -95,8 +95,8 @@ class Dashboard(Terminal):
         self._metrics: list[dict[str, float | None]] = [{} for _ in seeds]
         self._nonfinite = 0.0
         self._speed = "-"
-        self._phase: str | None = None
-        self._spent: dict[str, float] = {}
+        self._phase: Phase | None = None
+        self._spent: dict[Phase, float] = {}
         self._phase_began = time.monotonic()
         # Show the history before the progress bar begins to measure the speed.
         steps = 0
@@ -124,7 +124,7 @@ class Dashboard(Terminal):
 
     def begin(self) -> None:
         """Begin to draw, and to print above the dashboard what others print on this terminal."""
-        self.phase(COMPILING)
+        self.phase("compiling")
         self._drawing = True
         for name in ("stdout", "stderr"):
             stream = getattr(sys, name)
@@ -134,7 +134,7 @@ class Dashboard(Terminal):
                 setattr(sys, name, self._replaced[name][1])
         self._thread.start()
 
-    def phase(self, name: str | None) -> None:
+    def phase(self, name: Phase | None) -> None:
         """Show that a phase begins; None: the training has ended."""
         now = time.monotonic()
         with self._lock:
@@ -246,7 +246,7 @@ class Dashboard(Terminal):
         self._progress.update(self._task, completed=env_steps)
         self._speed = f"{speed:,.0f} environment steps/s" if speed else "-"
 
-    def _seconds_in(self, phase: str) -> float:
+    def _seconds_in(self, phase: Phase) -> float:
         running = time.monotonic() - self._phase_began if phase == self._phase else 0.0
         return self._spent.get(phase, 0.0) + running
 

@@ -103,12 +103,12 @@ def all_gather_ints(*values: int) -> Int[np.ndarray, "processes n"]:
     return np.asarray(multihost_utils.process_allgather(local))
 
 
-def run_on_primary(action: Callable[[], int]) -> int:
+def run_on_primary(action: Callable[[], int | None]) -> int:
     """Run a function in the first process, and return its result in all processes.
 
     Args:
       action: the function, which only the first process calls; it returns a number that is not
-        negative.
+        negative, or None for 0.
 
     Returns:
       The function's result.
@@ -117,14 +117,14 @@ def run_on_primary(action: Callable[[], int]) -> int:
       UserError: in the other processes, if the function raised an error in the first.
     """
     if jax.process_count() == 1:
-        return action()
+        return action() or 0
     if not is_primary():
         outcome = int(all_gather_ints(0)[0, 0])
         if outcome == _FAILED:
             raise UserError("process 0 has failed and prints the reason; this process ends too")
         return outcome
     try:
-        outcome = action()
+        outcome = action() or 0
     except BaseException:
         all_gather_ints(_FAILED)
         raise

@@ -21,7 +21,6 @@ from jetbot_mjx.agents.vision import activation_bytes
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import make_mj_model
 
 GIB = 2**30
 
@@ -132,9 +131,7 @@ def _physics(env: JetBotEnv) -> int:
     if env.physics.impl != "xla":
         # A single kernel stores its input and output only, no intermediate results.
         return 2 * _bytes(jax.eval_shape(env.reset, _KEY).pipeline_state)
-    build_scene = env.task.build_scene
-    model = make_mj_model(env.robot, env.config.physics, build_scene=build_scene, visual=False)
-    return _bytes(mjx.make_data(model))
+    return _bytes(mjx.make_data(env.physics.mj_model))
 
 
 def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
@@ -179,21 +176,24 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
     )
 
 
-def resized(config: Config, factor: float) -> Config | None:
-    """Return a configuration with `ppo.num_envs` and `ppo.batch_size` multiplied by a factor.
+def resized(config: Config, each: Sizes, device_count: int, factor: float) -> Footprint | None:
+    """Return the footprint with `ppo.num_envs` and `ppo.batch_size` multiplied by a factor.
 
     Args:
       config: the configuration of the run.
+      each: the memory of one environment, one sample and so on, from `sizes`.
+      device_count: number of devices over all processes.
       factor: the factor.
 
     Returns:
-      The configuration; None if the products are not whole numbers.
+      The footprint; None if the products are not whole numbers, or if the devices cannot share the
+      environments and minibatches evenly.
     """
-    num_envs, batch_size = config.ppo.num_envs * factor, config.ppo.batch_size * factor
-    if not (num_envs.is_integer() and batch_size.is_integer()):
+    changed = {name: getattr(config.ppo, name) * factor for name in ("num_envs", "batch_size")}
+    if any(value % device_count for value in changed.values()):
         return None
-    ppo = config.ppo.model_copy(update={"num_envs": int(num_envs), "batch_size": int(batch_size)})
-    return config.model_copy(update={"ppo": ppo})
+    ppo = config.ppo.model_copy(update={name: int(value) for name, value in changed.items()})
+    return footprint(config.model_copy(update={"ppo": ppo}), each, device_count)
 
 
 def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[Footprint]:
@@ -211,8 +211,8 @@ def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[F
     found = []
     power = -2
     while power <= 0 or (found[-1].total <= limit and found[-1].num_envs < _MOST_ENVS):
-        if (changed := resized(config, 2.0**power)) is not None and _divides(changed, device_count):
-            found.append(footprint(changed, each, device_count))
+        if one := resized(config, each, device_count, 2.0**power):
+            found.append(one)
         power += 1
     return found
 
@@ -232,8 +232,7 @@ def next_that_fits(
       Its footprint; None if none fits.
     """
     power = -1
-    while (changed := resized(config, 2.0**power)) is not None and _divides(changed, device_count):
-        found = footprint(changed, each, device_count)
+    while found := resized(config, each, device_count, 2.0**power):
         if limit is None or found.total <= limit:
             return found
         power -= 1
@@ -280,11 +279,6 @@ def device_memory() -> int | None:
         return None
     # Several CPU devices share the memory of the host.
     return host // jax.local_device_count()
-
-
-def _divides(config: Config, device_count: int) -> bool:
-    """Return whether the devices can share the environments and minibatches evenly."""
-    return config.ppo.num_envs % device_count == 0 and config.ppo.batch_size % device_count == 0
 
 
 def _bytes(tree: PyTree) -> int:

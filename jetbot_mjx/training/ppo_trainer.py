@@ -6,7 +6,7 @@ that was stopped anywhere must continue with bit-identical results.
 Protocol:
   Chunked calls. The compiled program `advance(state, steps, restart)` runs `steps` training steps
     in one call. The number is an argument, so that one program serves calls of any length;
-    `ChunkSizer` chooses it such that a call takes about one second. Between two calls the loop
+    `next_chunk` chooses it such that a call takes about one second. Between two calls the loop
     checks for signals and reports progress. The metrics are summed inside the state, so neither the
     results nor the logged metrics depend on how the steps were divided into calls.
   Exact resume. `TrainState` holds everything that the next step depends on. At the end of every
@@ -21,6 +21,7 @@ Protocol:
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future
 from typing import Any, Self
 
 import jax
@@ -58,12 +59,7 @@ def build_ppo(config: Config, env: JetBotEnv) -> PPO:
     Returns:
       PPO; its `networks` are the only ones of the training.
     """
-    networks = make_networks(
-        config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=config.ppo.normalize_observations,
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     wrapped = wrap_for_training(env, config.task.episode_length)
     return PPO(config.ppo, wrapped, networks, axis_name=_AXIS, device_count=jax.device_count())
 
@@ -151,7 +147,7 @@ class CompiledTrainer:
         """Copy the state from the devices to the host, and return that of each seed."""
         if jax.process_count() > 1:
             # A process cannot read the devices of another: replicate everything first.
-            state = jax.jit(_identity, out_shardings=self._replicated)(state)
+            state = jax.jit(lambda state: state, out_shardings=self._replicated)(state)
         host = jax.device_get(state)
         return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
 
@@ -217,7 +213,7 @@ def train(
       resumes: whether these states were reported before.
     """
     # Compile in the background while the initial policy is evaluated.
-    compiling = _Background(trainer.compile)
+    compiling = _in_background(trainer.compile)
     state = trainer.init() if states is None else trainer.put(states)
     done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step if states else 0
     if not resumes and not _report(trainer, recorder, state, 0.0):
@@ -225,7 +221,8 @@ def train(
     # Wait until every process has compiled; leave if one of them was asked to stop.
     running = True
     while running:
-        gathered = distributed.all_gather_ints(preemption.wait(_POLL_SECONDS), compiling.running)
+        stopped = preemption.wait(_POLL_SECONDS)
+        gathered = distributed.all_gather_ints(stopped, not compiling.done())
         if gathered[:, 0].any():
             return
         running = gathered[:, 1].any()
@@ -247,12 +244,12 @@ def _train_loop(
     config = trainer.ppo.config
     size = config.steps_per_training_step
     interval = -(-checkpoint_interval // size)
-    sizer = ChunkSizer(min(_MAX_CALL_SECONDS, preemption.notice / _CALLS_PER_NOTICE))
-    seconds, restart = 0.0, False
+    call_seconds = min(_MAX_CALL_SECONDS, preemption.notice / _CALLS_PER_NOTICE)
+    chunk, seconds, restart = 1, 0.0, False
     while done < config.training_steps:
         # Agree with the other processes on whether to go on, and on the length of the call.
         goal = min(config.training_steps, (done // interval + 1) * interval)
-        gathered = distributed.all_gather_ints(preemption.requested, min(sizer.steps, goal - done))
+        gathered = distributed.all_gather_ints(preemption.requested, min(chunk, goal - done))
         if gathered[:, 0].any():
             break
         count = int(gathered[0, 1])
@@ -261,7 +258,7 @@ def _train_loop(
         state, nan_dumps = advance(state, count, restart)
         found = np.asarray(nan_dumps.found)
         elapsed = time.perf_counter() - began
-        sizer.update(count, elapsed)
+        chunk = next_chunk(count, elapsed, call_seconds)
         done, seconds, restart = done + count, seconds + elapsed, False
         for device, seed in np.argwhere(found):
             nan_dump = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
@@ -276,7 +273,8 @@ def _train_loop(
         seconds, restart = 0.0, True
     # Save what was trained since the last report.
     if seconds > 0:
-        _save_preempted(trainer, recorder, state, seconds)
+        progress = _progress(trainer, state, seconds, restart=False)
+        distributed.run_on_primary(lambda: recorder.on_preempt(progress))
 
 
 def _report(
@@ -289,18 +287,6 @@ def _report(
     """
     progress = _progress(trainer, state, seconds, restart=True)
     return bool(distributed.run_on_primary(lambda: recorder.on_interval(progress)))
-
-
-def _save_preempted(
-    trainer: CompiledTrainer, recorder: TrainerCallback, state: TrainState, seconds: float
-) -> None:
-    progress = _progress(trainer, state, seconds, restart=False)
-
-    def save() -> int:
-        recorder.on_preempt(progress)
-        return 0
-
-    distributed.run_on_primary(save)
 
 
 def _progress(
@@ -323,56 +309,29 @@ def _progress(
     return progress
 
 
-def _identity(state: TrainState) -> TrainState:
-    return state
+def next_chunk(steps: int, seconds: float, wanted: float) -> int:
+    """Return how many training steps the next call runs.
+
+    Args:
+      steps: the steps of the last call.
+      seconds: the duration of the last call [s].
+      wanted: the desired duration of a call [s].
+    """
+    return max(1, int(steps * wanted / max(seconds, 1e-6)))
 
 
-class ChunkSizer:
-    """A `ChunkSizer` chooses how many training steps one call runs, by how long the last took."""
+def _in_background(function: Callable[[], Any]) -> Future[Any]:
+    """Compute a function's result in a thread, for which the process does not wait at its end."""
+    future: Future[Any] = Future()
 
-    def __init__(self, seconds: float) -> None:
-        """Begin with one step.
-
-        Args:
-          seconds: the desired duration of a call [s].
-        """
-        self._seconds = seconds
-        self.steps = 1
-
-    def update(self, steps: int, seconds: float) -> None:
-        """Set the number of steps of the next call.
-
-        Args:
-          steps: the steps of the last call.
-          seconds: the duration of the last call [s].
-        """
-        self.steps = max(1, int(steps * self._seconds / max(seconds, 1e-6)))
-
-
-class _Background:
-    """A `_Background` computes a function's result in a thread."""
-
-    def __init__(self, function: Callable[[], Any]) -> None:
-        self._outcome: list[Any] = []
-        self._error: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, args=[function], daemon=True)
-        self._thread.start()
-
-    @property
-    def running(self) -> bool:
-        return self._thread.is_alive()
-
-    def result(self) -> Any:
-        self._thread.join()
-        if self._error is not None:
-            raise self._error
-        return self._outcome[0]
-
-    def _run(self, function: Callable[[], Any]) -> None:
+    def run() -> None:
         try:
-            self._outcome.append(function())
+            future.set_result(function())
         except BaseException as error:  # `result` raises it in the caller's thread.
-            self._error = error
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future
 
 
 def env_steps(state: TrainState) -> int:

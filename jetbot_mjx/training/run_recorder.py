@@ -22,7 +22,6 @@ from jetbot_mjx.runs.metrics import (
     JsonlSink,
     MetricValues,
     Sink,
-    Sinks,
     TensorBoardSink,
     process_seconds,
 )
@@ -32,14 +31,7 @@ from jetbot_mjx.runs.run_dir import make_folder, writing_to
 from jetbot_mjx.runs.sb3_tags import aliases
 from jetbot_mjx.runs.wandb_sink import WandbSink
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
-from jetbot_mjx.training.console import (
-    COMPILING,
-    EVALUATING,
-    RENDERING,
-    SAVING,
-    TRAINING,
-    Terminal,
-)
+from jetbot_mjx.training.console import Phase, Terminal
 from jetbot_mjx.viewers.offscreen import find_backend
 from jetbot_mjx.viewers.video import EvaluationVideo
 
@@ -80,7 +72,7 @@ def open_sinks(
     history: Sequence[History],
     say: Callable[[str], None],
     seeds: int,
-) -> Sinks:
+) -> list[Sink]:
     """Open the logs of one seed.
 
     Args:
@@ -91,7 +83,7 @@ def open_sinks(
       seeds: number of seeds of the training.
 
     Returns:
-      The logs.
+      The logs, which receive the metrics in this order.
 
     Raises:
       UserError: the folder cannot be written.
@@ -103,45 +95,32 @@ def open_sinks(
             sinks.append(TensorBoardSink(folder, history, aliases(config.ppo), config))
         if config.wandb is not None:
             sinks.append(WandbSink(config, run_dir, history, say, seeds))
-    return Sinks(sinks)
+    return sinks
 
 
+@dataclasses.dataclass(eq=False)
 class RunRecorder(TrainerCallback):
-    """A `RunRecorder` records the training of one run; it is a context manager."""
+    """A `RunRecorder` records the training of one run; it is a context manager.
 
-    def __init__(
-        self,
-        seeds: Sequence["SeedRecorder"],
-        evaluate: Callable[[PolicyParams], Summary],
-        video: EvaluationVideo | None,
-        terminal: Terminal,
-        clock: CompileClock,
-        *,
-        total_steps: int,
-        stop_at_success: float | None,
-        only_last_video: bool = False,
-    ) -> None:
-        """Prepare to record.
+    Args:
+      config: the configuration of the run, which says when it is complete.
+      seeds: the recorder of each seed.
+      evaluate: a function that evaluates a policy on the fixed goals of training.
+      video: renders a policy after an evaluation; None: no videos.
+      terminal: shows the progress.
+      clock: measures the time that is spent on compilation.
+    """
 
-        Args:
-          seeds: the recorder of each seed.
-          evaluate: a function that evaluates a policy on the fixed goals of training.
-          video: renders a policy after an evaluation; None: no videos.
-          terminal: shows the progress.
-          clock: measures the time that is spent on compilation.
-          total_steps: environment steps of the whole training.
-          stop_at_success: the success rate at which the training ends early; None: it does not.
-          only_last_video: whether only the policy at the end of the training is rendered.
-        """
-        self._seeds = seeds
-        self._evaluate = evaluate
-        self._video = video
-        self._terminal = terminal
-        self._clock = clock
-        self._total_steps = total_steps
-        self._stop_at_success = stop_at_success
-        self._only_last_video = only_last_video
-        self._earlier_seconds = seeds[0].standing.wall_seconds
+    config: Config
+    seeds: Sequence["SeedRecorder"]
+    evaluate: Callable[[PolicyParams], Summary]
+    video: EvaluationVideo | None
+    terminal: Terminal
+    clock: CompileClock
+
+    def __post_init__(self) -> None:
+        """Begin to measure."""
+        self._earlier_seconds = self.seeds[0].standing.wall_seconds
         self._compiled = False
         self._compile_seconds = 0.0
         self._unlogged_compile_seconds = 0.0
@@ -151,19 +130,19 @@ class RunRecorder(TrainerCallback):
     @property
     def standings(self) -> list[Standing]:
         """Return how far each seed has come."""
-        return [seed.standing for seed in self._seeds]
+        return [seed.standing for seed in self.seeds]
 
     @property
     def fingerprints(self) -> list[str]:
         """Return the SHA-256 of each seed's last parameters."""
-        return [seed.fingerprint for seed in self._seeds]
+        return [seed.fingerprint for seed in self.seeds]
 
     @property
     def complete(self) -> bool:
         """Return whether every seed has made all its steps, or reached `stop_at_success`."""
-        target = self._stop_at_success
+        ppo, target = self.config.ppo, self.config.stop_at_success
         return all(
-            one.env_steps >= self._total_steps
+            one.env_steps >= ppo.training_steps * ppo.steps_per_training_step
             or (target is not None and one.last is not None and one.last.success_rate >= target)
             for one in self.standings
         )
@@ -176,28 +155,28 @@ class RunRecorder(TrainerCallback):
     def say(self, *lines: str) -> None:
         """Print lines on the terminal."""
         for line in lines:
-            self._terminal.say(line)
+            self.terminal.say(line)
 
     def begin(self, headline: str) -> None:
         """Print the headline, and show that compilation has begun."""
-        self._terminal.say(headline)
-        self._terminal.begin()
+        self.terminal.say(headline)
+        self.terminal.begin()
 
     def on_interval(self, progress: Sequence[Progress]) -> bool:
         """Evaluate, log and save every seed; return whether to go on."""
         # Evaluate the policy of every seed.
-        self._set_phase(EVALUATING)
+        self._set_phase("evaluating")
         # What Brax's trainer compiles while it trains is part of the time that it reports.
         compiling = self._lap()
         began = time.perf_counter()
-        summaries = [self._evaluate(one.params) for one in progress]
+        summaries = [self.evaluate(one.params) for one in progress]
         evaluating = time.perf_counter() - began
         # Log the metrics, and save a checkpoint.
-        self._set_phase(SAVING)
+        self._set_phase("saving")
         self._lap()
         compiled, self._unlogged_compile_seconds = self._unlogged_compile_seconds, 0.0
         logged = []
-        for seed, one, summary in zip(self._seeds, progress, summaries, strict=True):
+        for seed, one, summary in zip(self.seeds, progress, summaries, strict=True):
             steps = one.env_steps - seed.standing.env_steps
             training = one.seconds - (compiling if one.state is None else 0.0)
             metrics = {
@@ -214,31 +193,33 @@ class RunRecorder(TrainerCallback):
             logged.append(metrics)
         # Show the metrics, and render the videos.
         self._report_first_step()
-        self._terminal.write(progress[0].env_steps, logged)
+        self.terminal.write(progress[0].env_steps, logged)
         self._render_videos(progress)
         self._recording_seconds = time.perf_counter() - began - evaluating
         if progress[0].env_steps > 0:
             self._compiled = True
-        self._set_phase(TRAINING)
+        self._set_phase("training")
         return not self.complete
 
     def on_preempt(self, progress: Sequence[Progress]) -> None:
         """Save every seed without an evaluation."""
-        self._terminal.phase(SAVING)
-        for seed, one in zip(self._seeds, progress, strict=True):
+        self.terminal.phase("saving")
+        for seed, one in zip(self.seeds, progress, strict=True):
             seed.save(one, {}, self.wall_seconds)
 
     def on_progress(self, env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
         """Show the progress on the terminal."""
         self._report_first_step()
-        steps = env_steps - self._seeds[0].standing.env_steps
-        self._terminal.update(env_steps, metrics, steps / max(seconds, 1e-9))
+        steps = env_steps - self.seeds[0].standing.env_steps
+        self.terminal.update(env_steps, metrics, steps / max(seconds, 1e-9))
 
     def on_nan_dump(self, seed_index: int, env_steps: int, nan_dump: NanDump) -> None:
         """Save the dump for replay, and print the command that replays it."""
-        path = self._seeds[seed_index].save_nan_dump(env_steps, nan_dump)
+        seed = self.seeds[seed_index]
+        with writing_to(seed.run_dir):
+            path = save_nan_dump(seed.run_dir, seed.config, env_steps, nan_dump)
         if path is not None:
-            self._terminal.say(
+            self.terminal.say(
                 f"a state became non-finite before step {env_steps:,}, and its environment was"
                 f" reset: python -m jetbot_mjx.replay {path}"
             )
@@ -246,28 +227,29 @@ class RunRecorder(TrainerCallback):
     def on_compiled(self) -> None:
         """Show that training begins; the first step reports the time until then."""
         self._compiled = True
-        self._set_phase(TRAINING)
+        self._set_phase("training")
         self._awaiting_first_step = True
 
     def _render_videos(self, progress: Sequence[Progress]) -> None:
         """Render a video of every seed, last: an error leaves the log and checkpoints complete."""
-        if self._video is None or (self._only_last_video and not self.complete):
+        only_last = self.config.evaluation.video == "last"
+        if self.video is None or (only_last and not self.complete):
             return
-        self._set_phase(RENDERING)
+        self._set_phase("rendering")
         try:
             find_backend()
         except UserError as error:
-            self._terminal.say(f"evaluation.video: no videos are rendered: {error}")
-            self._video = None
+            self.terminal.say(f"evaluation.video: no videos are rendered: {error}")
+            self.video = None
             return
-        for seed, one in zip(self._seeds, progress, strict=True):
-            seed.render(self._video, one)
+        for seed, one in zip(self.seeds, progress, strict=True):
+            seed.render(self.video, one)
         # Leave the video's compilation out of the trainer's time.
         self._lap()
 
-    def _set_phase(self, phase: str) -> None:
+    def _set_phase(self, phase: Phase) -> None:
         """Show the phase; before the first training step most of the time is compilation."""
-        self._terminal.phase(phase if self._compiled else COMPILING)
+        self.terminal.phase(phase if self._compiled else "compiling")
 
     def _report_first_step(self) -> None:
         """Print after the first training step how long the start took."""
@@ -275,16 +257,16 @@ class RunRecorder(TrainerCallback):
             return
         self._awaiting_first_step = False
         self._lap()
-        cache = f"{self._clock.cached} of {self._clock.programs} programs from the cache"
-        if self._clock.cached:
-            cache += f", which saved {self._clock.saved_seconds:.1f} s"
-        self._terminal.say(
+        cache = f"{self.clock.cached} of {self.clock.programs} programs from the cache"
+        if self.clock.cached:
+            cache += f", which saved {self.clock.saved_seconds:.1f} s"
+        self.terminal.say(
             f"first training step done {process_seconds():.1f} s after the start;"
             f" {self._compile_seconds:.1f} s of it compiling ({cache})"
         )
 
     def _lap(self) -> float:
-        seconds = self._clock.lap()
+        seconds = self.clock.lap()
         self._compile_seconds += seconds
         self._unlogged_compile_seconds += seconds
         return seconds
@@ -295,42 +277,36 @@ class RunRecorder(TrainerCallback):
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all files are written."""
-        self._terminal.phase(SAVING)
+        self.terminal.phase("saving")
         with contextlib.ExitStack() as stack:
-            stack.callback(self._terminal.close)
-            for seed in self._seeds:
+            stack.callback(self.terminal.close)
+            for seed in self.seeds:
                 stack.callback(seed.close)
 
 
+@dataclasses.dataclass(eq=False)
 class SeedRecorder:
-    """A `SeedRecorder` writes the logs and checkpoints of one seed."""
+    """A `SeedRecorder` writes the logs and checkpoints of one seed.
 
-    def __init__(
-        self,
-        config: Config,
-        run_dir: Path,
-        sinks: Sinks,
-        about: Mapping[str, Any],
-        standing: Standing,
-        fingerprint: str,
-    ) -> None:
-        """Open the folder of checkpoints.
+    Args:
+      config: the configuration of this seed.
+      run_dir: the run folder of this seed.
+      sinks: the logs of this seed.
+      about: the metadata that every checkpoint carries, as JSON values.
+      standing: how far this seed has come.
+      fingerprint: the SHA-256 of its parameters; empty if there are none yet.
+    """
 
-        Args:
-          config: the configuration of this seed.
-          run_dir: the run folder of this seed.
-          sinks: the logs of this seed.
-          about: the metadata that every checkpoint carries, as JSON values.
-          standing: how far this seed has come.
-          fingerprint: the SHA-256 of its parameters; empty if there are none yet.
-        """
-        self.standing = standing
-        self.fingerprint = fingerprint
-        self._config = config
-        self._run_dir = run_dir
-        self._sinks = sinks
-        self._about = about
-        self._store = CheckpointStore(run_dir, config.checkpoints_to_keep)
+    config: Config
+    run_dir: Path
+    sinks: Sequence[Sink]
+    about: Mapping[str, Any]
+    standing: Standing
+    fingerprint: str
+
+    def __post_init__(self) -> None:
+        """Open the folder of checkpoints."""
+        self._store = CheckpointStore(self.run_dir, self.config.checkpoints_to_keep)
 
     def report(
         self, progress: Progress, summary: Summary, metrics: MetricValues, wall_seconds: float
@@ -347,8 +323,9 @@ class SeedRecorder:
         standing.env_steps, standing.last = progress.env_steps, summary
         if standing.best is None or summary.success_rate >= standing.best.success_rate:
             standing.best_steps, standing.best = progress.env_steps, summary
-        with writing_to(self._run_dir):
-            self._sinks.write(progress.env_steps, metrics)
+        with writing_to(self.run_dir):
+            for sink in self.sinks:
+                sink.write(progress.env_steps, metrics)
         self.save(progress, summary._asdict(), wall_seconds)
         self.fingerprint = digest(progress.params)
 
@@ -363,7 +340,7 @@ class SeedRecorder:
         self.standing.wall_seconds = wall_seconds
         trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}
         about = {
-            **self._about,
+            **self.about,
             "metrics": dict(evaluation),
             "progress": self.standing.to_json(),
         }
@@ -371,21 +348,18 @@ class SeedRecorder:
 
     def render(self, video: EvaluationVideo, progress: Progress) -> None:
         """Render a video of the policy into the run folder, and log it."""
-        name = checkpoint_path(self._run_dir, progress.env_steps).name
-        path = self._run_dir / "videos" / name / EVALUATION_VIDEO
+        name = checkpoint_path(self.run_dir, progress.env_steps).name
+        path = self.run_dir / "videos" / name / EVALUATION_VIDEO
         make_folder(path.parent)
         with writing_to(path):
             video.write(path, progress.params, progress.env_steps)
-            self._sinks.write_video(progress.env_steps, path)
-
-    def save_nan_dump(self, env_steps: int, nan_dump: NanDump) -> Path | None:
-        """Save a dump; return its path, or None if the run holds enough of them."""
-        with writing_to(self._run_dir):
-            return save_nan_dump(self._run_dir, self._config, env_steps, nan_dump)
+            for sink in self.sinks:
+                sink.write_video(progress.env_steps, path)
 
     def close(self) -> None:
         """Wait until the logs and checkpoints are written."""
         with contextlib.ExitStack() as stack:
-            stack.enter_context(writing_to(self._run_dir))
-            stack.callback(self._sinks.close)
+            stack.enter_context(writing_to(self.run_dir))
+            for sink in self.sinks:
+                stack.callback(sink.close)
             stack.enter_context(self._store)

@@ -7,10 +7,11 @@ modules receive what they need as required arguments.
 
 import contextlib
 import importlib.util
+import pickle
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -181,39 +182,23 @@ def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, Task
     A run that has checkpoints continues with the task that it was begun with. Of several processes,
     all train the task of the first one, which sends its source to those that lack it.
     """
-    name = config.task.name
-    task_class = None
-    if not distributed.is_primary():
-        task_class = _sent_task_class(name)
-    else:
-        resumes = _has_checkpoints(run_dirs)
-        _send_task_code(name, run_dirs[0] if resumes else None)
-        task_class = stored_task_class(run_dirs[0], name) if resumes else None
+    name, primary = config.task.name, distributed.is_primary()
+    resumes = primary and _has_checkpoints(run_dirs)
+
+    def source() -> bytes:
+        code = read_task_code(run_dirs[0]) if resumes else collect_task_code(name)
+        return pickle.dumps(code) if code else b""
+
+    sent = distributed.broadcast_bytes(source) if jax.process_count() > 1 else b""
+    task_class = stored_task_class(run_dirs[0], name) if resumes else None
+    if sent and not primary:
+        with tempfile.TemporaryDirectory() as folder:
+            write_task_code(Path(folder), pickle.loads(sent))
+            task_class = stored_task_class(Path(folder), name, silent=True)
     env = make_env(config, task_class)
     if name not in TRUSTED:
         require_trainable(env.task, config)
     return env, None if task_class else collect_task_code(name)
-
-
-def _send_task_code(name: str, run_dir: Path | None) -> None:
-    """Send the source of a task to the other processes: the stored one, or that of a new run."""
-
-    def source() -> bytes:
-        code = read_task_code(run_dir) if run_dir else collect_task_code(name)
-        return code.to_bytes() if code else b""
-
-    if jax.process_count() > 1:
-        distributed.broadcast_bytes(source)
-
-
-def _sent_task_class(name: str) -> type[Any] | None:
-    """Return the class of the task that the first process has sent; None: import it by its name."""
-    content = distributed.broadcast_bytes(bytes)
-    if not content:
-        return None
-    with tempfile.TemporaryDirectory() as folder:
-        write_task_code(Path(folder), TaskCode.from_bytes(content))
-        return stored_task_class(Path(folder), name, silent=True)
 
 
 def _store_run(training: Training) -> None:
@@ -330,16 +315,7 @@ def open_recorder(
         standing = Standing.from_json(resumed.progress[index])
         fingerprint = digest(resumed.states[index].policy_params) if resumption else ""
         seeds.append(SeedRecorder(seed_config, folder, sinks, about, standing, fingerprint))
-    return RunRecorder(
-        seeds,
-        evaluate,
-        video,
-        terminal,
-        clock,
-        total_steps=total_steps,
-        stop_at_success=config.stop_at_success,
-        only_last_video=config.evaluation.video == "last",
-    )
+    return RunRecorder(config, seeds, evaluate, video, terminal, clock)
 
 
 def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
@@ -394,8 +370,13 @@ def _open_folders(
     for folder in dict.fromkeys([run_dir, *run_dirs]):
         stack.enter_context(occupied(folder))
     resumption = resume(run_dirs, configs, template)
-    # Compare the versions before those of this process replace the stored ones.
-    messages = _resume_messages(run_dir, resumption) if resumption else []
+    messages = []
+    if resumption:
+        messages += [f"skipped: {reason}" for reason in resumption.skipped]
+        # Compare the versions before those of this process replace the stored ones.
+        if changes := changed_versions(run_dir):
+            messages.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
+        messages.append(f"resuming after {resumption.env_steps:,} steps")
     _store_run(training)
     return resumption, messages
 
@@ -409,14 +390,6 @@ def _result(training: Training, recorder: RunRecorder | None, *, finished: bool)
         finished=finished,
         wall_seconds=recorder.wall_seconds if recorder else 0.0,
     )
-
-
-def _resume_messages(run_dir: Path, resumption: Resumption) -> list[str]:
-    lines = [f"skipped: {reason}" for reason in resumption.skipped]
-    if changes := changed_versions(run_dir):
-        lines.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
-    lines.append(f"resuming after {resumption.env_steps:,} steps")
-    return lines
 
 
 def _complete_message(config: Config, standings: Sequence[Standing]) -> str:

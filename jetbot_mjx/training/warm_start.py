@@ -54,9 +54,8 @@ class WarmStart(NamedTuple):
     """The checkpoint."""
     env_steps: int
     """Environment steps that it was trained for."""
-    taken: list[str]
-    """Names of the fields in both layouts."""
     new: list[str]
+    """Names of the fields that only the new layout has."""
     dropped: list[str]
 
     def apply(self, state: TrainState) -> TrainState:
@@ -98,11 +97,11 @@ def make_warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmS
     _check_networks(source, config, env)
     old, new = source.about["layout"], layout_data(env.task.layout)
     rows = match_rows(old, new)
+    names = [[field["name"] for field in layout] for layout in (old, new)]
     if (rows < 0).all():
         raise UserError(
-            f"init_from {source.path}: no field of its observation"
-            f" ({', '.join(field['name'] for field in old)}) is one of {config.task.name}"
-            f" ({', '.join(field['name'] for field in new)})"
+            f"init_from {source.path}: no field of its observation ({', '.join(names[0])}) is one"
+            f" of {config.task.name} ({', '.join(names[1])})"
         )
     # Take over the networks and the statistics, row by row.
     params = PolicyParams(
@@ -113,15 +112,14 @@ def make_warm_start(source: Checkpoint, config: Config, env: JetBotEnv) -> WarmS
     # Measure the statistics of new fields while this policy drives.
     if (rows < 0).any():
         params = params._replace(normalizer=_measure(params, config, env, rows))
-    names = {field["name"] for field in old}, {field["name"] for field in new}
-    taken = _taken(new, rows)
+    ends = np.cumsum([field["size"] for field in new])
+    taken = [name for name, end in zip(names[1], ends, strict=True) if rows[end - 1] >= 0]
     return WarmStart(
         params=jax.device_get(params),
         source=source.path,
         env_steps=source.env_steps,
-        taken=[name for name in taken if taken[name]],
-        new=[name for name in taken if not taken[name]],
-        dropped=sorted(names[0] - {name for name in taken if taken[name]}),
+        new=[name for name in names[1] if name not in taken],
+        dropped=sorted(set(names[0]) - set(taken)),
     )
 
 
@@ -144,12 +142,6 @@ def match_rows(old: LayoutData, new: LayoutData) -> Int[np.ndarray, " new"]:
         size = field["size"]
         rows += [-1] * size if start is None else range(start, start + size)
     return np.asarray(rows, np.int64)
-
-
-def _taken(new: LayoutData, rows: Int[np.ndarray, " new"]) -> dict[str, bool]:
-    """Return for each field of the new layout whether the old one has it."""
-    ends = np.cumsum([field["size"] for field in new])
-    return {field["name"]: bool(rows[end - 1] >= 0) for field, end in zip(new, ends, strict=True)}
 
 
 def _check_networks(source: Checkpoint, config: Config, env: JetBotEnv) -> None:
@@ -223,12 +215,7 @@ def _measure(
     Running statistics have one count for all fields. It becomes that of the measurement, so that
     training changes all of them from there on, and the sums of squares are scaled with it.
     """
-    networks = make_networks(
-        config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=config.ppo.normalize_observations,
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     batched: Any = wrap_for_training(env, config.task.episode_length)
     policy = make_policy(networks, params)
 

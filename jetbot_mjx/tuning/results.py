@@ -13,7 +13,7 @@ import optuna
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.runs.run_dir import write_text, writing_to
-from jetbot_mjx.tuning.search import Entrant
+from jetbot_mjx.tuning.search import Entrant, completed_trials
 from jetbot_mjx.tuning.space import with_values
 
 _PLOTS = ("optimization_history", "param_importances", "slice", "parallel_coordinate")
@@ -76,7 +76,7 @@ def _trials_table(study: optuna.Study) -> str:
         f"| trial | mean success | last success [%] | mean time [s] | {' | '.join(names)} |",
         "|" + "---|" * (4 + len(names)),
     ]
-    for trial in sorted(_completed(study), key=lambda one: -(one.value or 0.0)):
+    for trial in sorted(completed_trials(study), key=lambda one: -(one.value or 0.0)):
         values = " | ".join(_short(trial.params.get(name)) for name in names)
         lines.append(
             f"| {trial.number} | {trial.value:.2%} | {100 * trial.user_attrs['success_rate']:.2f}"
@@ -100,7 +100,7 @@ def _csv(study: optuna.Study) -> str:
 def _plot(folder: Path, study: optuna.Study) -> None:
     """Draw Optuna's plots; those that need more trials or settings than there are, are left out."""
     for name in _PLOTS:
-        if len(_completed(study)) < 2:
+        if len(completed_trials(study)) < 2:
             return
         with warnings.catch_warnings(), plt.ioff():
             warnings.simplefilter("ignore")
@@ -114,10 +114,6 @@ def _plot(folder: Path, study: optuna.Study) -> None:
             figure.set_size_inches(11, 6)
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
             plt.close("all")
-
-
-def _completed(study: optuna.Study) -> list[optuna.trial.FrozenTrial]:
-    return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
 
 
 def _short(value: Any) -> str:

@@ -133,7 +133,7 @@ class Search:
         Raises:
           UserError: the values of no trial of a round fit together.
         """
-        with stage("trials", max(0, trials - len(self._completed()))) as advance:
+        with stage("trials", max(0, trials - len(completed_trials(self.study)))) as advance:
             while (count := self._next_round(trials, round_size)) > 0:
                 self._run_round(count, trials)
                 advance(count)
@@ -149,9 +149,9 @@ class Search:
             raise UserError(
                 f"none of the last {count} trials could be trained, such as: {errors[0]}"
             )
-        best = max((one.value for one in self._completed()), default=float("nan"))
+        best = max((one.value for one in completed_trials(self.study)), default=float("nan"))
         self._say(
-            f"{len(self._completed())} of {trials} trials, best mean success {best:.2%};"
+            f"{len(completed_trials(self.study))} of {trials} trials, best mean success {best:.2%};"
             f" this round of {count} took {time.perf_counter() - began:.1f} s"
         )
 
@@ -165,7 +165,7 @@ class Search:
         Returns:
           The given configuration first, then the best trials in the order of their score.
         """
-        ranked = sorted(self._completed(), key=lambda trial: -(trial.value or 0.0))
+        ranked = sorted(completed_trials(self.study), key=lambda trial: -(trial.value or 0.0))
         chosen: dict[str, Mapping[str, Any]] = {"as given": {}}
         for trial in ranked:
             if len(chosen) <= count and trial.params not in chosen.values():
@@ -220,9 +220,6 @@ class Search:
         ):
             self.study.enqueue_trial(own, skip_if_exists=True)
 
-    def _completed(self) -> list[Any]:
-        return self.study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
-
     def _stored(self, asked: Sequence[Any]) -> list[Any]:
         """Return trials as the storage has them."""
         numbers = {trial.number for trial in asked}
@@ -235,7 +232,7 @@ class Search:
             running = self.study.get_trials(
                 deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)
             )
-            missing = trials - len(self._completed()) - len(running)
+            missing = trials - len(completed_trials(self.study)) - len(running)
             if missing > 0 or not running:
                 return min(round_size, max(missing, 0))
             time.sleep(_POLL_SECONDS)
@@ -302,3 +299,8 @@ class Search:
         """Return the values of settings: those that were drawn, or those of the configuration."""
         given = {name: operator.attrgetter(name)(self._config) for name in names}
         return {name: drawn.get(name, value) for name, value in given.items()}
+
+
+def completed_trials(study: optuna.Study) -> list[Any]:
+    """Return the trials that were trained to their end."""
+    return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))

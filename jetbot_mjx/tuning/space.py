@@ -46,11 +46,6 @@ class Parameter(NamedTuple):
         """Return whether the range holds whole numbers only."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
-    @property
-    def ends(self) -> tuple[Any, ...]:
-        """Return the values that must be valid for all others to be: both ends, or all choices."""
-        return self.choices or (self.low, self.high)
-
     def contains(self, value: Any) -> bool:
         """Return whether the setting may take this value."""
         if self.choices:
@@ -113,7 +108,8 @@ def _parameter(name: Any, entry: Any, path: str | Path, config: Config) -> Param
         if not isinstance(log, bool) or (log and low <= 0):
             raise ConfigError(f"{where}.log = {log!r} is wrong: true needs a low above 0")
         found = Parameter(str(name), low, high, log)
-    for value in found.ends:
+    # If both ends of a range are valid, so is what lies between them.
+    for value in found.choices or (low, high):
         with_values(config, {found.name: value}, source=str(path), alone=True)
     return found
 

@@ -6,7 +6,8 @@ change shapes, such as the number of environments, belong to the program: trials
 run one group after the other.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -61,28 +62,22 @@ class Trials:
         self._names = tuple(names)
         env = make_env(config)
         self._env = wrap_for_training(env, config.task.episode_length)
-        self._networks = make_networks(
-            config.ppo.network,
-            env.observation_size,
-            env.action_size,
-            normalize=config.ppo.normalize_observations,
-        )
+        self._networks = make_networks(config.ppo, env.observation_size, env.action_size)
         episodes = rollout_fn(
             maybe_randomize(env), [policy_controller(self._networks)], config.task.episode_length
         )
         steps = np.linspace(0, config.ppo.training_steps, evaluations + 1).round().astype(np.int32)
         self._steps = np.diff(steps)
-        options = compiler_options(config)
+        init = jax.vmap(lambda traced, seed: self._ppo(traced).init(jax.random.PRNGKey(seed)))
+
+        def advance(traced: Any, state: TrainState, steps: Any) -> TrainState:
+            return self._ppo(traced).advance(state, steps, jnp.ones((), bool))[0]
+
         # `jax.jit` compiles anew for each number of trials.
-        self._init = jax.jit(jax.vmap(self._init_one), compiler_options=options)
-        self._advance = jax.jit(
-            jax.vmap(self._advance_one, in_axes=(0, 0, None)),
-            donate_argnums=1,
-            compiler_options=options,
-        )
-        self._episodes: Callable[..., Episodes] = jax.jit(
-            jax.vmap(episodes, in_axes=(None, 0, None)), compiler_options=options
-        )
+        jit = functools.partial(jax.jit, compiler_options=compiler_options(config))
+        self._init = jit(init)
+        self._advance = jit(jax.vmap(advance, in_axes=(0, 0, None)), donate_argnums=1)
+        self._episodes = jit(jax.vmap(episodes, in_axes=(None, 0, None)))
 
     def run(self, values: Sequence[Mapping[str, float]], seeds: Sequence[int]) -> list[Outcome]:
         """Train one policy for each trial, all at once.
@@ -140,16 +135,6 @@ class Trials:
     def _ppo(self, traced: Mapping[str, Float[Array, ""]]) -> PPO:
         # `model_copy` does not validate, so that traced values pass.
         return PPO(self._config.ppo.model_copy(update=dict(traced)), self._env, self._networks)
-
-    def _init_one(
-        self, traced: Mapping[str, Float[Array, ""]], seed: UInt32[Array, ""]
-    ) -> TrainState:
-        return self._ppo(traced).init(jax.random.PRNGKey(seed))
-
-    def _advance_one(
-        self, traced: Mapping[str, Float[Array, ""]], state: TrainState, steps: Any
-    ) -> TrainState:
-        return self._ppo(traced).advance(state, steps, jnp.ones((), bool))[0]
 
 
 def mean_seconds(episodes: Episodes, config: Config) -> list[float]:

@@ -1,18 +1,7 @@
 """Compute where a camera has to be to see given points."""
 
-from typing import NamedTuple
-
 import numpy as np
 from jaxtyping import Float
-
-
-class Slopes(NamedTuple):
-    """A `Slopes` holds the borders of a view, as distances from its axis per distance ahead."""
-
-    left: float
-    right: float
-    below: float
-    above: float
 
 
 def camera_axes(ahead_w: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
@@ -30,7 +19,7 @@ def camera_axes(ahead_w: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
 def eye_that_sees(
     points_w: Float[np.ndarray, "n 3"],
     axes_w: Float[np.ndarray, "3 3"],
-    slopes: Slopes,
+    slopes: Float[np.ndarray, "4"],
     nearest: float,
 ) -> Float[np.ndarray, "3"]:
     """Return the nearest position from which a camera sees all points between its borders.
@@ -44,7 +33,8 @@ def eye_that_sees(
     Args:
       points_w: the points [m], world frame.
       axes_w: the result of `camera_axes`.
-      slopes: the borders between which the points have to be.
+      slopes: the left, right, lower and upper border between which the points have to be, as
+        distances from the view's axis per distance ahead.
       nearest: the smallest distance from the camera to a point, along its axis [m].
     """
     x, y, z = axes_w @ points_w.T

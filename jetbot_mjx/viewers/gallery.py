@@ -40,54 +40,29 @@ _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
 _GIF_SIZE, _GALLERY_GIF_SIZE = 0.6, 0.75  # relative to the video
 
 
-class RenderedRun(NamedTuple):
-    """A `RenderedRun` holds the files rendered for one policy."""
+class Rendered(NamedTuple):
+    """A `Rendered` holds the files rendered for one policy, or for several of one run."""
 
-    mp4: Path
-    gif: Path
-    trajectories: Path
-    successes: int
-    episodes: int
-
-    def describe(self) -> str:
-        """Return what to print about it."""
-        return (
-            f"{self.successes} of {self.episodes} goals reached\n"
-            f"video: {self.mp4}\ngif:   {self.gif}\nplot:  {self.trajectories}"
-        )
-
-
-class Gallery(NamedTuple):
-    """A `Gallery` holds the files rendered for several policies of one run."""
-
-    mp4: Path
-    gif: Path
-    plots: Path
-    """Trajectories of the policies from above, side by side."""
-    successes: dict[int, int]
+    successes: Mapping[int, int]
     """Number of goals reached, by the checkpoint's environment steps."""
     episodes: int
     """Number of goals that each policy drove to."""
+    files: Mapping[str, Path]
+    """The files by what they are: `video`, `gif`, `plot`, `plots` or `image`."""
 
     def describe(self) -> str:
-        """Return what to print about it."""
-        return (
-            f"{successes_table(self.successes, self.episodes)}\n"
-            f"video: {self.mp4}\ngif:   {self.gif}\nplots: {self.plots}"
-        )
+        """Return what to print about it: a line for each checkpoint and for each file."""
+        lines = [
+            f"{step:>12,} steps  {count:,} of {self.episodes:,} goals reached"
+            for step, count in self.successes.items()
+        ]
+        return "\n".join([*lines, *(f"{f'{what}:':6} {path}" for what, path in self.files.items())])
 
 
-def successes_table(successes: Mapping[int, int], episodes: int) -> str:
-    """Return one line for each checkpoint, with the number of goals reached.
-
-    Args:
-      successes: the number of goals reached, by the checkpoint's environment steps.
-      episodes: the number of goals.
-    """
-    return "\n".join(
-        f"{step:>12,} steps  {count} of {episodes} goals reached"
-        for step, count in successes.items()
-    )
+def video_files(folder: Path, name: str) -> dict[str, Path]:
+    """Make a folder, and return the paths of a video and a GIF in it."""
+    make_folder(folder)
+    return {"video": folder / f"{name}.mp4", "gif": folder / f"{name}.gif"}
 
 
 def render_run(
@@ -96,7 +71,7 @@ def render_run(
     episodes: int = EPISODES,
     goals: Sequence[int] | None = None,
     which: Which = "best",
-) -> RenderedRun:
+) -> Rendered:
     """Render deterministic episodes of one policy on some of the report's fixed goals.
 
     Args:
@@ -124,26 +99,20 @@ def render_run(
     env = checkpoint.make_env()
     rolled_out = run_episodes([checkpoint], env, goals)[0]
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
-    make_folder(folder)
-    rendered = RenderedRun(
-        mp4=folder / f"{names[0]}.mp4",
-        gif=folder / f"{names[0]}.gif",
-        trajectories=folder / f"{names[1]}.png",
-        successes=int(rolled_out.success.sum()),
-        episodes=len(goals),
-    )
+    files = video_files(folder, names[0]) | {"plot": folder / f"{names[1]}.png"}
     # Plot the trajectories and render the videos.
-    with writing_to(rendered.trajectories):
-        _trajectory_plot(checkpoint, env, rolled_out, goals).save(rendered.trajectories)
+    with writing_to(files["plot"]):
+        _trajectory_plot(checkpoint, env, rolled_out, goals).save(files["plot"])
     with VideoRenderer(env) as renderer:
         drives = split_trajectories(env, rolled_out, goals)
         total = sum(renderer.frame_count([drive]) for drive in drives)
         videos = [renderer.render_episode(drive) for drive in drives]
-        _write_videos(rendered.mp4, rendered.gif, videos, total, _GIF_SIZE)
-    return rendered
+        _write_videos(files, videos, total, _GIF_SIZE)
+    successes = {checkpoint.env_steps: int(rolled_out.success.sum())}
+    return Rendered(successes, len(goals), files)
 
 
-def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> Gallery:
+def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> Rendered:
     """Render the first, the middle and the last checkpoint of a run driving to the same goals.
 
     The goals are the report's, from the first on, so that none is chosen by its outcome.
@@ -166,24 +135,15 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     env = checkpoints[0].make_env()
     goals = range(episodes)
     rolled_out = run_episodes(checkpoints, env, goals)
-    folder = path / "videos"
-    make_folder(folder)
-    successes = [int(each.success.sum()) for each in rolled_out]
     name = name_with_count("gallery", episodes, GALLERY_EPISODES)
-    gallery = Gallery(
-        mp4=folder / f"{name}.mp4",
-        gif=folder / f"{name}.gif",
-        plots=folder / f"{name}.png",
-        successes=dict(zip(chosen, successes, strict=True)),
-        episodes=episodes,
-    )
+    files = video_files(path / "videos", name) | {"plots": path / "videos" / f"{name}.png"}
     # Plot the trajectories side by side.
     plots = [
         np.asarray(_trajectory_plot(checkpoint, env, each, goals))
         for checkpoint, each in zip(checkpoints, rolled_out, strict=True)
     ]
-    with writing_to(gallery.plots):
-        Image.fromarray(np.hstack(plots)).save(gallery.plots)
+    with writing_to(files["plots"]):
+        Image.fromarray(np.hstack(plots)).save(files["plots"])
     # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
     by_goal = list(zip(*(split_trajectories(env, each, goals) for each in rolled_out), strict=True))
@@ -193,8 +153,11 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
             for same_goal in by_goal
         ]
         total = sum(renderer.frame_count(same_goal) for same_goal in by_goal)
-        _write_videos(gallery.mp4, gallery.gif, videos, total, _GALLERY_GIF_SIZE)
-    return gallery
+        _write_videos(files, videos, total, _GALLERY_GIF_SIZE)
+    successes = {
+        step: int(each.success.sum()) for step, each in zip(chosen, rolled_out, strict=True)
+    }
+    return Rendered(successes, episodes, files)
 
 
 def early_middle_final(steps: Sequence[int]) -> list[int]:
@@ -258,13 +221,12 @@ def _trajectory_plot(
 
 
 def _write_videos(
-    mp4: Path, gif: Path, videos: Sequence[Iterable[Frame]], total: int, size: float
+    files: Mapping[str, Path], videos: Sequence[Iterable[Frame]], total: int, size: float
 ) -> None:
     """Write all videos to one mp4 file, and the first ones to a gif of relative size `size`.
 
     Args:
-      mp4: The path of the mp4 file.
-      gif: The path of the gif.
+      files: The result of `video_files`.
       videos: The frames of each video.
       total: The number of frames of all videos.
       size: The size of the gif relative to the video.
@@ -279,10 +241,10 @@ def _write_videos(
                 yield frame
                 advance(1)
 
-    with stage("frames", total) as advance, writing_to(mp4):
-        write_mp4(mp4, frames(advance))
-    with stage("writing the gif"), writing_to(gif):
-        write_gif(gif, gif_frames)
+    with stage("frames", total) as advance, writing_to(files["video"]):
+        write_mp4(files["video"], frames(advance))
+    with stage("writing the gif"), writing_to(files["gif"]):
+        write_gif(files["gif"], gif_frames)
 
 
 def check_goals(goals: Sequence[int]) -> None:

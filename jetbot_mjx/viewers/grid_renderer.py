@@ -5,10 +5,10 @@ scene once for each robot. Robots that are only a few pixels long are drawn by t
 enlarged.
 """
 
+import contextlib
 import copy
-import itertools
 import math
-from typing import Self
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.viewers.offscreen import open_renderer, overview, reduce_image
+from jetbot_mjx.viewers.offscreen import add_lines, open_renderer, overview, reduce_image
 from jetbot_mjx.viewers.pose import set_pose
 from jetbot_mjx.viewers.robot_grid import WIDEST_CELL, RobotGrid
 from jetbot_mjx.viewers.video import Frame
@@ -34,7 +34,7 @@ _REACHED = np.array((0.20, 0.85, 0.30, 1.0), np.float32)
 _START_DISTANCE, _START_AZIMUTH, _START_ELEVATION = 0.85, 25.0, -30.0  # of the camera [m, degrees]
 
 
-class GridRenderer:
+class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
     """A `GridRenderer` renders a `RobotGrid`; it is a context manager that frees OpenGL."""
 
     def __init__(
@@ -75,34 +75,28 @@ class GridRenderer:
         self._data = mujoco.MjData(self._model)
         self._size, self._trail_width = (width, height), trail_width
         model = self._model
-        # The geoms of one robot are added robot by robot, and the floor only once.
-        shown = (model.geom_bodyid > 0) & (model.geom_group != _HIDDEN_GROUP)
-        model.geom_group[:] = np.select([floor, shown], [0, 1], _HIDDEN_GROUP)
-        self._floor_option, self._robot_option = mujoco.MjvOption(), mujoco.MjvOption()
-        self._floor_option.geomgroup[1:] = 0
-        self._robot_option.geomgroup[:] = np.arange(len(self._robot_option.geomgroup)) == 1
-        # The floor is darker than the robots.
-        model.geom_rgba[floor] = _FLOOR
-        model.mat_rgba[model.geom_matid[floor]] = _FLOOR
         # From far away, only the largest geoms of a robot are drawn, and all of a mocap body.
-        mocap = shown & (model.body_mocapid[model.geom_bodyid] >= 0)
-        volume = np.where(shown & ~mocap, model.geom_aabb[:, 3:].prod(axis=1), 0.0)
-        largest = np.argsort(volume)[-_LARGEST_GEOMS:]
+        shown = (model.geom_bodyid > 0) & (model.geom_group != _HIDDEN_GROUP)
+        self._mocap_ids = model.body_mocapid[model.geom_bodyid]
+        mocap, robot = shown & (self._mocap_ids >= 0), shown & (self._mocap_ids < 0)
+        volume = np.where(robot, model.geom_aabb[:, 3:].prod(axis=1), 0.0)
+        is_far = mocap.copy()
+        is_far[np.argsort(volume)[-_LARGEST_GEOMS:]] = True
         self._goal_geoms = frozenset(np.flatnonzero(mocap & _of_body(model, "goal")).tolist())
-        self._far_geoms = [
-            _FarGeom(model, int(index), smallest)
-            for indices, smallest in (
-                (largest[volume[largest] > 0], smallest_robot / _length(model, shown & ~mocap)),
-                (np.flatnonzero(mocap), smallest_marker / _length(model, mocap)),
-            )
-            for index in indices
-        ]
-        self._length = _length(model, shown & ~mocap)
-
-    @property
-    def fovy(self) -> float:
+        self._length = _length(model, robot)
+        # Pixels of a metre below which a geom is drawn enlarged.
+        self._smallest = np.where(
+            mocap, smallest_marker / _length(model, mocap), smallest_robot / self._length
+        )
+        # The geoms of one robot are added robot by robot, and the floor only once.
+        model.geom_group[:] = np.select([floor, is_far & shown, shown], [0, 1, 2], _HIDDEN_GROUP)
+        self._floor_option, self._far_option, self._detailed_option = (
+            _show_groups(groups) for groups in ((0,), (1,), (1, 2))
+        )
+        # The floor is darker than the robots.
+        model.geom_rgba[floor] = model.mat_rgba[model.geom_matid[floor]] = _FLOOR
+        self.fovy = float(model.vis.global_.fovy)
         """Field of view of the camera in height [degrees]."""
-        return float(self._model.vis.global_.fovy)
 
     def frame(self, grid: RobotGrid, seconds: float, camera: mujoco.MjvCamera) -> Frame:
         """Render the state at one time of the video.
@@ -138,95 +132,63 @@ class GridRenderer:
         for index, step in enumerate(steps.tolist()):
             places = {name: place[index] for name, place in grid.markers.items()}
             set_pose(model, self._data, grid.qpos[index, step], places)
-            mujoco.mj_kinematics(model, self._data)
             self._add_trail(grid.qpos[index, : step + 1, :2])
-            if detailed[index]:
-                self._add_detailed(reached=bool(reached[index]))
-            else:
-                self._add_far(robots_w[index], float(pixels[index]), reached=bool(reached[index]))
+            self._add_robot(
+                robots_w[index],
+                float(pixels[index]),
+                detailed=bool(detailed[index]),
+                reached=bool(reached[index]),
+            )
         return reduce_image(self._renderer.render())
 
-    def _add_detailed(self, *, reached: bool) -> None:
-        """Add all geoms of the robot and of its markers in their current pose."""
-        scene, first = self._renderer.scene, self._renderer.scene.ngeom
-        everything = int(mujoco.mjtCatBit.mjCAT_ALL)
-        perturbation = mujoco.MjvPerturb()
-        mujoco.mjv_addGeoms(
-            self._model, self._data, self._robot_option, perturbation, everything, scene
-        )
-        if reached:
-            for index in range(first, scene.ngeom):
-                if scene.geoms[index].objid in self._goal_geoms:
-                    scene.geoms[index].rgba[:] = _REACHED
-
-    def _add_far(self, robot_w: Float[np.ndarray, "3"], pixels: float, *, reached: bool) -> None:
-        """Add the largest geoms of the robot and its markers, enlarged around their bodies.
+    def _add_robot(
+        self, robot_w: Float[np.ndarray, "3"], pixels: float, *, detailed: bool, reached: bool
+    ) -> None:
+        """Add the geoms of the robot and of its markers in their current pose.
 
         Args:
           robot_w: The position of the robot [m].
           pixels: The pixels of a metre.
+          detailed: Whether to add all geoms, or only the largest, enlarged around their bodies.
           reached: Whether the robot is at its goal.
         """
-        scene, data = self._renderer.scene, self._data
-        for far in self._far_geoms:
-            scale = max(1.0, far.smallest / pixels)
-            centre = robot_w if far.mocap_id < 0 else data.mocap_pos[far.mocap_id]
-            ground = np.array([centre[0], centre[1], 0.0])
-            rotation = data.geom_xmat[far.index]
-            position = data.geom_xpos[far.index] + rotation.reshape(3, 3) @ far.offset
-            mujoco.mjv_initGeom(
-                scene.geoms[scene.ngeom],
-                far.kind,
-                scale * far.size,
-                ground + scale * (position - ground),
-                rotation,
-                _REACHED if reached and far.index in self._goal_geoms else far.rgba,
-            )
-            scene.ngeom += 1
+        scene, first = self._renderer.scene, self._renderer.scene.ngeom
+        option = self._detailed_option if detailed else self._far_option
+        everything = int(mujoco.mjtCatBit.mjCAT_ALL)
+        perturbation = mujoco.MjvPerturb()
+        mujoco.mjv_addGeoms(self._model, self._data, option, perturbation, everything, scene)
+        for geom in (scene.geoms[index] for index in range(first, scene.ngeom)):
+            if reached and geom.objid in self._goal_geoms:
+                geom.rgba[:] = _REACHED
+            if not detailed:
+                mocap_id = self._mocap_ids[geom.objid]
+                centre = robot_w if mocap_id < 0 else self._data.mocap_pos[mocap_id]
+                scale = max(1.0, self._smallest[geom.objid] / pixels)
+                ground = np.array([centre[0], centre[1], 0.0])
+                geom.matid = -1  # plain colours are seen from farther away than materials
+                if geom.type == mujoco.mjtGeom.mjGEOM_CYLINDER:
+                    geom.size[2] = geom.size[0]  # so are wide wheels
+                geom.size[:] *= scale
+                geom.pos[:] = ground + scale * (geom.pos - ground)
 
     def _add_trail(self, path_w: Float[np.ndarray, "time 2"]) -> None:
         """Add lines along the path of a robot, up to its current position."""
-        scene, kind = self._renderer.scene, mujoco.mjtGeom.mjGEOM_LINE
         last = len(path_w) - 1
         points = np.full((-(-last // self._steps) + 1, 3), _TRAIL_HEIGHT)
         points[:-1, :2], points[-1, :2] = path_w[: last : self._steps], path_w[last]
         width = self._trail_width * self._renderer.height / self._size[1]
-        for start, end in itertools.pairwise(points):
-            geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), _TRAIL)
-            mujoco.mjv_connector(geom, kind, width, start, end)
-            scene.ngeom += 1
-
-    def __enter__(self) -> Self:
-        """Return the renderer."""
-        return self
+        add_lines(self._renderer.scene, points, width, _TRAIL)
 
     def __exit__(self, *exception: object) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
 
 
-class _FarGeom:
-    """A `_FarGeom` holds how one geom of the model is drawn if it is far away."""
-
-    def __init__(self, model: mujoco.MjModel, index: int, smallest: float) -> None:
-        """Read the geom; a mesh is drawn as the box around it."""
-        self.index = index
-        self.smallest = smallest  # pixels of a metre below which it is drawn enlarged
-        self.mocap_id = int(model.body_mocapid[model.geom_bodyid[index]])
-        material = model.geom_matid[index]
-        rgba = model.mat_rgba[material] if material >= 0 else model.geom_rgba[index]
-        self.rgba = np.array(rgba, np.float32)
-        kind = int(model.geom_type[index])
-        self.kind, size, self.offset = kind, np.array(model.geom_size[index]), np.zeros(3)
-        if kind in (mujoco.mjtGeom.mjGEOM_CYLINDER, mujoco.mjtGeom.mjGEOM_CAPSULE):
-            size = size[[0, 0, 1]]
-        elif kind == mujoco.mjtGeom.mjGEOM_SPHERE:
-            size = size[[0, 0, 0]]
-        elif kind not in (mujoco.mjtGeom.mjGEOM_BOX, mujoco.mjtGeom.mjGEOM_ELLIPSOID):
-            self.kind = int(mujoco.mjtGeom.mjGEOM_BOX)
-            self.offset, size = np.split(np.array(model.geom_aabb[index]), 2)
-        self.size = size
+def _show_groups(groups: Sequence[int]) -> mujoco.MjvOption:
+    """Return the option to draw the geoms of some groups only."""
+    option = mujoco.MjvOption()
+    option.geomgroup[:] = np.isin(np.arange(len(option.geomgroup)), groups)
+    return option
 
 
 def _of_body(model: mujoco.MjModel, name: str) -> np.ndarray:

@@ -3,22 +3,14 @@
 import contextlib
 import getpass
 import socket
-import types
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Literal
 
-from jetbot_mjx.errors import MissingPackageError, UserError
+from jetbot_mjx.errors import UserError, requires_extra
 from jetbot_mjx.runs.checkpoint import Which, find_checkpoint
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
-
-
-class Played(NamedTuple):
-    """A `Played` holds the number of successes and episodes while the viewer was open."""
-
-    successes: int
-    episodes: int
 
 
 def play_live(
@@ -33,7 +25,7 @@ def play_live(
     port: int | None = None,
     allow: Sequence[str] = (),
     tell: Callable[[str], None],
-) -> Played:
+) -> tuple[int, int]:
     """Drive and show a policy in real time until the user interrupts or closes the window.
 
     Args:
@@ -49,7 +41,7 @@ def play_live(
       tell: A function that receives messages for the user, line by line.
 
     Returns:
-      How many goals were reached.
+      How many goals were reached, and in how many episodes.
 
     Raises:
       UserError: there is no usable checkpoint, no viewer, no display, or the port is taken.
@@ -59,24 +51,24 @@ def play_live(
         raise UserError(f"--robots {robots}: --viewer native shows one robot, use the browser")
     find_checkpoint(run_or_checkpoint, which)
     if viewer == "browser":
-        server = _server()
-        free: int = server.free_port(host, port)
-    else:
-        mujoco_window.require_window()
-    tell(f"loading {run_or_checkpoint} and compiling: some seconds")
-    player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed, robots=robots)
-    try:
-        if viewer == "browser":
-            with server.ViserViewer(player, host=host, port=free, allow=allow, tell=tell) as page:
+        with requires_extra("play", "the browser viewer"):
+            from jetbot_mjx.viewers import viser_server
+        free = viser_server.free_port(host, port)
+
+        def run(player: Player) -> None:
+            with viser_server.ViserViewer(player, host, free, allow=allow, tell=tell) as page:
                 for line in addresses(host, free):
                     tell(line)
                 page.run()
-        else:
-            mujoco_window.run(player)
-    except KeyboardInterrupt:
-        # Ctrl-C is the normal way to end the viewer.
-        pass
-    return Played(player.successes, player.episodes)
+    else:
+        mujoco_window.require_window()
+        run = mujoco_window.run
+    tell(f"loading {run_or_checkpoint} and compiling: some seconds")
+    player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed, robots=robots)
+    # Ctrl-C is the normal way to end the viewer.
+    with contextlib.suppress(KeyboardInterrupt):
+        run(player)
+    return player.successes, player.episodes
 
 
 def addresses(host: str, port: int) -> list[str]:
@@ -103,14 +95,3 @@ def addresses(host: str, port: int) -> list[str]:
     if everywhere:
         lines.append(f"--host {host}: everyone who reaches this machine can watch and interfere")
     return lines
-
-
-def _server() -> types.ModuleType:
-    try:
-        from jetbot_mjx.viewers import viser_server
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(
-            f"the browser viewer is an extra ({error.name} is missing): pip install"
-            " 'jetbot_mjx[play]'"
-        ) from None
-    return viser_server

@@ -6,7 +6,7 @@ The episodes are recorded in one batch, placed on a `RobotGrid`, and drawn by a 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -15,7 +15,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Which, explanation, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
-from jetbot_mjx.viewers.gallery import run_episodes, run_folder, successes_table
+from jetbot_mjx.viewers.gallery import Rendered, run_episodes, run_folder, video_files
 from jetbot_mjx.viewers.grid_renderer import GridRenderer, camera_above, pull_back_camera
 from jetbot_mjx.viewers.robot_grid import RobotGrid, place_on_grid
 from jetbot_mjx.viewers.video import FPS, GIF_STRIDE, Frame, resize_frame, write_gif, write_mp4
@@ -39,39 +39,9 @@ _STRIP_ROBOT, _STRIP_MARKER, _STRIP_TRAIL = 18.0, 13.0, 2.0  # [pixels]
 _EARLY_SUCCESS = 0.4  # the early policy is the one closest to this success rate
 
 
-class ManyRobotsVideo(NamedTuple):
-    """A `ManyRobotsVideo` holds the files rendered for many robots with one policy."""
-
-    mp4: Path
-    gif: Path
-    successes: int
-    robots: int
-
-    def describe(self) -> str:
-        """Return what to print about it."""
-        return (
-            f"{self.successes:,} of {self.robots:,} goals reached\n"
-            f"video: {self.mp4}\ngif:   {self.gif}"
-        )
-
-
-class TrainingStrip(NamedTuple):
-    """A `TrainingStrip` holds the image of an untrained, an early and a trained policy."""
-
-    png: Path
-    successes: dict[int, int]
-    """Number of goals reached, by the checkpoint's environment steps."""
-    robots: int
-    """Number of goals that each policy drove to."""
-
-    def describe(self) -> str:
-        """Return what to print about it."""
-        return f"{successes_table(self.successes, self.robots)}\nimage: {self.png}"
-
-
 def render_many(
     run_or_checkpoint: str | Path, *, robots: int = 1024, which: Which = "best"
-) -> ManyRobotsVideo:
+) -> Rendered:
     """Render many robots with one policy that drive to the report's first goals in one scene.
 
     The camera starts close to one robot and moves back until it sees all. The robots start in the
@@ -93,25 +63,21 @@ def render_many(
     env = checkpoint.make_env()
     grid = place_on_grid(env, run_episodes([checkpoint], env, range(robots))[0])
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
-    make_folder(folder)
-    name = f"many-{robots}"
-    video = ManyRobotsVideo(
-        folder / f"{name}.mp4", folder / f"{name}.gif", int(grid.reached.sum()), robots
-    )
+    files = video_files(folder, f"many-{robots}")
     # Render the frames, and write the animation in the largest size that fits.
     with GridRenderer(env, robots, *_SIZE) as renderer:
         frames = list(_video_frames(grid, renderer))
-    with writing_to(video.mp4):
-        write_mp4(video.mp4, frames)
-    with writing_to(video.gif):
+    with writing_to(files["video"]):
+        write_mp4(files["video"], frames)
+    with writing_to(files["gif"]):
         for scale in _GIF_SCALES:
-            write_gif(video.gif, [resize_frame(frame, scale) for frame in frames[::GIF_STRIDE]])
-            if video.gif.stat().st_size <= MAX_GIF_BYTES:
+            write_gif(files["gif"], [resize_frame(frame, scale) for frame in frames[::GIF_STRIDE]])
+            if files["gif"].stat().st_size <= MAX_GIF_BYTES:
                 break
-    return video
+    return Rendered({checkpoint.env_steps: int(grid.reached.sum())}, robots, files)
 
 
-def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> TrainingStrip:
+def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     """Render the ends of the same episodes with an untrained, an early and a trained policy.
 
     The early policy is the checkpoint whose success rate in its own evaluation is closest to 40 %.
@@ -162,8 +128,10 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> TrainingS
     png = folder / "training.png"
     with writing_to(png):
         Image.fromarray(np.hstack(panels)).save(png)
-    successes = [int(grid.reached.sum()) for grid in grids]
-    return TrainingStrip(png, dict(zip(chosen.values(), successes, strict=True)), robots)
+    successes = {
+        step: int(grid.reached.sum()) for step, grid in zip(chosen.values(), grids, strict=True)
+    }
+    return Rendered(successes, robots, {"image": png})
 
 
 def _video_frames(grid: RobotGrid, renderer: GridRenderer) -> Iterator[Frame]:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 import trimesh
-from jaxtyping import Float
 
 _VISIBLE_GROUPS = (0, 1, 2)  # as in MuJoCo's viewer; collision geoms are in group 3
 _ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
@@ -15,29 +14,18 @@ _DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
 class Geom(NamedTuple):
-    """A `Geom` holds the mesh of a visible geom and its pose in the frame of its body."""
+    """A `Geom` holds the mesh of a visible geom."""
 
     name: str
     """Name of the geom, or its index if it has no name."""
     body: int
     """Index of its body."""
-    position_b: Float[np.ndarray, "3"]
-    """Position in the body frame [m]."""
-    quat_b: Float[np.ndarray, "4"]
-    """Orientation in the body frame (w, x, y, z)."""
     mesh: trimesh.Trimesh
-    """Surface in the frame of the geom [m]."""
+    """Surface in the frame of the body [m]."""
     rgba: tuple[float, float, float, float]
     """Colour and opacity, each in [0, 1]."""
     smooth: bool
     """Whether to use smooth shading, as for spheres and ellipsoids."""
-
-    def mesh_b(self) -> trimesh.Trimesh:
-        """Return the surface in the body frame [m]."""
-        pose_b = np.eye(4)
-        pose_b[:3, :3] = trimesh.transformations.quaternion_matrix(self.quat_b)[:3, :3]
-        pose_b[:3, 3] = self.position_b
-        return self.mesh.copy().apply_transform(pose_b)
 
 
 def visible_geoms(model: mujoco.MjModel, sections: int = 48) -> Iterator[Geom]:
@@ -56,12 +44,12 @@ def visible_geoms(model: mujoco.MjModel, sections: int = 48) -> Iterator[Geom]:
         rgba = _rgba(model, index)
         if mesh is None or geom.group[0] not in _VISIBLE_GROUPS or rgba[3] == 0:
             continue
+        pose_b = trimesh.transformations.quaternion_matrix(geom.quat)
+        pose_b[:3, 3] = geom.pos
         yield Geom(
             name=geom.name or str(index),
             body=int(geom.bodyid[0]),
-            position_b=np.array(geom.pos),
-            quat_b=np.array(geom.quat),
-            mesh=mesh,
+            mesh=mesh.apply_transform(pose_b),
             rgba=rgba,
             smooth=mujoco.mjtGeom(model.geom_type[index]) in _ROUND,
         )

@@ -1,12 +1,13 @@
 """Show a player in MuJoCo's own window, on machines with a display."""
 
+import contextlib
 import queue
 import sys
 import time
 import types
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any, Self
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -45,7 +46,7 @@ def require_window(remedy: str = _REMEDY) -> types.ModuleType:
     return mujoco.viewer
 
 
-class Window:
+class Window(contextlib.AbstractContextManager["Window"]):
     """A window that shows a model; a context manager that closes it."""
 
     def __init__(
@@ -102,17 +103,9 @@ class Window:
             self._viewer.set_texts((None, None, *texts))
         self._viewer.sync()
 
-    def close(self) -> None:
-        """Close the window."""
-        self._viewer.close()
-
-    def __enter__(self) -> Self:
-        """Return the window."""
-        return self
-
     def __exit__(self, *exception: object) -> None:
         """Close the window."""
-        self.close()
+        self._viewer.close()
 
 
 def run(player: Player) -> None:
@@ -131,17 +124,8 @@ def run(player: Player) -> None:
             while not pressed.empty():
                 player.nudge(*_ARROWS.get(pressed.get(), (0, 0)))
             player.advance()
-            window.show(np.asarray(player.snapshot.qpos), player.snapshot.markers, _texts(player))
+            texts = {**player.describe(), "Agent": player.agent}
+            columns = "\n".join(texts), "\n".join(texts.values())
+            window.show(np.asarray(player.snapshot.qpos), player.snapshot.markers, columns)
             player.frames.count(time.monotonic())
             time.sleep(player.wait())
-
-
-def _texts(player: Player) -> tuple[str, str]:
-    """Return labels and values, line by line."""
-    values = {
-        "goals": f"{player.successes} of {player.episodes} reached",
-        "episode": f"{player.time:.1f} of {player.time_limit:.1f} s",
-        "distance": f"{player.distance:.2f} m",
-        "agent": player.agent,
-    }
-    return "\n".join(values), "\n".join(values.values())

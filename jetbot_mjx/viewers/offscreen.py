@@ -4,6 +4,7 @@ MuJoCo chooses its OpenGL back end from `MUJOCO_GL` when it is imported, before 
 whether it works. This module tries each back end in a subprocess, and uses the first that works.
 """
 
+import contextlib
 import copy
 import functools
 import importlib
@@ -13,7 +14,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Mapping
-from typing import Any, Self
+from typing import Any
 from unittest import mock
 
 import mujoco
@@ -23,7 +24,7 @@ from mujoco.rendering.classic import gl_context
 from PIL import Image
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.viewers.camera import Slopes, camera_axes, eye_that_sees
+from jetbot_mjx.viewers.camera import camera_axes, eye_that_sees
 from jetbot_mjx.viewers.pose import set_pose
 
 _BACKENDS = ("egl", "osmesa", "glfw")
@@ -36,7 +37,7 @@ _OVERSAMPLING = 2
 """Rendered pixels per pixel of the image, along each axis. This is as smooth as OpenGL's four
 samples per pixel, and on a CPU it takes two thirds of the time (one third for small images)."""
 
-_TRAIL_RGBA = (0.10, 0.35, 0.85, 1.0)
+_TRAIL = np.array((0.10, 0.35, 0.85, 1.0), np.float32)
 _TRAIL_WIDTH = 0.01  # fraction of the image's width
 
 _NEAR = 0.005  # [m] near clipping plane: the onboard camera comes close to the goal
@@ -57,7 +58,7 @@ _REMEDY_LINUX = (
 _REMEDY_ELSEWHERE = "run it in a session with a display, where GLFW can open a window"
 
 
-class Renderer:
+class Renderer(contextlib.AbstractContextManager["Renderer"]):
     """A `Renderer` renders a model; it is a context manager that frees its OpenGL context."""
 
     def __init__(self, mj_model: mujoco.MjModel, *, width: int = 480, height: int = 480) -> None:
@@ -96,34 +97,41 @@ class Renderer:
           The image, RGB.
         """
         set_pose(self._model, self._data, qpos, markers)
-        mujoco.mj_kinematics(self._model, self._data)
         mujoco.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, camera=camera)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
         if trail_w is not None:
-            self._add_trail(np.asarray(trail_w, float))
+            width = _TRAIL_WIDTH * self._renderer.width
+            add_lines(self._renderer.scene, np.asarray(trail_w, float), width, _TRAIL)
         return reduce_image(self._renderer.render())
-
-    def _add_trail(self, points_w: Float[np.ndarray, "n 3"]) -> None:
-        """Add lines between consecutive points to the scene, as far as it has room."""
-        scene, kind = self._renderer.scene, mujoco.mjtGeom.mjGEOM_LINE
-        colour = np.array(_TRAIL_RGBA, np.float32)
-        width = _TRAIL_WIDTH * self._renderer.width
-        for start, end in itertools.pairwise(points_w):
-            if scene.ngeom == scene.maxgeom:
-                return
-            geom = scene.geoms[scene.ngeom]
-            mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), colour)
-            mujoco.mjv_connector(geom, kind, width, start, end)
-            scene.ngeom += 1
-
-    def __enter__(self) -> Self:
-        """Return the renderer."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
+
+
+def add_lines(
+    scene: mujoco.MjvScene,
+    points_w: Float[np.ndarray, "n 3"],
+    width: float,
+    rgba: Float[np.ndarray, "4"],
+) -> None:
+    """Add lines between consecutive points to a scene, as far as it has room.
+
+    Args:
+      scene: the scene of a renderer.
+      points_w: the points [m], world frame.
+      width: the width of the lines, before `reduce_image` [pixels].
+      rgba: their colour, float32.
+    """
+    kind = mujoco.mjtGeom.mjGEOM_LINE
+    for start, end in itertools.pairwise(points_w):
+        if scene.ngeom == scene.maxgeom:
+            return
+        geom = scene.geoms[scene.ngeom]
+        mujoco.mjv_initGeom(geom, kind, np.zeros(3), np.zeros(3), np.zeros(9), rgba)
+        mujoco.mjv_connector(geom, kind, width, start, end)
+        scene.ngeom += 1
 
 
 def open_renderer(
@@ -183,7 +191,7 @@ def overview(
     angle = math.radians(_ELEVATION)
     axes_w = camera_axes(np.array([math.cos(angle), 0.0, math.sin(angle)]))
     slopes = math.tan(math.radians(fovy) / 2) * np.array([sides, sides, below, above])
-    eye_w = eye_that_sees(points_w, axes_w, Slopes(*slopes), _NEAREST)
+    eye_w = eye_that_sees(points_w, axes_w, slopes, _NEAREST)
     camera = mujoco.MjvCamera()
     camera.type = mujoco.mjtCamera.mjCAMERA_FREE
     camera.azimuth, camera.elevation = 0.0, _ELEVATION

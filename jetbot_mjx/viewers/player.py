@@ -59,7 +59,10 @@ class Player:
           UserError: there is no usable checkpoint, its task cannot be built, or there is no such
             agent.
         """
+        if agent not in AGENTS:
+            raise UserError(f"--agent {agent!r} is none: choose from {', '.join(AGENTS)}")
         self.agent = agent
+        """The agent that drives, one of `AGENTS`."""
         checkpoint = load_checkpoint(run_or_checkpoint, which)
         self.env = checkpoint.make_env()
         self.run_dir = checkpoint.run_dir
@@ -80,13 +83,12 @@ class Player:
         self._key, key = self._put(tuple(jax.random.split(jax.random.PRNGKey(seed))))
         # The first robot's goals do not depend on the number of robots.
         keys = [key, *(jax.random.fold_in(key, robot) for robot in range(1, robots))]
-        self._count = 0
-        self._rate = Rate()
-        self._speed = 1.0
+        self._count, self._rate, self._speed = 0, Rate(), 1.0
         self.drive(0.0, 0.0)
         self._use(checkpoint)
         self._hold = np.zeros(robots, int)
-        self._robot = 0
+        self.robot = 0
+        """Index of the chosen robot."""
         self._set(self._fns.reset(self._put(jnp.stack(keys))))
         one = jax.tree.map(operator.itemgetter(0), self._states)
         self.cannot_move_goal = move_goal_error(self.env, one)
@@ -106,7 +108,7 @@ class Player:
             self.episodes += int(ended.sum())
             self.successes += int(self.crowd.success[ended].sum())
             self._hold[ended] = round(_HOLD_SECONDS / self.env.dt)
-            if ended[self._robot]:
+            if ended[self.robot]:
                 self.outcome = _outcome(self.snapshot)
         self._hold[standing] -= 1
         over = standing & (self._hold == 0)
@@ -150,8 +152,8 @@ class Player:
         if self.cannot_move_goal:
             return False
         position_w = np.array([x, y, self.snapshot.goal_w[2]], np.float32)
-        self._hold[self._robot] = 0
-        self._set(self._fns.move(self._states, np.int32(self._robot), position_w))
+        self._hold[self.robot] = 0
+        self._set(self._fns.move(self._states, np.int32(self.robot), position_w))
         return True
 
     def switch_checkpoint(self, env_steps: int) -> None:
@@ -193,25 +195,9 @@ class Player:
         self.drive(speed + ahead * limits.max_speed / _NUDGES, yaw_rate)
 
     @property
-    def robot(self) -> int:
-        """Index of the chosen robot."""
-        return self._robot
-
-    @robot.setter
-    def robot(self, index: int) -> None:
-        self._robot = index
-        self.snapshot = jax.tree.map(operator.itemgetter(index), self.crowd)
-
-    @property
-    def agent(self) -> str:
-        """Return the agent that drives, one of `AGENTS`."""
-        return AGENTS[self._agent]
-
-    @agent.setter
-    def agent(self, name: str) -> None:
-        if name not in AGENTS:
-            raise UserError(f"--agent {name!r} is none: choose from {', '.join(AGENTS)}")
-        self._agent = AGENTS.index(name)
+    def snapshot(self) -> Snapshot:
+        """What a viewer shows of the last step of the chosen robot, on the host."""
+        return jax.tree.map(operator.itemgetter(self.robot), self.crowd)
 
     @property
     def speed(self) -> float:
@@ -251,14 +237,24 @@ class Player:
 
     def image(self) -> UInt8[np.ndarray, "h w c"]:
         """Return the newest image of the chosen robot's camera; only if the policy sees."""
-        return np.asarray(self._fns.see(self._states, np.int32(self._robot)))
+        return np.asarray(self._fns.see(self._states, np.int32(self.robot)))
 
     def occlusion_map(self) -> Float[np.ndarray, "h w"]:
         """Return how far the policy's action changes if a pixel of that image is covered.
 
         The policy is that of the checkpoint, whoever drives; `evaluation.occlusion` explains it.
         """
-        return np.asarray(self._fns.occlusion(self._states, np.int32(self._robot), self._params))
+        return np.asarray(self._fns.occlusion(self._states, np.int32(self.robot), self._params))
+
+    def describe(self) -> dict[str, str]:
+        """Return the texts that a viewer shows about the chosen robot and the pace, by label."""
+        ended = f", {self.outcome}" if self.snapshot.done else ""
+        return {
+            "Goals": f"{self.successes} of {self.episodes} reached",
+            "Episode": f"{self.time:.1f} of {self.time_limit:.1f} s{ended}",
+            "Distance": f"{self.distance:.2f} m",
+            "Pace": f"{self.steps_per_second:.0f} steps/s, {self.frames_per_second:.0f} frames/s",
+        }
 
     @property
     def steps_per_second(self) -> float:
@@ -277,7 +273,7 @@ class Player:
 
     def _inputs(self) -> Inputs:
         return Inputs(
-            agent=np.int32(self._agent),
+            agent=np.int32(AGENTS.index(self.agent)),
             params=self._params,
             twist_b=np.array(self.command, np.float32),
             key=self._key,
@@ -288,9 +284,7 @@ class Player:
     def _set(self, result: tuple[State, Snapshot]) -> None:
         self._states = result[0]
         self.crowd: Snapshot = jax.device_get(result[1])
-        """What a viewer shows of the last step of all robots, on the host."""
-        self.snapshot: Snapshot = jax.tree.map(operator.itemgetter(self._robot), self.crowd)
-        """The same of the chosen robot."""
+        """The same of all robots."""
 
     def _put(self, tree: Any) -> Any:
         return jax.device_put(tree, self._device)

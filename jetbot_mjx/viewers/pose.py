@@ -14,7 +14,7 @@ def set_pose(
     qpos: Float[np.ndarray, " nq"],
     markers: Mapping[str, Any],
 ) -> None:
-    """Set the pose of the robot and of the task's mocap bodies; body frames are not updated.
+    """Set the pose of the robot and of the task's mocap bodies, and update the body frames.
 
     Args:
       model: the model with all visual elements.
@@ -25,3 +25,4 @@ def set_pose(
     data.qpos[:] = qpos
     for name, position in markers.items():
         data.mocap_pos[model.body(name).mocapid[0]] = np.asarray(position)
+    mujoco.mj_kinematics(model, data)

@@ -10,18 +10,17 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import imageio.v3 as iio
 import jax
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, UInt8
-from PIL import Image, ImageDraw, ImageFont
+from jaxtyping import Float, UInt8
+from PIL import Image, ImageDraw, ImageFont, ImageOps
 
 from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
@@ -112,7 +111,7 @@ def split_trajectories(
     ]
 
 
-class VideoRenderer:
+class VideoRenderer(contextlib.ExitStack):
     """A `VideoRenderer` renders trajectories; it is a context manager that frees its cameras."""
 
     def __init__(self, env: JetBotEnv, side: int = VIEW, fps: float = FPS) -> None:
@@ -126,14 +125,19 @@ class VideoRenderer:
         Raises:
           UserError: this machine has no OpenGL that works without a display.
         """
+        super().__init__()
         self._fovy = float(env.mj_model.vis.global_.fovy)
         self._side, self._fps = side, fps
         width, height = (round(share * side) for share in _INSET)
-        self._policy_image = None if env.camera is None else _image_fn(env.camera)
-        with contextlib.ExitStack() as stack:
-            self._view = stack.enter_context(Renderer(env.mj_model, width=side, height=side))
-            self._inset = stack.enter_context(Renderer(env.mj_model, width=width, height=height))
-            self._stack = stack.pop_all()
+        self._policy_image = None
+        if (camera := env.camera) is not None:
+            self._policy_image = jax.jit(
+                lambda qpos, markers: camera.render(
+                    camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), markers
+                )
+            )
+        self._view = self.enter_context(Renderer(env.mj_model, width=side, height=side))
+        self._inset = self.enter_context(Renderer(env.mj_model, width=width, height=height))
 
     def render_episode(self, trajectory: Trajectory) -> Iterator[Frame]:
         """Render one episode: chase camera with the onboard camera as inset, and the top view.
@@ -143,15 +147,10 @@ class VideoRenderer:
         Args:
           trajectory: the episode.
 
-        Yields:
+        Returns:
           Frames, two views wide.
         """
-        last_step, frame = -1, np.empty(0)
-        for seconds in self._frame_times([trajectory]):
-            step = trajectory.step_at(seconds)
-            if step != last_step:
-                last_step, frame = step, self._episode_frame(trajectory, step)
-            yield frame
+        return self._frames([trajectory], [functools.partial(self._episode_frame, trajectory)])
 
     def render_side_by_side(self, episodes: Sequence[tuple[str, Trajectory]]) -> Iterator[Frame]:
         """Render several episodes side by side in the same time; finished robots stand still.
@@ -162,31 +161,37 @@ class VideoRenderer:
         Args:
           episodes: a heading and a trajectory for each view, from left to right.
 
-        Yields:
+        Returns:
           Frames, one view wide per episode.
         """
-        extent = np.vstack([_extent(trajectory) for _, trajectory in episodes])
-        camera = overview(extent, self._fovy, **_FILLED)
-        last_steps = [-1] * len(episodes)
-        views = [np.empty(0)] * len(episodes)
-        for seconds in self._frame_times([trajectory for _, trajectory in episodes]):
-            for index, (heading, trajectory) in enumerate(episodes):
-                step = trajectory.step_at(seconds)
-                if step != last_steps[index]:
-                    last_steps[index] = step
-                    views[index] = self._episode_view(heading, trajectory, step, camera)
-            yield np.hstack(views)
+        trajectories = [trajectory for _, trajectory in episodes]
+        camera = overview(np.vstack([*map(_extent, trajectories)]), self._fovy, **_FILLED)
+        draws = [functools.partial(self._episode_view, *one, camera=camera) for one in episodes]
+        return self._frames(trajectories, draws)
+
+    def _frames(
+        self, trajectories: Sequence[Trajectory], draws: Sequence[Callable[[int], Frame]]
+    ) -> Iterator[Frame]:
+        """Render trajectories side by side, up to a pause after the longest.
+
+        Args:
+          trajectories: the episodes, from left to right.
+          draws: for each of them a function that renders the index of a state.
+        """
+        # A view is rendered again only if its robot has made a step.
+        draws = [functools.lru_cache(1)(draw) for draw in draws]
+        for frame in range(self.frame_count(trajectories)):
+            steps = [trajectory.step_at(frame / self._fps) for trajectory in trajectories]
+            yield np.hstack([draw(step) for draw, step in zip(draws, steps, strict=True)])
 
     def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
         chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
         top = self._frame_with_trail(trajectory, step, "top")
         inset = self._inset_image(trajectory, step, _SEEN)
-        if self._policy_image is None:
-            # In the lower corner the inset hides a goal only while the robot drives away from it.
-            chase = self._with_inset(chase, inset, top=False, left=False)
-            return np.hstack([self._with_text(chase, trajectory, step), top])
-        chase = self._with_inset(chase, inset, top=True, left=True)
-        beside = round(_MARGIN * self._side) + inset.shape[1]
+        # In the lower corner the inset hides a goal only while the robot drives away from it.
+        sees = self._policy_image is not None
+        chase = self._with_inset(chase, inset, top=sees, left=sees)
+        beside = round(_MARGIN * self._side) + inset.shape[1] if sees else 0
         return np.hstack([self._with_text(chase, trajectory, step, beside=beside), top])
 
     def frame_count(self, trajectories: Sequence[Trajectory]) -> int:
@@ -199,10 +204,6 @@ class VideoRenderer:
     ) -> Frame:
         qpos, trail_w = trajectory.qpos[step], trajectory.trail_w(step)
         return self._view.frame(qpos, trajectory.markers, camera, shadows=False, trail_w=trail_w)
-
-    def _frame_times(self, trajectories: Sequence[Trajectory]) -> Iterator[float]:
-        """Return the times of the frames [s], up to a pause after the longest episode."""
-        return (frame / self._fps for frame in range(self.frame_count(trajectories)))
 
     def _episode_view(
         self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
@@ -273,26 +274,6 @@ class VideoRenderer:
             )
         return np.asarray(image)
 
-    def __enter__(self) -> Self:
-        """Return the renderer."""
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        """Free the cameras."""
-        self._stack.close()
-
-
-def _image_fn(camera: Camera) -> Callable[..., UInt8[Array, "h w c"]]:
-    """Return a compiled function of `qpos` and markers: the image of a robot's camera."""
-
-    @jax.jit
-    def image(
-        qpos: Float[Array, " nq"], markers: Mapping[str, Float[Array, "3"]]
-    ) -> UInt8[Array, "h w c"]:
-        return camera.render(camera.pose(qpos[QPOS_XYZ], qpos[QPOS_QUAT]), markers)
-
-    return image
-
 
 @functools.cache
 def _font(size: float) -> Any:
@@ -358,9 +339,7 @@ def resize_frame(frame: Frame, factor: float) -> Frame:
       frame: the frame, RGB.
       factor: the factor on width and height, below 1.
     """
-    image = Image.fromarray(frame)
-    size = (round(image.width * factor), round(image.height * factor))
-    return np.asarray(image.resize(size, Image.Resampling.BOX))
+    return np.asarray(ImageOps.scale(Image.fromarray(frame), factor, Image.Resampling.BOX))
 
 
 def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:

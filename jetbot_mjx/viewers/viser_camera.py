@@ -8,7 +8,7 @@ import numpy as np
 import viser
 from jaxtyping import Float
 
-from jetbot_mjx.viewers.camera import Slopes, camera_axes, eye_that_sees
+from jetbot_mjx.viewers.camera import camera_axes, eye_that_sees
 
 Camera = Literal["robot and goal", "behind the robot", "overview", "free"]
 CAMERAS: tuple[Camera, ...] = get_args(Camera)
@@ -153,8 +153,8 @@ def _plan(
     return _Move(shown, eye_w, look_at_w, to_eye_w, to_look_at_w)
 
 
-def _slopes(fov: float, width: float, height: float) -> Slopes:
-    """Return the borders of the page beside the panel, less a margin.
+def _slopes(fov: float, width: float, height: float) -> Float[np.ndarray, "4"]:
+    """Return the borders of the page beside the panel, less a margin, for `eye_that_sees`.
 
     Args:
       fov: the field of view in height [rad].
@@ -166,4 +166,4 @@ def _slopes(fov: float, width: float, height: float) -> Slopes:
     left, right = width / 2 - (1 - _FILLED) * middle, open_width - width / 2
     per_pixel = 2 * np.tan(fov / 2) / height
     filled = _FILLED * height / 2
-    return Slopes(*(per_pixel * np.array([left, right - (1 - _FILLED) * middle, filled, filled])))
+    return per_pixel * np.array([left, right - (1 - _FILLED) * middle, filled, filled])

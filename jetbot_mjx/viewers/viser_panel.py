@@ -48,10 +48,8 @@ class ControlPanel:
         self._server, self._player, self._scene, self._ask = server, player, scene, ask
         gui = server.gui
         gui.configure_theme(show_logo=False, show_share_button=False, brand_color=(60, 105, 0))
-        self.goals = gui.add_text("Goals", "", disabled=True)
-        self.episode = gui.add_text("Episode", "", disabled=True)
-        self.distance = gui.add_text("Distance", "", disabled=True)
-        self.pace = gui.add_text("Pace", "", disabled=True)
+        labels = player.describe()
+        self.texts = {label: gui.add_text(label, "", disabled=True) for label in labels}
         self.policy_view = PolicyView(gui, player) if player.sees else None
         self._largest = dict.fromkeys(player.snapshot.rewards, 1e-9)
         self.rewards = gui.add_html("")
@@ -68,13 +66,8 @@ class ControlPanel:
     def update(self) -> None:
         """Show the present values of the player."""
         player = self._player
-        ended = f", {player.outcome}" if player.snapshot.done else ""
-        self.goals.value = f"{player.successes} of {player.episodes} reached"
-        self.episode.value = f"{player.time:.1f} of {player.time_limit:.1f} s{ended}"
-        self.distance.value = f"{player.distance:.2f} m"
-        self.pace.value = (
-            f"{player.steps_per_second:.0f} steps/s, {player.frames_per_second:.0f} frames/s"
-        )
+        for label, text in player.describe().items():
+            self.texts[label].value = text
         self.rewards.content = self._reward_bars()
         # Do not assign equal values: the page would rebuild the control.
         checkpoints = _labels(player)

@@ -77,8 +77,7 @@ class Scene:
         self._lines_scale = 1 if self._few else _COARSE_LINES
         self.cameras = Cameras(server, "robot and goal" if player.robots == 1 else "overview")
         """The cameras of all clients."""
-        self._add_floor()
-        self._add_lights()
+        self._add_surroundings()
         self._parts = self._add_bodies()
         server.scene.on_click()(self._on_click)
         robots_w = self._robots_w()
@@ -119,7 +118,6 @@ class Scene:
         for robot, cell_w in enumerate(self._cells_w):
             markers = {name: places[robot] for name, places in crowd.markers.items()}
             set_pose(self._model, self._data, np.asarray(crowd.qpos[robot]), markers)
-            mujoco.mj_kinematics(self._model, self._data)
             positions[robot] = self._data.xpos + cell_w
             quats[robot] = self._data.xquat
         return positions, quats
@@ -214,7 +212,8 @@ class Scene:
             self._plane.visible = cast
             self._lines.visible = not cast
 
-    def _add_floor(self) -> None:
+    def _add_surroundings(self) -> None:
+        """Add the floor and the lights."""
         scene = self._server.scene
         # Without a GPU in the browser, a plane that fills the page takes half of the render time.
         # Therefore the floor is lines on the white page, and the plane is shown only with shadows.
@@ -234,9 +233,6 @@ class Scene:
         self._lines = scene.add_glb(
             "/lines", _lines(self._edge, self._lines_scale), cast_shadow=False, receive_shadow=False
         )
-
-    def _add_lights(self) -> None:
-        scene = self._server.scene
         # viser's default lights cast shadows and reflect; without a GPU, that gives two frames per
         # second.
         scene.configure_environment_map(None)
@@ -258,7 +254,7 @@ class Scene:
         positions, quats = self._poses()
         parts = []
         for number, ((body, smooth, rgba), same) in enumerate(itertools.groupby(geoms, look)):
-            mesh: Any = trimesh.util.concatenate([geom.mesh_b() for geom in same])
+            mesh: Any = trimesh.util.concatenate([geom.mesh for geom in same])
             name = self._model.body(body).name or f"body {body}"
             rgb = _page_rgb(255 * np.array(rgba[:3]))
             node = self._server.scene.add_batched_meshes_simple(

@@ -20,7 +20,8 @@ import socket
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Self
+from typing import Any
+from unittest import mock
 
 import rich
 import viser
@@ -46,7 +47,7 @@ class _Server(viser.ViserServer):
         del verbose
 
 
-class ViserViewer:
+class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
     """A `ViserViewer` serves one player to any number of clients.
 
     It is a context manager that stops the server.
@@ -55,9 +56,9 @@ class ViserViewer:
     def __init__(
         self,
         player: Player,
-        *,
         host: str,
         port: int,
+        *,
         allow: Sequence[str] = (),
         tell: Callable[[str], None],
     ) -> None:
@@ -115,10 +116,6 @@ class ViserViewer:
         with _quiet():
             self.server.stop()
 
-    def __enter__(self) -> Self:
-        """Return the viewer."""
-        return self
-
     def __exit__(self, *exception: object) -> None:
         """Stop the server."""
         self.close()
@@ -149,8 +146,7 @@ class _OriginCheck:
     @contextlib.contextmanager
     def install(self) -> Iterator[None]:
         """Add the check to a server that viser starts inside; viser has no option for this."""
-        module = websockets.asyncio.server
-        serve = module.serve
+        serve = websockets.asyncio.server.serve
 
         def serve_with_check(*arguments: Any, process_request: Any, **options: Any) -> Any:
             def check(connection: Any, request: Any) -> Any:
@@ -160,11 +156,8 @@ class _OriginCheck:
             self.installed = True
             return serve(*arguments, process_request=check, **options)
 
-        module.serve = serve_with_check
-        try:
+        with mock.patch.object(websockets.asyncio.server, "serve", serve_with_check):
             yield
-        finally:
-            module.serve = serve
 
     def _refusal(self, connection: Any, request: Any) -> Any:
         """Return the HTTP response that refuses a request; None if the request is accepted."""
@@ -199,19 +192,11 @@ class _OriginCheck:
         try:
             parts = urllib.parse.urlsplit(origin.lower())
             name = parts.hostname or ""
+            if parts.scheme not in ("http", "https") or parts.netloc != host.lower():
+                return False
+            return name in self._names or bool(ipaddress.ip_address(name))
         except ValueError:
             return False
-        if parts.scheme not in ("http", "https") or parts.netloc != host.lower():
-            return False
-        return name in self._names or _is_address(name)
-
-
-def _is_address(name: str) -> bool:
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def free_port(host: str, port: int | None) -> int:
@@ -233,10 +218,9 @@ def free_port(host: str, port: int | None) -> int:
                     # Ignore closed connections of an earlier server on this port.
                     probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
                     probe.bind(address[4])
-        except socket.gaierror as error:
-            raise UserError(f"--host {host!r} is no address: {error.strerror}") from None
-        except UnicodeError as error:
-            raise UserError(f"--host {host!r} is no address: {error}") from None
+        except (socket.gaierror, UnicodeError) as error:
+            reason = getattr(error, "strerror", error)
+            raise UserError(f"--host {host!r} is no address: {reason}") from None
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
                 raise UserError(f"--host {host!r} is no address of this machine") from None
@@ -247,12 +231,6 @@ def free_port(host: str, port: int | None) -> int:
     raise UserError(f"{which} cannot be had at --host {host} ({reason}): name another port")
 
 
-@contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def _quiet() -> contextlib.AbstractContextManager[Any]:
     """Suppress the messages that viser prints when it starts and stops."""
-    console = rich.get_console()
-    before, console.quiet = console.quiet, True
-    try:
-        yield
-    finally:
-        console.quiet = before
+    return mock.patch.object(rich.get_console(), "quiet", True)

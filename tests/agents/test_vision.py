@@ -13,7 +13,7 @@ from jetbot_mjx.agents import vision
 from jetbot_mjx.agents.networks import init_normalizer, make_networks, update_normalizer
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.agents.vision import Encoder, convolve
-from jetbot_mjx.config import NetworkConfig, parse_config
+from jetbot_mjx.config import NetworkConfig, PPOConfig, parse_config
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.errors import InvalidError
 
@@ -57,16 +57,16 @@ def test_a_convolution_is_xla_s(layer, extra_rows, extra_columns):
 
 @pytest.mark.parametrize("cnn", SMALLEST)
 def test_the_smallest_image_is_encoded_and_a_smaller_one_refused(cnn):
-    config, side = NetworkConfig(cnn=cnn), SMALLEST[cnn]
+    config, side = PPOConfig(network=NetworkConfig(cnn=cnn)), SMALLEST[cnn]
     for height, width in ((side, side + 9), (side - 1, side + 9), (side, side - 1)):
         shapes = {PIXELS: (height, width, 3)}
         if min(height, width) == side:
-            networks = make_networks(config, shapes, 2, normalize=True)
+            networks = make_networks(config, shapes, 2)
             policy = jax.eval_shape(networks.policy_network.init, jax.random.PRNGKey(0))
             assert policy["encoder"]["params"]["dense"]["kernel"].shape[0] > 0
             continue
         with pytest.raises(InvalidError) as error:
-            make_networks(config, shapes, 2, normalize=True)
+            make_networks(config, shapes, 2)
         assert str(error.value).startswith(
             f"camera.width = {width} and camera.height = {height} are too small for"
             f" ppo.network.cnn = {cnn!r}: "
@@ -94,7 +94,7 @@ def make_ppo(shapes, **network):
     network = {"cnn": "small", "activation": "relu", "cnn_dtype": "float32"} | network
     sizes = {"policy_hidden_layer_sizes": HIDDEN, "value_hidden_layer_sizes": HIDDEN}
     config = parse_config({"ppo": {"network": network | sizes}})
-    networks = make_networks(config.ppo.network, shapes, 2, normalize=True)
+    networks = make_networks(config.ppo, shapes, 2)
     return PPO(config.ppo, NoEnv(), networks)
 
 

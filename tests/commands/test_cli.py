@@ -219,7 +219,7 @@ def trained(tmp_path_factory):
     """A run folder with two checkpoints, untrained."""
     network = {"policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}
     config = parse_config({"ppo": {"network": network}})
-    networks = make_networks(config.ppo.network, 16, 2, normalize=True)
+    networks = make_networks(config.ppo, 16, 2)
     key = jax.random.PRNGKey(0)
     params = PolicyParams(
         running_statistics.init_state(specs.Array((16,), np.dtype("float32"))),
@@ -277,9 +277,9 @@ def test_a_mistaken_command_line_is_refused(refused, command, arguments, said):
 @pytest.mark.parametrize(
     ("value", "said"),
     [
-        ("2", "2 is not between 0 and 1"),
-        ("-0.1", "-0.1 is not between 0 and 1"),
-        ("nan", "nan is not between 0 and 1"),
+        ("2", "2 is too large: give at most 1"),
+        ("-0.1", "-0.1 is too small: give at least 0"),
+        ("nan", "nan is too small: give at least 0"),
         ("95%", "'95%' is no number"),
     ],
 )

@@ -20,7 +20,7 @@ from jetbot_mjx import export
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.deployment import export_policy, exporters, numpy_policy, policy_export
-from jetbot_mjx.deployment.exporters import FORMATS, Source
+from jetbot_mjx.deployment.exporters import FORMATS
 from jetbot_mjx.deployment.numpy_policy import (
     TOLERANCE,
     Recording,
@@ -66,9 +66,7 @@ def checkpoint_of(settings, tmp_path):
     config = parse_config(settings)
     env = make_env(config)
     size = env.observation_size
-    networks = make_networks(
-        config.ppo.network, size, 2, normalize=config.ppo.normalize_observations
-    )
+    networks = make_networks(config.ppo, size, 2)
     key = jax.random.PRNGKey(3)
     normalizer = running_statistics.init_state(specs.Array((size,), np.dtype("float32")))
     normalizer = normalizer.replace(
@@ -111,7 +109,7 @@ def test_every_network_is_written_as_it_is(activation, distribution, normalize, 
     policy = portable_policy(checkpoint)
     for name in ("numpy", "onnx"):
         path = tmp_path / FORMATS[name].file
-        FORMATS[name].write(Source(policy, as_jax(checkpoint, env)), path)
+        FORMATS[name].write(policy, as_jax(checkpoint, env), path)
         found = difference(recording, FORMATS[name].read(path)(obs), policy.controller)
         assert found < TOLERANCE, name
     one, speeds = FORMATS["numpy"].read(tmp_path / "policy.py")(obs[0])

@@ -16,14 +16,13 @@ def test_every_command_is_listed_with_what_it_does(capsys):
     for line in capsys.readouterr().out.splitlines():
         if found := re.fullmatch(r"    (\w+) {2,}(.+)", line):
             listed[found[1]] = found[2]
-    assert listed == {name: command.help for name, command in overview.COMMANDS.items()}
+    assert listed == {name: text for name, (_, text) in overview.COMMANDS.items()}
     at_root = {path.stem for path in (ROOT / PACKAGE).glob("*.py")}
-    modules = {
-        command.module for command in overview.COMMANDS.values() if "." not in command.module
-    }
-    assert modules == at_root - {"__init__", "__main__", "cli", *COMMON}
-    for command in overview.COMMANDS.values():
-        assert callable(importlib.import_module(f"jetbot_mjx.{command.module}").main)
+    modules = [module for module, _ in overview.COMMANDS.values()]
+    alone = {module for module in modules if "." not in module}
+    assert alone == at_root - {"__init__", "__main__", "cli", *COMMON}
+    for module in modules:
+        assert callable(importlib.import_module(f"jetbot_mjx.{module}").main)
 
 
 def test_it_is_printed_at_once():

@@ -78,7 +78,7 @@ def type_(home, monkeypatch, capfd):
         monkeypatch.setattr("sys.argv", ["jetbot-mjx", *words[1:]])
         run = functools.partial(entry.main, words)
         if words[0] in entry.COMMANDS:
-            module = importlib.import_module(f"jetbot_mjx.{entry.COMMANDS[words[0]].module}")
+            module = importlib.import_module(f"jetbot_mjx.{entry.COMMANDS[words[0]][0]}")
             run = functools.partial(cli.run_command, module.main)
         with pytest.raises(SystemExit) as caught:
             run()

@@ -131,7 +131,11 @@ def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
     every = jax.vmap(env.reset)(report_keys(4)).goal
     for number, goal_w in goals_w.items():
         np.testing.assert_array_equal(goal_w, every[number])
-    assert names(pictures.mp4.parent) == ["goals-3,1.gif", "goals-3,1.mp4", "goals-3,1.png"]
+    assert names(pictures.files["video"].parent) == [
+        "goals-3,1.gif",
+        "goals-3,1.mp4",
+        "goals-3,1.png",
+    ]
 
 
 @pytest.mark.parametrize(
@@ -238,11 +242,11 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys, s
 
 def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
     rendered = render_gallery(run_copy, episodes=2)
-    film = iio.imread(rendered.mp4, plugin="pyav")
+    film = iio.imread(rendered.files["video"], plugin="pyav")
     assert film.shape[1:] == (80, 240, 3)
     assert names(run_copy / "videos") == ["gallery-2.gif", "gallery-2.mp4", "gallery-2.png"]
-    assert iio.imread(rendered.gif).shape[1:] == (60, 180, 3)
-    height, width, _ = iio.imread(rendered.plots).shape
+    assert iio.imread(rendered.files["gif"]).shape[1:] == (60, 180, 3)
+    height, width, _ = iio.imread(rendered.files["plots"]).shape
     assert width == 3 * height
     assert list(rendered.successes) == [0, 32_768, 65_536]
 

@@ -8,7 +8,7 @@ import pytest
 import random_functions
 from run_program import evaluate
 
-from jetbot_mjx.compiler import ffi_wrapper, llvm_backend, llvm_codegen, lower_jaxpr, ptx_backend
+from jetbot_mjx.compiler import ffi_wrapper, llvm_backend, lower_jaxpr, ptx_backend
 from jetbot_mjx.compiler.kernel import Kernel, as_step
 
 if not llvm_backend.is_available():
@@ -39,11 +39,8 @@ def agree(ours, theirs, errors, what):
 def by_llvm(program, lanes, arguments):
     """What a kernel of so many lanes makes of the arguments; one lane is a GPU's thread."""
     text = ffi_wrapper.kernel_text(
-        llvm_codegen.step_text(program, carried=1, lanes=lanes),
-        [array.size for array in program.inputs],
-        carried=1,
+        Kernel(program, carried=1, steps=1, fallback=list),
         lanes=lanes,
-        steps=1,
         name=llvm_backend._NAME,
         machine=llvm_backend._host().machine,
     )

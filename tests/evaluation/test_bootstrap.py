@@ -7,8 +7,8 @@ import scipy.stats
 from jetbot_mjx.evaluation.bootstrap import (
     Estimate,
     bootstrap,
+    bootstrap_interval,
     interquartile_mean,
-    mean_band,
     mean_difference,
     median_estimate,
     probability_of_improvement,
@@ -59,7 +59,7 @@ def test_one_seed_has_no_interval_and_none_no_figure():
 
 def test_a_band_is_the_interval_of_every_column():
     values = np.random.default_rng(0).random((5, 3))
-    low, high = mean_band(values)
+    low, high = bootstrap_interval(np.mean, [values], axis=0)
     for column in range(3):
         _, *ends = bootstrap(np.mean, values[:, column].tolist())
         np.testing.assert_allclose([low[column], high[column]], ends, atol=0.02)

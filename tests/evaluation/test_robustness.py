@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import PPOConfig, parse_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.look_params import MAX_CAMERA_DELAY, MAX_CLUTTER, LookParams
@@ -123,12 +123,8 @@ class Counted(DomainRandomizationWrapper):
 def swept():
     """An untrained policy over two quantities, and how often the program was traced."""
     env = make_env(parse_config({"task": {"observation": "egocentric"}}))
-    networks = make_networks(
-        env.config.ppo.network,
-        env.observation_size,
-        env.action_size,
-        normalize=False,
-    )
+    ppo = PPOConfig(normalize_observations=False)
+    networks = make_networks(ppo, env.observation_size, env.action_size)
     key = jax.random.PRNGKey(0)
     params = PolicyParams(None, networks.policy_network.init(key), None)
     values = {"motor_gain": (0.2, 1.0), "action_delay": (0.0, 9.0)}

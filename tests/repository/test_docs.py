@@ -442,12 +442,7 @@ def reader(tmp_path, monkeypatch):
             (tmp_path / name).write_text(text, encoding="utf-8")
         monkeypatch.chdir(tmp_path)
 
-    # A page's own modules belong to its test alone.
-    before = set(sys.modules)
-    yield sit
-    for name in set(sys.modules) - before:
-        if name in {"my_task", "obstacle_task", "pillars_task", "gates_task"}:
-            del sys.modules[name]
+    return sit
 
 
 def test_there_are_commands_on_the_pages():

@@ -35,7 +35,7 @@ ROOMS = (
 COMMON = ("config", "errors", "imports", "interrupts")
 """Modules of the root that every room may import."""
 
-COMMANDS = ("__main__", *(command.module for command in command_line.COMMANDS.values()))
+COMMANDS = ("__main__", *(module for module, _ in command_line.COMMANDS.values()))
 """A command imports whatever it likes but adapters and other commands; it may be in a room."""
 
 MOST_AT_THE_ROOT = 18

@@ -24,7 +24,6 @@ from jetbot_mjx.runs.metrics import (
     CompileClock,
     History,
     JsonlSink,
-    Sinks,
     TensorBoardSink,
     mean_of,
     process_seconds,
@@ -300,46 +299,6 @@ def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):
     (folder / "notes.txt").write_text("mine")
     TensorBoardSink(folder, HISTORY).close()
     assert (folder / "notes.txt").read_text() == "mine"
-
-
-class TrainerCallback:
-    """A sink that remembers."""
-
-    def __init__(self, log):
-        self.log = log
-
-    def write(self, env_steps, metrics):
-        self.log.append((self, env_steps, dict(metrics)))
-
-    def write_video(self, env_steps, mp4):
-        self.log.append((self, env_steps, mp4))
-
-    def close(self):
-        self.log.append((self, "closed"))
-
-
-def test_joined_sinks_all_get_everything_and_are_all_closed():
-    log = []
-    first, second = TrainerCallback(log), TrainerCallback(log)
-    with Sinks([first, second]) as sinks:
-        sinks.write(3, {"a": 1.0})
-        sinks.write_video(3, "a.mp4")
-    assert log == [
-        (first, 3, {"a": 1.0}),
-        (second, 3, {"a": 1.0}),
-        (first, 3, "a.mp4"),
-        (second, 3, "a.mp4"),
-        (first, "closed"),
-        (second, "closed"),
-    ]
-
-
-def test_joined_sinks_are_closed_where_training_fails():
-    log = []
-    sink = TrainerCallback(log)
-    with pytest.raises(ZeroDivisionError), Sinks([sink]):
-        raise ZeroDivisionError
-    assert log == [(sink, "closed")]
 
 
 def test_tensorboard_is_written_again_with_the_same_other_names(tmp_path):

@@ -74,9 +74,7 @@ def program(config, smoke_run):
         def init(self):
             return self.put(first())
 
-    networks = make_networks(
-        config.ppo.network, env.observation_size, env.action_size, normalize=True
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluator = Evaluator(env, networks, ProgramCache(compiler_options(config)))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(ppo_trainer, "CompiledTrainer", Program)
@@ -205,11 +203,10 @@ class StopAfter:
 @pytest.fixture
 def stop_after(monkeypatch):
     """Makes the next trainings stop after so many training steps, each a call of its own."""
-    pace = types.SimpleNamespace(steps=1, update=lambda steps, seconds: None)
 
     def stop_after(training_steps):
         monkeypatch.setattr(session, "Preemption", lambda notice: StopAfter(training_steps))
-        monkeypatch.setattr(ppo_trainer, "ChunkSizer", lambda seconds: pace)
+        monkeypatch.setattr(ppo_trainer, "next_chunk", lambda steps, seconds, wanted: 1)
 
     return stop_after
 

@@ -23,8 +23,7 @@ from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, read_about
-from jetbot_mjx.runs.nan_dump import load_nan_dump, save_nan_dump
-from jetbot_mjx.runs.nan_replay import replay_nan_dump
+from jetbot_mjx.runs.nan_dump import load_nan_dump, replay_nan_dump, save_nan_dump
 
 STEP = 512  # environment steps in one training step
 SETTINGS = {

@@ -6,7 +6,7 @@ import types
 import pytest
 
 from jetbot_mjx.training import console
-from jetbot_mjx.training.console import EVALUATING, Terminal
+from jetbot_mjx.training.console import Terminal
 
 
 @pytest.fixture
@@ -96,6 +96,6 @@ def test_that_it_compiles_is_said_at_once_and_phases_are_not():
     stream = io.StringIO()
     lines = Terminal(10_000, stream)
     lines.begin()
-    lines.phase(EVALUATING)
+    lines.phase("evaluating")
     lines.close()
     assert stream.getvalue() == "compiling ...\n"

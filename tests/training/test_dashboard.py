@@ -16,7 +16,7 @@ from jetbot_mjx import train
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.training import dashboard as dashboard_module
-from jetbot_mjx.training.console import EVALUATING, SAVING, TRAINING, Terminal
+from jetbot_mjx.training.console import Terminal
 from jetbot_mjx.training.dashboard import Dashboard, open_terminal, sparkline
 
 PATIENCE = 60
@@ -174,7 +174,7 @@ def test_what_is_said_stands_above_and_the_last_figures_stay(screen, opened):
 
 def test_nothing_is_drawn_before_it_begins(screen, opened):
     dashboard = opened()
-    dashboard.phase(SAVING)
+    dashboard.phase("saving")
     dashboard.close()
     print("nothing else", flush=True)
     screen.until("nothing else")
@@ -221,7 +221,7 @@ def test_a_terminal_that_nobody_reads_does_not_block_the_training(tmp_path, monk
         for step in range(1_000):
             dashboard.write(step, [REPORT])
             dashboard.update(step, {}, 1.0)
-            dashboard.phase(TRAINING)
+            dashboard.phase("training")
             dashboard.say("line")
             print("printed")
         assert time.monotonic() - began < 1.0
@@ -389,7 +389,7 @@ def test_the_time_left_counts_evaluating_and_saving_but_not_compiling(now):
 
 def test_each_phase_has_its_time(now):
     one = dashboard_of()
-    for seconds, phase in [(10, TRAINING), (3, EVALUATING), (2, SAVING), (70, TRAINING)]:
+    for seconds, phase in [(10, "training"), (3, "evaluating"), (2, "saving"), (70, "training")]:
         one.phase(phase)
         now[0] += seconds
     one.phase(None)
@@ -435,7 +435,7 @@ def test_a_dashboard_fits_into_the_terminal(seeds, width):
     full = dashboard_of(seeds, total=10**10, width=width)
     for step in range(200):
         full.write(10**9 + step, [REPORT] * seeds)
-    full.phase(TRAINING)
+    full.phase("training")
     lines = text_of(full)
     assert max(map(len, lines)) <= width
     assert len(lines) < 30 or width < 30

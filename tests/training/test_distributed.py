@@ -50,7 +50,7 @@ class Sent(GoalTask):
 
 
 def tell(interrupted, *arguments):
-    ppo_trainer.ChunkSizer.update = lambda self, steps, seconds: None
+    ppo_trainer.next_chunk = lambda steps, seconds, wanted: 1
     report = ppo_trainer._report
 
     def reported(trainer, recorder, state, seconds):

@@ -68,8 +68,8 @@ def test_what_a_gpu_had_in_use_was_foretold(root):
     each = sizes(build_ppo(config, env), env)
     for row in measured["results"]:
         if row["rate"] == "training":
-            size = resized(config, row["num_envs"] / config.ppo.num_envs)
-            told, had = footprint(size, each, 1).total, row["peak_device_bytes"]
+            factor, had = row["num_envs"] / config.ppo.num_envs, row["peak_device_bytes"]
+            told = resized(config, each, 1, factor).total
             print(f"{row['num_envs']} environments: {told / had:.2f} of what was in use")
             assert had <= told <= 1.3 * had + 2**24
 
@@ -101,7 +101,7 @@ def test_seeds_take_their_memory_each(config, each):
 
 
 def test_the_ladder_ends_with_the_first_that_does_not_fit(config, each):
-    limit = footprint(resized(config, 3.0), each, 1).total
+    limit = resized(config, each, 1, 3.0).total
     found = ladder(config, each, 1, limit)
     assert [one.num_envs for one in found[:4]] == [32, 64, 128, 256]
     assert [one.total <= limit for one in found] == [True] * (len(found) - 1) + [False]
@@ -112,12 +112,12 @@ def test_the_next_size_is_smaller_and_fits(config, each):
     whole = footprint(config, each, 1).total
     assert next_that_fits(config, each, 1, None).num_envs == 64
     assert next_that_fits(config, each, 1, 10 * whole).num_envs == 64
-    little = footprint(resized(config, 0.25), each, 1).total
+    little = resized(config, each, 1, 0.25).total
     assert next_that_fits(config, each, 1, little).num_envs == 32
     assert next_that_fits(config, each, 1, 1000) is None
     assert next_that_fits(config, each, 32, None).num_envs == 64
     assert next_that_fits(config, each, 64, None) is None  # half a batch of 64 is 32
-    assert resized(config, 1 / 128) is None
+    assert resized(config, each, 1, 1 / 128) is None
 
 
 def test_a_cpu_has_the_memory_of_its_machine():

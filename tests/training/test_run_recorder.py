@@ -12,6 +12,7 @@ from jetbot_mjx import load_config, make_env
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps, read_about
 from jetbot_mjx.runs.metrics import CompileClock
@@ -197,3 +198,24 @@ def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
         json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
     ]
     assert lines[1]["time/recording_seconds"] > 0.5
+
+
+def test_all_logs_get_everything_and_are_all_closed(root, tmp_path):
+    class Sink:
+        def write(self, env_steps, metrics):
+            log.append((self, env_steps, dict(metrics)))
+
+        def close(self):
+            log.append((self, "closed"))
+            raise OSError("disk full")
+
+    log, sinks = [], [Sink(), Sink()]
+    config = load_config(root / "configs" / "smoke.yaml")
+    seed = run_recorder.SeedRecorder(config, tmp_path, sinks, {}, run_recorder.Standing(), "")
+    summary = Summary(*[0.0] * len(Summary._fields))
+    seed.report(Progress(3, PARAMS, {}, 1.0), summary, {"a": 1.0}, 1.0)
+    with pytest.raises(UserError, match="disk full"):
+        seed.close()
+    first, second = sinks
+    written = [(first, 3, {"a": 1.0}), (second, 3, {"a": 1.0})]
+    assert log == [*written, (second, "closed"), (first, "closed")]

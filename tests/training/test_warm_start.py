@@ -110,7 +110,7 @@ def cut(params):
 
 
 def networks_of(config, env):
-    return make_networks(config.ppo.network, env.observation_size, env.action_size, normalize=True)
+    return make_networks(config.ppo, env.observation_size, env.action_size)
 
 
 def test_the_noise_begins_anew_and_the_direction_stays(source):

@@ -46,19 +46,19 @@ def test_what_shows_is_there_and_nothing_else(model, geoms):
 
 
 @pytest.mark.parametrize(
-    ("name", "half"),
+    ("name", "half", "centre"),
     [
-        ("box", (0.1, 0.2, 0.3)),
-        ("ball", (0.2, 0.2, 0.2)),
-        ("can", (0.1, 0.1, 0.3)),
-        ("pill", (0.1, 0.1, 0.4)),
-        ("8", (0.1, 0.2, 0.3)),
+        ("box", (0.1, 0.2, 0.3), (0, 0, 0)),
+        ("ball", (0.2, 0.2, 0.2), (0, 0, 0)),
+        ("can", (0.3, 0.1, 0.1), (0, 0, 2)),
+        ("pill", (0.1, 0.1, 0.4), (0, 0, 0)),
+        ("8", (0.1, 0.2, 0.3), (0, 0, 0)),
     ],
 )
-def test_a_shape_has_its_size_about_its_centre(geoms, name, half):
-    bounds = geoms[name].mesh.bounds
-    np.testing.assert_allclose(bounds[1], half, rtol=0.01)
-    np.testing.assert_allclose(bounds[0], -bounds[1], atol=1e-9)
+def test_a_shape_has_its_size_about_its_centre(geoms, name, half, centre):
+    low, high = geoms[name].mesh.bounds
+    np.testing.assert_allclose(high - centre, half, rtol=0.01)
+    np.testing.assert_allclose(low + high, 2 * np.array(centre), atol=1e-9)
     assert geoms[name].mesh.is_watertight
 
 
@@ -67,8 +67,8 @@ def test_a_mesh_lies_where_mujoco_puts_it(model, geoms):
     wedge = geoms["wedge"]
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    index = model.geom("wedge").id
-    corners = wedge.mesh.vertices @ data.geom_xmat[index].reshape(3, 3).T + data.geom_xpos[index]
+    rotation, place = data.xmat[wedge.body].reshape(3, 3), data.xpos[wedge.body]
+    corners = wedge.mesh.vertices @ rotation.T + place
     # Body at x = 1, geom at y = 1.
     expected = [[1, 1, 0], [2, 1, 0], [1, 3, 0], [1, 1, 3]]
     for corner in expected:

@@ -258,9 +258,9 @@ def test_a_task_whose_goals_cannot_be_moved_says_so_in_one_line(task, reason):
 
 def test_the_players_goal_stays_where_the_task_says_so(player, monkeypatch):
     monkeypatch.setattr(player, "cannot_move_goal", "it stays")
-    before = player.snapshot
+    before = player.crowd
     assert not player.move_goal(0.1, 0.1)
-    assert player.snapshot is before
+    assert player.crowd is before
     ticks(player, 5)
 
 
@@ -431,8 +431,7 @@ def test_presses_add_up_and_the_first_against_a_turn_ends_it(player):
 
 def test_who_is_no_agent_is_refused(player):
     with pytest.raises(UserError, match="'nobody' is none: choose from policy, scripted"):
-        player.agent = "nobody"
-    assert player.agent == "policy"
+        Player(player.run_dir, agent="nobody")
 
 
 # Where the policy comes from.

@@ -56,7 +56,7 @@ def player():
     """A player of two robots, whose policy has learnt nothing."""
     config = parse_config(SEEING)
     env = make_env(config)
-    networks = make_networks(config.ppo.network, env.observation_size, 2, normalize=True)
+    networks = make_networks(config.ppo, env.observation_size, 2)
     params = PolicyParams(
         normalizer=init_normalizer(env.observation_size),
         policy=networks.policy_network.init(jax.random.PRNGKey(0)),
@@ -92,9 +92,7 @@ def test_a_player_shows_the_newest_image_of_the_chosen_robot(player):
 
 
 def test_a_player_maps_what_the_policy_looks_at_for_the_chosen_robot(player):
-    networks = make_networks(
-        player.env.config.ppo.network, player.env.observation_size, 2, normalize=True
-    )
+    networks = make_networks(player.env.config.ppo, player.env.observation_size, 2)
     policy = make_policy(networks, player._params)
     maps = []
     for player.robot in (0, 1):
