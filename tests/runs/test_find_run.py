@@ -50,9 +50,8 @@ def test_what_is_not_there_is_told_with_the_likely_name(runs):
     assert isinstance(caught.value, FileNotFoundError)
     with pytest.raises(CheckpointError, match="give a run folder or a checkpoint in it"):
         find_checkpoint("something else")
-    with pytest.raises(
-        NotFoundError, match="there are jetbot_camera, jetbot_egocentric, real_jetbot"
-    ):
+    names = "there are camera_real, jetbot_camera, jetbot_egocentric, real_jetbot"
+    with pytest.raises(NotFoundError, match=names):
         find_run("pretrained:x")
 
 
