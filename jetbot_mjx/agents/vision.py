@@ -74,6 +74,33 @@ class VisionNetworks(NamedTuple):
     """Encode observations: (normaliser, parameters of both networks, observation)."""
 
 
+class _ObservationEncoder(NamedTuple):
+    """An `_ObservationEncoder` joins the features of the images and the normalised numbers."""
+
+    encoder: "Encoder"
+    shapes: Shapes
+    normalize: Callable[[Any, Any], Any]
+
+    @property
+    def features(self) -> int:
+        """Return the length of an encoded observation."""
+        numbers = (shape[0] for name, shape in self.shapes.items() if not is_image(name))
+        return self.encoder.features + sum(numbers)
+
+    def init(self, key: Any) -> Any:
+        """Return initial parameters of the encoder."""
+        images = {name: (1, *shape) for name, shape in self.shapes.items() if is_image(name)}
+        pixels = {name: jnp.zeros(shape, jnp.uint8) for name, shape in sorted(images.items())}
+        return self.encoder.init(key, _joined(pixels))
+
+    def __call__(self, normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
+        images = {name: obs[name] for name in sorted(self.shapes) if is_image(name)}
+        numbers = {name: obs[name] for name in sorted(self.shapes) if name not in images}
+        values = self.normalize(numbers, normalizer)
+        features: Any = self.encoder.apply(params[_ENCODER], _joined(images))
+        return jnp.concatenate([features, *(values[name] for name in numbers)], axis=-1)
+
+
 def is_image(name: str) -> bool:
     """Return whether a part of an observation holds images, as Brax's networks decide it."""
     return name.startswith("pixels/")
@@ -105,26 +132,8 @@ def make_vision_networks(
     layers = _CNNS[config.cnn]
     _check_size(config.cnn, shapes)
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
-    images = [name for name in sorted(shapes) if is_image(name)]
-    numbers = {name: shape for name, shape in shapes.items() if not is_image(name)}
-    length = layers.features + sum(shape[0] for shape in numbers.values())
-    brax_heads = make_heads(length, action_size)
-
-    def init(head: brax_networks.FeedForwardNetwork, encodes: bool) -> Callable[[Any], Any]:
-        def init_network(key: Any) -> Any:
-            encoder_key, head_key = jax.random.split(key)
-            pixels = _joined({name: jnp.zeros((1, *shapes[name]), jnp.uint8) for name in images})
-            own = {_ENCODER: encoder.init(encoder_key, pixels)} if encodes else {}
-            return {_HEAD: head.init(head_key), **own}
-
-        return init_network
-
-    def encode_one(normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
-        features: Any = encoder.apply(
-            params[_ENCODER], _joined({name: obs[name] for name in images})
-        )
-        values = normalize({name: obs[name] for name in numbers}, normalizer)
-        return jnp.concatenate([features, *(values[name] for name in sorted(numbers))], axis=-1)
+    encode_one = _ObservationEncoder(encoder, shapes, normalize)
+    brax_heads = make_heads(encode_one.features, action_size)
 
     def encode(normalizer: Any, params: Any, obs: Any) -> dict[str, Any]:
         for_policy = encode_one(normalizer, params.policy, obs)
@@ -136,8 +145,8 @@ def make_vision_networks(
     # Pyright does not follow flax's dataclasses.
     networks: Any = ppo_networks.PPONetworks
     heads = networks(
-        _on_features(_POLICY, policy, init(policy, True)),
-        _on_features(_VALUE, value, init(value, not config.shared_cnn)),
+        _on_features(_POLICY, policy, encode_one),
+        _on_features(_VALUE, value, None if config.shared_cnn else encode_one),
         brax_heads.parametric_action_distribution,
     )
 
@@ -157,15 +166,21 @@ def make_vision_networks(
 
 
 def _on_features(
-    name: str, head: brax_networks.FeedForwardNetwork, init: Callable[[Any], Any]
+    name: str, head: brax_networks.FeedForwardNetwork, encoder: _ObservationEncoder | None
 ) -> brax_networks.FeedForwardNetwork:
     """Return one of Brax's networks as a network of an encoded observation.
 
     Args:
       name: the part of the encoded observation that the network takes.
       head: Brax's network of features.
-      init: initialises the parameters, with those of the encoder if the network owns it.
+      encoder: the encoder whose parameters are among the network's; None: another has them.
     """
+
+    def init(key: Any) -> Any:
+        encoder_key, head_key = jax.random.split(key)
+        own = {} if encoder is None else {_ENCODER: encoder.init(encoder_key)}
+        return {_HEAD: head.init(head_key), **own}
+
     return brax_networks.FeedForwardNetwork(
         init=init,
         apply=lambda _, params, encoded: head.apply(None, params[_HEAD], encoded[name]),

@@ -36,6 +36,7 @@ cli.run_command(train.main)
 """
 
 
+@pytest.mark.slow
 def test_a_training_runs_where_windows_lacks_what_unix_has(tmp_path):
     arguments = [part for setting in SETTINGS for part in ("--set", setting)]
     done = subprocess.run(

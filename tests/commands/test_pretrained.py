@@ -50,6 +50,7 @@ def test_it_acts():
     assert float(policy(right)[1]) < -0.1
 
 
+@pytest.mark.slow
 def test_it_can_be_trained_further(runs):
     run = runs[NAMES.index("jetbot_egocentric")]
     (start,) = (int(path.name) for path in (run / "checkpoints").iterdir())

@@ -14,7 +14,7 @@ from jetbot_mjx.compiler.kernel import Kernel, as_step
 if not llvm_backend.is_available():
     pytest.skip("llvmlite compiles nothing here", allow_module_level=True)
 
-QUICK = 12
+QUICK = 6
 BATCH = 50  # functions in one test of the slow suite
 BATCHES = 20
 

@@ -72,7 +72,7 @@ def test_one_robot_or_any_batch_of_batches_in_a_loop(step):
     np.testing.assert_array_equal(alone["x"], [0, 9, 18])
 
 
-@pytest.fixture(scope="module", params=["isaac", "real"])
+@pytest.fixture(scope="module", params=["isaac", pytest.param("real", marks=pytest.mark.slow)])
 def driven(request):
     """An environment of each preset, and a function that drives so many robots with targets."""
     env = make_env(parse_config({"robot": {"preset": request.param}, "physics": {"impl": "llvm"}}))
