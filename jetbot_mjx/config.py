@@ -252,7 +252,8 @@ class RandomizationConfig(_Section):
     """Domain randomization: parameters drawn uniformly from [low, high] for every episode.
 
     Each parameter is drawn independently for each robot of a training. null: the preset's value is
-    used; if all are null, nothing is drawn.
+    used; if all are null, nothing is drawn. From `cube_brightness` on, parameters change what the
+    camera sees, and need `task.observation: camera`.
     """
 
     friction: Range = _range(0.05, 5)
@@ -303,6 +304,79 @@ class RandomizationConfig(_Section):
     """[m] start position of the robot, to the left of the origin."""
     start_yaw: Range = _range(-math.pi - 1e-3, math.pi + 1e-3)
     """[rad] heading at the start, counter-clockwise."""
+    cube_brightness: Range = _range(0, 4)
+    """Factor on the colour of the goal's cube."""
+    cube_red: Range = _range(0, 8)
+    """Further factor on the cube's red."""
+    cube_blue: Range = _range(0, 8)
+    """Further factor on the cube's blue."""
+    cube_yaw: Range = _range(-math.pi - 1e-3, math.pi + 1e-3)
+    """[rad] turn of the cube about the vertical, counter-clockwise."""
+    floor_brightness: Range = _range(0, 4)
+    """Factor on the colours of the floor."""
+    floor_red: Range = _range(0, 8)
+    """Further factor on the floor's red."""
+    floor_blue: Range = _range(0, 8)
+    """Further factor on the floor's blue."""
+    floor_contrast: Range = _range(0, 8)
+    """Factor on the difference between the two colours of the floor and their mean."""
+    floor_texture: Range = _range(0, 3, whole=True)
+    """Pattern of the floor: 0 checker, 1 stripes, 2 tiles with joints, 3 soft spots."""
+    floor_scale: Range = _range(0.05, 20)
+    """Factor on the size of the pattern; the checker's squares have half a metre."""
+    floor_yaw: Range = _range(-math.pi - 1e-3, math.pi + 1e-3)
+    """[rad] turn of the pattern, counter-clockwise."""
+    sky_brightness: Range = _range(0, 4)
+    """Factor on the colours of the sky."""
+    sky_red: Range = _range(0, 8)
+    """Further factor on the sky's red."""
+    sky_blue: Range = _range(0, 8)
+    """Further factor on the sky's blue."""
+    walls: Range = _range(0, 0.8)
+    """[1/m] nearness of four walls around the origin, 1/distance; 0: none. Their turn, height and
+    colours are drawn too."""
+    clutter: Range = _range(0, 8, whole=True)
+    """Number of objects around, in drawn places and in colours unlike the cube's; only to see."""
+    ambient: Range = _range(0, 4)
+    """Factor on the light from all sides."""
+    light: Range = _range(0, 4)
+    """Factor on the strength of the lights with a direction."""
+    light_x: Range = _range(-5, 5)
+    """[m/m] slope by which these lights are tilted, forwards as seen from the start."""
+    light_y: Range = _range(-5, 5)
+    """[m/m] slope by which these lights are tilted to the left."""
+    exposure: Range = _range(0, 8)
+    """Factor on all channels, before they are clipped at white."""
+    red_gain: Range = _range(0, 4)
+    """Factor on the red channel: white balance."""
+    blue_gain: Range = _range(0, 4)
+    """Factor on the blue channel: white balance."""
+    pixel_noise: Range = _range(0, 1)
+    """Standard deviation of the noise of every pixel and channel; white is 1."""
+    blur: Range = _range(0, 8)
+    """[pixels] how much wider than one pixel the area is that a pixel averages."""
+    camera_x: Range = _range(-0.05, 0.05)
+    """[m] shift of the camera forwards."""
+    camera_y: Range = _range(-0.05, 0.05)
+    """[m] shift of the camera to the left."""
+    camera_z: Range = _range(-0.05, 0.05)
+    """[m] shift of the camera upwards."""
+    camera_pitch: Range = _range(-1, 1)
+    """[rad] angle by which the camera looks further down."""
+    camera_roll: Range = _range(-1, 1)
+    """[rad] turn of the camera about its axis, clockwise as seen from behind."""
+    camera_yaw: Range = _range(-1, 1)
+    """[rad] turn of the camera to the left."""
+    focal_length: Range = _range(0.5, 2)
+    """Factor on the focal length; above 1 the field of view is narrower."""
+    distortion: Range = _range(-0.3, 0.3)
+    """Share by which the ray of the farthest pixel is bent outwards."""
+    camera_delay: Range = _range(0, 60, whole=True)
+    """[control steps] delay of the images."""
+    camera_interval: Range = _range(1, 60, whole=True)
+    """[control steps] from one image to the next; in between the last one stays."""
+    frame_drop: Range = _range(0, 1)
+    """Probability that an image is lost, and the one before it stays."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -335,6 +409,13 @@ class RandomizationConfig(_Section):
         """Return the ranges of the parameters that are drawn, by name."""
         ranges = {name: getattr(self, name) for name in type(self).model_fields}
         return {name: span for name, span in ranges.items() if span is not None}
+
+    @property
+    def looks(self) -> list[str]:
+        """Return the names of the drawn parameters that change what the camera sees."""
+        first = list(type(self).model_fields).index("cube_brightness")
+        looks = list(type(self).model_fields)[first:]
+        return [name for name in looks if getattr(self, name) is not None]
 
 
 class NetworkConfig(_Section):
@@ -489,11 +570,18 @@ class Config(_Section):
     @model_validator(mode="after")
     def _settings_fit(self) -> Self:
         step = self.ppo.steps_per_training_step
+        unseen = None if self.task.sees else next(iter(self.randomization.looks), None)
         for is_wrong, message in (
             (
                 self.seed + self.seeds > 2**32,
                 f"seeds = {self.seeds} from seed = {self.seed} on go beyond {2**32 - 1}:"
                 f" make seed at most {2**32 - self.seeds}",
+            ),
+            (
+                unseen is not None,
+                f"randomization.{unseen} = {list(self.randomization.drawn.get(str(unseen), ()))}"
+                f" changes an image, and task.observation = {self.task.observation!r} sees none:"
+                " set task.observation: camera, or leave it out",
             ),
             (
                 self.task.sees and self.init_from is not None,

@@ -1,8 +1,9 @@
-"""Randomize the robot: give it fixed robot parameters, or draw them anew in every episode.
+"""Randomize the robot and what it sees: fixed parameters, or drawn anew in every episode.
 
-The drawn parameters and the states of actuators and sensors are data in `State.episode_params`:
-`NewEpisodeWrapper` replaces them where a new episode begins, and checkpoints store them. `step`
-makes the physics model from them, so one compiled program serves all robots.
+The drawn parameters and the states of actuators, sensors and camera are data in
+`State.episode_params`: `NewEpisodeWrapper` replaces them where a new episode begins, and
+checkpoints store them. `step` makes the physics model from them, so one compiled program serves
+all robots.
 """
 
 import math
@@ -17,7 +18,12 @@ from jaxtyping import Array, Float, UInt32
 from jetbot_mjx.config import RandomizationConfig
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import ActuatorState, initial_actuator_state, step_actuators
+from jetbot_mjx.envs.camera.scene import GOAL
+from jetbot_mjx.envs.camera.surroundings import draw_surroundings
+from jetbot_mjx.envs.camera.timing import CameraState, initial_camera_state, step_camera
+from jetbot_mjx.envs.camera.wrapper import seen_pose
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.look_params import MAX_CAMERA_DELAY, MAX_CLUTTER, LookParams
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.robot_params import (
     MAX_ACTION_DELAY,
@@ -27,9 +33,13 @@ from jetbot_mjx.envs.robot_params import (
 )
 from jetbot_mjx.envs.sensors import SensorState, add_offsets, initial_sensor_state, step_sensors
 from jetbot_mjx.envs.state import PhysicsState, State, robot_state
+from jetbot_mjx.errors import InvalidError
 
-_INTEGERS = ("action_delay", "observation_delay")
-"""Parameters in control steps: every integer of the range is equally likely."""
+_INTEGERS = (
+    *("action_delay", "observation_delay", "camera_delay", "camera_interval"),
+    *("clutter", "floor_texture"),
+)
+"""Whole numbers: every one of the range is equally likely."""
 
 _MODEL = ("friction", "mass", "com_x", "com_y", "com_z")
 _START = ("start_x", "start_y", "start_yaw")
@@ -42,15 +52,17 @@ class EpisodeParams(NamedTuple):
     """An `EpisodeParams` holds the robot parameters and model states of one episode."""
 
     drawn: Float[Array, " quantities"]
-    """The drawn robot parameters, in the order of `RandomizationConfig.drawn`."""
+    """The drawn robot and look parameters, in the order of `RandomizationConfig.drawn`."""
     motors: ActuatorState
     """State of the actuator model."""
     sensors: SensorState
     """State of the sensor model."""
+    camera: CameraState | None
+    """Looks of the episode and poses of its last steps; None: the camera sees the plain scene."""
 
 
 def draw(ranges: RandomizationConfig, key: UInt32[Array, "2"]) -> Float[Array, " quantities"]:
-    """Draw robot parameters, each one uniformly from its range.
+    """Draw robot and look parameters, each one uniformly from its range.
 
     Args:
       ranges: the range of every parameter that is drawn.
@@ -69,11 +81,11 @@ def draw(ranges: RandomizationConfig, key: UInt32[Array, "2"]) -> Float[Array, "
 
 
 class DomainRandomizationWrapper(Wrapper):
-    """A wrapper that varies the robot: its physics model, actuators, sensors and start pose.
+    """A wrapper that varies the robot: its model, actuators, sensors, start pose, and what it sees.
 
     Like the environment inside, it sees one robot without a batch axis. It observes numbers only:
-    `with_camera` renders outside of it. A step is: wheel speed targets of the action, actuator
-    model, physics with the varied model, sensor model, observation.
+    `with_camera` renders outside of it, with the looks that the state holds. A step is: wheel speed
+    targets of the action, actuator model, physics with the varied model, sensor model, observation.
     """
 
     env: JetBotEnv
@@ -83,6 +95,7 @@ class DomainRandomizationWrapper(Wrapper):
         env: JetBotEnv,
         robot_params: RobotParams | None = None,
         ranges: RandomizationConfig | None = None,
+        look_params: LookParams | None = None,
     ) -> None:
         """Wrap one environment.
 
@@ -91,28 +104,44 @@ class DomainRandomizationWrapper(Wrapper):
           robot_params: parameters of the robot in every episode, which may be traced; None: those
             of the preset.
           ranges: ranges of the parameters that are drawn anew in every episode, which replace
-            those of `robot_params`; None: no parameter is drawn.
+            those of `robot_params` and `look_params`; None: no parameter is drawn.
+          look_params: look parameters in every episode, which may be traced; None: the plain scene.
+
+        Raises:
+          UserError: looks differ, and the environment has no camera.
         """
         super().__init__(env.blind())
         self.camera = env.camera
         self._constant = robot_params or RobotParams()
+        self._constant_looks = look_params or LookParams()
         self._ranges = ranges or RandomizationConfig()
-        self._max_action_delay = self._max_delay("action_delay", MAX_ACTION_DELAY)
-        self._max_observation_delay = self._max_delay("observation_delay", MAX_OBSERVATION_DELAY)
+        looks = self._ranges.looks
+        looks += [name for name in LookParams._fields if self._constant_looks.differs(name)]
+        if looks and self.camera is None:
+            raise InvalidError(
+                f"randomization.{looks[0]} changes an image, and a policy with task.observation ="
+                f" {env.config.task.observation!r} sees none: leave it out"
+            )
+        self._sees_looks = bool(looks)
+        self._max_action_delay = self._highest("action_delay", MAX_ACTION_DELAY)
+        self._max_observation_delay = self._highest("observation_delay", MAX_OBSERVATION_DELAY)
+        self._max_camera_delay = self._highest("camera_delay", MAX_CAMERA_DELAY)
+        self._max_clutter = self._highest("clutter", MAX_CLUTTER)
         limit = env.robot.max_wheel_speed
         self._limit = math.inf if limit is None else limit
         self._full_speed = limit or env.config.task.max_speed / CONTROLLER_WHEEL_RADIUS
 
-    def _max_delay(self, name: str, traced: int) -> int:
-        """Return the longest delay that the program must support [control steps].
+    def _highest(self, name: str, traced: int) -> int:
+        """Return the largest value of a whole number that the program must support.
 
         Args:
-          name: the robot parameter.
-          traced: the limit if the delay is a traced value.
+          name: the parameter.
+          traced: the limit if it is a traced value.
         """
         if name in self._ranges.drawn:
             return round(self._ranges.drawn[name][1])
-        value = getattr(self._constant, name)
+        constant = self._constant if name in RobotParams._fields else self._constant_looks
+        value = getattr(constant, name)
         return round(value) if isinstance(value, int | float) else traced
 
     def robot_params(self, state: State) -> RobotParams:
@@ -124,7 +153,29 @@ class DomainRandomizationWrapper(Wrapper):
         return self._robot_params(state.episode_params.drawn)
 
     def _robot_params(self, drawn: Float[Array, " quantities"]) -> RobotParams:
-        return self._constant._replace(**dict(zip(self._ranges.drawn, drawn, strict=True)))
+        return self._constant._replace(**self._drawn_of(RobotParams, drawn))
+
+    def _drawn_of(
+        self, kind: type[RobotParams | LookParams], drawn: Float[Array, " quantities"]
+    ) -> dict[str, Array]:
+        """Return the drawn parameters of one kind, by name."""
+        named = zip(self._ranges.drawn, drawn, strict=True)
+        return {name: value for name, value in named if name in kind._fields}
+
+    def _begin_camera(
+        self, state: State, drawn: Float[Array, " quantities"], rng: UInt32[Array, "2"]
+    ) -> CameraState | None:
+        """Return the state of the camera at the start of an episode."""
+        if not self._sees_looks:
+            return None
+        assert self.camera is not None
+        params = self._constant_looks._replace(**self._drawn_of(LookParams, drawn))
+        key, image_key = jax.random.split(jax.random.fold_in(rng, _KEY_SALT + 2))
+        start = seen_pose(self.env.task, state)
+        surroundings = draw_surroundings(
+            key, params, self._max_clutter, self.camera.scene, start.markers.get(GOAL)
+        )
+        return initial_camera_state(start, image_key, params, surroundings, self._max_camera_delay)
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
         """Begin an episode with newly drawn robot parameters; the goal is that of `env.reset`.
@@ -140,11 +191,12 @@ class DomainRandomizationWrapper(Wrapper):
         noise_key = jax.random.fold_in(rng, _KEY_SALT + 1)
         sensors = initial_sensor_state(robot, noise_key, robot_params, self._max_observation_delay)
         motors = initial_actuator_state(robot_params, self._max_action_delay)
-        return state.replace(
+        state = state.replace(
             pipeline_state=physics,
             obs=self.env.observe(add_offsets(robot, robot_params), state.goal),
-            episode_params=EpisodeParams(drawn, motors, sensors),
         )
+        camera = self._begin_camera(state, drawn, rng)
+        return state.replace(episode_params=EpisodeParams(drawn, motors, sensors, camera))
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
         """Make one environment step through actuator model, physics and sensor model.
@@ -153,7 +205,7 @@ class DomainRandomizationWrapper(Wrapper):
           state: a state of this environment.
           action: the action, in [-1, 1]².
         """
-        drawn, motors, sensors = state.episode_params
+        drawn, motors, sensors, camera = state.episode_params
         robot_params = self._robot_params(drawn)
         # The limit is electronic: it applies before the motor lag.
         command = jnp.clip(self.env.wheel_targets(action), -self._limit, self._limit)
@@ -164,9 +216,11 @@ class DomainRandomizationWrapper(Wrapper):
         robot = robot_state(state.pipeline_state)
         count = jnp.round(state.pipeline_state.time / self.env.dt).astype(jnp.int32)
         sensors, measured = step_sensors(sensors, robot, robot_params, count)
+        if camera is not None:
+            camera = step_camera(camera, seen_pose(self.env.task, state), count)
         return state.replace(
             obs=self.env.observe(measured, state.goal),
-            episode_params=EpisodeParams(drawn, motors, sensors),
+            episode_params=EpisodeParams(drawn, motors, sensors, camera),
         )
 
     def _env_of(self, robot_params: RobotParams) -> JetBotEnv:

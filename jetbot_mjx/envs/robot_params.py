@@ -5,7 +5,8 @@ gives each robot its own. Friction and masses enter the physics model here; whee
 in `actuators`, and measurement errors in `sensors`.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -25,6 +26,20 @@ _CHASSIS = "jetbot"
 _SIDES = ("left", "right")
 
 Quantity = Float[ArrayLike, ""]
+
+
+def differs(params: Any, names: Iterable[str]) -> bool:
+    """Return whether any of some parameters may differ from its default.
+
+    Args:
+      params: a `NamedTuple` of parameters with defaults.
+      names: the parameters; a traced one may always differ.
+    """
+    values = {name: getattr(params, name) for name in names}
+    return any(
+        not (isinstance(value, int | float) and value == params._field_defaults[name])
+        for name, value in values.items()
+    )
 
 
 class RobotParams(NamedTuple):
@@ -89,12 +104,7 @@ class RobotParams(NamedTuple):
         Args:
           *names: the parameters; a traced one may always differ.
         """
-        presets = type(self)._field_defaults
-        values = {name: getattr(self, name) for name in names}
-        return any(
-            not (isinstance(value, int | float) and value == presets[name])
-            for name, value in values.items()
-        )
+        return differs(self, names)
 
 
 def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams) -> mjx.Model:

@@ -53,7 +53,7 @@ class State(struct.PyTreeNode):
     """Random key from which the next episode is drawn."""
     episode_params: Any = None
     """`EpisodeParams` of a `DomainRandomizationWrapper`: the robot parameters of this episode and
-    the states of actuators and sensors. None: the robot is its preset."""
+    the states of actuators, sensors and camera. None: the robot is its preset."""
 
 
 def robot_state(physics: PhysicsState) -> RobotState:

@@ -64,7 +64,8 @@ def wrap_for_training(
     """
 
     def wrap_one(env: JetBotEnv) -> Any:
-        one = maybe_randomize(env.blind())
+        varied = maybe_randomize(env)
+        one: Any = env.blind() if varied is env else varied
         if final_images:
             one = with_camera(one, env.camera)
         one = NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))

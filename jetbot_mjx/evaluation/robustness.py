@@ -2,7 +2,8 @@
 
 A sweep changes one parameter at a time from the preset's value. Goals, rules and metrics are those
 of the report. One compiled program evaluates all robots, with the policy and with the scripted
-controller. The evaluation in C MuJoCo uses the same robot with numerics that no training uses.
+controller. A policy that sees is also evaluated with changed looks, which the scripted controller
+does not see. The evaluation in C MuJoCo uses the same robot with numerics that no training uses.
 
 Sources of the ranges in `assets/robustness.yaml`, by tag; BOM, EST and SIM are those of
 `envs/robot_model.py`:
@@ -10,6 +11,7 @@ Sources of the ranges in `assets/robustness.yaml`, by tag; BOM, EST and SIM are 
   CSE276A     gassajor000/cse276a_jetbot: calibration of a JetBot's motors
   DUCKIETOWN  gym-duckietown: simulator of a robot with the same motors
   ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: domain randomization of Isaac's JetBot
+  IMX219      Sony's sensor with 160° lens modules; drivers tint them until they are calibrated
   PICOBOT     uni-obuda picobot: system identification of a robot with the same motors
   TT          measurements of the same motors: newscrewdriver.com, SunFounder's data
   WHEELEDLAB  WheeledLab: domain randomization of a drifting car
@@ -21,7 +23,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, UInt32
+from jaxtyping import Array, Int, UInt32
 
 from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
@@ -29,6 +31,7 @@ from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
 from jetbot_mjx.config import RandomizationConfig, read_yaml
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.look_params import LookParams
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
 from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.evaluation.evaluator import (
@@ -50,11 +53,15 @@ ROBUST_SUCCESS_RATE = 0.95
 """Lowest success rate at which a policy counts as robust to a changed value."""
 
 
+Variant = tuple[RobotParams, LookParams]
+"""A robot, and what its camera sees."""
+
+
 class Sweep(NamedTuple):
     """A `Sweep` holds one parameter and the values at which a policy is evaluated."""
 
     name: str
-    """Name of the parameter, a field of `RobotParams`."""
+    """Name of the parameter, a field of `RobotParams` or `LookParams`."""
     label: str
     unit: str
     values: tuple[float, ...]
@@ -65,12 +72,25 @@ class Sweep(NamedTuple):
     @property
     def nominal(self) -> float:
         """Return the preset's value."""
-        return getattr(RobotParams(), self.name)
+        return getattr(
+            RobotParams() if self.name in RobotParams._fields else LookParams(), self.name
+        )
 
     @property
-    def robots(self) -> list[RobotParams]:
-        """Return the robot for each value."""
-        return [RobotParams()._replace(**{self.name: value}) for value in self.values]
+    def is_look(self) -> bool:
+        """Return whether the parameter changes what the camera sees."""
+        return self.name in LookParams._fields
+
+    @property
+    def variants(self) -> list[Variant]:
+        """Return robot and looks for each value."""
+        kind = 1 if self.is_look else 0
+        variants = []
+        for value in self.values:
+            parts: list[Any] = [RobotParams(), LookParams()]
+            parts[kind] = parts[kind]._replace(**{self.name: value})
+            variants.append((parts[0], parts[1]))
+        return variants
 
 
 SWEEPS = tuple(
@@ -105,15 +125,17 @@ class Sweeper:
           env: one unwrapped environment with its preset's robot.
           networks: the networks of the policies.
           keys: one reset key for each episode, such as `report_keys(128)`.
-          sweeps: the parameters with their values.
+          sweeps: the parameters with their values; without a camera, those of looks are left out.
         """
-        self._env, self._keys, self._sweeps = env, keys, tuple(sweeps)
+        sees = env.camera is not None
+        self._env, self._keys = env, keys
+        self._sweeps = tuple(one for one in sweeps if sees or not one.is_look)
         # The preset's robot occurs in every sweep, but is evaluated only once.
-        self._robots = list(dict.fromkeys(robot for one in sweeps for robot in one.robots))
+        self._variants = list(dict.fromkeys(v for one in self._sweeps for v in one.variants))
         # Run robots one after the other on a CPU: the solver iterates until the last robot of a
         # batch has converged, so those that slide would slow down the rest. A GPU needs the whole
         # batch to be busy.
-        self._at_once = 1 if jax.default_backend() == "cpu" else len(self._robots)
+        self._at_once = 1 if jax.default_backend() == "cpu" else len(self._variants)
         controllers = [policy_controller(networks), BASELINES["scripted"](env)]
         length = env.config.task.episode_length
 
@@ -121,16 +143,19 @@ class Sweeper:
             index: int | Int[Array, ""],
             params: PolicyParams,
             keys: UInt32[Array, "n 2"],
-            robot_params: Float[Array, "robots quantities"],
+            variants: Variant,
         ) -> Episodes:
-            def one(robot_params: Float[Array, " quantities"]) -> Episodes:
-                randomized_env = DomainRandomizationWrapper(env, RobotParams(*robot_params))
+            def one(variant: Variant) -> Episodes:
+                robot_params, look_params = variant
+                randomized_env = DomainRandomizationWrapper(
+                    env, robot_params, look_params=look_params if sees else None
+                )
                 return rollout_fn(randomized_env, controllers, length)(index, params, keys)
 
-            return jax.vmap(one)(robot_params)
+            return jax.vmap(one)(variants)
 
         self._run_episodes = jax.jit(run_episodes, compiler_options=compiler_options(env.config))
-        self._scripted: dict[RobotParams, Summary] = {}
+        self._scripted: dict[Variant, Summary] = {}
 
     def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
         """Evaluate a policy at every value of every parameter, on the same goals.
@@ -142,30 +167,36 @@ class Sweeper:
           One result for each sweep.
         """
         host = jax.device_get(params)
-        policy = self._evaluate(0, host)
-        self._scripted = self._scripted or self._evaluate(1, host)
+        policy = self._evaluate(0, host, self._variants)
+        if not self._scripted:
+            # The scripted controller does not see: the robot counts, and not its looks.
+            robots = dict.fromkeys((robot, LookParams()) for robot, _ in self._variants)
+            self._scripted = self._evaluate(1, host, list(robots))
         return tuple(
             SweepResult(
                 one,
-                tuple(policy[robot] for robot in one.robots),
-                tuple(self._scripted[robot] for robot in one.robots),
+                tuple(policy[variant] for variant in one.variants),
+                tuple(self._scripted[robot, LookParams()] for robot, _ in one.variants),
             )
             for one in self._sweeps
         )
 
-    def _evaluate(self, controller: int, params: PolicyParams) -> dict[RobotParams, Summary]:
-        robot_params = jnp.asarray(self._robots, jnp.float32)
+    def _evaluate(
+        self, controller: int, params: PolicyParams, variants: Sequence[Variant]
+    ) -> dict[Variant, Summary]:
         summaries: list[Summary] = []
         name = ("policy", "scripted")[controller]
-        with stage(f"robustness values, {name}", len(self._robots)) as advance:
-            for first in range(0, len(robot_params), self._at_once):
-                some = robot_params[first : first + self._at_once]
-                episodes = jax.device_get(self._run_episodes(controller, params, self._keys, some))
+        with stage(f"robustness values, {name}", len(variants)) as advance:
+            for first in range(0, len(variants), self._at_once):
+                some = variants[first : first + self._at_once]
+                stacked = jax.tree.map(lambda *values: jnp.asarray(values, jnp.float32), *some)
+                found = self._run_episodes(controller, params, self._keys, stacked)
+                episodes = jax.device_get(found)
                 for i in range(len(some)):
                     one = jax.tree.map(lambda x, i=i: x[i], episodes)
                     summaries.append(summarize(one, self._env.dt))
                 advance(len(some))
-        return dict(zip(self._robots, summaries, strict=True))
+        return dict(zip(variants, summaries, strict=True))
 
 
 class MujocoResult(NamedTuple):

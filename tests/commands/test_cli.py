@@ -26,8 +26,8 @@ from jetbot_mjx.runs.checkpoint import FORMAT
 from jetbot_mjx.training import session
 
 FILE_OR_NAME = (
-    "give a file, or one of camera_gpu, gpu, isaac_sb3, jetbot, jetbot_camera, jetbot_egocentric,"
-    " real_jetbot, smoke"
+    "give a file, or one of camera_gpu, camera_real, gpu, isaac_sb3, jetbot, jetbot_camera,"
+    " jetbot_egocentric, real_jetbot, smoke"
 )
 SMOKE = str(Path(__file__).parents[2] / "configs" / "smoke.yaml")
 COMMANDS = {

@@ -12,7 +12,7 @@ from jetbot_mjx.runs import copy_pretrained
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.viewers import live
 
-NAMES = ("jetbot_camera", "jetbot_egocentric", "real_jetbot")
+NAMES = ("camera_real", "jetbot_camera", "jetbot_egocentric", "real_jetbot")
 LONGER = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
 """What a run that comes with the package changes of its configuration."""
 
@@ -23,7 +23,7 @@ def runs(tmp_path, monkeypatch):
     return copy_pretrained(pretrained.FOLDER)
 
 
-def test_there_is_a_run_for_each_of_three_configurations(runs):
+def test_there_is_a_run_for_each_of_four_configurations(runs):
     assert runs == tuple(Path("runs/pretrained") / name for name in NAMES)
 
 
@@ -63,12 +63,12 @@ def test_it_can_be_trained_further(runs):
 def test_nothing_is_overwritten(runs):
     kept = runs[1] / "config.yaml"
     kept.write_text("mine")
-    with pytest.raises(UserError, match="runs/pretrained/jetbot_camera is there already: give"):
+    with pytest.raises(UserError, match="runs/pretrained/camera_real is there already: give"):
         pretrained.main([])
     for path in sorted(runs[0].rglob("*"), reverse=True):
         path.unlink() if path.is_file() else path.rmdir()
     runs[0].rmdir()
-    with pytest.raises(UserError, match="runs/pretrained/jetbot_egocentric is there already: give"):
+    with pytest.raises(UserError, match="runs/pretrained/jetbot_camera is there already: give"):
         pretrained.main([])
     assert kept.read_text() == "mine"
     assert not runs[0].exists()
@@ -76,7 +76,7 @@ def test_nothing_is_overwritten(runs):
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"file/runs/jetbot_camera cannot be written: Not a dir"):
+    with pytest.raises(UserError, match=r"file/runs/camera_real cannot be written: Not a dir"):
         copy_pretrained(tmp_path / "file" / "runs")
 
 

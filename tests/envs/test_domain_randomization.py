@@ -14,6 +14,7 @@ from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper, draw, maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.look_params import LookParams
 from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -24,6 +25,8 @@ from jetbot_mjx.training import session
 ENVS = 64
 EPISODES = 5
 EPISODE_LENGTH = 3
+WHOLE = {"floor_texture", "clutter", "camera_delay", "camera_interval"}
+SMALL = {"distortion": [0.1, 0.1], **{f"camera_{axis}": [0.01, 0.01] for axis in "xyz"}}
 NOT_OBSERVED = {"height_offset", "pitch_offset"}  # by an egocentric policy
 
 
@@ -38,7 +41,11 @@ def ranges(config):
 
 
 def test_what_can_be_drawn_is_what_can_differ():
-    assert tuple(RandomizationConfig.model_fields) == RobotParams._fields
+    names = tuple(RandomizationConfig.model_fields)
+    assert names == RobotParams._fields + LookParams._fields
+    everything = {name: [1, 1] if name in WHOLE else [0.7, 0.7] for name in LookParams._fields}
+    camera = {"task": {"observation": "camera"}, "randomization": everything | SMALL}
+    assert tuple(parse_config(camera).randomization.looks) == LookParams._fields
 
 
 def test_the_preset_draws_all_that_its_policy_can_tell_around_the_presets_robot(ranges):

@@ -2,6 +2,7 @@
 
 import json
 
+import gliding
 import jax
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import PPOConfig, parse_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.look_params import MAX_CAMERA_DELAY, MAX_CLUTTER, LookParams
 from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, MAX_OBSERVATION_DELAY, RobotParams
 from jetbot_mjx.evaluation import robustness
 from jetbot_mjx.evaluation.evaluator import Summary, report_keys, wilson_interval
@@ -41,7 +43,7 @@ def result(policy, values=(0.4, 0.6, 1.0, 1.2)):
 
 
 def test_every_difference_is_swept_around_the_presets_value():
-    assert tuple(one.name for one in SWEEPS) == RobotParams._fields
+    assert tuple(one.name for one in SWEEPS) == RobotParams._fields + LookParams._fields
     for one in SWEEPS:
         assert one.nominal in one.values
         assert list(one.values) == sorted(set(one.values))
@@ -51,6 +53,8 @@ def test_every_difference_is_swept_around_the_presets_value():
     by_name = {one.name: max(one.values) for one in SWEEPS}
     assert by_name["action_delay"] == MAX_ACTION_DELAY
     assert by_name["observation_delay"] == MAX_OBSERVATION_DELAY
+    assert by_name["camera_delay"] == MAX_CAMERA_DELAY
+    assert by_name["clutter"] == MAX_CLUTTER
 
 
 @pytest.mark.parametrize("one", SWEEPS, ids=lambda one: one.name)
@@ -110,9 +114,9 @@ class Counted(DomainRandomizationWrapper):
 
     built = 0
 
-    def __init__(self, env, robot_params):
+    def __init__(self, env, robot_params, **looks):
         type(self).built += 1
-        super().__init__(env, robot_params)
+        super().__init__(env, robot_params, **looks)
 
 
 @pytest.fixture(scope="module")
@@ -151,3 +155,44 @@ def test_a_weak_robot_and_a_slow_answer_cost_success(swept):
     assert gain.scripted[1].success_rate == 1.0
     assert gain.scripted[0].success_rate < 0.5  # 0.2 m/s do not last for the way
     assert delay.scripted[1].success_rate < 0.8
+
+
+@pytest.fixture(scope="module")
+def swept_looks():
+    """An untrained policy that sees, on a gliding robot: what it did under which looks."""
+    camera = {"width": 16, "height": 16, "samples": 1}
+    task = {"observation": "camera", "episode_length": 12}
+    network = {"cnn": "tiny", "policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}
+    config = parse_config({"task": task, "camera": camera, "ppo": {"network": network}})
+    env = make_env(config)
+    networks = make_networks(
+        config.ppo.network, env.observation_size, env.action_size, normalize=False
+    )
+    key = jax.random.PRNGKey(0)
+    params = PolicyParams(None, networks.policy_network.init(key), None)
+    values = {"motor_gain": (0.5, 1.0), "exposure": (0.0, 1.0), "camera_delay": (0.0, 9.0)}
+    sweeps = [one._replace(values=values[one.name]) for one in SWEEPS if one.name in values]
+    with gliding.everywhere():
+        return Sweeper(env, networks, report_keys(EPISODES), sweeps).run(params)
+
+
+def test_looks_are_swept_for_a_policy_that_sees(swept_looks):
+    gain, exposure, delay = swept_looks
+    assert [one.sweep.name for one in swept_looks] == ["motor_gain", "exposure", "camera_delay"]
+    assert exposure.policy[1] == delay.policy[0] == gain.policy[1]
+    assert exposure.policy[0].episode_return != exposure.policy[1].episode_return
+    assert delay.policy[1].episode_return != delay.policy[0].episode_return
+
+
+def test_the_scripted_controller_does_not_see_the_looks(swept_looks):
+    gain, exposure, delay = swept_looks
+    assert {*exposure.scripted, *delay.scripted} == {gain.scripted[1]}
+
+
+def test_a_policy_that_does_not_see_is_swept_without_looks():
+    env = make_env(parse_config({"task": {"observation": "egocentric"}}))
+    networks = make_networks(
+        env.config.ppo.network, env.observation_size, env.action_size, normalize=False
+    )
+    sweeper = Sweeper(env, networks, report_keys(1))
+    assert tuple(one.name for one in sweeper._sweeps) == RobotParams._fields

@@ -50,9 +50,8 @@ def test_what_is_not_there_is_told_with_the_likely_name(runs):
     assert isinstance(caught.value, FileNotFoundError)
     with pytest.raises(CheckpointError, match="give a run folder or a checkpoint in it"):
         find_checkpoint("something else")
-    with pytest.raises(
-        NotFoundError, match="there are jetbot_camera, jetbot_egocentric, real_jetbot"
-    ):
+    names = "there are camera_real, jetbot_camera, jetbot_egocentric, real_jetbot"
+    with pytest.raises(NotFoundError, match=names):
         find_run("pretrained:x")
 
 
@@ -129,7 +128,7 @@ def test_configurations_are_found_by_name(tmp_path, monkeypatch):
     [
         ("jetbot_egocentrc", "did you mean jetbot_egocentric?"),
         ("configs/smokee.yaml", "did you mean smoke?"),
-        ("xyz", "give a file, or one of camera_gpu, gpu, isaac_sb3,"),
+        ("xyz", "give a file, or one of camera_gpu, camera_real, gpu,"),
     ],
 )
 def test_a_mistaken_configuration_is_told_the_likely_one(tmp_path, monkeypatch, name, told):

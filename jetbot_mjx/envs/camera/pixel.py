@@ -17,7 +17,8 @@ from jaxtyping import Array
 from jetbot_mjx.envs.camera import geometry
 from jetbot_mjx.envs.camera.geometry import Hit, Vector
 from jetbot_mjx.envs.camera.lens import Footprint, Rays
-from jetbot_mjx.envs.camera.scene import Checker, Rgb, Scene, SceneGeom
+from jetbot_mjx.envs.camera.scene import Checker, Rgb, Scene, SceneGeom, ground_of
+from jetbot_mjx.envs.camera.surroundings import Room, wall_colour, wall_slope
 
 HITS = {
     "plane": geometry.hit_plane,
@@ -65,11 +66,19 @@ class Frame(NamedTuple):
     """A `Frame` holds everything that the pixels of a frame share."""
 
     axes: dict[bytes, Axes]
-    """By the bytes of the geom's rotation: geoms that are turned alike share them."""
+    """By the geom's `axes_key`: geoms that are turned alike share them."""
     looks: list[Look]
     """In the order of the scene's geoms."""
     up: Vector
     """How far right, down and forward of the image point upwards."""
+    params: dict[str, Any]
+    """The look parameters that differ from the plain scene and enter the pixels."""
+    clutter: list[Rgb]
+    """Colours of the objects around."""
+    room: Room | None
+    """The walls; None: there are none."""
+    floor_turn: tuple[Any, Any] | None
+    """Cosine and sine of the turn of the ground's pattern; None: it is not turned."""
 
 
 class _Sample(NamedTuple):
@@ -92,16 +101,26 @@ class _Sums(NamedTuple):
     """Number of rays that see the ground."""
     sky: Any
     """Number of rays that see nothing."""
+    wall: Any
+    """Number of rays that see a wall; None: there are none."""
 
 
-def ground_of(scene: Scene) -> int | None:
-    """Return the index of the first plane that is infinite both ways; None: there is none."""
-    infinite = (
-        i
-        for i, geom in enumerate(scene.geoms)
-        if geom.kind == "plane" and geom.size[0] == geom.size[1] == 0
-    )
-    return next(infinite, None)
+class _Slopes(NamedTuple):
+    """A `_Slopes` holds 1/depth of what a ray meets behind all geoms, 0 or less: nothing."""
+
+    ground: Any
+    wall: Any
+    """None: there are no walls."""
+
+    @property
+    def nearest(self) -> Any:
+        """Return the larger one."""
+        return self.ground if self.wall is None else jnp.maximum(self.ground, self.wall)
+
+    @property
+    def is_wall(self) -> Any:
+        """Return whether the nearest one is a wall."""
+        return self.wall > jnp.maximum(self.ground, 0.0)
 
 
 def pixel_colour(
@@ -117,12 +136,15 @@ def pixel_colour(
     """
     ground = ground_of(scene)
     others = [i for i in range(len(scene.geoms)) if i != ground]
-    slopes = [_ground_slope(scene, frame, ground, rays) for rays in samples]
+    slopes = [_slopes(scene, frame, ground, rays) for rays in samples]
 
     def background() -> _Sums:
-        below = sum((slope > 0).astype(jnp.float32) for slope in slopes)
         zero = jnp.zeros(())
-        return _Sums(zero, zero, zero, below, len(samples) - below)
+        seen = sum((slope.nearest > 0).astype(jnp.float32) for slope in slopes)
+        if frame.room is None:
+            return _Sums(zero, zero, zero, seen, len(samples) - seen, None)
+        wall = sum(slope.is_wall.astype(jnp.float32) for slope in slopes)
+        return _Sums(zero, zero, zero, seen - wall, len(samples) - seen, wall)
 
     def with_geoms(near: Sequence[Any]) -> _Sums:
         found = [_Sample(jnp.float32(np.inf), *[jnp.zeros(())] * 3) for _ in samples]
@@ -133,7 +155,7 @@ def pixel_colour(
                 lambda before: before,
                 found,
             )
-        return _sum(scene, frame, ground, found, slopes)
+        return _sum(found, slopes)
 
     near = [_is_near(scene.geoms[i], frame.looks[i], footprint) for i in others]
     if not others:
@@ -149,6 +171,9 @@ def pixel_colour(
         geom, look = scene.geoms[ground], frame.looks[ground]
         colour = _plane_colour(geom, look, frame, footprint, sums.ground > 0)
         channels = [channels[k] + sums.ground * (colour[k] * look.faces[0][k]) for k in range(3)]
+    if frame.room is not None:
+        wall = wall_colour(frame.room, footprint.centre)
+        channels = [channels[k] + sums.wall * wall[k] for k in range(3)]
     sky = _sky(scene, frame.up, footprint.centre)
     return [(channels[k] + sums.sky * sky[k]) / len(samples) for k in range(3)]
 
@@ -191,12 +216,18 @@ def _is_near(geom: SceneGeom, look: Look, footprint: Footprint) -> Any:
     return distance * squared - along * along <= bound * bound
 
 
+def _slopes(scene: Scene, frame: Frame, ground: int | None, rays: Rays) -> _Slopes:
+    """Return what a ray meets behind all geoms."""
+    wall = None if frame.room is None else wall_slope(frame.room, frame.up, rays)
+    return _Slopes(_ground_slope(scene, frame, ground, rays), wall)
+
+
 def _ground_slope(scene: Scene, frame: Frame, ground: int | None, rays: Rays) -> Any:
     """Return how steeply a ray falls towards the ground: 1/depth, at most 0 if it does not."""
     if ground is None:
         return jnp.zeros(())
     look = frame.looks[ground]
-    right, down, forward = frame.axes[scene.geoms[ground].rotation.tobytes()].image
+    right, down, forward = frame.axes[scene.geoms[ground].axes_key].image
     falls = -(right[2] * rays.x + (down[2] * rays.y + forward[2]))
     # A camera below the ground does not see it.
     return falls * jnp.where(look.origin[2] > 0, 1.0 / look.origin[2], 0.0)
@@ -212,7 +243,7 @@ def _meet(
 ) -> list[_Sample]:
     """Return what the rays of a pixel have met after one more geom."""
     geom, look = scene.geoms[index], frame.looks[index]
-    axes = frame.axes[geom.rotation.tobytes()]
+    axes = frame.axes[geom.axes_key]
     after = []
     for rays, sample in zip(samples, before, strict=True):
         direction = directions(axes, rays)
@@ -221,7 +252,7 @@ def _meet(
         light = _light(scene, geom, look, axes, direction, hit)
         colour = geom.rgb
         if geom.checker is not None:
-            colour = _checker_colours(geom.checker, look.origin, axes, footprint)
+            colour = _checker_colours(geom.checker, look.origin, axes, None, footprint)
         seen = [hit.depth, *(colour[k] * light[k] for k in range(3))]
         pairs = zip(seen, sample, strict=True)
         after.append(_Sample(*(jnp.where(closer, new, old) for new, old in pairs)))
@@ -250,19 +281,20 @@ def _light(
     ]
 
 
-def _sum(
-    scene: Scene, frame: Frame, ground: int | None, found: Sequence[_Sample], slopes: Sequence[Any]
-) -> _Sums:
-    """Add up the rays of a pixel; those that meet the ground before a geom see the ground."""
-    total = _Sums(*[jnp.zeros(())] * 5)
+def _sum(found: Sequence[_Sample], slopes: Sequence[_Slopes]) -> _Sums:
+    """Add up the rays of a pixel; those that meet ground or wall before a geom see that."""
+    totals: list[Any] = [jnp.zeros(())] * (5 if slopes[0].wall is None else 6)
     for sample, slope in zip(found, slopes, strict=True):
         is_free = sample.depth == np.inf
-        is_ground = (slope > 0) & (sample.depth * slope > 1.0)
-        is_sky = is_free & ~is_ground
-        shown = [jnp.where(is_ground, 0.0, x) for x in (sample.red, sample.green, sample.blue)]
-        counts = [x.astype(jnp.float32) for x in (is_ground, is_sky)]
-        total = _Sums(*(a + b for a, b in zip(total, [*shown, *counts], strict=True)))
-    return total
+        is_behind = (slope.nearest > 0) & (sample.depth * slope.nearest > 1.0)
+        seen = [is_behind, is_free & ~is_behind]
+        if slope.wall is not None:
+            is_wall = is_behind & slope.is_wall
+            seen = [is_behind & ~is_wall, is_free & ~is_behind, is_wall]
+        shown = [jnp.where(is_behind, 0.0, x) for x in (sample.red, sample.green, sample.blue)]
+        counts = [x.astype(jnp.float32) for x in seen]
+        totals = [a + b for a, b in zip(totals, [*shown, *counts], strict=True)]
+    return _Sums(*totals, *[None] * (6 - len(totals)))
 
 
 def _plane_colour(
@@ -272,10 +304,10 @@ def _plane_colour(
     checker = geom.checker
     if checker is None:
         return geom.rgb
-    axes = frame.axes[geom.rotation.tobytes()]
+    axes = frame.axes[geom.axes_key]
     return jax.lax.cond(
         is_seen,
-        lambda: _checker_colours(checker, look.origin, axes, footprint),
+        lambda: _checker_colours(checker, look.origin, axes, frame.floor_turn, footprint),
         lambda: [jnp.zeros(())] * 3,
     )
 
@@ -293,13 +325,23 @@ def directions(axes: Axes, rays: Rays) -> Vector:
     return x, y, z
 
 
-def _checker_colours(checker: Checker, origin: Vector, axes: Axes, pixel: Footprint) -> list[Array]:
+def _checker_colours(
+    checker: Checker,
+    origin: Vector,
+    axes: Axes,
+    turn: tuple[Any, Any] | None,
+    pixel: Footprint,
+) -> list[Array]:
     """Return the mean colour of a checker texture over every pixel's area on its plane.
 
     The point p = o - d o_z/d_z that a pixel sees moves by t (e - d e_z/d_z) where d changes by e.
     A checker is the product of two square waves; the mean of each over the pixel's extent is exact,
     of the product it is for a pixel whose sides are parallel to the squares'.
     """
+    if turn is not None:
+        origin = _unturned(origin, turn)
+        right, down, forward = (_unturned(vector, turn) for vector in axes.image)
+        axes = axes._replace(image=(right, down, forward))
     direction = directions(axes, pixel.centre)
     # A pixel at or above the horizon sees the plane far away, if any of its rays does.
     down = jnp.minimum(direction[2], -1e-4)
@@ -309,7 +351,7 @@ def _checker_colours(checker: Checker, origin: Vector, axes: Axes, pixel: Footpr
         [axes.image[0][k] * change.x + axes.image[1][k] * change.y for k in range(3)]
         for change in (pixel.right, pixel.down)
     ]
-    waves: Any = 1.0
+    waves, places = [], []
     for axis in (0, 1):
         scale = 1.0 / checker.size[axis]
         at = (origin[axis] - checker.start[axis]) + depth * direction[axis]
@@ -319,11 +361,59 @@ def _checker_colours(checker: Checker, origin: Vector, axes: Axes, pixel: Footpr
             squared = squared + moved * moved
         # A pixel's shadow on the axis has the variance of an interval of this length.
         extent = jnp.sqrt(squared) * scale
-        waves = waves * _square_wave(at * scale, jnp.maximum(extent, 1e-3))
-    even = 0.5 + 0.5 * waves
+        places.append((at * scale, jnp.maximum(extent, 1e-3)))
+        waves.append(_square_wave(*places[-1]))
+    even = 0.5 + 0.5 * _pattern(checker.texture, waves, places)
     return [
         odd + (of_even - odd) * even for of_even, odd in zip(checker.even, checker.odd, strict=True)
     ]
+
+
+def _unturned(vector: Vector, turn: tuple[Any, Any]) -> Vector:
+    """Return a vector in axes that are turned about z by an angle of given cosine and sine."""
+    (x, y, z), (cosine, sine) = vector, turn
+    return cosine * x + sine * y, cosine * y - sine * x, z
+
+
+_JOINT = 0.06
+"""Width of the joints between tiles, of a tile's side."""
+
+
+def _pattern(texture: Any, waves: Sequence[Any], places: Sequence[tuple[Array, Array]]) -> Any:
+    """Return the mean of a pattern over a pixel, from -1 to 1.
+
+    Args:
+      texture: the kind, as of `LookParams.floor_texture`; None: a checker.
+      waves: along x and y, the mean of a wave that is 1 and -1 in turn.
+      places: along x and y, where the pixel is and how long, in squares.
+    """
+    columns, rows = waves
+    if texture is None:
+        return columns * rows
+    (x, wide), (y, long) = places
+    tiles = 2.0 * _tile(x, wide) * _tile(y, long) - 1.0
+    spots = _soft_wave(x, wide) * _soft_wave(y, long)
+    soft = jnp.where(texture > 2.5, spots, tiles)
+    hard = jnp.where(texture > 0.5, columns, columns * rows)
+    return jnp.where(texture > 1.5, soft, hard)
+
+
+def _tile(at: Array, width: Array) -> Array:
+    """Return the share of a pixel's extent that lies within tiles, and not in joints."""
+
+    def joints(x: Array) -> Array:
+        """Return the length of all joints from 0 to x."""
+        whole = jnp.floor(x)
+        return whole * _JOINT + jnp.minimum(x - whole, _JOINT)
+
+    return 1.0 - (joints(at + 0.5 * width) - joints(at - 0.5 * width)) / width
+
+
+def _soft_wave(at: Array, width: Array) -> Array:
+    """Return a wave of parabolas with the period of `_square_wave`, fainter in wide pixels."""
+    phase = at - 2.0 * jnp.floor(0.5 * at + 0.5)
+    # As fast as a sine falls that is averaged over the width.
+    return 4.0 * phase * (1.0 - jnp.abs(phase)) / (1.0 + 2.0 * width * width)
 
 
 def _square_wave(at: Array, width: Array) -> Array:
@@ -342,7 +432,7 @@ def _sky(scene: Scene, up: Vector, rays: Rays) -> Sequence[Any]:
     MuJoCo's gradients are mixed by m = √2 e / √(1 + e²), where e is the elevation, 1 at the zenith.
     Of the sine s of that angle, m = 1 - √(1 - s) (1 - 0.3754 s - 0.1205 s²), to within 0.003.
     """
-    if scene.horizon == scene.zenith:
+    if scene.zenith is None:
         return scene.horizon
     length = jnp.sqrt(rays.x * rays.x + (rays.y * rays.y + 1.0))
     sine = jnp.maximum((up[0] * rays.x + (up[1] * rays.y + up[2])) / length, 0.0)

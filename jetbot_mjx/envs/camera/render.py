@@ -27,6 +27,16 @@ from jetbot_mjx.config import CameraConfig
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.camera.geometry import Vector
 from jetbot_mjx.envs.camera.lens import pixel_grid
+from jetbot_mjx.envs.camera.looks import (
+    PLAIN,
+    Appearance,
+    bend_rays,
+    developed,
+    pixel_values,
+    squared_length,
+    styled,
+    turned,
+)
 from jetbot_mjx.envs.camera.pixel import (
     HITS,
     Axes,
@@ -37,6 +47,8 @@ from jetbot_mjx.envs.camera.pixel import (
     strengths,
 )
 from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
+from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, with_clutter
+from jetbot_mjx.envs.look_params import LookParams
 from jetbot_mjx.errors import UserError
 
 _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
@@ -81,6 +93,7 @@ class Camera:
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
         self._mount_rotation = axes.astype(np.float32)
         self._mount_position = np.asarray(config.position, np.float32)
+        self._kernels: dict[Any, Kernel | None] = {}
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -93,46 +106,67 @@ class Camera:
         height, width, channels = self.shape
         return height, width, channels * self.config.frames
 
-    def pose(self, position_w: Float[Array, "3"], quat: Float[Array, "4"]) -> Pose:
+    def pose(
+        self,
+        position_w: Float[Array, "3"],
+        quat: Float[Array, "4"],
+        params: LookParams = PLAIN.params,
+    ) -> Pose:
         """Return the camera's pose on a robot.
 
         Args:
           position_w: position of the axle midpoint [m], world frame.
           quat: attitude of the robot as a unit quaternion (w, x, y, z).
+          params: look parameters, of which those of the mount are used.
         """
         body = jnp.stack([kinematics.rotate(quat, axis) for axis in jnp.eye(3)], 1)
         highest = jax.lax.Precision.HIGHEST
-        mount = jnp.dot(body, self._mount_position, precision=highest)
-        return Pose(position_w + mount, jnp.dot(body, self._mount_rotation, precision=highest))
+        offset, rotation = _mounted(self._mount_position, self._mount_rotation, params)
+        mount = jnp.dot(body, offset, precision=highest)
+        return Pose(position_w + mount, jnp.dot(body, rotation, precision=highest))
 
     def render(
-        self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]
+        self,
+        pose: Pose,
+        mocap_positions: Mapping[str, Float[Array, "3"]],
+        appearance: Appearance = PLAIN,
     ) -> UInt8[Array, "h w c"]:
-        """Return the image.
+        """Return the image, without noise.
 
         Args:
           pose: the pose of the camera.
           mocap_positions: positions [m] of mocap bodies, world frame, by name; those of others are
             the model's.
+          appearance: how the world looks; parameters of the mount, the noise and the time do not
+            count here.
 
         Returns:
           Colours from 0 to 255, red, green, blue, or one channel of grey; the first row is the
           upper one.
         """
-        shared = jnp.stack(jax.tree.leaves(self._frame(pose, mocap_positions)))
-        kernel = self._kernel
-        values = self._fallback(shared)[0] if kernel is None else as_map(kernel)(shared)
+        leaves, structure = jax.tree.flatten(self._frame(pose, mocap_positions, appearance))
+        shared = jnp.stack(leaves)
+        kernel = self._kernel(structure)
+        values = self._fallback(structure, shared)[0] if kernel is None else as_map(kernel)(shared)
         return values.reshape(self.shape)
 
-    @functools.cached_property
-    def _kernel(self) -> Kernel | None:
-        """An image as one kernel; None: XLA compiles it."""
+    def _kernel(self, structure: Any) -> Kernel | None:
+        """Return an image as one kernel; None: XLA compiles it.
+
+        Args:
+          structure: the tree structure of the `Frame`, which says what differs between episodes.
+        """
+        if structure not in self._kernels:
+            self._kernels[structure] = self._make_kernel(structure)
+        return self._kernels[structure]
+
+    def _make_kernel(self, structure: Any) -> Kernel | None:
         if self.config.impl == "xla":
             return None
-        size = len(jax.tree.leaves(self._frame_shapes))
-        arguments = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in (size, len(self._table))]
+        sizes = structure.num_leaves, len(self._table)
+        arguments = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in sizes]
         try:
-            program = scalarize(self._pixel, *arguments)
+            program = scalarize(functools.partial(self._pixel, structure), *arguments)
             llvm_codegen.require(program)
         except UnsupportedError as error:
             if self.config.impl != "auto":
@@ -145,24 +179,21 @@ class Camera:
             program,
             carried=0,
             steps=1,
-            fallback=self._fallback,
+            fallback=functools.partial(self._fallback, structure),
             impl=self.config.impl,
             setting="camera.impl",
             table=self._table,
         )
 
-    @functools.cached_property
-    def _frame_shapes(self) -> Frame:
-        shapes: Any = [jax.ShapeDtypeStruct(x, jnp.float32) for x in ((3,), (3, 3))]
-        pose = Pose(*shapes)
-        return jax.eval_shape(lambda pose: self._frame(pose, {}), pose)
-
-    def _fallback(self, shared: Float[Array, " shared"]) -> list[UInt8[Array, " bytes"]]:
+    def _fallback(
+        self, structure: Any, shared: Float[Array, " shared"]
+    ) -> list[UInt8[Array, " bytes"]]:
         """Compute all pixels by XLA."""
         # Keep the stages apart: XLA would compute what the pixels share in every pixel, and all
         # rays of a pixel for each of its channels.
         shared = jax.lax.optimization_barrier(shared)
-        channels = jax.vmap(self._pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
+        pixel = functools.partial(self._pixel, structure)
+        channels = jax.vmap(pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
         channels = jax.lax.optimization_barrier(channels)
         return [jnp.stack(channels, axis=-1).astype(jnp.uint8).reshape(-1)]
 
@@ -171,10 +202,21 @@ class Camera:
         columns = [np.broadcast_to(column, self.shape[:2]) for column in self._grid.columns]
         return np.stack(columns).reshape(len(columns), -1).astype(np.float32)
 
-    def _pixel(self, shared: Float[Array, " shared"], columns: Float[Array, " columns"]) -> Any:
+    @functools.cached_property
+    def _farthest(self) -> float:
+        """The largest x² + y² of the directions of all pixels."""
+        return squared_length(self._grid.expand(self._grid.columns)[1].centre)
+
+    def _pixel(
+        self, structure: Any, shared: Float[Array, " shared"], columns: Float[Array, " columns"]
+    ) -> Any:
         """Return the channels of a pixel, whole numbers from 0 to 255 as floats."""
-        frame = jax.tree.unflatten(jax.tree.structure(self._frame_shapes), list(shared))
-        channels = pixel_colour(self.scene, frame, *self._grid.expand(list(columns)))
+        frame: Frame = jax.tree.unflatten(structure, list(shared))
+        scene = with_clutter(self.scene, frame.clutter)
+        scene = styled(scene, LookParams()._replace(**frame.params))
+        samples, footprint = self._grid.expand(list(columns))
+        rays = bend_rays(frame.params, samples, footprint, self._farthest)
+        channels = developed(frame.params, pixel_colour(scene, frame, *rays))
         if self.config.colour == "grey":
             channels = [sum(weight * x for weight, x in zip(_GREY, channels, strict=True))]
         return [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
@@ -192,12 +234,12 @@ class Camera:
           The depth along the optical axis [m], infinite where there is nothing, and the geom's
           index in the model, -1 where there is none.
         """
-        frame = self._frame(pose, mocap_positions)
+        frame = self._frame(pose, mocap_positions, PLAIN)
         nearest = jnp.full(self.shape[:2], jnp.inf)
         found = jnp.full(self.shape[:2], -1)
         _, footprint = self._grid.expand(self._grid.columns)
         for geom, look in zip(self.scene.geoms, frame.looks, strict=True):
-            axes = frame.axes[geom.rotation.tobytes()]
+            axes = frame.axes[geom.axes_key]
             rays = directions(axes, footprint.centre)
             hit = HITS[geom.kind](look.origin, rays, geom.size)
             closer = hit.mask & (hit.depth < nearest)
@@ -205,26 +247,67 @@ class Camera:
             found = jnp.where(closer, geom.geom_id, found)
         return nearest, found
 
-    def _frame(self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]) -> Frame:
+    def _frame(
+        self,
+        pose: Pose,
+        mocap_positions: Mapping[str, Float[Array, "3"]],
+        appearance: Appearance,
+    ) -> Frame:
         """Compute everything that all pixels of a frame share."""
-        scene = self.scene
+        params, (walls, clutter) = appearance
+        places, colours = {**self._standing, **mocap_positions}, []
+        if clutter is not None:
+            places |= clutter_positions(clutter, params.clutter)
+            colours = [(one[2], one[3], one[4]) for one in clutter]
+        scene = styled(with_clutter(self.scene, colours), params)
         towards = [*(-light.direction for light in scene.lights), -pose.rotation[:, 2]]
         axes, looks = {}, []
         for geom in scene.geoms:
-            key = geom.rotation.tobytes()
-            if key not in axes:
-                right, down, forward = (_into(geom.rotation, pose.rotation[:, k]) for k in range(3))
-                lights = tuple(_into(geom.rotation, vector) for vector in towards)
-                axes[key] = Axes((right, down, forward), lights)
-            position: Any = geom.position
+            rotation, position = geom.rotation, geom.position
+            if geom.yaw is not None:
+                rotation = turned(rotation, geom.yaw)
+                position = turned(position[:, None], geom.yaw)[:, 0]
+            if geom.axes_key not in axes:
+                right, down, forward = (_into(rotation, pose.rotation[:, k]) for k in range(3))
+                lights = tuple(_into(rotation, vector) for vector in towards)
+                axes[geom.axes_key] = Axes((right, down, forward), lights)
             if geom.mocap is not None:
-                start = mocap_positions.get(geom.mocap, self._standing[geom.mocap])
-                position = position + start
-            origin = _into(geom.rotation, pose.position - position)
+                position = position + places[geom.mocap]
+            origin = _into(rotation, pose.position - position)
             centre = _into(pose.rotation, position - pose.position)
-            looks.append(Look(origin, centre, _faces(scene, geom, origin, axes[key].lights)))
-        up = pose.rotation[2, 0], pose.rotation[2, 1], pose.rotation[2, 2]
-        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), Frame(axes, looks, up))
+            faces = _faces(scene, geom, origin, axes[geom.axes_key].lights)
+            looks.append(Look(origin, centre, faces))
+        yaw = params.floor_yaw
+        frame = Frame(
+            axes,
+            looks,
+            up=(pose.rotation[2, 0], pose.rotation[2, 1], pose.rotation[2, 2]),
+            params=pixel_values(params),
+            clutter=colours,
+            room=None if walls is None else make_room(walls, params.walls, *pose),
+            floor_turn=(jnp.cos(yaw), jnp.sin(yaw)) if params.differs("floor_yaw") else None,
+        )
+        return jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), frame)
+
+
+def _mounted(
+    position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"], params: LookParams
+) -> tuple[Any, Any]:
+    """Return place and axes of the camera, body frame, for another mount."""
+    names = ("camera_x", "camera_y", "camera_z")
+    place: Any = position
+    if params.differs(*names):
+        place = position + jnp.stack([jnp.asarray(getattr(params, name)) for name in names])
+    axes: Any = rotation
+    if params.differs("camera_pitch", "camera_roll", "camera_yaw"):
+        right, down, forward = jnp.asarray(rotation).T
+        cosine, sine = jnp.cos(params.camera_roll), jnp.sin(params.camera_roll)
+        right, down = cosine * right + sine * down, cosine * down - sine * right
+        x, y, z = jnp.stack([right, down, forward], axis=1)
+        cosine, sine = jnp.cos(params.camera_pitch), jnp.sin(params.camera_pitch)
+        lowered = jnp.stack([cosine * x + sine * z, y, cosine * z - sine * x])
+        axes = turned(lowered, params.camera_yaw)
+    return place, axes
 
 
 def _faces(

@@ -1,7 +1,7 @@
 """Read what a camera can see out of a MuJoCo model: geoms, colours, lights and the sky."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import mujoco
 import numpy as np
@@ -9,7 +9,11 @@ from jaxtyping import Float
 
 from jetbot_mjx.errors import UserError
 
-Rgb = tuple[float, float, float]
+Rgb = tuple[Any, Any, Any]
+"""Red, green and blue, 1 is white: numbers, or traced in the scene of one episode."""
+
+GOAL = "goal"
+"""Mocap body that marks the goal."""
 
 _KINDS = {
     mujoco.mjtGeom.mjGEOM_PLANE: "plane",
@@ -32,10 +36,12 @@ class Checker(NamedTuple):
     even: Rgb
     """Colour of the square whose least x and y are those of `start`."""
     odd: Rgb
-    size: tuple[float, float]
+    size: tuple[Any, Any]
     """Side lengths of a square [m]."""
     start: tuple[float, float]
     """Where the squares begin [m], in the plane's frame."""
+    texture: Any = None
+    """Pattern as of `LookParams.floor_texture`; None: a checker."""
 
 
 class SceneGeom(NamedTuple):
@@ -54,12 +60,19 @@ class SceneGeom(NamedTuple):
     """Position [m] in the axes of the world."""
     rotation: Float[np.ndarray, "3 3"]
     """Axes of the geom, as columns, in the axes of the world."""
+    yaw: Any = None
+    """Further turn about the vertical through the body [rad]; None: none."""
+
+    @property
+    def axes_key(self) -> bytes:
+        """Return the same bytes for geoms that are turned alike."""
+        return self.rotation.tobytes() + (b"" if self.yaw is None else b"yaw")
 
 
 class Light(NamedTuple):
     """A `Light` holds a directional light."""
 
-    direction: Float[np.ndarray, "3"]
+    direction: Any
     """Direction of the light's rays, a unit vector in the world frame."""
     diffuse: Rgb
 
@@ -73,8 +86,19 @@ class Scene(NamedTuple):
     """Diffuse light along the optical axis."""
     lights: tuple[Light, ...]
     horizon: Rgb
-    zenith: Rgb
-    """Colours of the sky."""
+    """Colour of the sky at the horizon."""
+    zenith: Rgb | None
+    """Colour of the sky at the zenith; None: the sky has one colour."""
+
+
+def ground_of(scene: Scene) -> int | None:
+    """Return the index of the first plane that is infinite both ways; None: there is none."""
+    infinite = (
+        i
+        for i, geom in enumerate(scene.geoms)
+        if geom.kind == "plane" and geom.size[0] == geom.size[1] == 0
+    )
+    return next(infinite, None)
 
 
 def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
@@ -114,7 +138,7 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
             _read_light(model, data, i) for i in np.flatnonzero(model.light_active).tolist()
         ),
         horizon=horizon,
-        zenith=zenith,
+        zenith=None if zenith == horizon else zenith,
     )
 
 

@@ -8,7 +8,9 @@ import jax.numpy as jnp
 from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, UInt8, UInt32
 
+from jetbot_mjx.envs.camera.looks import Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
+from jetbot_mjx.envs.camera.timing import SeenPose, noise_seed
 from jetbot_mjx.envs.state import State, robot_state
 
 PIXELS = "pixels/front"
@@ -45,9 +47,7 @@ def see(
       before: the images of the state before; None: there is none.
       begins: whether the state is the first of an episode, which stacks copies of its image.
     """
-    robot = robot_state(state.pipeline_state)
-    pose = camera.pose(robot.position_w, robot.quat)
-    image = camera.render(pose, task.markers(state.goal))
+    image = _render(camera, task, state)
     if camera.config.frames > 1:
         first = jnp.tile(image, (1, 1, camera.config.frames))
         if before is None:
@@ -59,6 +59,34 @@ def see(
     if jax.tree.leaves(state.obs):
         obs[NUMBERS] = state.obs
     return state.replace(obs=obs)
+
+
+def seen_pose(task: _Task, state: State) -> SeenPose:
+    """Return the pose that a camera without delay sees.
+
+    Args:
+      task: the task, whose `markers` say where its bodies stand.
+      state: a state of one robot.
+    """
+    robot = robot_state(state.pipeline_state)
+    markers = dict(task.markers(state.goal))
+    return SeenPose(robot.position_w, robot.quat, markers, state.pipeline_state.time)
+
+
+def _render(camera: Camera, task: _Task, state: State) -> UInt8[Array, "h w c"]:
+    """Return the image of a state, with the looks of its episode."""
+    now = seen_pose(task, state)
+    looks = state.episode_params.camera if state.episode_params is not None else None
+    if looks is None:
+        return camera.render(camera.pose(now.position_w, now.quat), now.markers)
+    seen: SeenPose = now if looks.seen is None else looks.seen
+    # Keep the stages apart: XLA would compute drawn numbers again wherever they are used.
+    looks, seen = jax.lax.optimization_barrier((looks, seen))
+    pose = jax.lax.optimization_barrier(camera.pose(seen.position_w, seen.quat, looks.params))
+    image = camera.render(pose, seen.markers, Appearance(looks.params, looks.surroundings))
+    if looks.params.differs("pixel_noise"):
+        image = add_noise(image, looks.params.pixel_noise, noise_seed(looks.key, seen.time))
+    return image
 
 
 def observation_shapes(camera: Camera, numbers: int) -> dict[str, tuple[int, ...]]:
