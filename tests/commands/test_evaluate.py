@@ -431,7 +431,7 @@ def test_checkpoints_of_one_run_are_told_apart_by_their_steps(several, tmp_path,
     folder, _, _ = several
     run = folder / "five" / "seed-0"
     monkeypatch.setattr(
-        evaluate_runs, "_write_reports", lambda *args: pytest.fail("they are the same")
+        evaluate_runs._Reporter, "write", lambda *args, **kwargs: pytest.fail("they are the same")
     )
     with pytest.raises(UserError, match=r"are the same policy, .*000000065536: name each once"):
         judge(run, run / "checkpoints" / "000000065536")

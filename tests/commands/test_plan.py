@@ -37,7 +37,7 @@ def test_the_table_tells_what_fits_and_marks_the_configuration(smoke, capsys):
 
 
 def test_a_configuration_that_does_not_fit_gives_1(smoke, capsys):
-    code, out = said(capsys, "--config", smoke, "--memory", "1e-6")
+    code, out = said(capsys, "--config", smoke, "--memory", "0.001")
     assert code == plan.TOO_LARGE == 1
     assert "none of them fits" in out
 
