@@ -39,7 +39,7 @@ from jetbot_mjx.envs.camera.pixel import (
 from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 from jetbot_mjx.errors import UserError
 
-_GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
+GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 
 
 class Pose(NamedTuple):
@@ -176,7 +176,7 @@ class Camera:
         frame = jax.tree.unflatten(jax.tree.structure(self._frame_shapes), list(shared))
         channels = pixel_colour(self.scene, frame, *self._grid.expand(list(columns)))
         if self.config.colour == "grey":
-            channels = [sum(weight * x for weight, x in zip(_GREY, channels, strict=True))]
+            channels = [sum(weight * x for weight, x in zip(GREY, channels, strict=True))]
         return [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
 
     def trace(
