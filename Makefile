@@ -33,7 +33,7 @@ train: RUN := $(RUN)
 train: setup
 	$(BIN)/python -m jetbot_mjx.train --config $(CONFIG) --run-dir $(RUN)
 	$(BIN)/python -m jetbot_mjx.evaluate $(RUN)
-	-$(BIN)/python -m jetbot_mjx.render $(RUN)
+	-$(BIN)/python -m jetbot_mjx.render $(RUN) --episodes 8
 	@echo "everything lies in $(RUN)"
 
 test: setup

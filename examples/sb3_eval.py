@@ -8,10 +8,12 @@ It drives to twenty goals in a window; `--headless` opens no window:
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO
+from stable_baselines3.common.preprocessing import is_image_space
 
 from jetbot_mjx import cli
 from jetbot_mjx.adapters import JetBotGymEnv
@@ -40,9 +42,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"--policy {options.policy} does not exist: examples/sb3_train.py saves one"
         )
 
-    env = JetBotGymEnv(headless=options.headless, seed=1)
     torch.set_num_threads(1)
     policy = PPO.load(options.policy, device="cpu")
+    config = {}
+    space: Any = policy.observation_space
+    if is_image_space(space):
+        # Stable-Baselines3 puts the channels first.
+        _, height, width = space.shape
+        config = {"task": {"observation": "camera"}, "camera": {"width": width, "height": height}}
+    env = JetBotGymEnv(headless=options.headless, seed=1, config=config)
     reached, lengths = [], []
     for _ in range(options.episodes):
         obs, info = env.reset()

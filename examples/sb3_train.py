@@ -3,6 +3,7 @@
     pip install '.[sb3,tensorboard]'
     python examples/sb3_train.py                          # one robot, as in the tutorial
     python examples/sb3_train.py --num-envs 32            # 32 robots in one program
+    python examples/sb3_train.py --camera                 # `CnnPolicy`, from images
 
 To run a script that follows the tutorial, change its import of the environment:
 
@@ -26,6 +27,8 @@ from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
 _STEPS = 2560
 """Environment steps between two updates, over all robots."""
 
+_CAMERA = {"task": {"observation": "camera"}, "camera": {"width": 64, "height": 64}}
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Train and save the policy.
@@ -41,18 +44,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--num-envs", type=cli.whole_number(1, _STEPS), default=1, help="default: 1"
     )
+    parser.add_argument(
+        "--camera", action="store_true", help="images instead of numbers, 64 x 64 pixels"
+    )
     parser.add_argument("--folder", type=Path, default=Path("sb3_policy"))
     options = parser.parse_args(arguments)
 
+    config = _CAMERA if options.camera else None
     if options.num_envs == 1:
-        env = JetBotGymEnv()
+        env = JetBotGymEnv(config=config)
     else:
-        env = VecMonitor(JetBotVecEnv(options.num_envs), info_keywords=("is_success",))
+        robots = JetBotVecEnv(options.num_envs, config=config)
+        env = VecMonitor(robots, info_keywords=("is_success",))
     # More threads do not speed up networks of this size, and slow down on a busy machine.
     torch.set_num_threads(1)
     layers = {"pi": [16, 128, 128, 128], "vf": [16, 128, 128, 128]}
     ppo = PPO(
-        "MlpPolicy",
+        "CnnPolicy" if options.camera else "MlpPolicy",
         env,
         n_steps=_STEPS // options.num_envs,
         batch_size=64,
@@ -64,7 +72,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         ent_coef=7.5e-8,
         vf_coef=0.95,
         max_grad_norm=0.9,
-        policy_kwargs={"activation_fn": torch.nn.Tanh, "net_arch": layers},
+        policy_kwargs=None
+        if options.camera
+        else {"activation_fn": torch.nn.Tanh, "net_arch": layers},
         tensorboard_log=str(options.folder) if importlib.util.find_spec("tensorboard") else None,
         device="cpu",  # a network of this size is slower on a GPU
         seed=0,

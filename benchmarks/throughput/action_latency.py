@@ -3,7 +3,8 @@
     python benchmarks/throughput/action_latency.py runs/mine/policy
 
 `python -m jetbot_mjx.export RUN --format all` writes the folder. Every call takes one observation,
-as on a robot, and includes the conversion from and to NumPy. StableHLO is compiled by `jax.jit`.
+which is one image if the policy sees, as on a robot, and includes the conversion from and to NumPy.
+StableHLO is compiled by `jax.jit`.
 """
 
 import argparse
@@ -34,13 +35,13 @@ class Latency(NamedTuple):
     worst: float
 
 
-def measure(name: str, act: Act, observations: np.ndarray, calls: int = CALLS) -> Latency:
+def measure(name: str, act: Act, inputs: Sequence[np.ndarray], calls: int = CALLS) -> Latency:
     """Time single calls of a policy.
 
     Args:
       name: The name of the row.
       act: The function from an observation to an action.
-      observations: Observations of shape (n, obs); every call takes the next one.
+      inputs: The parts of n observations, each with a batch axis; every call takes the next one.
       calls: The number of timed calls after the warm-up.
 
     Returns:
@@ -48,9 +49,10 @@ def measure(name: str, act: Act, observations: np.ndarray, calls: int = CALLS) -
     """
     times = []
     for index in range(_WARM_UP + calls):
-        obs = observations[index % len(observations)][None]
+        row = index % len(inputs[0])
+        parts = [part[row : row + 1] for part in inputs]
         start = time.perf_counter_ns()
-        for output in act(obs):
+        for output in act(*parts):
             np.asarray(output)
         times.append(1e-3 * (time.perf_counter_ns() - start))
     timed = np.array(times[_WARM_UP:])
@@ -71,15 +73,15 @@ def run(folder: Path, calls: int = CALLS) -> Iterator[Latency]:
       UserError: The folder is not an export, or a package is missing.
     """
     try:
-        files = json.loads((folder / FILE).read_text("utf-8"))["files"]
+        spec = json.loads((folder / FILE).read_text("utf-8"))
         with np.load(folder / "recording.npz") as recording:
-            observations = recording["obs"][:1000]
+            inputs = [recording[one["name"]][:1000] for one in spec["inputs"]]
     except (OSError, ValueError, LookupError) as error:
         raise UserError(f"{folder} is not an export: {error}") from None
-    for name, file in files.items():
+    for name, file in spec["files"].items():
         with requires_extra("export", f"--format {name}"):
             act = FORMATS[name].read(folder / file["file"])
-        yield measure(name, act, observations, calls)
+        yield measure(name, act, inputs, calls)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

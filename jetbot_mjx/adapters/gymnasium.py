@@ -7,8 +7,9 @@ from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions
 from jetbot_mjx.adapters.base import AdapterBase
+from jetbot_mjx.adapters.batched_env import unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
-from jetbot_mjx.envs.mujoco_env import MujocoJetBot
+from jetbot_mjx.envs.mujoco_env import MujocoJetBot, Observation
 from jetbot_mjx.errors import UserError, requires_extra
 
 with requires_extra("gymnasium", "the adapter"):
@@ -20,10 +21,11 @@ ENV_ID = "JetBot-v0"
 class JetBotGymEnv(AdapterBase, gymnasium.Env):
     """One robot, with the tutorial's constructor; physics runs in C MuJoCo (`MujocoJetBot`).
 
-    Action, observation, reward and termination are those of `jetbot_mjx.JetBotEnv`. `terminated`
-    is the task's end, `truncated` the time limit, which the environment counts itself; `info` has
-    `is_success`. A step to a non-finite state is truncated with reward 0, and `info` then has
-    `nonfinite_world`. Without a seed `reset` continues the random stream that the first one began.
+    Action, observation, reward and termination are those of `jetbot_mjx.JetBotEnv`, images too:
+    `observation_space` of the module `base` describes the spaces. `terminated` is the task's end,
+    `truncated` the time limit, which the environment counts itself; `info` has `is_success`. A step
+    to a non-finite state is truncated with reward 0, and `info` then has `nonfinite_world`. Without
+    a seed `reset` continues the random stream that the first one began.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 60}  # noqa: RUF012
@@ -77,7 +79,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Float[np.ndarray, " obs"], dict[str, Any]]:
+    ) -> tuple[Observation, dict[str, Any]]:
         """Begin an episode: the robot at rest at the origin, a new goal.
 
         Args:
@@ -93,11 +95,11 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         self._next_key = next_key[None]
         self._is_begun, self._steps = True, 0
         self._show()
-        return obs, {}
+        return unwrap_single(obs), {}
 
     def step(
         self, action: Float[np.ndarray, "2"]
-    ) -> tuple[Float[np.ndarray, " obs"], float, bool, bool, dict[str, Any]]:
+    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
         """Apply an action for one environment step.
 
         Args:
@@ -118,7 +120,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         if not finite:
             info["nonfinite_world"] = True
         self._show()
-        return obs, reward, terminated, truncated, info
+        return unwrap_single(obs), reward, terminated, truncated, info
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | None:
         """Return an image of the robot and its goal; None unless the mode is `rgb_array`.

@@ -34,7 +34,9 @@ Shapes = Mapping[str, tuple[int, ...]]
 """Shapes of the parts of an observation, by name."""
 
 _POLICY, _VALUE = "policy", "value"
-_ENCODER, _HEAD = "encoder", "head"
+
+ENCODER, HEAD = "encoder", "head"
+"""Keys of the parts of a network's parameters."""
 
 
 class _Layers(NamedTuple):
@@ -53,11 +55,12 @@ class _Layers(NamedTuple):
         return size
 
 
-_CNNS = {
+CNNS = {
     "nature": _Layers(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),
     "small": _Layers(((16, 4, 2), (32, 4, 2), (32, 3, 1)), 128),
     "tiny": _Layers(((16, 4, 4), (32, 4, 2)), 64),
 }
+"""Encoders by the name that `ppo.network.cnn` takes."""
 
 
 class VisionNetworks(NamedTuple):
@@ -72,6 +75,33 @@ class VisionNetworks(NamedTuple):
     """The networks behind the encoder, which take encoded observations."""
     encode: Callable[[Any, Any, Any], dict[str, Float[Array, "*batch features"]]]
     """Encode observations: (normaliser, parameters of both networks, observation)."""
+
+
+class _ObservationEncoder(NamedTuple):
+    """An `_ObservationEncoder` joins the features of the images and the normalised numbers."""
+
+    encoder: "Encoder"
+    shapes: Shapes
+    normalize: Callable[[Any, Any], Any]
+
+    @property
+    def features(self) -> int:
+        """Return the length of an encoded observation."""
+        numbers = (shape[0] for name, shape in self.shapes.items() if not is_image(name))
+        return self.encoder.features + sum(numbers)
+
+    def init(self, key: Any) -> Any:
+        """Return initial parameters of the encoder."""
+        images = {name: (1, *shape) for name, shape in self.shapes.items() if is_image(name)}
+        pixels = {name: jnp.zeros(shape, jnp.uint8) for name, shape in sorted(images.items())}
+        return self.encoder.init(key, _joined(pixels))
+
+    def __call__(self, normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
+        images = {name: obs[name] for name in sorted(self.shapes) if is_image(name)}
+        numbers = {name: obs[name] for name in sorted(self.shapes) if name not in images}
+        values = self.normalize(numbers, normalizer)
+        features: Any = self.encoder.apply(params[ENCODER], _joined(images))
+        return jnp.concatenate([features, *(values[name] for name in numbers)], axis=-1)
 
 
 def is_image(name: str) -> bool:
@@ -102,29 +132,11 @@ def make_vision_networks(
     Raises:
       InvalidError: the images are too small for the convolutions.
     """
-    layers = _CNNS[config.cnn]
+    layers = CNNS[config.cnn]
     _check_size(config.cnn, shapes)
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
-    images = [name for name in sorted(shapes) if is_image(name)]
-    numbers = {name: shape for name, shape in shapes.items() if not is_image(name)}
-    length = layers.features + sum(shape[0] for shape in numbers.values())
-    brax_heads = make_heads(length, action_size)
-
-    def init(head: brax_networks.FeedForwardNetwork, encodes: bool) -> Callable[[Any], Any]:
-        def init_network(key: Any) -> Any:
-            encoder_key, head_key = jax.random.split(key)
-            pixels = _joined({name: jnp.zeros((1, *shapes[name]), jnp.uint8) for name in images})
-            own = {_ENCODER: encoder.init(encoder_key, pixels)} if encodes else {}
-            return {_HEAD: head.init(head_key), **own}
-
-        return init_network
-
-    def encode_one(normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
-        features: Any = encoder.apply(
-            params[_ENCODER], _joined({name: obs[name] for name in images})
-        )
-        values = normalize({name: obs[name] for name in numbers}, normalizer)
-        return jnp.concatenate([features, *(values[name] for name in sorted(numbers))], axis=-1)
+    encode_one = _ObservationEncoder(encoder, shapes, normalize)
+    brax_heads = make_heads(encode_one.features, action_size)
 
     def encode(normalizer: Any, params: Any, obs: Any) -> dict[str, Any]:
         for_policy = encode_one(normalizer, params.policy, obs)
@@ -136,8 +148,8 @@ def make_vision_networks(
     # Pyright does not follow flax's dataclasses.
     networks: Any = ppo_networks.PPONetworks
     heads = networks(
-        _on_features(_POLICY, policy, init(policy, True)),
-        _on_features(_VALUE, value, init(value, not config.shared_cnn)),
+        _on_features(_POLICY, policy, encode_one),
+        _on_features(_VALUE, value, None if config.shared_cnn else encode_one),
         brax_heads.parametric_action_distribution,
     )
 
@@ -157,18 +169,24 @@ def make_vision_networks(
 
 
 def _on_features(
-    name: str, head: brax_networks.FeedForwardNetwork, init: Callable[[Any], Any]
+    name: str, head: brax_networks.FeedForwardNetwork, encoder: _ObservationEncoder | None
 ) -> brax_networks.FeedForwardNetwork:
     """Return one of Brax's networks as a network of an encoded observation.
 
     Args:
       name: the part of the encoded observation that the network takes.
       head: Brax's network of features.
-      init: initialises the parameters, with those of the encoder if the network owns it.
+      encoder: the encoder whose parameters are among the network's; None: another has them.
     """
+
+    def init(key: Any) -> Any:
+        encoder_key, head_key = jax.random.split(key)
+        own = {} if encoder is None else {ENCODER: encoder.init(encoder_key)}
+        return {HEAD: head.init(head_key), **own}
+
     return brax_networks.FeedForwardNetwork(
         init=init,
-        apply=lambda _, params, encoded: head.apply(None, params[_HEAD], encoded[name]),
+        apply=lambda _, params, encoded: head.apply(None, params[HEAD], encoded[name]),
     )
 
 
@@ -179,7 +197,7 @@ def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
       config: the layers, and whether policy and value function share them.
       shapes: the shapes of the observation's parts.
     """
-    layers = _CNNS[config.cnn]
+    layers = CNNS[config.cnn]
     images = [shape for name, shape in shapes.items() if is_image(name)]
     height, width, _ = images[0]
     channels = sum(shape[2] for shape in images)
@@ -195,8 +213,8 @@ def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
 def _check_size(cnn: str, shapes: Shapes) -> None:
     """Raise an error if an image is too small for convolutions."""
     for height, width, _ in (shape for name, shape in shapes.items() if is_image(name)):
-        if min(height, width) < _CNNS[cnn].smallest:
-            sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in _CNNS.items())
+        if min(height, width) < CNNS[cnn].smallest:
+            sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in CNNS.items())
             raise InvalidError(
                 f"camera.width = {width} and camera.height = {height} are too small for"
                 f" ppo.network.cnn = {cnn!r}: make both at least that of the network ({sizes})"

@@ -1,9 +1,11 @@
 """A policy of jetbot_mjx in NumPy alone, for Python 3.6 or newer and NumPy 1.13 or newer.
 
     from policy import act
-    action, wheel_speeds = act(obs)
+    action, wheel_speeds = act(obs)            # a policy that observes numbers
+    action, wheel_speeds = act(image)          # a policy that sees
+    action, wheel_speeds = act(image, state)   # a policy that sees, and observes numbers too
 
-`policy.json` describes each number. `act` applies the normaliser, the network, the clip to [-1, 1]
+`policy.json` describes the inputs. `act` applies the normaliser, the network, the clip to [-1, 1]
 and the controller that converts an action to wheel speeds. It does not compute motor values, which
 depend on the robot. `python3 policy.py` checks the policy against the recording beside it, and
 measures the time of a call.
@@ -14,6 +16,7 @@ import json
 import os
 import sys
 import time
+from typing import Optional
 
 import numpy as np
 
@@ -48,29 +51,92 @@ def _activate(x: np.ndarray) -> np.ndarray:
 
 
 _MEAN, _STD, *_REST = _arrays()
-_KERNELS, _BIASES = _REST[0::2], _REST[1::2]
+_LAYERS = list(zip(_REST[0::2], _REST[1::2]))
+_CONVOLUTIONS = [(*_LAYERS.pop(0), stride) for stride in ABOUT["strides"]]
+_DENSE = [_LAYERS.pop(0)] if _CONVOLUTIONS else []
 
 
-def act(obs: np.ndarray) -> tuple:
+def stack(image: np.ndarray, before: Optional[np.ndarray] = None) -> np.ndarray:
+    """Return what `act` takes as the image, if it takes the images of several control periods.
+
+    Call it once in every control period. `act` cannot stack, since it keeps nothing.
+
+    Args:
+      image: The newest image, uint8 of shape [height, width, 1 for grey or 3].
+      before: The result of the period before; None at the start: copies of the image.
+
+    Returns:
+      The images along the channels, the newest last.
+    """
+    if before is None:
+        return np.tile(image, (1, 1, ABOUT["image"][2] // image.shape[2]))
+    return np.concatenate([before[:, :, image.shape[2] :], image], axis=2)
+
+
+def _normalised(numbers: np.ndarray) -> np.ndarray:
+    x = np.asarray(numbers, np.float32)
+    if x.ndim == 0 or x.shape[-1] != _MEAN.size:
+        raise ValueError(f"the observation has the shape {x.shape}, not {_MEAN.size} numbers")
+    return (x - _MEAN) / _STD
+
+
+def _features(image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image)
+    if image.dtype != np.uint8 or list(image.shape[-3:]) != ABOUT["image"] or image.ndim > 4:
+        raise ValueError(
+            f"the image is {image.dtype} of shape {image.shape}, not uint8 of {ABOUT['image']}"
+        )
+    x = image.reshape((-1, *image.shape[-3:])).astype(np.float32)
+    for kernel, bias, stride in _CONVOLUTIONS:
+        x = np.maximum(_convolve(x, kernel, stride) + bias, np.float32(0))
+    x = x.reshape(x.shape[0], -1)
+    for kernel, bias in _DENSE:
+        x = np.maximum(np.dot(x, kernel) + bias, np.float32(0))
+    return x.reshape((*image.shape[:-3], -1))
+
+
+def _convolve(x: np.ndarray, kernel: np.ndarray, stride: int) -> np.ndarray:
+    side, channels = kernel.shape[0], kernel.shape[2]
+    count, height, width, _ = x.shape
+    rows, columns = (height - side) // stride + 1, (width - side) // stride + 1
+    # A view of the squares that the kernel covers, each of which becomes a row of a matrix.
+    every, down, right, channel = x.strides
+    squares = np.lib.stride_tricks.as_strided(
+        x,
+        (count, rows, columns, side, side, channels),
+        (every, stride * down, stride * right, down, right, channel),
+    )
+    squares = squares.reshape(count * rows * columns, side * side * channels)
+    return np.dot(squares, kernel.reshape(squares.shape[1], -1)).reshape(count, rows, columns, -1)
+
+
+def act(obs: np.ndarray, state: Optional[np.ndarray] = None) -> tuple:
     """Return the action and the wheel speeds for one observation or a batch.
 
     Args:
-      obs: Observation of shape [obs] or [n, obs], in the order and the units of `policy.json`.
+      obs: Numbers of shape [obs] or [n, obs], in the order and the units of `policy.json`. A policy
+        that sees takes the image here, uint8 of shape [height, width, channels], or n of them.
+      state: The numbers beside the image, of shape [state] or [n, state]; None: there are none.
 
     Returns:
       The action in [-1, 1], and the wheel speeds (left, right) [rad/s] that it commands, before the
       limits of any motor; for a batch, one row each.
 
     Raises:
-      ValueError: The observation has another length.
+      ValueError: The observation has another shape or type, or there are too many parts.
     """
-    x = np.asarray(obs, np.float32)
-    if x.ndim == 0 or x.shape[-1] != _MEAN.size:
-        raise ValueError(f"the observation has the shape {x.shape}, not {_MEAN.size} numbers")
-    x = (x - _MEAN) / _STD
-    for kernel, bias in zip(_KERNELS[:-1], _BIASES[:-1]):
+    if (state is not None) != ("state" in ABOUT["inputs"]):
+        raise ValueError(f"give {' and '.join(ABOUT['inputs'])}")
+    if not _CONVOLUTIONS:
+        x = _normalised(obs)
+    elif state is None:
+        x = _features(obs)
+    else:
+        x = np.concatenate([_features(obs), _normalised(state)], axis=-1)
+    for kernel, bias in _LAYERS[:-1]:
         x = _activate(np.dot(x, kernel) + bias)
-    x = np.dot(x, _KERNELS[-1]) + _BIASES[-1]
+    kernel, bias = _LAYERS[-1]
+    x = np.dot(x, kernel) + bias
     if ABOUT["squash"]:
         x = np.tanh(x)
     action = np.clip(x, np.float32(-1), np.float32(1))
@@ -108,13 +174,21 @@ def check(path: str) -> float:
     about = ABOUT["controller"]
     turn = 0.5 * about["max_yaw_rate"] * about["wheel_separation"]
     fastest = (about["max_speed"] + turn) / about["wheel_radius"]
-    with np.load(path) as recording:
-        action, wheels = act(recording["obs"])
-        worst = [
-            np.abs(action - recording["action"]).max(),
-            np.abs(wheels - recording["wheel_speeds"]).max() / fastest,
-        ]
+    inputs, (wanted_action, wanted_wheels) = _recorded(path)
+    worst = [0.0]
+    # Piece by piece, since all images at once would fill the memory of a small computer.
+    for start in range(0, len(wanted_action), 100):
+        piece = slice(start, start + 100)
+        action, wheels = act(*(part[piece] for part in inputs))
+        worst.append(np.abs(action - wanted_action[piece]).max())
+        worst.append(np.abs(wheels - wanted_wheels[piece]).max() / fastest)
     return float(max(worst))
+
+
+def _recorded(path: str) -> tuple:
+    with np.load(path) as recording:
+        inputs = [recording[name] for name in ABOUT["inputs"]]
+        return inputs, (recording["action"], recording["wheel_speeds"])
 
 
 def _main() -> int:
@@ -123,12 +197,10 @@ def _main() -> int:
         print(f"{path} is missing: copy the whole folder")
         return 2
     worst = check(path)
-    with np.load(path) as recording:
-        observations = recording["obs"][:1000]
     times = []
-    for obs in observations:
+    for parts in zip(*(part[:1000] for part in _recorded(path)[0])):
         start = time.perf_counter()
-        act(obs)
+        act(*parts)
         times.append(1e6 * (time.perf_counter() - start))
     print(
         f"Python {sys.version.split()[0]}, NumPy {np.__version__}: at most {worst:.1e} from JAX;"

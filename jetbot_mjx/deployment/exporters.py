@@ -1,7 +1,7 @@
 """Export a policy to files, and read each file back with the library that will run it.
 
 `numpy` is one file of Python, and `stablehlo` is serialised by `jax.export`. `onnx` is built here
-node by node, from nine kinds of node: the maintained exporter, jax2onnx 0.17, requires an older
+node by node, from a dozen kinds of node: the maintained exporter, jax2onnx 0.17, requires an older
 Orbax than this package, and installs a model viewer and a hub client.
 """
 
@@ -9,16 +9,15 @@ import base64
 import json
 import re
 import types
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float
 
-from jetbot_mjx.deployment.numpy_policy import Outputs, PortablePolicy
+from jetbot_mjx.deployment.numpy_policy import Encoder, Layer, Outputs, PortablePolicy
 
 _TEXT_WIDTH = 96
 
@@ -26,30 +25,37 @@ _TEXT_WIDTH = 96
 _ONNX_OPSET = 13
 _ONNX_IR_VERSION = 7
 
+_OUTPUTS = ["action", "wheel_speeds"]
+
 _PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 
-Act = Callable[[Float[np.ndarray, "n obs"]], Outputs]
-"""A function from a batch of observations to actions and wheel speeds."""
-
-AsJax = Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]
-"""The same as a function of JAX."""
+Act = Callable[..., Outputs]
+"""A function from batches of the inputs, in their order, to actions and wheel speeds."""
 
 
 class Format(NamedTuple):
     """A `Format` describes one kind of exported file."""
 
     file: str
-    write: Callable[[PortablePolicy, AsJax, Path], None]
+    write: Callable[[PortablePolicy, Act, Path], None]
+    """Write the file, from the policy as arrays or as a function of JAX."""
     read: Callable[[Path], Act]
     """Load the file as its user would, without this package."""
     needs: tuple[str, ...] = ()
     """Packages of the extra `export` that the format needs."""
 
 
-def _write_numpy(policy: PortablePolicy, _: AsJax, path: Path) -> None:
-    arrays = [policy.mean, policy.std, *(array for layer in policy.layers for array in layer)]
+def _write_numpy(policy: PortablePolicy, _: Act, path: Path) -> None:
+    encoder = policy.encoder
+    convolutions = encoder.convolutions if encoder else ()
+    layers = [*([encoder.dense] if encoder else []), *policy.layers]
+    pairs = [*(one[:2] for one in convolutions), *layers]
+    arrays = [policy.mean, policy.std, *(array for pair in pairs for array in pair)]
     about = {
         "shapes": [list(array.shape) for array in arrays],
+        "inputs": list(policy.inputs),
+        "image": list(encoder.image_shape) if encoder else None,
+        "strides": [one.stride for one in convolutions],
         "activation": policy.activation,
         "squash": policy.squash,
         "controller": policy.controller._asdict(),
@@ -69,12 +75,12 @@ def _read_numpy(path: Path) -> Act:
     return module.act
 
 
-def _write_stablehlo(policy: PortablePolicy, as_jax: AsJax, path: Path) -> None:
+def _write_stablehlo(policy: PortablePolicy, as_jax: Act, path: Path) -> None:
     from jax import export
 
     (batch,) = export.symbolic_shape("batch")
-    obs = jax.ShapeDtypeStruct((batch, policy.mean.size), np.float32)
-    exported = export.export(jax.jit(as_jax), platforms=_PLATFORMS)(obs)
+    inputs = [jax.ShapeDtypeStruct((batch, *x.shape), x.dtype) for x in policy.inputs.values()]
+    exported = export.export(jax.jit(as_jax), platforms=_PLATFORMS)(*inputs)
     path.write_bytes(exported.serialize())
 
 
@@ -84,54 +90,91 @@ def _read_stablehlo(path: Path) -> Act:
     return jax.jit(export.deserialize(bytearray(path.read_bytes())).call)
 
 
-def _write_onnx(policy: PortablePolicy, _: AsJax, path: Path) -> None:
-    import onnx
-    from onnx import TensorProto, helper, numpy_helper
+class _OnnxGraph:
+    """An `_OnnxGraph` collects nodes and constants."""
 
-    nodes, constants = [], []
+    def __init__(self) -> None:
+        self.nodes: list[Any] = []
+        self.constants: list[Any] = []
 
-    def constant(name: str, value: Any) -> str:
-        constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
+    def constant(self, name: str, value: Any) -> str:
+        """Add an array of float32 and return its name."""
+        from onnx import numpy_helper
+
+        self.constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
         return name
 
-    def node(kind: str, *inputs: str, to: str, **attributes: Any) -> str:
-        nodes.append(helper.make_node(kind, inputs, [to], name=to, **attributes))
-        return to
+    def node(self, kind: str, *inputs: str, out: str, **attributes: Any) -> str:
+        """Add a node and return the name of its output, `out`."""
+        from onnx import helper
 
-    # Normalise the observation, and apply the layers with their activations.
-    x = node("Sub", "obs", constant("mean", policy.mean), to="centred")
-    x = node("Div", x, constant("std", policy.std), to="normalised")
+        self.nodes.append(helper.make_node(kind, inputs, [out], name=out, **attributes))
+        return out
+
+    def dense(self, layer: Layer, x: str, name: str) -> str:
+        """Add a dense layer; its constants are named `kernel_name` and `bias_name`."""
+        kernel = self.constant(f"kernel_{name}", layer.kernel)
+        bias = self.constant(f"bias_{name}", layer.bias)
+        return self.node("Gemm", x, kernel, bias, out=f"layer_{name}")
+
+    def features(self, encoder: Encoder) -> str:
+        """Add the encoder of the input `image`; ONNX has the channels before rows and columns."""
+        from onnx import TensorProto
+
+        x = self.node("Cast", "image", out="pixels", to=TensorProto.FLOAT)
+        x = self.node("Transpose", x, out="channels_first", perm=[0, 3, 1, 2])
+        for index, (kernel, bias, stride) in enumerate(encoder.convolutions):
+            weights = self.constant(f"kernel_conv_{index}", kernel.transpose(3, 2, 0, 1))
+            biases = self.constant(f"bias_conv_{index}", bias)
+            x = self.node("Conv", x, weights, biases, out=f"conv_{index}", strides=[stride, stride])
+            x = self.node("Relu", x, out=f"conv_{index}_relu")
+        x = self.node("Transpose", x, out="channels_last", perm=[0, 2, 3, 1])
+        x = self.node("Flatten", x, out="flat")
+        return self.node("Relu", self.dense(encoder.dense, x, "features"), out="features")
+
+
+def _write_onnx(policy: PortablePolicy, _: Act, path: Path) -> None:
+    import onnx
+    from onnx import helper
+
+    graph = _OnnxGraph()
+    constant, node = graph.constant, graph.node
+    # Encode the image, normalise the numbers, and apply the layers with their activations.
+    parts = [graph.features(policy.encoder)] if policy.encoder else []
+    if policy.mean.size:
+        x = node("Sub", list(policy.inputs)[-1], constant("mean", policy.mean), out="centred")
+        parts.append(node("Div", x, constant("std", policy.std), out="normalised"))
+    x = parts[0] if len(parts) == 1 else node("Concat", *parts, out="observed", axis=1)
     last = len(policy.layers) - 1
     for index, layer in enumerate(policy.layers):
-        kernel = constant(f"kernel_{index}", layer.kernel)
-        x = node("Gemm", x, kernel, constant(f"bias_{index}", layer.bias), to=f"layer_{index}")
+        x = graph.dense(layer, x, str(index))
         if index < last and policy.activation == "swish":
-            x = node("Mul", x, node("Sigmoid", x, to=f"gate_{index}"), to=f"hidden_{index}")
+            x = node("Mul", x, node("Sigmoid", x, out=f"gate_{index}"), out=f"hidden_{index}")
         elif index < last:
             kind = {"tanh": "Tanh", "relu": "Relu", "elu": "Elu"}[policy.activation]
-            x = node(kind, x, to=f"hidden_{index}")
+            x = node(kind, x, out=f"hidden_{index}")
     if policy.squash:
-        x = node("Tanh", x, to="squashed")
-    node("Clip", x, constant("low", -1.0), constant("high", 1.0), to="action")
+        x = node("Tanh", x, out="squashed")
+    node("Clip", x, constant("low", -1.0), constant("high", 1.0), out="action")
     # Append the controller, which is linear in the action.
     drive = 0.5 * policy.controller.max_speed / policy.controller.wheel_radius
     turn = policy.controller.fastest - 2.0 * drive
     mixing = constant("mixing", [[drive, drive], [-turn, turn]])
-    node("Gemm", "action", mixing, constant("half_speed", [drive, drive]), to="wheel_speeds")
+    node("Gemm", "action", mixing, constant("half_speed", [drive, drive]), out="wheel_speeds")
 
-    def tensor(name: str, size: int) -> Any:
-        return helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
+    def tensor(name: str, shape: Sequence[int], dtype: Any) -> Any:
+        kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
+        return helper.make_tensor_value_info(name, kind, ["batch", *shape])
 
     # Check and write the graph.
-    graph = helper.make_graph(
-        nodes,
-        "policy",
-        [tensor("obs", policy.mean.size)],
-        [tensor("action", 2), tensor("wheel_speeds", 2)],
-        constants,
-    )
     model = helper.make_model(
-        graph,
+        helper.make_graph(
+            graph.nodes,
+            "policy",
+            [tensor(name, x.shape, x.dtype) for name, x in policy.inputs.items()],
+            [tensor(name, [2], np.float32) for name in _OUTPUTS],
+            graph.constants,
+        ),
         opset_imports=[helper.make_opsetid("", _ONNX_OPSET)],
         ir_version=_ONNX_IR_VERSION,
         producer_name="jetbot_mjx",
@@ -146,7 +189,8 @@ def _read_onnx(path: Path) -> Act:
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session: Any = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    return lambda obs: tuple(session.run(["action", "wheel_speeds"], {"obs": obs}))
+    names = [one.name for one in session.get_inputs()]
+    return lambda *inputs: tuple(session.run(_OUTPUTS, dict(zip(names, inputs, strict=True))))
 
 
 FORMATS = {

@@ -1,11 +1,12 @@
 """Convert a policy to NumPy arrays and to a pure JAX function, and compare implementations.
 
-An exported policy is one function of a batch of observations. It applies the normaliser, the
-network, the distribution's mode, the environment's clip to [-1, 1] and the controller that converts
-an action to wheel speeds; it returns both the actions and the wheel speeds.
+An exported policy is one function of a batch of observations: `obs`, numbers, or `image`, and
+`state`, the numbers beside it, if there are any. It applies the normaliser, the network, the
+distribution's mode, the environment's clip to [-1, 1] and the controller that converts an action to
+wheel speeds; it returns both the actions and the wheel speeds.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -13,20 +14,24 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jetbot_mjx.agents.networks import make_policy
+from jetbot_mjx.agents.networks import make_networks, make_policy
+from jetbot_mjx.agents.vision import CNNS, ENCODER, HEAD
+from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.mujoco_env import MujocoJetBot
+from jetbot_mjx.envs.mujoco_env import MujocoJetBot, Observation
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
-from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.runs.checkpoint import Checkpoint
 from jetbot_mjx.runs.progress import stage
 
-RECORDED = 10_000
-"""Number of observations on which an export is checked."""
+RECORDED, RECORDED_IMAGES = 10_000, 1_000
+"""Number of observations on which an export is checked, and that of observations with an image."""
 
 TOLERANCE = 1e-5
 """Largest difference from JAX that an export may have, in the unit of an action."""
+
+_PARTS = {"image": PIXELS, "state": NUMBERS}
+"""Inputs of a policy that sees, and their keys in the environment's observation."""
 
 Outputs = tuple[Float[Array | np.ndarray, "n 2"], Float[Array | np.ndarray, "n 2"]]
 """Actions in [-1, 1], and the wheel speeds (left, right) [rad/s] that they command."""
@@ -58,12 +63,33 @@ class Layer(NamedTuple):
     bias: Float[np.ndarray, " outputs"]
 
 
+class Convolution(NamedTuple):
+    """A convolution without padding, and a ReLU behind it."""
+
+    kernel: Float[np.ndarray, "side side c_in c_out"]
+    bias: Float[np.ndarray, " c_out"]
+    stride: int
+
+
+class Encoder(NamedTuple):
+    """An `Encoder` maps an image to features, which come before the numbers beside it."""
+
+    image_shape: tuple[int, int, int]
+    """Height, width and channels."""
+    convolutions: tuple[Convolution, ...]
+    """The first kernel takes pixels from 0 to 255."""
+    dense: Layer
+    """From the last outputs, row by row with the channels last, to the features; a ReLU follows."""
+
+
 class PortablePolicy(NamedTuple):
     """A `PortablePolicy` holds a deterministic policy as arrays."""
 
-    mean: Float[np.ndarray, " obs"]
-    """Mean of the observation's normaliser; zeros without one."""
-    std: Float[np.ndarray, " obs"]
+    encoder: Encoder | None
+    """None: the policy observes numbers only."""
+    mean: Float[np.ndarray, " numbers"]
+    """Mean of the normaliser of the numbers; zeros without one."""
+    std: Float[np.ndarray, " numbers"]
     """Standard deviation of the normaliser; ones without one."""
     layers: tuple[Layer, ...]
     """The last layer gives only the location of the distribution."""
@@ -73,11 +99,21 @@ class PortablePolicy(NamedTuple):
     """Whether tanh follows the last layer; the clip to [-1, 1] follows in any case."""
     controller: Controller
 
+    @property
+    def inputs(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """Return shape and type of each input by its name, without a batch, in their order."""
+        numbers = jax.ShapeDtypeStruct(self.mean.shape, np.float32)
+        if self.encoder is None:
+            return {"obs": numbers}
+        image = jax.ShapeDtypeStruct(self.encoder.image_shape, np.uint8)
+        return {"image": image, "state": numbers} if self.mean.size else {"image": image}
+
 
 class Recording(NamedTuple):
-    """Observations from a drive, and JAX's outputs for them; on the host, float32."""
+    """Observations from a drive, and JAX's outputs for them; on the host."""
 
-    obs: Float[np.ndarray, "n obs"]
+    inputs: Mapping[str, np.ndarray]
+    """Inputs of the policy by their names, in their order, each with a batch axis."""
     action: Float[np.ndarray, "n 2"]
     wheel_speeds: Float[np.ndarray, "n 2"]
     """(left, right) [rad/s]."""
@@ -91,33 +127,28 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
 
     Returns:
       The policy as arrays. Compare its outputs with `as_jax`, which uses Brax's own code.
-
-    Raises:
-      UserError: the policy sees images.
     """
     config = checkpoint.config
-    if config.task.sees:
-        raise UserError(
-            f"{checkpoint.run_dir} has task.observation = {config.task.observation!r}: only"
-            " policies that observe numbers can be exported"
-        )
     network = config.ppo.network
     params: Any = jax.device_get(checkpoint.params)
-    size = checkpoint.about["observation_size"]
+    size, encoder, policy = checkpoint.about["observation_size"], None, params.policy
+    statistics = params.normalizer.mean, params.normalizer.std
+    if config.task.sees:
+        encoder = _encoder(network.cnn, size[PIXELS], policy[ENCODER]["params"])
+        statistics = [one.get(NUMBERS, np.zeros(0, np.float32)) for one in statistics]
+        size, policy = sum(size.get(NUMBERS, ())), policy[HEAD]
     mean, std = np.zeros(size, np.float32), np.ones(size, np.float32)
     if config.ppo.normalize_observations:
-        mean, std = np.asarray(params.normalizer.mean), np.asarray(params.normalizer.std)
-    dense: Mapping[str, Any] = params.policy["params"]
+        mean, std = map(np.asarray, statistics)
+    dense: Mapping[str, Any] = policy["params"]
     if network.distribution_type == "normal":
         # Brax stores the last layer of this distribution apart, with a standard deviation.
         dense = {**dense["MLP_0"], f"hidden_{len(dense['MLP_0'])}": dense["Dense_0"]}
-    layers = [
-        Layer(np.asarray(one["kernel"]), np.asarray(one["bias"]))
-        for one in (dense[f"hidden_{index}"] for index in range(len(dense)))
-    ]
+    layers = [_layer(dense[f"hidden_{index}"]) for index in range(len(dense))]
     actions = checkpoint.about["action_size"]
     layers[-1] = Layer(layers[-1].kernel[:, :actions], layers[-1].bias[:actions])
     return PortablePolicy(
+        encoder=encoder,
         mean=mean,
         std=std,
         layers=tuple(layers),
@@ -132,9 +163,34 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
     )
 
 
-def as_jax(
-    checkpoint: Checkpoint, env: JetBotEnv
-) -> Callable[[Float[Array, "n obs"]], tuple[Float[Array, "n 2"], Float[Array, "n 2"]]]:
+def _layer(params: Mapping[str, Any]) -> Layer:
+    return Layer(np.asarray(params["kernel"]), np.asarray(params["bias"]))
+
+
+def _encoder(cnn: str, image_shape: Sequence[int], params: Mapping[str, Any]) -> Encoder:
+    """Return the encoder with the division of the pixels by 255 in its first kernel.
+
+    Args:
+      cnn: the name of the encoder's layers, `ppo.network.cnn`.
+      image_shape: height, width and channels of the image.
+      params: the encoder's parameters.
+    """
+    kernels = [np.asarray(params[f"conv_{i}_kernel"]) for i in range(len(CNNS[cnn].convolutions))]
+    kernels[0] = kernels[0] / np.float32(255)
+    height, width, channels = image_shape
+    return Encoder(
+        image_shape=(height, width, channels),
+        convolutions=tuple(
+            Convolution(kernel, np.asarray(params[f"conv_{i}_bias"]), stride)
+            for i, (kernel, (_, _, stride)) in enumerate(
+                zip(kernels, CNNS[cnn].convolutions, strict=True)
+            )
+        ),
+        dense=_layer(params["dense"]),
+    )
+
+
+def as_jax(checkpoint: Checkpoint, env: JetBotEnv) -> Callable[..., Outputs]:
     """Return the policy as used in training and evaluation, the reference for every export.
 
     Args:
@@ -142,11 +198,21 @@ def as_jax(
       env: The environment that the policy was trained in.
 
     Returns:
-      A pure function of a batch of observations, in full float32 on every device.
+      A pure function of batches of the inputs, in their order, in full float32 on every device.
     """
-    policy = make_policy(checkpoint.networks, checkpoint.params)
+    networks = checkpoint.networks
+    if checkpoint.config.task.sees:
+        # The convolutions of a training on GPUs compute in bfloat16.
+        ppo = checkpoint.config.ppo
+        network = ppo.network.model_copy(update={"cnn_dtype": "float32"})
+        size = env.observation_size
+        networks = make_networks(ppo.model_copy(update={"network": network}), size, env.action_size)
+    policy = make_policy(networks, checkpoint.params)
 
-    def act(obs: Float[Array, "n obs"]) -> tuple[Float[Array, "n 2"], Float[Array, "n 2"]]:
+    def act(*inputs: Array) -> Outputs:
+        obs: Any = inputs[0]
+        if checkpoint.config.task.sees:
+            obs = dict(zip(_PARTS.values(), inputs, strict=False))
         with jax.default_matmul_precision("highest"):
             action = jnp.clip(policy(obs), -1.0, 1.0)
         return action, jax.vmap(env.wheel_targets)(action)
@@ -154,7 +220,7 @@ def as_jax(
     return act
 
 
-def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Recording:
+def record(checkpoint: Checkpoint, env: JetBotEnv, count: int | None = None) -> Recording:
     """Drive to the report's fixed goals, one after the other, and record the observations.
 
     The drive runs in C MuJoCo, which needs no compilation and simulates the same robot.
@@ -162,30 +228,39 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int = RECORDED) -> Rec
     Args:
       checkpoint: The checkpoint of the policy.
       env: The environment that the policy was trained in.
-      count: Number of observations.
+      count: Number of observations; None: `RECORDED`, or `RECORDED_IMAGES`.
 
     Returns:
       The recording, the same for the same checkpoint on the same machine.
     """
+    if count is None:
+        count = RECORDED_IMAGES if checkpoint.config.task.sees else RECORDED
     robot = MujocoJetBot(checkpoint.config, type(env.task))
     act = jax.jit(as_jax(checkpoint, env))
     keys = iter(np.asarray(report_keys(count)))
-    seen: list[np.ndarray] = []
+    seen: list[dict[str, np.ndarray]] = []
     with stage("observations of a drive", count) as advance:
         while len(seen) < count:
             before = len(seen)
             obs, _ = robot.reset(next(keys))
             for _ in range(min(checkpoint.config.task.episode_length, count - before)):
-                seen.append(obs)
-                (action,), _ = jax.device_get(act(obs[None]))
+                seen.append(_inputs(obs))
+                (action,), _ = jax.device_get(act(*(x[None] for x in seen[-1].values())))
                 step = robot.step(action)
                 obs = step.obs
                 if step.terminated or not step.finite:
                     break
             advance(len(seen) - before)
-    obs = np.stack(seen)
-    action, wheel_speeds = jax.device_get(act(obs))
-    return Recording(obs, action, wheel_speeds)
+    inputs = {name: np.stack([one[name] for one in seen]) for name in seen[0]}
+    action, wheel_speeds = jax.device_get(act(*inputs.values()))
+    return Recording(inputs, action, wheel_speeds)
+
+
+def _inputs(obs: Observation) -> dict[str, np.ndarray]:
+    """Return an observation of the environment as inputs of an exported policy."""
+    if not isinstance(obs, dict):
+        return {"obs": obs}
+    return {name: obs[key] for name, key in _PARTS.items() if key in obs}
 
 
 def difference(recording: Recording, outputs: Outputs, controller: Controller) -> float:

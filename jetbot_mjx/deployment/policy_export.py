@@ -82,28 +82,30 @@ def export_policy(
             path = unfinished / FORMATS[name].file
             with stage(f"writing and checking {path.name}"):
                 FORMATS[name].write(policy, reference, path)
-                outputs = FORMATS[name].read(path)(recording.obs)
+                outputs = FORMATS[name].read(path)(*recording.inputs.values())
                 found = difference(recording, outputs, policy.controller)
             if not found < TOLERANCE:
                 raise UserError(
                     f"nothing was written to {folder}: {path.name} differs from JAX by {found:.1e}"
-                    f" on {len(recording.obs):,} observations, and {TOLERANCE:.0e} is allowed"
+                    f" on {len(recording.action):,} observations, and {TOLERANCE:.0e} is allowed"
                 )
             differences[name] = found
         # Write the observations and the description of all files.
         _write_spec(unfinished, policy_spec(checkpoint, env, policy), differences, recording)
-    return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.obs))
+    return ExportedPolicy(folder, checkpoint.env_steps, differences, len(recording.action))
 
 
 def _write_spec(
     folder: Path, spec: dict[str, Any], differences: Mapping[str, float], recording: Recording
 ) -> None:
-    np.savez_compressed(folder / RECORDING, **recording._asdict())
+    arrays = {**recording.inputs, **recording._asdict()}
+    del arrays["inputs"]
+    np.savez_compressed(folder / RECORDING, **arrays)
     spec["files"] = {
         name: {"file": FORMATS[name].file, "largest_difference": found}
         for name, found in differences.items()
     }
-    spec["recording"] = {"file": RECORDING, "observations": len(recording.obs)}
+    spec["recording"] = {"file": RECORDING, "observations": len(recording.action)}
     write_json(folder / FILE, spec)
 
 

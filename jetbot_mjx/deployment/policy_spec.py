@@ -4,7 +4,11 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from jetbot_mjx.deployment.numpy_policy import PortablePolicy
+import numpy as np
+
+from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.deployment.numpy_policy import Encoder, PortablePolicy
+from jetbot_mjx.envs.camera.lens import intrinsics
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.task import GOAL_HEIGHT, Layout
@@ -36,7 +40,7 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
     Returns:
       The spec as JSON; `export` adds the files and the difference of each to JAX.
     """
-    config = checkpoint.config
+    config, encoder = checkpoint.config, policy.encoder
     rest = env.mj_model.qpos0
     return {
         "format": FORMAT,
@@ -46,7 +50,12 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "robot": config.robot.preset,
         "control_rate": 1.0 / env.dt,
         "control_period": env.dt,
+        "inputs": [
+            {"name": name, "dtype": str(np.dtype(one.dtype)), "shape": list(one.shape)}
+            for name, one in policy.inputs.items()
+        ],
         "observation": _observations(env.task.layout),
+        **({"image": _image(config.camera, env.dt)} if encoder else {}),
         "action": [
             {"name": "drive", "index": 0, "unit": "1", "low": -1.0, "high": 1.0},
             {"name": "turn", "index": 1, "unit": "1", "low": -1.0, "high": 1.0},
@@ -63,9 +72,17 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
             **policy.controller._asdict(),
             "limit_in_training": env.robot.max_wheel_speed,
         },
-        "inside": ["normaliser", "network", "clip to [-1, 1]", "action to wheel speeds"],
-        "outside": ["limits and dead-band of the motors", "wheel speed to motor value"],
+        "inside": [
+            *(["pixels / 255", "convolutions"] if encoder else []),
+            *(["normaliser"] if policy.mean.size else []),
+            *("network", "clip to [-1, 1]", "action to wheel speeds"),
+        ],
+        "outside": [
+            *(["resizing the camera's image", "stacking images"] if encoder else []),
+            *("limits and dead-band of the motors", "wheel speed to motor value"),
+        ],
         "network": {
+            **(_sizes(encoder) if encoder else {}),
             "layers": [layer.bias.size for layer in policy.layers],
             "activation": policy.activation,
             "squash": "tanh" if policy.squash else None,
@@ -78,6 +95,50 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "episode_seconds": config.task.episode_length * env.dt,
         "evaluation": _evaluation(checkpoint),
         "versions": versions(),
+    }
+
+
+def _sizes(encoder: Encoder) -> dict[str, Any]:
+    return {
+        "convolutions": [
+            {"channels": one.bias.size, "side": len(one.kernel), "stride": one.stride}
+            for one in encoder.convolutions
+        ],
+        "features": encoder.dense.bias.size,
+    }
+
+
+def _image(camera: CameraConfig, period: float) -> dict[str, Any]:
+    """Return the description of the image, and of the camera that takes it.
+
+    Args:
+      camera: the camera section.
+      period: the time from one image to the next [s].
+    """
+    fx, fy, cx, cy = (float(one) for one in intrinsics(camera))
+    return {
+        "height": camera.height,
+        "width": camera.width,
+        "channels": ["red", "green", "blue"] if camera.colour == "rgb" else ["grey"],
+        "grey": "0.299 red + 0.587 green + 0.114 blue" if camera.colour == "grey" else None,
+        "axes": ["row from above", "column from the left", "channel"],
+        "dtype": "uint8",
+        "range": [0, 255],
+        "resize": "area mean: a pixel is the mean of all that it covers of the camera's image",
+        "frames": camera.frames,
+        "frame_period": period,
+        "frame_order": "along the channels, the newest last; a drive begins with copies",
+        "stacked_by": "the caller, by stack() of policy.py",
+        "camera": {
+            "position": list(camera.position),
+            "frame": "body",
+            "unit": "m",
+            "pitch_down_degrees": camera.pitch,
+            "lens": camera.lens,
+            "matrix": {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "unit": "pixels of the image"},
+            "distortion": list(camera.distortion),
+            "distortion_order": "OpenCV's",
+        },
     }
 
 

@@ -1,7 +1,7 @@
 """Simulate a single robot and its task with C MuJoCo, which for one robot is faster than MJX.
 
 The model is the one that MJX gets. Everything but physics (goals, positions of solid bodies,
-observation, reward, termination) is the code of `JetBotEnv`, compiled by JAX for the CPU.
+observation, images, reward, termination) is the code of `JetBotEnv`, compiled by JAX for the CPU.
 """
 
 import copy
@@ -13,15 +13,15 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float, UInt8, UInt32
 
 from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import Config
+from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, see
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
-from jetbot_mjx.envs.state import PhysicsState, robot_state
-from jetbot_mjx.envs.task import AdvancesGoal, Goal, RobotState, layout_size
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.envs.state import PhysicsState, State, robot_state
+from jetbot_mjx.envs.task import AdvancesGoal, Goal, layout_size
 
 # MuJoCo prints each of these warnings once per episode and appends it to a file in the working
 # directory. They are suppressed, since `Step.finite` reports the same.
@@ -31,10 +31,14 @@ _NONFINITE_WARNINGS = [
 ]
 
 
+Observation = Float[np.ndarray, " obs"] | dict[str, np.ndarray]
+"""Numbers; of a robot that sees, a dictionary as of `CameraWrapper`."""
+
+
 class Step(NamedTuple):
     """A `Step` holds the result of one step."""
 
-    obs: Float[np.ndarray, " obs"]
+    obs: Observation
     """Observation after the step."""
     reward: float
     """Reward of the step."""
@@ -52,10 +56,12 @@ class _Programs(NamedTuple):
     env: JetBotEnv
     model: mujoco.MjModel
     reset: Any
-    """From a key to (first pose, goal, positions of solid bodies, observation, next key)."""
+    """From a key to (first pose, goal, positions of solid bodies, numbers of the observation, its
+    images, next key)."""
     task_step: Any
-    """From (poses and action, goal) to (observation and scalars of the step, goal, positions of
-    solid bodies); the last two are None if goals cannot change."""
+    """From (poses and action, goal, images before) to (numbers and scalars of the step, images,
+    goal, positions of solid bodies); the last two are None if goals cannot change. Images are None
+    without a camera."""
 
 
 class MujocoJetBot:
@@ -69,14 +75,8 @@ class MujocoJetBot:
           task_class: the class of the task; None: the one that `task.name` imports.
 
         Raises:
-          UserError: the task or its scene cannot be built, or the policy sees images.
+          UserError: the task or its scene cannot be built.
         """
-        if config.task.sees:
-            raise UserError(
-                f"task.observation = {config.task.observation!r}: one robot in C MuJoCo observes"
-                " numbers only, world or egocentric; a batch of robots sees (JetBotVectorEnv,"
-                " JetBotVecEnv)"
-            )
         programs = _programs(config.model_dump_json(), task_class)
         self.env, self.model, self._reset, self._task_step = programs
         self.data = mujoco.MjData(self.model)
@@ -89,11 +89,10 @@ class MujocoJetBot:
         self._qpos, self._qvel, self._ctrl = self.data.qpos, self.data.qvel, self.data.ctrl
         self._mocap_pos: Float[np.ndarray, "nmocap 3"] = self.data.mocap_pos.copy()
         self._before = np.concatenate((self._qpos, self._qvel), dtype=np.float32)
-        self._obs = np.zeros(layout_size(self.env.task.layout), np.float32)
+        self._numbers = np.zeros(layout_size(self.env.task.layout), np.float32)
+        self._images: UInt8[np.ndarray, "h w c"] | None = None
 
-    def reset(
-        self, key: UInt32[np.ndarray, "2"]
-    ) -> tuple[Float[np.ndarray, " obs"], UInt32[np.ndarray, "2"]]:
+    def reset(self, key: UInt32[np.ndarray, "2"]) -> tuple[Observation, UInt32[np.ndarray, "2"]]:
         """Begin the episode that `JetBotEnv.reset` draws from a key.
 
         Args:
@@ -102,12 +101,19 @@ class MujocoJetBot:
         Returns:
           The first observation, and the key of the next episode.
         """
-        pose, self.goal, mocap_pos, obs, next_key = self._reset(key)
-        self._before, self._obs = np.array(pose), np.array(obs)
+        pose, self.goal, mocap_pos, numbers, self._images, next_key = self._reset(key)
+        self._before, self._numbers = np.array(pose), np.array(numbers)
         if mocap_pos is not None:
             self._mocap_pos = np.asarray(mocap_pos)
         self._restore(time=0.0)
-        return self._obs.copy(), np.asarray(next_key)
+        return self._observation(), np.asarray(next_key)
+
+    def _observation(self) -> Observation:
+        """Return the caller's copy of the observation."""
+        if self._images is None:
+            return self._numbers.copy()
+        numbers = {NUMBERS: self._numbers.copy()} if self._numbers.size else {}
+        return {PIXELS: np.array(self._images), **numbers}
 
     def step(self, action: Float[np.ndarray, "2"]) -> Step:
         """Make one environment step.
@@ -126,19 +132,20 @@ class MujocoJetBot:
         # Apply the task. Each array passed to or from JAX costs a third of the time of physics,
         # so that all numbers are concatenated.
         given = np.concatenate((self._before, self._qpos, self._qvel, action), dtype=np.float32)
-        result, goal, mocap_pos = self._task_step(given, self.goal)
+        result, images, goal, mocap_pos = self._task_step(given, self.goal, self._images)
         result = np.array(result)
         reward, terminated, success, finite = result[-4:].tolist()
         if not finite:
             return self._discarded(time)
-        self._before, self._obs = given[len(self._before) : -len(action)], result[:-4]
+        self._before, self._numbers = given[len(self._before) : -len(action)], result[:-4]
+        self._images = images
         # Update the goal.
         if self._goal_advances:
             self.goal = goal
             if mocap_pos is not None:
                 self._mocap_pos = np.asarray(mocap_pos)
                 self.data.mocap_pos[:] = self._mocap_pos
-        return Step(self._obs.copy(), reward, terminated > 0, success > 0, True)
+        return Step(self._observation(), reward, terminated > 0, success > 0, True)
 
     def wheel_targets(self, action: Float[np.ndarray, "2"]) -> tuple[float, float]:
         """Return the wheel speeds (left, right) [rad/s] of an action, before motor limits.
@@ -157,7 +164,7 @@ class MujocoJetBot:
     def _discarded(self, time: float) -> Step:
         """Restore the state before a non-finite step, and return its result."""
         self._restore(time)
-        return Step(self._obs.copy(), 0.0, False, False, False)
+        return Step(self._observation(), 0.0, False, False, False)
 
     def _restore(self, time: float) -> None:
         """Set robot and solid bodies to their last finite state."""
@@ -183,28 +190,46 @@ def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
     nq, size = model.nq, model.nq + model.nv
 
+    def see_from(state: State, before: Array | None) -> Array | None:
+        """Return the images of a state; `before`: those of the step before, if there is one."""
+        if env.camera is None:
+            return None
+        return see(env.camera, env.task, state, before, begins=before is None).obs[PIXELS]
+
     def reset(key: UInt32[Array, "2"]) -> tuple[Any, ...]:
-        state = env.reset(key)
+        state = env.blind().reset(key)
         pose = jnp.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel])
-        return pose, state.goal, env.mocap_positions(state.goal), state.obs, state.key
+        mocap_pos, numbers = env.mocap_positions(state.goal), _vector(state.obs)
+        return pose, state.goal, mocap_pos, numbers, see_from(state, None), state.key
 
-    def robot_of(pose: Float[Array, " n"]) -> RobotState:
-        time = jnp.zeros(())
-        return robot_state(PhysicsState(pose[:nq], pose[nq:], jnp.zeros(model.nv), time))
+    def physics_of(pose: Float[Array, " n"]) -> PhysicsState:
+        return PhysicsState(pose[:nq], pose[nq:], jnp.zeros(model.nv), jnp.zeros(()))
 
-    def task_step(given: Float[Array, " n"], goal: Goal) -> tuple[Array, Goal, Array | None]:
+    def task_step(
+        given: Float[Array, " n"], goal: Goal, images: Array | None
+    ) -> tuple[Array, Array | None, Goal, Array | None]:
         before, after, action = jnp.split(given, [size, 2 * size])
-        task = env.task_step(robot_of(before), robot_of(after), goal, action)
-        finite = jnp.isfinite(jnp.concatenate([after, task.obs, task.reward[None]])).all()
+        physics = physics_of(after)
+        task = env.task_step(robot_state(physics_of(before)), robot_state(physics), goal, action)
+        numbers = _vector(task.obs)
+        finite = jnp.isfinite(jnp.concatenate([after, numbers, task.reward[None]])).all()
         scalars = jnp.stack([task.reward, task.terminated, task.success, finite])
-        result = jnp.concatenate([task.obs, scalars])
+        result = jnp.concatenate([numbers, scalars])
+        state = State(physics, {}, task.reward, task.terminated, {}, {}, task.goal, jnp.zeros(2))
+        images = see_from(state, images)
         if not isinstance(env.task, AdvancesGoal):
-            return result, None, None
-        return result, task.goal, env.mocap_positions(task.goal)
+            return result, images, None, None
+        return result, images, task.goal, env.mocap_positions(task.goal)
 
     # Compile for the CPU: on a GPU, every call would wait for the device.
     with default_device_cpu():
         key, given = np.zeros(2, np.uint32), np.zeros(2 * size + env.action_size, np.float32)
         reset_program = jax.jit(reset).lower(key).compile()
-        task_program = jax.jit(task_step).lower(given, reset_program(key)[1]).compile()
+        _, goal, _, _, images, _ = reset_program(key)
+        task_program = jax.jit(task_step).lower(given, goal, images).compile()
     return _Programs(env, model, reset_program, task_program)
+
+
+def _vector(obs: Any) -> Float[Array, " obs"]:
+    """Return the numbers of an observation without images, which may be an empty dictionary."""
+    return jnp.zeros(0) if isinstance(obs, dict) else obs

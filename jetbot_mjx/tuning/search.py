@@ -57,6 +57,20 @@ class Entrant(NamedTuple):
     """Mean duration of the report's episodes [s], for each seed; a failed one counts in full."""
 
 
+def _open_storage(url: str) -> optuna.storages.RDBStorage:
+    """Open a study's database, which enqueues the trials of killed workers again."""
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+    # Heartbeats are recorded here, for a whole round of trials.
+    warnings.filterwarnings("ignore", "Heartbeat of storage", UserWarning)
+    return optuna.storages.RDBStorage(
+        url,
+        heartbeat_interval=_BEAT_SECONDS,
+        grace_period=_STALE_SECONDS,
+        heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
+    )
+
+
 class Search:
     """A `Search` runs trials of one study."""
 
@@ -93,17 +107,8 @@ class Search:
         new = not folder.exists()
         make_folder(folder)
         url = storage or f"sqlite:///{folder.absolute() / 'study.db'}"
-        optuna.logging.set_verbosity(optuna.logging.ERROR)
-        warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-        # Heartbeats are recorded here, for a whole round of trials.
-        warnings.filterwarnings("ignore", "Heartbeat of storage", UserWarning)
         try:
-            self._storage = optuna.storages.RDBStorage(
-                url,
-                heartbeat_interval=_BEAT_SECONDS,
-                grace_period=_STALE_SECONDS,
-                heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
-            )
+            self._storage = _open_storage(url)
             self.study = optuna.create_study(
                 storage=self._storage,
                 study_name=folder.name,

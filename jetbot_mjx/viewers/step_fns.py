@@ -114,17 +114,6 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
         ]
         return episode_env.step(state, jax.lax.switch(inputs.agent, branches))
 
-    def move_one(state: State, position_w: Float[Array, "3"]) -> State:
-        assert isinstance(env.task, MovesGoal)
-        goal = env.task.move_goal(state.goal, position_w)
-        obs = env.blind().observe(robot_state(state.pipeline_state), goal)
-        info = {**state.info, "steps": jnp.zeros(())}
-        seen, state = state.obs, state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
-        if env.camera is None:
-            return state
-        # The episode goes on, so the images before stay in the stack.
-        return see(env.camera, env.task, state, seen[PIXELS], begins=False)
-
     def reset(keys: UInt32[Array, "robots 2"]) -> tuple[State, Snapshot]:
         states = jax.vmap(episode_env.reset)(keys)
         return states, _snapshot(env, states)
@@ -142,7 +131,7 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
     def move(
         states: State, robot: Int[Array, ""], position_w: Float[Array, "3"]
     ) -> tuple[State, Snapshot]:
-        moved = jax.vmap(move_one, in_axes=(0, None))(states, position_w)
+        moved = jax.vmap(lambda state: _move_goal(env, state, position_w))(states)
         states = _where(jnp.arange(len(states.done)) == robot, moved, states)
         return states, _snapshot(env, states)
 
@@ -158,6 +147,19 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
 
     compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))
     return ViewerFns(*map(compiled, (reset, restart, step, move, see_one, occlusion)))
+
+
+def _move_goal(env: JetBotEnv, state: State, position_w: Float[Array, "3"]) -> State:
+    """Return the state of a robot whose goal is moved; its episode's time begins anew."""
+    assert isinstance(env.task, MovesGoal)
+    goal = env.task.move_goal(state.goal, position_w)
+    obs = env.blind().observe(robot_state(state.pipeline_state), goal)
+    info = {**state.info, "steps": jnp.zeros(())}
+    seen, state = state.obs, state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
+    if env.camera is None:
+        return state
+    # The episode goes on, so the images before stay in the stack.
+    return see(env.camera, env.task, state, seen[PIXELS], begins=False)
 
 
 def _snapshot(env: JetBotEnv, states: State) -> Snapshot:

@@ -502,6 +502,62 @@ def _check_same_infos(mine, wanted, layout):
             np.testing.assert_array_equal(mine[name], value)
 
 
+# What the camera sees.
+
+
+def sees(observation="camera", **camera):
+    return {
+        "task": {"observation": observation},
+        "camera": {"width": 40, "height": 36, **camera},
+    }
+
+
+def test_the_spaces_of_images_say_how_they_are_ordered():
+    box = JetBotGymEnv(config=sees(colour="grey", frames=2)).observation_space
+    assert box == gymnasium.spaces.Box(0, 255, (36, 40, 2), np.uint8)
+    parts = JetBotGymEnv(config=sees("camera+egocentric")).observation_space
+    assert isinstance(parts, gymnasium.spaces.Dict)
+    assert set(parts) == {"pixels/front", "state"}
+    assert parts["pixels/front"] == gymnasium.spaces.Box(0, 255, (36, 40, 3), np.uint8)
+    assert parts["state"] == gymnasium.spaces.Box(-np.inf, np.inf, (7,), np.float32)
+
+
+@pytest.mark.filterwarnings("ignore:.*A Box observation space m..imum value is -?infinity")
+@pytest.mark.parametrize("observation", ["camera", "camera+egocentric"])
+def test_gymnasiums_checker_passes_with_images(observation):
+    check_env(JetBotGymEnv(config=sees(observation)), skip_render_check=True)
+    batch = JetBotVectorEnv(2, config=sees(observation))
+    obs, _ = batch.reset(seed=0)
+    assert batch.observation_space.contains(obs)
+    obs, *_ = batch.step(np.zeros((2, 2), np.float32))
+    assert batch.observation_space.contains(obs)
+
+
+def test_one_robot_sees_what_the_batch_sees():
+    config = sees("camera+egocentric", frames=2)
+    ours = JetBotVectorEnv(2, max_episode_length=12, config=config)
+    theirs = SyncVectorEnv(
+        [lambda: JetBotGymEnv(max_episode_length=12, config=config)] * 2,
+        autoreset_mode=AutoresetMode.SAME_STEP,
+    )
+    mine, wanted = ours.reset(seed=2)[0], theirs.reset(seed=2)[0]
+    action, before = np.float32([[-0.5, 1.0], [0.5, -1.0]]), None
+    for index in range(20):
+        assert mine.keys() == wanted.keys()
+        np.testing.assert_allclose(mine["state"], wanted["state"], atol=2e-3)
+        image, other = mine["pixels/front"], wanted["pixels/front"].astype(int)
+        assert other.std() > 10
+        # A border between two surfaces may lie on the other side of a ray.
+        assert np.mean(np.abs(image - other) > 2) < 5e-3, index
+        if before is None or index == 12:
+            np.testing.assert_array_equal(other[..., :3], other[..., 3:])
+        else:
+            np.testing.assert_array_equal(other[..., :3], before[..., 3:])
+            assert (other[..., :3] != other[..., 3:]).any()
+        before = other
+        mine, wanted = ours.step(action)[0], theirs.step(action)[0]
+
+
 def test_robots_that_are_drawn_are_a_batch():
     drawn = {"randomization": {"friction": [0.5, 1.0], "mass": [0.9, 1.1]}}
     with pytest.raises(UserError, match=r"randomization\.friction, mass: .*take JetBotVectorEnv"):

@@ -264,8 +264,10 @@ def test_robots_are_drawn_side_by_side(needs_opengl):
     env.close()
 
 
-@pytest.mark.parametrize("num_envs", [1, 4])
-def test_the_examples_train_and_evaluate(num_envs, root, tmp_path, monkeypatch, capsys):
+@pytest.mark.parametrize(
+    "options", [["--num-envs", "1"], ["--num-envs", "4"], ["--camera"]], ids=" ".join
+)
+def test_the_examples_train_and_evaluate(options, root, tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(str(root / "examples"))
     for name in ("sb3_train", "sb3_eval"):
         monkeypatch.delitem(sys.modules, name, raising=False)
@@ -275,7 +277,7 @@ def test_the_examples_train_and_evaluate(num_envs, root, tmp_path, monkeypatch, 
     monkeypatch.setattr(sb3_train, "_STEPS", 64)
     folder = ["--folder", str(tmp_path)]
     with everywhere():
-        assert sb3_train.main(["--steps", "64", "--num-envs", str(num_envs), *folder]) == 0
+        assert sb3_train.main(["--steps", "64", *options, *folder]) == 0
     policy = str(tmp_path / "jetbot.zip")
     assert sb3_eval.main(["--policy", policy, "--episodes", "2", "--headless"]) == 0
     assert re.search(r"^[012] of 2 goals, \d+ steps", capsys.readouterr().out, re.MULTILINE)
@@ -323,6 +325,6 @@ def test_numbers_beside_an_image_are_a_dictionary():
     assert both.observation_space.contains(seen)
 
 
-def test_one_robot_in_mujoco_says_that_it_does_not_see():
-    with pytest.raises(UserError, match=r"observes numbers only.*a batch of robots sees"):
-        JetBotGymEnv(config=SEES)
+@pytest.mark.parametrize("observation", ["camera", "camera+egocentric"])
+def test_its_checker_passes_with_images(observation):
+    check_env(JetBotGymEnv(config={**SEES, "task": {"observation": observation}}))

@@ -131,11 +131,12 @@ def epoch_keys(seed):
         yield jax.random.split(epoch, 1)[0]
 
 
-# The real robot, which compiles so long, in one of them. ("NONE", 1.0) has a whole epoch below.
+# ("NONE", 1.0) has a whole epoch below.
 VARIANTS = [
-    (JetBotEnv, "ADAPTIVE_KL", 1.0),
-    (Gliding, "NONE", None),
     (Gliding, "ADAPTIVE_KL", None),
+    pytest.param((Gliding, "NONE", None), marks=pytest.mark.slow),
+    # Through the real robot, which compiles so long.
+    pytest.param((JetBotEnv, "ADAPTIVE_KL", 1.0), marks=pytest.mark.slow),
 ]
 
 

@@ -17,7 +17,7 @@ from jetbot_mjx.config import NetworkConfig, PPOConfig, parse_config
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.errors import InvalidError
 
-LAYERS = sorted({layer for layers in vision._CNNS.values() for layer in layers.convolutions})
+LAYERS = sorted({layer for layers in vision.CNNS.values() for layer in layers.convolutions})
 SMALLEST = {"nature": 36, "small": 18, "tiny": 16}
 
 
@@ -146,7 +146,7 @@ def init(ppo):
 def as_brax(params):
     """Rename the parameters of an encoder and a head to those of Brax's one network."""
     encoder, head = params["encoder"]["params"], params["head"]["params"]
-    layers = len(vision._CNNS["small"].convolutions)
+    layers = len(vision.CNNS["small"].convolutions)
     convolutions = {
         f"Conv_{i}": {"kernel": encoder[f"conv_{i}_kernel"], "bias": encoder[f"conv_{i}_bias"]}
         for i in range(layers)
@@ -182,7 +182,7 @@ def separate():
 
 def test_the_loss_of_separate_encoders_is_that_of_brax_s_networks(separate):
     params, batch, ((loss, metrics), gradient) = separate
-    layers = vision._CNNS["small"]
+    layers = vision.CNNS["small"]
     channels, sides, strides = zip(*layers.convolutions, strict=True)
     theirs = networks_vision.make_ppo_networks_vision(
         {PIXELS: SHAPE},

@@ -14,10 +14,9 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from brax.training.acme import running_statistics, specs
 
 from jetbot_mjx import export
-from jetbot_mjx.agents.networks import PolicyParams, make_networks
+from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.deployment import export_policy, exporters, numpy_policy, policy_export
 from jetbot_mjx.deployment.exporters import FORMATS
@@ -68,9 +67,10 @@ def checkpoint_of(settings, tmp_path):
     size = env.observation_size
     networks = make_networks(config.ppo, size, 2)
     key = jax.random.PRNGKey(3)
-    normalizer = running_statistics.init_state(specs.Array((size,), np.dtype("float32")))
+    normalizer = init_normalizer(size)
     normalizer = normalizer.replace(
-        mean=jnp.linspace(-1.0, 1.0, size), std=jnp.linspace(0.1, 2.0, size)
+        mean=jax.tree.map(lambda x: jnp.linspace(-1.0, 1.0, x.size), normalizer.mean),
+        std=jax.tree.map(lambda x: jnp.linspace(0.1, 2.0, x.size), normalizer.std),
     )
     params = PolicyParams(normalizer, networks.policy_network.init(key), None)
     return Checkpoint(
@@ -84,9 +84,9 @@ def checkpoint_of(settings, tmp_path):
     ), env
 
 
-def outputs_of(checkpoint, env, obs):
-    action, wheel_speeds = jax.device_get(jax.jit(as_jax(checkpoint, env))(obs))
-    return Recording(obs, action, wheel_speeds)
+def outputs_of(checkpoint, env, **inputs):
+    action, wheel_speeds = jax.device_get(jax.jit(as_jax(checkpoint, env))(*inputs.values()))
+    return Recording(inputs, action, wheel_speeds)
 
 
 @pytest.mark.parametrize(
@@ -104,7 +104,7 @@ def test_every_network_is_written_as_it_is(activation, distribution, normalize, 
     ppo = {"network": {**network, **layers}, "normalize_observations": normalize}
     checkpoint, env = checkpoint_of({"ppo": ppo, "task": {"max_speed": 0.4}}, tmp_path)
     obs = np.random.default_rng(0).normal(size=(200, 16)).astype(np.float32) * 3.0
-    recording = outputs_of(checkpoint, env, obs)
+    recording = outputs_of(checkpoint, env, obs=obs)
     assert recording.action.std() > 0.1
     policy = portable_policy(checkpoint)
     for name in ("numpy", "onnx"):
@@ -220,7 +220,7 @@ def record_example(monkeypatch, tmp_path):
 
     def record_example(name, count):
         settings = load_config(ROOT / "examples" / f"{name}.yaml").model_dump()
-        return record(*checkpoint_of(settings, tmp_path), count).obs
+        return record(*checkpoint_of(settings, tmp_path), count).inputs["obs"]
 
     return record_example
 
@@ -327,6 +327,138 @@ def test_the_files_for_a_robot_are_python_3_6(exported, root):
             assert path.read_text("utf-8").isascii()
 
 
+# Policies that see.
+
+
+@pytest.fixture(scope="module")
+def seeing(tmp_path_factory):
+    """The export of the policy that comes with the package."""
+    folder = tmp_path_factory.mktemp("seeing") / "policy"
+    command = ["pretrained:jetbot_camera", "--format", "all", "--out", str(folder)]
+    assert export.main(command) == 0
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("cnn", "camera", "observation", "distribution"),
+    [
+        ("tiny", {"width": 33, "height": 32}, "camera", "tanh_normal"),
+        ("small", {"colour": "grey", "frames": 3}, "camera+egocentric", "normal"),
+        ("nature", {"width": 40, "height": 37}, "camera+world", "tanh_normal"),
+    ],
+)
+def test_every_encoder_is_written_as_it_is(cnn, camera, observation, distribution, tmp_path):
+    network = {"cnn": cnn, "distribution_type": distribution, "cnn_dtype": "bfloat16"}
+    settings = {"ppo": {"network": network}, "camera": camera, "task": {"observation": observation}}
+    checkpoint, env = checkpoint_of(settings, tmp_path)
+    policy, rng = portable_policy(checkpoint), np.random.default_rng(0)
+    inputs = {
+        name: rng.integers(256, size=(50, *one.shape), dtype=np.uint8)
+        if name == "image"
+        else rng.normal(size=(50, *one.shape)).astype(np.float32) * 3.0
+        for name, one in policy.inputs.items()
+    }
+    assert inputs["image"].shape[1:] == env.observation_size["pixels/front"]
+    assert ("state" in inputs) == (observation != "camera")
+    recording = outputs_of(checkpoint, env, **inputs)
+    assert recording.action.std() > 1e-3
+    for name, one in FORMATS.items():
+        path = tmp_path / one.file
+        one.write(policy, as_jax(checkpoint, env), path)
+        found = difference(recording, one.read(path)(*inputs.values()), policy.controller)
+        assert found < TOLERANCE, name
+    single, speeds = FORMATS["numpy"].read(tmp_path / "policy.py")(*(x[0] for x in inputs.values()))
+    assert np.abs(single - recording.action[0]).max() < TOLERANCE
+    assert speeds.shape == (2,)
+
+
+def test_the_recording_of_a_policy_that_sees_is_of_its_drives(seeing, capsys):
+    checkpoint = load_checkpoint("pretrained:jetbot_camera")
+    env = checkpoint.make_env()
+    with np.load(seeing / "recording.npz") as recording:
+        images = recording["image"]
+    assert (images.shape, images.dtype) == ((1000, 32, 32, 3), np.uint8)
+    first = env.reset(report_keys(1)[0]).obs["pixels/front"]
+    np.testing.assert_array_equal(images[0], first)
+    # The robot turns to the cube and drives to it, again and again: it is red.
+    red = images[..., 0].astype(int) - images[..., 1:].max(axis=-1) > 60
+    share = red.mean(axis=(1, 2))
+    assert share.max() > 0.1
+    assert np.count_nonzero(np.diff(share) < -0.05) >= 3
+    told = json.loads((seeing / "policy.json").read_text())
+    assert all(one["largest_difference"] < TOLERANCE for one in told["files"].values())
+
+
+def test_the_contract_of_a_policy_that_sees_tells_the_image_and_the_camera(seeing):
+    told = json.loads((seeing / "policy.json").read_text())
+    assert told["inputs"] == [{"name": "image", "dtype": "uint8", "shape": [32, 32, 3]}]
+    assert told["observation"] == []
+    image = told["image"]
+    assert (image["height"], image["width"], image["frames"]) == (32, 32, 1)
+    assert image["channels"] == ["red", "green", "blue"]
+    assert (image["dtype"], image["range"]) == ("uint8", [0, 255])
+    assert image["resize"].startswith("area mean")
+    assert image["stacked_by"].startswith("the caller")
+    camera = image["camera"]
+    assert (camera["position"], camera["pitch_down_degrees"]) == ([0.018, 0.0, 0.059], 20.0)
+    assert (camera["lens"], camera["distortion"]) == ("pinhole", [])
+    # 115 degrees from the upper to the lower border.
+    seen = np.degrees(2 * np.arctan(16 / camera["matrix"]["fy"]))
+    assert seen == pytest.approx(115.0)
+
+
+def test_the_numpy_file_that_sees_needs_numpy_alone(seeing, tmp_path):
+    path = seeing / "policy.py"
+    done = alone(
+        site_with(tmp_path, NUMPY),
+        f"import runpy; runpy.run_path({str(path)!r}, run_name='__main__')",
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "from JAX" in done.stdout
+    ast.parse(path.read_text("utf-8"), feature_version=(3, 6))
+
+
+def test_the_onnx_file_that_sees_takes_bytes(seeing):
+    import onnxruntime
+
+    session = onnxruntime.InferenceSession(seeing / "policy.onnx")
+    (one,) = session.get_inputs()
+    assert (one.name, one.type, one.shape) == ("image", "tensor(uint8)", ["batch", 32, 32, 3])
+
+
+def test_the_time_of_a_frame_is_told_for_every_file(seeing, capsys):
+    from benchmarks.throughput import action_latency
+
+    assert action_latency.main([str(seeing), "--calls", "5"]) == 0
+    rows = [line.split() for line in capsys.readouterr().out.splitlines()[1:]]
+    assert [row[0] for row in rows] == list(FORMATS)
+
+
+def test_the_caller_stacks_images_as_the_environment_does(tmp_path):
+    settings = {"task": {"observation": "camera"}, "camera": {"frames": 3}}
+    checkpoint, env = checkpoint_of(settings, tmp_path)
+    FORMATS["numpy"].write(portable_policy(checkpoint), as_jax(checkpoint, env), tmp_path / "p.py")
+    stack = FORMATS["numpy"].read(tmp_path / "p.py").__globals__["stack"]
+    before = None
+    for images in record(checkpoint, env, 8).inputs["image"]:
+        before = stack(images[..., -3:], before)
+        np.testing.assert_array_equal(before, images)
+    assert (before[..., :3] != before[..., 3:6]).any()
+
+
+@pytest.mark.parametrize(
+    ("inputs", "said"),
+    [
+        ((np.zeros((32, 32, 3)),), r"the image is float64 of shape \(32, 32, 3\), not uint8"),
+        ((np.zeros((3, 32, 32), np.uint8),), r"of shape \(3, 32, 32\), not uint8 of \[32, 32, 3\]"),
+        ((np.zeros((32, 32, 3), np.uint8), np.zeros(7)), "give image$"),
+    ],
+)
+def test_what_is_no_image_is_refused(inputs, said, seeing):
+    with pytest.raises(ValueError, match=said):
+        FORMATS["numpy"].read(seeing / "policy.py")(*inputs)
+
+
 # Mistakes.
 
 
@@ -334,10 +466,10 @@ def test_what_differs_from_jax_is_not_written(run_dir, exported, shortly, monkey
     before = {path.name: path.read_bytes() for path in exported.iterdir()}
     write = FORMATS["numpy"].write
 
-    def write_another(source, path):
-        *layers, last = source.policy.layers
+    def write_another(policy, as_jax, path):
+        *layers, last = policy.layers
         other = last._replace(bias=last.bias + np.float32(1e-3))
-        write(source._replace(policy=source.policy._replace(layers=(*layers, other))), path)
+        write(policy._replace(layers=(*layers, other)), as_jax, path)
 
     monkeypatch.setitem(exporters.FORMATS, "numpy", FORMATS["numpy"]._replace(write=write_another))
     for folder in (tmp_path / "new", exported):
@@ -371,7 +503,7 @@ def test_an_export_that_is_stopped_leaves_the_earlier_one(run_dir, exported, sho
 )
 def test_a_difference_is_seen(action, wheel_speeds, run_dir):
     controller = portable_policy(load_checkpoint(run_dir)).controller
-    recording = Recording(np.zeros((2, 16)), np.zeros((2, 2)), np.zeros((2, 2)))
+    recording = Recording({"obs": np.zeros((2, 16))}, np.zeros((2, 2)), np.zeros((2, 2)))
     assert difference(recording, (action, wheel_speeds), controller) > TOLERANCE
     assert difference(recording, recording[1:], controller) == 0.0
 
@@ -409,4 +541,4 @@ def test_a_shorter_recording_is_the_beginning_of_a_longer_one(exported, run_dir)
     checkpoint = load_checkpoint(run_dir)
     short = record(checkpoint, checkpoint.make_env(), 20)
     with np.load(exported / "recording.npz") as recording:
-        np.testing.assert_array_equal(short.obs, recording["obs"][:20])
+        np.testing.assert_array_equal(short.inputs["obs"], recording["obs"][:20])

@@ -13,10 +13,8 @@ import pytest
 pytest.importorskip("gymnasium")
 
 from jetbot_mjx import check_env, evaluate, load_policy, make_env, train
-from jetbot_mjx.adapters import JetBotGymEnv
 from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import ConfigError, parse_config
-from jetbot_mjx.deployment.numpy_policy import portable_policy
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import InvalidError, UserError
@@ -176,18 +174,6 @@ def test_images_too_small_for_the_network_are_refused_before_a_run_begins(config
     with pytest.raises(UserError, match=r"^camera\.width = 16 and camera\.height = 16"):
         train.main(["--config", str(config_file), *arguments])
     assert not run_dir.exists()
-
-
-def test_one_robot_in_mujoco_refuses_images_in_one_line(config_file):
-    with pytest.raises(UserError, match="one robot in C MuJoCo observes numbers only") as error:
-        JetBotGymEnv(config=parse_config(SETTINGS))
-    assert "\n" not in str(error.value)
-
-
-def test_an_export_refuses_images_in_one_line(run):
-    with pytest.raises(UserError, match="only policies that observe numbers") as error:
-        portable_policy(load_checkpoint(run))
-    assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("randomization", [{}, {"start_x": [0.0, 0.1]}])

@@ -9,6 +9,7 @@ import sys
 import time
 from pathlib import Path
 
+import gliding
 import jax
 import numpy as np
 import pytest
@@ -71,7 +72,8 @@ def tell(interrupted, *arguments):
     ppo_trainer._report = reported
     if interrupted == "interrupted":
         TrainerCallback.on_progress = interrupt
-    cli.run_command(lambda _: train.main(arguments))
+    with gliding.everywhere():
+        cli.run_command(lambda _: train.main(arguments))
 
 
 def start(arguments, *, interrupted=False, **variables):
