@@ -11,6 +11,7 @@ import copy
 import math
 import os
 import threading
+import weakref
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
@@ -214,6 +215,30 @@ class MujocoCamera(Camera):
             done.result()
         return images.reshape(*batch, *self.shape)
 
+    def picture(
+        self,
+        position_w: Float[np.ndarray, "3"],
+        quat: Float[np.ndarray, "4"],
+        mocap_positions: Mapping[str, Float[np.ndarray, "3"]],
+        scenery: int = 0,
+    ) -> UInt8[np.ndarray, "h w c"]:
+        """Return the image of one robot, on the host, in the calling thread.
+
+        Args:
+          position_w: position of the axle midpoint [m], world frame.
+          quat: attitude of the robot as a unit quaternion (w, x, y, z).
+          mocap_positions: positions [m] of mocap bodies, world frame, by name.
+          scenery: number of the scenery, with varied appearance.
+        """
+        body = np.empty(9)
+        mujoco.mju_quat2Mat(body, np.asarray(quat, float))
+        body = body.reshape(3, 3)
+        mocap = self._base.body_pos[self._base.body_mocapid >= 0]
+        for name, place in mocap_positions.items():
+            mocap[self._mocap_ids[name]] = place
+        position = np.asarray(position_w, float) + body @ self._mount_position
+        return self._draw(scenery % SCENERIES, position, body @ self._mount_rotation, mocap)
+
     def _draw(
         self,
         number: int,
@@ -252,11 +277,14 @@ class _Stage:
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._buffer = np.empty((height, width, 3), np.uint8)
         self._number: int | None = None
+        # Another context may be current when this one is collected, and would lose its textures.
+        weakref.finalize(self, _free, self._gl, self._context).atexit = False
 
     def set_scenery(self, number: int, scenery: Scenery) -> None:
         """Show a scenery, and upload its textures unless they are there."""
         if number != self._number:
             self._number = number
+            self._gl.make_current()
             for texture in paint(self._model, scenery):
                 mujoco.mjr_uploadTexture(self._model, self._context, texture)
 
@@ -267,6 +295,8 @@ class _Stage:
         mocap: Float[np.ndarray, "nmocap 3"],
     ) -> UInt8[np.ndarray, "H W 3"]:
         """Render a picture; the array is overwritten by the next one."""
+        # A thread may have made several contexts.
+        self._gl.make_current()
         model, data = self._model, self._data
         data.mocap_pos[:] = mocap
         mujoco.mj_kinematics(model, data)
@@ -284,6 +314,13 @@ class _Stage:
         mujoco.mjr_readPixels(self._buffer, None, self._rect, self._context)
         # OpenGL's first row is the lowest.
         return self._buffer[::-1]
+
+
+def _free(gl: Any, context: mujoco.MjrContext) -> None:
+    """Free what a stage holds in OpenGL."""
+    gl.make_current()
+    context.free()
+    gl.free()
 
 
 def _without_robot(model: mujoco.MjModel, robot: str, lens: Lens) -> mujoco.MjModel:

@@ -1,5 +1,7 @@
 """The camera through MuJoCo's renderer: the same directions, other light, and one line without."""
 
+import gc
+
 import jax
 import numpy as np
 import pytest
@@ -121,3 +123,18 @@ def test_without_opengl_one_line_says_so(env, monkeypatch):
     with pytest.raises(UserError, match="no OpenGL") as caught:
         MujocoCamera(CameraConfig(), env.mj_model)
     assert "\n" not in str(caught.value)
+
+
+def test_a_camera_that_is_gone_takes_nothing_from_the_next(env, with_opengl):
+    place = np.array([0.0, 0.0, 0.0325]), np.array([1.0, 0.0, 0.0, 0.0])
+    cube, config = {"goal": GOALS[0]}, CameraConfig(width=16, height=16)
+    first = MujocoCamera(config, env.mj_model, appearance="varied")
+    first.picture(*place, cube, 3)
+    second = MujocoCamera(config, env.mj_model, appearance="varied")
+    wanted = second.picture(*place, cube, 3)
+    first.picture(*place, cube, 5)
+    np.testing.assert_array_equal(second.picture(*place, cube, 3), wanted)
+    del first
+    gc.collect()
+    np.testing.assert_array_equal(second.picture(*place, cube, 3), wanted)
+    assert np.abs(second.picture(*place, cube, 5).astype(int) - wanted).mean() > 2.0
