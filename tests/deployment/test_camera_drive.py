@@ -8,7 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jetbot_mjx import sim2real
 from jetbot_mjx.config import CameraConfig, Config
+from jetbot_mjx.deployment.drive_log import read_log
+from jetbot_mjx.deployment.drive_pictures import picture_strip
 from jetbot_mjx.deployment.policy_spec import _image
 from jetbot_mjx.deployment.simulated_camera import CameraModel, camera_config
 from jetbot_mjx.deployment.simulated_jetbot import MotorModel, SimulatedJetBot
@@ -313,6 +316,43 @@ def test_mistakes_are_told_in_one_line(folder, arguments, said, monkeypatch, cap
     error = capsys.readouterr().err
     assert said in error
     assert error.count("\n") == 1
+
+
+def write_log(path, goal, timeout=2.0):
+    """Drive straight ahead by camera, and log it."""
+    clock, policy = Clock(), make_policy(ahead)
+    settings = camera_sense.CameraSettings(goal=goal)
+    _, lines = by_camera(policy, FakeCamera(clock), clock, timeout, settings)
+    header = drive.log_header(policy, motors.default_calibration(), settings, "camera")
+    path.write_text("".join(json.dumps(line) + "\n" for line in [header, *lines]))
+
+
+@pytest.mark.parametrize("goal", [None, (0.6, 0.0)])
+def test_a_log_is_replayed_with_its_pictures(tmp_path, goal, capsys):
+    write_log(tmp_path / "drive.jsonl", goal)
+    assert sim2real.main([str(tmp_path / "drive.jsonl")]) == 0
+    told = capsys.readouterr().out
+    assert "41 pictures" in told
+    assert ("from the goal" in told) == (goal is not None)
+    found = json.loads((tmp_path / "drive.sim2real.json").read_text())
+    assert (found["goal_distance_logged"] is None) == (goal is None)
+    assert found["position_error_max"] < 0.05
+    log = read_log(tmp_path / "drive.jsonl")
+    np.testing.assert_allclose(log.pictures[0].image.mean((0, 1)), FLOOR, atol=1.5)
+    at = np.array([0.0, 1.0, 2.0])
+    strip = picture_strip(log.header, log.pictures, at, np.zeros((3, 3)))
+    assert strip.shape == (32 if goal is None else 64, 8 * 32, 3)
+    # The simulated robot sees the cube.
+    red = strip[32:].astype(int)
+    assert (goal is None) or np.any(red[..., 0] > 2 * red[..., 1])
+
+
+def test_a_picture_of_another_size_is_no_log(tmp_path):
+    path = tmp_path / "drive.jsonl"
+    write_log(path, None)
+    path.write_text(path.read_text().replace('"height": 32', '"height": 31'))
+    with pytest.raises(UserError, match=r"is not a log of deploy/drive\.py: line 2"):
+        read_log(path)
 
 
 # In the SimulatedJetBot.
