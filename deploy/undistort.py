@@ -124,8 +124,8 @@ class Reducer:
         """
         values = picture.astype(np.float32)
         if self._points is None:
-            values = np.einsum("hH,HWc->hWc", self._rows, values)
-            values = np.einsum("wW,hWc->hwc", self._columns, values)
+            values = np.tensordot(self._rows, values, (1, 0))
+            values = np.tensordot(values, self._columns, (1, 1)).transpose(0, 2, 1)
         else:
             (row, lower, down), (column, further, right) = self._points
             upper = values[row, column] * (1 - right) + values[row, further] * right
