@@ -1,11 +1,14 @@
-"""Drive a JetBot to a goal: `python3 drive.py POLICY --goal X Y`.
+"""Drive a JetBot to a goal: `python3 drive.py POLICY --goal X Y`, or `--camera`.
 
 It runs on the robot with Python 3.6 or newer, NumPy and NVIDIA's `jetbot`. POLICY is the folder
 that `python -m jetbot_mjx.export` wrote. X and Y are metres: ahead and to the left of the robot at
 the start, or in the frame of a tracker (`--tracker PORT`, see poses.py). A tracker on another
 machine needs `--tracker-host 0.0.0.0`, and a key that it shares with the robot.
 
-The motors are set to zero before the first command; while the newest pose is older than
+A policy that sees drives by the robot's camera alone, `--camera`: see camera_sense.py. The goal is
+reached when its nearest edge is `--arrive-within` metres from the axle.
+
+The motors are set to zero before the first command; while the newest pose or picture is older than
 `--stale-after`; at the goal, at `--timeout`, after any error, on Ctrl-C, SIGTERM and SIGHUP.
 `--dry-run` needs no robot and takes poses from dead reckoning. Exit codes: 0 goal reached, 1 goal
 not reached, 2 wrong usage, 128 + n after signal n.
@@ -20,8 +23,16 @@ import signal
 import sys
 import time
 import types
-from typing import Any, Callable, Iterator, NamedTuple, Optional
+from typing import Any, Callable, Iterator, NamedTuple, Optional, Union
 
+from camera_sense import (
+    ARRIVE_WITHIN,
+    FRAME_STALE_AFTER,
+    GOAL_COLOUR,
+    CameraSense,
+    CameraSettings,
+    make_camera,
+)
 from datagrams import Key
 from motors import (
     Calibration,
@@ -33,8 +44,9 @@ from motors import (
     stop,
     wheel_speed,
 )
-from observations import Observer
-from poses import Odometry, Pose, Tracker, udp_tracker
+from observations import PoseSense
+from poses import Odometry, Tracker, udp_tracker
+from undistort import read_lens
 
 LOG_FORMAT = "jetbot_mjx-drive/1"
 
@@ -59,6 +71,8 @@ class Policy(NamedTuple):
     """From an observation to the action and the wheel speeds (left, right) [rad/s]."""
     spec: dict
     """The policy spec, `policy.json`."""
+    stack: Optional[Callable] = None
+    """Stacks the images of several control periods, of a policy that sees."""
 
 
 class Settings(NamedTuple):
@@ -132,7 +146,7 @@ def load_policy(folder: str) -> Policy:
             source = file.read()
         module = types.ModuleType("policy")
         exec(compile(source, path, "exec"), module.__dict__)
-        return Policy(module.__dict__["act"], spec)
+        return Policy(module.__dict__["act"], spec, module.__dict__.get("stack"))
     except OSError as error:
         raise DriveError(f"{folder} is not an exported policy: {error.strerror}")
     except (ValueError, LookupError, TypeError, SyntaxError, RecursionError) as error:
@@ -178,11 +192,36 @@ def drive(
     Raises:
       DriveError: The policy needs an observation that this driver cannot provide.
     """
+    sense = PoseSense(poses, policy.spec, settings)
+    return drive_by(robot, clock, sense, policy, calibration, settings.timeout, log)
+
+
+def drive_by(
+    robot: Any,
+    clock: Any,
+    sense: Any,
+    policy: Policy,
+    calibration: Calibration,
+    timeout: float,
+    log: Optional[Log] = None,
+) -> Outcome:
+    """Drive by a sense, at the control rate of training, and set the motors to zero at the end.
+
+    Args:
+      robot: As for `drive`, like all arguments that are not named here.
+      clock: The clock.
+      sense: A `PoseSense`, or a `CameraSense` of camera_sense.py.
+      policy: The policy.
+      calibration: The calibration of the motors.
+      timeout: Time limit [s].
+      log: The log.
+
+    Returns:
+      The result. The motors are set to zero after an exception too.
+    """
     try:
         stop(robot)
-        return _drive(
-            robot, clock, poses, policy, calibration, settings, log or (lambda line: None)
-        )
+        return _drive(robot, clock, sense, policy, calibration, timeout, log or (lambda line: None))
     finally:
         stop(robot)
 
@@ -190,55 +229,50 @@ def drive(
 def _drive(
     robot: Any,
     clock: Any,
-    poses: Any,
+    sense: Any,
     policy: Policy,
     calibration: Calibration,
-    settings: Settings,
+    timeout: float,
     log: Log,
 ) -> Outcome:
-    observe = Observer(policy.spec)
     period = policy.spec["control_period"]
     # The first call of a policy takes far longer than a period, so make it before the start.
-    policy.act(observe(Pose(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), settings.goal))
+    policy.act(*sense.example())
     start = due = clock.now()
     distance, ticks, late, stale = None, 0, 0, 0
     while True:
-        # Read the pose, and let the policy set the motor values where the pose is fresh.
+        # Let the policy set the motor values where what the sense tells is fresh.
         began = clock.now()
-        pose = poses.read(began)
-        line = {"t": began - start, "fresh": False}
-        values, reached = (0.0, 0.0), False
-        if pose is not None:
-            fresh = began - pose.time <= settings.stale_after
-            distance = math.hypot(settings.goal[0] - pose.x, settings.goal[1] - pose.y)
-            reached = fresh and distance < settings.arrive_within
-            line.update(pose._asdict(), fresh=fresh, pose_age=began - pose.time)
-            del line["time"]
-            if fresh and not reached:
-                action, wheels = policy.act(observe(pose, settings.goal))
-                line["action"] = [float(value) for value in action]
-                line["wheel_speeds"] = [float(value) for value in wheels]
-                values = _motor_values(line["wheel_speeds"], policy, calibration)
+        seen = sense.read(began)
+        line = dict(seen.line, t=began - start, fresh=seen.fresh)
+        distance = distance if seen.distance is None else seen.distance
+        values = (0.0, 0.0)
+        if seen.fresh and not seen.reached:
+            action, wheels = policy.act(*seen.inputs)
+            line["action"] = [float(value) for value in action]
+            line["wheel_speeds"] = [float(value) for value in wheels]
+            values = _motor_values(line["wheel_speeds"], policy, calibration)
 
         # Finish at the goal or the time limit, before the motors are set again.
-        if reached or began - start >= settings.timeout:
+        if seen.reached or began - start >= timeout:
             stop(robot)
-            log(dict(line, motors=[0.0, 0.0], outcome="reached" if reached else "timed out"))
-            return Outcome(reached, began - start, distance, ticks, late, stale)
+            outcome = "reached" if seen.reached else "timed out"
+            log(dict(line, motors=[0.0, 0.0], outcome=outcome))
+            return Outcome(seen.reached, began - start, distance, ticks, late, stale)
 
-        # Set the motors, and tell the pose source for its dead reckoning.
+        # Set the motors, and tell the sense for its dead reckoning.
         robot.set_motors(*values)
         done = clock.now()
         left = wheel_speed(values[0], calibration.left)
         right = wheel_speed(values[1], calibration.right)
-        poses.commanded(done, left, right)
+        sense.commanded(done, left, right)
 
         # Wait for the next period. After a late one the schedule starts anew, so that lost time
         # is not made up by shorter periods.
         due += period
         behind = done > due
         log(dict(line, motors=list(values), latency=done - began, late=behind))
-        ticks, late, stale = ticks + 1, late + behind, stale + (not line["fresh"])
+        ticks, late, stale = ticks + 1, late + behind, stale + (not seen.fresh)
         if behind:
             due = clock.now()
         else:
@@ -257,25 +291,33 @@ def _motor_values(wheel_speeds: list, policy: Policy, calibration: Calibration) 
     )
 
 
-def log_header(policy: Policy, calibration: Calibration, settings: Settings, source: str) -> dict:
+def log_header(
+    policy: Policy,
+    calibration: Calibration,
+    settings: Union[Settings, CameraSettings],
+    source: str,
+) -> dict:
     """Return the first line of a log, with all that is needed to replay the drive.
 
     Args:
       policy: The policy.
       calibration: The calibration of the motors.
       settings: The settings of the drive.
-      source: The name of the pose source.
+      source: The name of the pose source, or `camera`.
     """
-    spec = policy.spec
-    return {
-        "format": LOG_FORMAT,
-        "policy": {name: spec[name] for name in ("run", "env_steps", "task", "robot")},
-        "goal": list(settings.goal),
-        "arrive_within": settings.arrive_within,
-        "control_period": spec["control_period"],
-        "pose_source": source,
-        "calibration": as_json(calibration),
-    }
+    spec, by_camera = policy.spec, isinstance(settings, CameraSettings)
+    arrival = ("arrive_within", "goal_colour") if by_camera else ("arrive_within",)
+    return dict(
+        {name: getattr(settings, name) for name in arrival},
+        format=LOG_FORMAT,
+        policy={name: spec[name] for name in ("run", "env_steps", "task", "robot")},
+        goal=None if settings.goal is None else list(settings.goal),
+        control_period=spec["control_period"],
+        # Beside the camera, poses are those of dead reckoning.
+        pose_source="odometry" if by_camera else source,
+        calibration=as_json(calibration),
+        **({"image": spec["image"]} if by_camera else {}),
+    )
 
 
 @contextlib.contextmanager
@@ -351,8 +393,25 @@ def _parser() -> argparse.ArgumentParser:
         nargs=2,
         type=at_least(-1000.0, 1000.0),
         metavar=("X", "Y"),
-        required=True,
-        help="position of the goal [m]",
+        help="position of the goal [m]; with --camera for the log alone",
+    )
+    parser.add_argument("--camera", action="store_true", help="drive by the robot's camera alone")
+    parser.add_argument(
+        "--undistort", metavar="FILE", help="OpenCV's calibration of the lens, to take it out"
+    )
+    parser.add_argument(
+        "--arrive-within",
+        type=at_least(0.01, 1.0),
+        metavar="M",
+        help="with --camera: distance from the axle to the edge of the goal when reached [m]"
+        f" (default: {ARRIVE_WITHIN:g})",
+    )
+    parser.add_argument(
+        "--goal-colour",
+        nargs=3,
+        type=at_least(0.0, 255.0),
+        metavar=("R", "G", "B"),
+        help=f"colour of the goal (default: {' '.join(map(str, GOAL_COLOUR))})",
     )
     parser.add_argument("--calibration", metavar="FILE", help="file that calibrate.py wrote")
     parser.add_argument(
@@ -377,13 +436,13 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--stale-after",
         type=at_least(0.0),
-        default=STALE_AFTER,
         metavar="S",
-        help="age of a pose above which the motors stop [s] (default: 0.08)",
+        help="age of a pose or picture above which the motors stop [s]"
+        f" (default: {STALE_AFTER:g}; of a picture {FRAME_STALE_AFTER:g})",
     )
     parser.add_argument("--log", metavar="FILE", help="file for one JSON object per control period")
     parser.add_argument(
-        "--dry-run", action="store_true", help="run without a robot, by dead reckoning"
+        "--dry-run", action="store_true", help="turn no motor; by dead reckoning, or --camera"
     )
     return parser
 
@@ -396,6 +455,36 @@ def _pose_source(options: argparse.Namespace, calibration: Calibration) -> Any:
                 raise DriveError(f"--tracker-{name} needs a tracker: give --tracker PORT too")
         return Odometry(calibration)
     return udp_tracker(options.tracker, host or "127.0.0.1", None if key is None else Key(key))
+
+
+def _sense(options: argparse.Namespace, policy: Policy, calibration: Calibration) -> tuple:
+    """Return the sense of a drive, and what is to be closed at its end."""
+    if not options.camera:
+        for name in ("undistort", "arrive_within", "goal_colour"):
+            if getattr(options, name) is not None:
+                flag = name.replace("_", "-")
+                raise DriveError(f"--{flag} is about pictures: give --camera too")
+        if options.goal is None:
+            raise DriveError("give --goal X Y, or --camera for a policy that sees")
+        stale_after = STALE_AFTER if options.stale_after is None else options.stale_after
+        within = arrival_radius(policy.spec)
+        settings = Settings(tuple(options.goal), options.timeout, stale_after, within)
+        poses = _pose_source(options, calibration)
+        return PoseSense(poses, policy.spec, settings), poses, settings
+    if options.tracker is not None:
+        raise DriveError("--tracker and --camera are two senses: give one")
+    given = {
+        "stale_after": options.stale_after,
+        "arrive_within": options.arrive_within,
+        "goal_colour": options.goal_colour and tuple(options.goal_colour),
+        "goal": options.goal and tuple(options.goal),
+        "lens": options.undistort and read_lens(options.undistort),
+    }
+    settings = CameraSettings(**{name: one for name, one in given.items() if one is not None})
+    # Check policy and colour before the camera starts, which takes seconds.
+    CameraSense(None, policy, calibration, settings)
+    sense = CameraSense(make_camera(), policy, calibration, settings)
+    return sense, sense, settings
 
 
 def main(arguments: Optional[list] = None, clock: Any = None) -> int:
@@ -414,30 +503,26 @@ def main(arguments: Optional[list] = None, clock: Any = None) -> int:
         calibration = default_calibration()
         if options.calibration:
             calibration = read_calibration(options.calibration)
-        settings = Settings(
-            tuple(options.goal),
-            options.timeout,
-            options.stale_after,
-            arrival_radius(policy.spec),
-        )
         robot = NoRobot() if options.dry_run else make_robot()
-        poses = _pose_source(options, calibration)
-        with contextlib.closing(poses), _log_file(options.log) as log, _exiting_on_signals():
+        sense, source, settings = _sense(options, policy, calibration)
+        with contextlib.closing(source), _log_file(options.log) as log, _exiting_on_signals():
             if log is not None:
-                log(log_header(policy, calibration, settings, poses.name))
-            outcome = drive(robot, clock or WallClock(), poses, policy, calibration, settings, log)
+                log(log_header(policy, calibration, settings, source.name))
+            outcome = drive_by(
+                robot, clock or WallClock(), sense, policy, calibration, options.timeout, log
+            )
     except DriveError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
-    if isinstance(poses, Tracker) and poses.rejected:
-        print(f"{poses.rejected} datagrams were rejected, the last because {poses.reason}")
-    distance = "without any pose"
+    if isinstance(source, Tracker) and source.rejected:
+        print(f"{source.rejected} datagrams were rejected, the last because {source.reason}")
+    distance = "by camera" if options.camera else "without any pose"
     if outcome.distance is not None:
         distance = f"{outcome.distance:.3f} m from the goal"
     print(
         f"{'reached' if outcome.reached else 'not reached'} after {outcome.seconds:.2f} s,"
         f" {distance}; {outcome.ticks} periods, {outcome.late_ticks} late,"
-        f" {outcome.stale_ticks} without a fresh pose"
+        f" {outcome.stale_ticks} without a fresh {'picture' if options.camera else 'pose'}"
     )
     return 0 if outcome.reached else 1
 

@@ -1,15 +1,34 @@
 """Compute the observations that `policy.json` lists, from a pose on the floor and a goal.
 
+A sense tells the driver what it needs in every control period: `PoseSense` from a pose source, and
+`CameraSense` of camera_sense.py from pictures.
+
 It needs Python 3.6 and the standard library. Height and tilt are those of the robot at rest.
 """
 
 import math
+from typing import Any, NamedTuple, Optional
 
 from motors import DriveError
 from poses import Pose
 
 # Least distance by which `goal_direction` divides, as in training [m].
 _MIN_DISTANCE = 1e-3
+
+
+class Reading(NamedTuple):
+    """What a sense tells in one control period."""
+
+    fresh: bool
+    """Whether it is new enough to drive by."""
+    reached: bool
+    """Whether the goal is reached."""
+    inputs: tuple
+    """The inputs of the policy; empty unless `fresh`."""
+    distance: Optional[float]
+    """Distance from the goal [m]; None: not known."""
+    line: dict
+    """Entries for the log."""
 
 
 class Observer:
@@ -67,3 +86,48 @@ class Observer:
             ("forward_speed", "body"): [pose.speed],
             ("yaw_rate", "body"): [pose.yaw_rate],
         }
+
+
+class PoseSense:
+    """What a policy needs to know, from a pose source and a goal."""
+
+    def __init__(self, poses: Any, spec: dict, settings: Any) -> None:
+        """Check that the observation can be computed.
+
+        Args:
+          poses: A pose source of `poses.py`.
+          spec: The policy spec.
+          settings: Goal, `stale_after` and `arrive_within` of the drive.
+
+        Raises:
+          DriveError: The policy needs an observation that this driver cannot provide.
+        """
+        self._poses, self._settings = poses, settings
+        if "image" in spec:
+            raise DriveError("this policy sees: drive with --camera")
+        self._observe = Observer(spec)
+
+    def example(self) -> tuple:
+        """Return the inputs of the policy's first call, which takes longest."""
+        return (self._observe(Pose(0.0, 0.0, 0.0, 0.0, 0.0, 0.0), self._settings.goal),)
+
+    def read(self, now: float) -> Reading:
+        """Read the newest pose.
+
+        Args:
+          now: The time on the driver's clock [s].
+        """
+        pose, goal = self._poses.read(now), self._settings.goal
+        if pose is None:
+            return Reading(False, False, (), None, {})
+        fresh = now - pose.time <= self._settings.stale_after
+        distance = math.hypot(goal[0] - pose.x, goal[1] - pose.y)
+        line = dict(pose._asdict(), pose_age=now - pose.time)
+        del line["time"]
+        inputs = (self._observe(pose, goal),) if fresh else ()
+        reached = fresh and distance < self._settings.arrive_within
+        return Reading(fresh, reached, inputs, distance, line)
+
+    def commanded(self, now: float, left: float, right: float) -> None:
+        """Pass the speeds [m/s] on to the pose source."""
+        self._poses.commanded(now, left, right)

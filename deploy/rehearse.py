@@ -3,6 +3,7 @@
 It runs where jetbot_mjx is installed. The robot is a `SimulatedJetBot`, with delay, dead-band and
 lag between motor value and wheel. A simulated tracker sends its pose `--rate` times a second, with
 noise of `--noise` metres. Goals are drawn as in the tutorial, and each drive starts at the origin.
+With `--camera` a policy drives by pictures: see rehearse_camera.py.
 """
 
 import argparse
@@ -16,8 +17,11 @@ import numpy as np
 from drive import Outcome, Policy, Settings, arrival_radius, at_least, drive, load_policy
 from motors import Calibration, DriveError, check_calibration, default_calibration
 from poses import Tracker
+from rehearse_camera import CameraRehearsal, summary
 
+from jetbot_mjx.deployment.simulated_camera import CameraModel
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, SimulatedJetBot
+from jetbot_mjx.errors import UserError
 
 
 class Camera:
@@ -121,8 +125,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--delay",
         type=at_least(0.0),
-        default=nominal.delay,
-        help="of the motors [s] (default: 0.05)",
+        help=f"of the motors [s] (default: {nominal.delay:g}; with --camera 0)",
     )
     parser.add_argument(
         "--lag", type=at_least(0.0), default=nominal.lag, help="of the motors [s] (default: 0.1)"
@@ -151,7 +154,53 @@ def _parser() -> argparse.ArgumentParser:
         default=0.95,
         help="share of the goals to reach for exit code 0 (default: 0.95)",
     )
+    parser.add_argument(
+        "--lost", type=at_least(0.0, 1.0), default=0.0, help="share of lost motor values"
+    )
+    _add_camera_arguments(parser)
     return parser
+
+
+def _add_camera_arguments(parser: argparse.ArgumentParser) -> None:
+    usual = CameraModel()
+    parser.add_argument("--camera", action="store_true", help="drive by pictures alone")
+    parser.add_argument(
+        "--latency",
+        type=at_least(0.0),
+        default=usual.latency,
+        help="from the light to the driver [s] (default: 0.08)",
+    )
+    parser.add_argument(
+        "--frame-rate", type=at_least(1.0), default=usual.rate, help="pictures per second"
+    )
+    parser.add_argument(
+        "--dropped", type=at_least(0.0, 1.0), default=usual.dropped, help="share of lost pictures"
+    )
+    parser.add_argument(
+        "--appearance", choices=("plain", "varied"), default="plain", help="of the pictures"
+    )
+    parser.add_argument(
+        "--faults", type=int, default=20, help="drives with a broken camera (default: 20)"
+    )
+    parser.add_argument(
+        "--searches", type=int, default=5, help="drives that begin without a cube (default: 5)"
+    )
+
+
+def _by_camera(policy: Policy, motors: MotorModel, options: argparse.Namespace) -> int:
+    """Rehearse a policy that sees, print the result and return the exit code."""
+    camera = CameraModel(options.latency, options.frame_rate, options.dropped)
+    calibration = true_calibration(motors)
+    rehearsal = CameraRehearsal(policy, calibration, motors, camera, options.appearance)
+    outcomes = [
+        rehearsal.drive(goal, options.timeout, number)
+        for number, goal in enumerate(draw_goals(options.goals))
+    ]
+    faults = rehearsal.faults(options.faults)
+    searches = [rehearsal.search(options.timeout, seed) for seed in range(options.searches)]
+    print(summary(outcomes, faults, searches))
+    reached = sum(outcome.reached for outcome in outcomes)
+    return int(reached < options.min_success * len(outcomes))
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -170,10 +219,15 @@ def main(arguments: list[str] | None = None) -> int:
             raise DriveError(f"--goals {options.goals}: give at least 1")
         policy = load_policy(options.policy)
         began = time.monotonic()
+        delay = options.delay
+        if delay is None:
+            delay = 0.0 if options.camera else MotorModel().delay
         motors = MotorModel()._replace(
-            delay=options.delay, lag=options.lag, dead_band=(options.dead_band,) * 2
+            delay=delay, lag=options.lag, dead_band=(options.dead_band,) * 2, lost=options.lost
         )
         check_calibration(true_calibration(motors))
+        if options.camera:
+            return _by_camera(policy, motors, options)
         outcomes = rehearse(
             policy,
             draw_goals(options.goals),
@@ -182,13 +236,13 @@ def main(arguments: list[str] | None = None) -> int:
             noise=options.noise,
             timeout=options.timeout,
         )
-    except DriveError as error:
+    except (DriveError, UserError) as error:
         print(f"error: {error}", file=sys.stderr)
         return 2
     reached = [outcome.seconds for outcome in outcomes if outcome.reached]
     median = f", median time {statistics.median(reached):.2f} s" if reached else ""
     print(
-        f"{len(reached)} of {len(outcomes)} goals reached{median}; delay {options.delay:g} s,"
+        f"{len(reached)} of {len(outcomes)} goals reached{median}; delay {delay:g} s,"
         f" lag {options.lag:g} s, dead-band {options.dead_band:g};"
         f" computed in {time.monotonic() - began:.0f} s"
     )

@@ -152,7 +152,7 @@ _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
-    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `offscreen.find_backend` reports
+    # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `opengl.find_backend` reports
     # the reason if images are needed. PyOpenGL raises an AttributeError if the library is missing.
     "mujoco.rendering.classic.gl_context": lambda: contextlib.suppress(
         ImportError, AttributeError, OSError, RuntimeError

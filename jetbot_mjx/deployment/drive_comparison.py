@@ -62,14 +62,20 @@ def compare_drive(
 def summarize_drive(comparison: DriveComparison) -> str:
     """Return a comparison as lines for the terminal."""
     found = comparison.metrics
+    seen = f", {found['pictures']} pictures" if found["pictures"] else ""
+    to_goal = ""
+    if found["goal_distance_logged"] is not None:
+        to_goal = (
+            f"from the goal at the end: {found['goal_distance_logged']:.3f} m logged,"
+            f" {found['goal_distance_simulated']:.3f} m simulated\n"
+        )
     return (
         f"{found['outcome']} after {found['seconds']:.2f} s; {found['poses']} poses by"
-        f" {found['pose_source']}, {found['stale_periods']} of {found['periods']} periods without a"
-        " fresh one\n"
+        f" {found['pose_source']}{seen}, {found['stale_periods']} of {found['periods']} periods"
+        " without a fresh one\n"
         f"simulated from logged: {1e3 * found['position_error_final']:.0f} mm at the end,"
         f" {1e3 * found['position_error_max']:.0f} mm at most, over"
         f" {found['path_length_logged']:.2f} m\n"
-        f"from the goal at the end: {found['goal_distance_logged']:.3f} m logged,"
-        f" {found['goal_distance_simulated']:.3f} m simulated\n"
+        f"{to_goal}"
         f"{comparison.image}\n{comparison.json}"
     )

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
 
+from jetbot_mjx.deployment.drive_pictures import LoggedPicture, picture_strip, read_picture
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, replayed
 from jetbot_mjx.errors import UserError
 
@@ -26,8 +27,8 @@ class DriveLog(NamedTuple):
     """Policy, goal and pose source."""
     calibration: MotorModel
     """The motors that the driver assumed, without a delay."""
-    goal_w: tuple[float, float]
-    """Position of the goal in the frame of the poses [m]."""
+    goal_w: tuple[float, float] | None
+    """Position of the goal in the frame of the poses [m]; None: a drive by camera knows none."""
     outcome: str
     """`reached`, `timed out`, or `interrupted` where the log has no end."""
     times: Float[np.ndarray, " n"]
@@ -41,7 +42,9 @@ class DriveLog(NamedTuple):
     latencies: Float[np.ndarray, " k"]
     """Time from the start of a period to the motor command [s]."""
     stale_ticks: int
-    """Periods without a fresh pose."""
+    """Periods without a fresh pose or picture."""
+    pictures: tuple[LoggedPicture, ...]
+    """The images of a drive by camera."""
 
 
 class Replay(NamedTuple):
@@ -80,11 +83,12 @@ def read_log(path: Path) -> DriveLog:
     # Parse the header and one line per control period; the number tells where a log is wrong.
     times, motors, latencies = [], [], []
     poses: dict[float, tuple[float, ...]] = {}
+    pictures: list[LoggedPicture | None] = []
     outcome, stale_ticks, number = "interrupted", 0, 1
     try:
         header = json.loads(lines[0])
         calibration = _parse_calibration(header)
-        x, y = map(float, header["goal"])
+        goal_w = _parse_goal(header)
         for number, text in enumerate(lines[1:], start=2):
             if number == len(lines) and not text.endswith("}"):
                 break  # The drive ended while this line was written.
@@ -99,6 +103,7 @@ def read_log(path: Path) -> DriveLog:
                 pose_time = round(times[-1] - float(period["pose_age"]), 6)
                 pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
                 poses.setdefault(pose_time, pose)
+            pictures.append(read_picture(header, period, times[-1]))
             if "latency" in period:
                 latencies.append(float(period["latency"]))
     except (ValueError, TypeError, LookupError, AttributeError) as error:
@@ -115,7 +120,7 @@ def read_log(path: Path) -> DriveLog:
         path=path,
         header=header,
         calibration=calibration,
-        goal_w=(x, y),
+        goal_w=goal_w,
         outcome=outcome,
         times=np.array(times),
         motors=np.array(motors),
@@ -123,6 +128,7 @@ def read_log(path: Path) -> DriveLog:
         poses=np.array(list(poses.values())),
         latencies=np.array(latencies),
         stale_ticks=stale_ticks,
+        pictures=tuple(picture for picture in pictures if picture is not None),
     )
 
 
@@ -133,6 +139,14 @@ def _read_lines(path: Path) -> list[str]:
         raise UserError(f"{path} cannot be read: {error.strerror}") from None
     except UnicodeDecodeError:
         raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
+
+
+def _parse_goal(header: Any) -> tuple[float, float] | None:
+    """Return the position of the goal; only a drive by camera may have none."""
+    if header["goal"] is None and "image" in header:
+        return None
+    x, y = map(float, header["goal"])
+    return x, y
 
 
 def _parse_calibration(header: Any) -> MotorModel:
@@ -182,7 +196,9 @@ def metrics(replay: Replay) -> dict[str, Any]:
     def length(path: Float[np.ndarray, "m 3"]) -> float:
         return float(np.linalg.norm(np.diff(path[:, :2], axis=0), axis=-1).sum())
 
-    def to_goal(pose: Float[np.ndarray, "3"]) -> float:
+    def to_goal(pose: Float[np.ndarray, "3"]) -> float | None:
+        if log.goal_w is None:
+            return None
         return float(np.linalg.norm(pose[:2] - np.array(log.goal_w)))
 
     return {
@@ -194,6 +210,7 @@ def metrics(replay: Replay) -> dict[str, Any]:
         "poses": len(log.poses),
         "periods": len(log.times),
         "stale_periods": log.stale_ticks,
+        "pictures": len(log.pictures),
         "rate": float(1.0 / np.median(periods)) if len(periods) and np.median(periods) else None,
         "latency_median": float(np.median(log.latencies)) if len(log.latencies) else None,
         "latency_p95": float(np.percentile(log.latencies, 95)) if len(log.latencies) else None,
@@ -219,13 +236,17 @@ def plot(replay: Replay) -> Figure:
       The figure.
     """
     log = replay.log
-    figure = Figure(figsize=(10, 4.6), layout="constrained")
-    axes = figure.subplot_mosaic([["plan", "place"], ["plan", "turn"]])
+    layout: list[Any] = [["plan", "place"], ["plan", "turn"]]
+    if log.pictures:
+        layout.append(["seen", "seen"])
+    figure = Figure(figsize=(10, 4.6 + 2.2 * bool(log.pictures)), layout="constrained")
+    axes = figure.subplot_mosaic(layout)
     plan = axes["plan"]
     plan.plot(*log.poses[:, :2].T, color="C0", label=f"logged ({log.outcome})")
     plan.plot(*replay.simulated[:, :2].T, color="C1", linestyle="--", label="simulated")
     plan.plot(*log.poses[0, :2], "o", color="C0", markersize=5)
-    plan.plot(*log.goal_w, "s", color="C2", label="goal")
+    if log.goal_w is not None:
+        plan.plot(*log.goal_w, "s", color="C2", label="goal")
     plan.set(xlabel="x [m]", ylabel="y [m]", title="From above")
     plan.set_aspect("equal", adjustable="datalim")
     plan.margins(0.1)
@@ -238,4 +259,10 @@ def plot(replay: Replay) -> Figure:
     turn.set(xlabel="time [s]", ylabel="heading error [°]")
     for panel in (place, turn):
         panel.grid(visible=True)
+    if log.pictures:
+        seen = axes["seen"]
+        strip = picture_strip(log.header, log.pictures, log.pose_times, replay.simulated)
+        seen.imshow(strip, interpolation="nearest")
+        below = "" if log.goal_w is None else "; below, what the simulated robot sees"
+        seen.set(title=f"What the camera saw{below}", xticks=[], yticks=[])
     return figure

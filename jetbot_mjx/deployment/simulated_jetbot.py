@@ -12,7 +12,7 @@ and a lag:
 import collections
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import mujoco
@@ -37,6 +37,8 @@ class MotorModel(NamedTuple):
     """Time constant [s]. PICOBOT: 0.085."""
     delay: float = 0.05
     """Delay from setting a motor value to its effect on the motor [s]."""
+    lost: float = 0.0
+    """Share of the motor values that the bus loses, so that the ones before stay."""
 
 
 class Pose(NamedTuple):
@@ -65,6 +67,9 @@ class SimulatedJetBot:
         self._model = make_mj_model(robot, PhysicsConfig(), visual=False)
         self._data = mujoco.MjData(self._model)
         self._time = 0.0
+        self._rng = np.random.default_rng(0)
+        self.watchers: list[Callable[[], None]] = []
+        """Functions that are called after every physics step, such as a camera's."""
         self.place(Pose(0.0, 0.0, 0.0))
 
     def place(self, pose: Pose) -> None:
@@ -78,7 +83,7 @@ class SimulatedJetBot:
         self._wheels = np.zeros(2)
         self._pending: collections.deque[tuple[float, np.ndarray]] = collections.deque()
         self.motors = (0.0, 0.0)
-        """The last motor values (left, right)."""
+        """The last motor values (left, right) that arrived."""
 
     def set_motors(self, left_speed: float, right_speed: float) -> None:
         """Set both motor values, as `jetbot.Robot` does.
@@ -87,6 +92,8 @@ class SimulatedJetBot:
           left_speed: Motor value of the left motor in [-1, 1]; values outside are clipped.
           right_speed: Motor value of the right motor.
         """
+        if self.motor_model.lost > 0 and self._rng.random() < self.motor_model.lost:
+            return
         self.motors = (float(left_speed), float(right_speed))
         values = np.clip(self.motors, -1.0, 1.0)
         self._pending.append((self._time + self.motor_model.delay, values))
@@ -118,6 +125,11 @@ class SimulatedJetBot:
         yaw = math.atan2(2.0 * (w * k + i * j), 1.0 - 2.0 * (j * j + k * k))
         return Pose(float(x), float(y), yaw)
 
+    def attitude(self) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "4"]]:
+        """Return the position [m] of the axle midpoint, and the attitude (w, x, y, z)."""
+        qpos = self._data.qpos
+        return qpos[QPOS_XYZ].copy(), qpos[QPOS_QUAT].copy()
+
     def speed(self) -> float:
         """Return the speed of the axle midpoint over the floor [m/s]."""
         return float(np.hypot(*self._data.qvel[:2]))
@@ -132,6 +144,8 @@ class SimulatedJetBot:
         self._data.ctrl[:] = self._wheels
         mujoco.mj_step(self._model, self._data)
         self._time += dt
+        for watch in self.watchers:
+            watch()
 
 
 def _wheel_speed(value: float, dead_band: float, full_speed: float) -> float:

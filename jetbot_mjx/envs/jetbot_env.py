@@ -118,6 +118,16 @@ class JetBotEnv(brax.envs.Env):
         env.camera = None
         return env
 
+    def with_camera(self, camera: Camera) -> "JetBotEnv":
+        """Return a copy of this environment that sees through another camera.
+
+        Args:
+          camera: a camera whose images have the same shape.
+        """
+        env = copy.copy(self)
+        env.camera = camera
+        return env
+
     @property
     def mjx_model(self) -> mjx.Model:
         """Return the MJX model that is stepped."""

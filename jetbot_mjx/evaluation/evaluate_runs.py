@@ -89,6 +89,8 @@ def evaluate_in_mujoco(
 ) -> MujocoResult:
     """Evaluate one policy in C MuJoCo, without writing anything.
 
+    A policy that sees is evaluated by the pictures of MuJoCo's renderer too.
+
     Args:
       run_or_checkpoint: A run folder, or one of its checkpoint folders.
       episodes: The number of fixed goals, from the first on.
@@ -100,11 +102,13 @@ def evaluate_in_mujoco(
       The metrics.
 
     Raises:
-      UserError: there is no usable checkpoint, or JAX was told to do without a CPU.
+      UserError: there is no usable checkpoint, JAX was told to do without a CPU, or the policy
+        sees and this machine has no OpenGL.
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     robots = _read_ranges(ranges) or checkpoint.config.randomization
-    evaluator = MujocoEvaluator(checkpoint.make_env(), checkpoint.networks, robots, numerics)
+    env = checkpoint.make_env()
+    evaluator = MujocoEvaluator(env, checkpoint.networks, robots, numerics, pictures=True)
     return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
@@ -246,6 +250,7 @@ class _Reporter:
         """Take the options of `evaluate_run`."""
         self._keys, self._versions = report_keys(episodes), versions()
         self._robustness, self._in_mujoco = robustness, robustness or simulator is not None
+        self._pictures = simulator is not None
         self._ranges, self._ranges_file = _read_ranges(ranges), ranges
         self._built_for: tuple[Any, ...] = ()
 
@@ -275,8 +280,10 @@ class _Reporter:
         if ranges.drawn:
             varied = DomainRandomizationWrapper(env, ranges=ranges)
             self._randomized = Evaluator(varied, networks, programs)
-        self._mujoco = MujocoEvaluator(env, networks, ranges) if self._in_mujoco else None
         self._moments = MomentFinder(env, networks, programs) if env.camera else None
+        self._mujoco = None
+        if self._in_mujoco:
+            self._mujoco = MujocoEvaluator(env, networks, ranges, pictures=self._pictures)
         self._built_for = parts
 
     def _on_other_robots(self, checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
@@ -312,6 +319,7 @@ class _Reporter:
         parts = {
             "robustness": self._robustness,
             "mujoco": self._in_mujoco,
+            "rendered": self._pictures and env.camera is not None,
             "randomized": bool(ranges.drawn),
         }
         has = frozenset(name for name, wanted in parts.items() if wanted)

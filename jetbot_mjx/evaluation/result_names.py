@@ -5,8 +5,9 @@ from pathlib import Path
 
 from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, REPORT_GOALS
 
-PARTS = ("robustness", "randomized", "mujoco")
-"""Parts of a report that are written on request or if the run has ranges; keys of its JSON file."""
+PARTS = ("robustness", "randomized", "mujoco", "rendered")
+"""Parts of a report that are written on request or if the run has ranges; keys of its JSON file,
+but `rendered`, which is a key below `mujoco`."""
 
 
 def name_with_count(name: str, count: int, default: int, unit: str = "") -> str:
@@ -75,7 +76,8 @@ def _goals_and_parts(folder: Path) -> tuple[int, frozenset[str]] | None:
         values = json.loads((folder / "report.json").read_text(encoding="utf-8"))
         if values["goal_set_version"] != GOAL_SET_VERSION:
             return None
-        parts = frozenset(part for part in PARTS if values.get(part) is not None)
+        found = {**values, "rendered": (values.get("mujoco") or {}).get("rendered")}
+        parts = frozenset(part for part in PARTS if found.get(part) is not None)
         return int(values["policy"]["episodes"]), parts
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         # Whatever cannot be read is not worth keeping.

@@ -17,7 +17,7 @@ Sources of the ranges in `assets/robustness.yaml`, by tag; BOM, EST and SIM are 
   WHEELEDLAB  WheeledLab: domain randomization of a drifting car
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,6 +29,8 @@ from jetbot_mjx.agents.networks import Networks, PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
 from jetbot_mjx.config import RandomizationConfig, read_yaml
+from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
+from jetbot_mjx.envs.camera.scenery import Appearance
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.look_params import LookParams
@@ -55,6 +57,11 @@ ROBUST_SUCCESS_RATE = 0.95
 
 Variant = tuple[RobotParams, LookParams]
 """A robot, and what its camera sees."""
+
+RENDERED_GOALS = 256
+"""Number of the report's fixed goals that a policy drives to by MuJoCo's pictures."""
+
+_APPEARANCES: tuple[Appearance, ...] = ("plain", "varied")
 
 
 class Sweep(NamedTuple):
@@ -207,6 +214,10 @@ class MujocoResult(NamedTuple):
     """Metrics with the preset's robot."""
     randomized: Summary | None = None
     """Metrics with a robot sampled for each goal; None without ranges to sample from."""
+    rendered: Mapping[str, Summary] | None = None
+    """Metrics with the preset's robot and the pictures of MuJoCo's renderer, by appearance, on
+    the first `RENDERED_GOALS` goals; None where they were not asked for, or the policy does not
+    see."""
 
 
 class MujocoEvaluator:
@@ -218,6 +229,8 @@ class MujocoEvaluator:
         networks: Networks,
         ranges: RandomizationConfig | None = None,
         numerics: Numerics = OTHER_NUMERICS,
+        *,
+        pictures: bool = False,
     ) -> None:
         """Build the simulator, whose programs compile at their first use.
 
@@ -227,9 +240,12 @@ class MujocoEvaluator:
           ranges: ranges from which a robot is sampled for each goal, in addition to the
             evaluation with the preset's robot; None: no sampled robots.
           numerics: numerical settings of C MuJoCo.
+          pictures: whether a policy that sees is evaluated also by the pictures of MuJoCo's own
+            renderer.
 
         Raises:
-          UserError: JAX is configured without a CPU.
+          UserError: JAX is configured without a CPU, or pictures are asked for on a machine
+            without OpenGL.
         """
         self._numerics, self._dt = numerics, env.dt
         simulator = in_mujoco(env, numerics)
@@ -238,6 +254,13 @@ class MujocoEvaluator:
         if ranges is not None and ranges.drawn:
             envs.append(DomainRandomizationWrapper(simulator, ranges=ranges))
         self._evaluators = [Evaluator(one, networks, programs) for one in envs]
+        self._rendered: dict[Appearance, Evaluator] = {}
+        if pictures and env.camera is not None:
+            config, model = env.camera.config, env.mj_model
+            for name in _APPEARANCES:
+                camera = MujocoCamera(config, model, appearance=name)
+                own = Evaluator(simulator.with_camera(camera), networks, programs)
+                self._rendered[name] = own
 
     def run(self, params: PolicyParams, keys: UInt32[Array, "n 2"]) -> MujocoResult:
         """Evaluate a policy.
@@ -248,7 +271,12 @@ class MujocoEvaluator:
         """
         with default_device_cpu(), stage("in C MuJoCo"):
             found = [summarize(one.run(params, keys), self._dt) for one in self._evaluators]
-        return MujocoResult(self._numerics, *found)
+            rendered = {
+                name: summarize(one.run(params, keys[:RENDERED_GOALS]), self._dt)
+                for name, one in self._rendered.items()
+            }
+        randomized = found[1] if len(found) > 1 else None
+        return MujocoResult(self._numerics, found[0], randomized, rendered or None)
 
 
 def robust_range(result: SweepResult) -> tuple[float, float] | None:

@@ -74,6 +74,8 @@ def policies_table(policies: Mapping[str, Report]) -> str:
         rows += _rows(name, report.policy, report.randomized)
         if report.mujoco:
             rows += _rows(f"{name} in C MuJoCo", report.mujoco.policy, report.mujoco.randomized)
+            for appearance, summary in (report.mujoco.rendered or {}).items():
+                rows += _rows(f"{name} in C MuJoCo, {appearance} pictures", summary)
     for name, summary in first.baselines.items():
         rows += _rows(name, summary)
     if best := first.best_known:

@@ -10,6 +10,7 @@ from typing import Any, Self
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import Config
+from jetbot_mjx.envs.opengl import find_backend
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.checkpoint import POLICY
@@ -32,7 +33,6 @@ from jetbot_mjx.runs.sb3_tags import aliases
 from jetbot_mjx.runs.wandb_sink import WandbSink
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.console import Phase, Terminal
-from jetbot_mjx.viewers.offscreen import find_backend
 from jetbot_mjx.viewers.video import EvaluationVideo
 
 

@@ -1,18 +1,9 @@
-"""Render images of the simulation without a display.
-
-MuJoCo chooses its OpenGL back end from `MUJOCO_GL` when it is imported, before anybody knows
-whether it works. This module tries each back end in a subprocess, and uses the first that works.
-"""
+"""Render images of the simulation without a display."""
 
 import contextlib
 import copy
-import functools
-import importlib
 import itertools
 import math
-import os
-import subprocess
-import sys
 from collections.abc import Mapping
 from typing import Any
 from unittest import mock
@@ -23,15 +14,9 @@ from jaxtyping import Float, UInt8
 from mujoco.rendering.classic import gl_context
 from PIL import Image
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.envs.opengl import context_class
 from jetbot_mjx.viewers.camera import camera_axes, eye_that_sees
 from jetbot_mjx.viewers.pose import set_pose
-
-_BACKENDS = ("egl", "osmesa", "glfw")
-
-_UNDECIDED = ("", "0", "1", "disable", "disabled", "enable", "enabled", "false", "off", "on")
-_UNDECIDED += ("true", "cgl", "glx", "wgl")
-"""Other values of `MUJOCO_GL` that MuJoCo accepts; with these, this module chooses."""
 
 _OVERSAMPLING = 2
 """Rendered pixels per pixel of the image, along each axis. This is as smooth as OpenGL's four
@@ -43,19 +28,6 @@ _TRAIL_WIDTH = 0.01  # fraction of the image's width
 _NEAR = 0.005  # [m] near clipping plane: the onboard camera comes close to the goal
 _ELEVATION = -50.0  # [degrees] elevation of the overview camera
 _NEAREST = 1.2  # [m] smallest distance from the overview camera to a point
-
-_PROBE = """
-import importlib, mujoco
-context = importlib.import_module("mujoco.{backend}").GLContext(64, 64)
-context.make_current()
-mujoco.MjrContext(mujoco.MjModel.from_xml_string("<mujoco/>"), 150)
-"""
-
-_REMEDY_LINUX = (
-    "install one of libegl1 with a GPU driver or libegl-mesa0, or"
-    " libosmesa6 (Debian and Ubuntu: apt-get install libegl1 libegl-mesa0)"
-)
-_REMEDY_ELSEWHERE = "run it in a session with a display, where GLFW can open a window"
 
 
 class Renderer(contextlib.AbstractContextManager["Renderer"]):
@@ -157,9 +129,8 @@ def open_renderer(
     model.vis.quality.offsamples = 0
     model.vis.global_.offwidth = width
     model.vis.global_.offheight = height
-    backend = importlib.import_module(f"mujoco.{find_backend()}")
     # MuJoCo's renderer has no other way to set a back end after import.
-    with mock.patch.object(gl_context, "GLContext", backend.GLContext, create=True):
+    with mock.patch.object(gl_context, "GLContext", context_class(), create=True):
         return model, mujoco.Renderer(model, height, width, max_geoms)
 
 
@@ -199,33 +170,3 @@ def overview(
     camera.distance = -float(axes_w[2] @ eye_w)
     camera.lookat[:] = eye_w + camera.distance * axes_w[2]
     return camera
-
-
-@functools.cache
-def find_backend() -> str:
-    """Return the first OpenGL back end that works: `egl`, `osmesa` or `glfw`.
-
-    If `MUJOCO_GL` names one of them, only that one is tried.
-
-    Raises:
-      UserError: `MUJOCO_GL` has an unknown value, or no back end works; the message names what to
-        install.
-    """
-    wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
-    if wanted not in (*_BACKENDS, *_UNDECIDED):
-        raise UserError(
-            f"MUJOCO_GL = {wanted!r}: no such back end; unset it, or give egl or osmesa"
-        )
-    candidates = (wanted,) if wanted in _BACKENDS else _BACKENDS
-    for backend in candidates:
-        # Without a display, glfw fails slowly and with much output.
-        if backend == "glfw" and sys.platform == "linux" and "DISPLAY" not in os.environ:
-            continue
-        environment = {**os.environ, "MUJOCO_GL": backend}
-        probe = [sys.executable, "-c", _PROBE.format(backend=backend)]
-        if subprocess.run(probe, env=environment, capture_output=True).returncode == 0:
-            return backend
-    remedy = _REMEDY_LINUX if sys.platform == "linux" else _REMEDY_ELSEWHERE
-    if wanted in _BACKENDS:
-        raise UserError(f"MUJOCO_GL = {wanted!r} does not work here: unset it, or {remedy}")
-    raise UserError(f"no OpenGL for pictures: {remedy}")

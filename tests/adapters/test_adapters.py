@@ -23,12 +23,12 @@ from jetbot_mjx.adapters.arguments import key_from_seed
 from jetbot_mjx.adapters.base import observation_space
 from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.opengl import find_backend
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
 from jetbot_mjx.envs.task import GOAL_HEIGHT
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers import mujoco_window
-from jetbot_mjx.viewers.offscreen import find_backend
 
 ROOT = Path(__file__).parents[2]
 

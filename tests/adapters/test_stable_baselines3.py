@@ -20,8 +20,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnvWrapper, VecMoni
 
 from jetbot_mjx.adapters import JetBotGymEnv, JetBotVectorEnv
 from jetbot_mjx.adapters.stable_baselines3 import JetBotVecEnv
+from jetbot_mjx.envs.opengl import find_backend
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.viewers.offscreen import find_backend
 
 GOAL = slice(13, 16)
 BATCHES = (JetBotVecEnv, JetBotVectorEnv)

@@ -6,9 +6,9 @@ import sys
 
 import pytest
 
+from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.find_run import find_run
-from jetbot_mjx.viewers import offscreen
 
 SETTINGS = ["ppo.num_timesteps=8192", "checkpoint_interval=8192", "evaluation.episodes=8"]
 
@@ -58,9 +58,9 @@ def test_without_opengl_the_remedy_is_one_of_this_system(monkeypatch, system, sa
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("MUJOCO_GL", raising=False)
     failed = subprocess.CompletedProcess([], 1)
-    monkeypatch.setattr(offscreen.subprocess, "run", lambda *args, **kwargs: failed)
+    monkeypatch.setattr(opengl.subprocess, "run", lambda *args, **kwargs: failed)
     with pytest.raises(UserError, match=said) as caught:
-        offscreen.find_backend.__wrapped__()
+        opengl.find_backend.__wrapped__()
     assert "\n" not in str(caught.value)
 
 

@@ -12,6 +12,7 @@ import pytest
 
 from jetbot_mjx import render
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
@@ -24,7 +25,7 @@ from jetbot_mjx.viewers.video import VideoRenderer
 @pytest.fixture(scope="module")
 def needs_opengl():
     try:
-        offscreen.find_backend()
+        opengl.find_backend()
     except UserError as error:
         pytest.skip(str(error))
 
@@ -259,14 +260,14 @@ def test_one_checkpoint_makes_no_gallery(run_copy):
 
 
 def test_without_opengl_one_line_names_the_remedy(monkeypatch, run_copy):
-    monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit(1) # {backend}")
+    monkeypatch.setattr(opengl, "_PROBE", "raise SystemExit(1) # {backend}")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    offscreen.find_backend.cache_clear()
+    opengl.find_backend.cache_clear()
     try:
         with pytest.raises(UserError, match="apt-get install") as caught:
             render_run(run_copy, episodes=2)
     finally:
-        offscreen.find_backend.cache_clear()
+        opengl.find_backend.cache_clear()
     assert "\n" not in str(caught.value)
     # What needs no OpenGL is there all the same.
     assert list(run_copy.glob("videos/*/trajectories-2.png"))
@@ -274,13 +275,13 @@ def test_without_opengl_one_line_names_the_remedy(monkeypatch, run_copy):
 
 def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
     monkeypatch.setenv("MUJOCO_GL", "osmesa")
-    monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit('{backend}' == 'osmesa')")
-    offscreen.find_backend.cache_clear()
+    monkeypatch.setattr(opengl, "_PROBE", "raise SystemExit('{backend}' == 'osmesa')")
+    opengl.find_backend.cache_clear()
     try:
         with pytest.raises(UserError, match="'osmesa' does not work here: unset it, or install"):
-            offscreen.find_backend()
+            opengl.find_backend()
     finally:
-        offscreen.find_backend.cache_clear()
+        opengl.find_backend.cache_clear()
 
 
 @pytest.mark.parametrize(
@@ -297,9 +298,10 @@ def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
 from jetbot_mjx import errors, imports
 imports.install_lazy_imports()
 import jetbot_mjx.envs.physics
+from jetbot_mjx.envs import opengl
 from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run
 try:
-    offscreen.find_backend()
+    opengl.find_backend()
 except errors.UserError as error:
     print(error)
 """

@@ -19,7 +19,9 @@ ALL, NONE = frozenset(PARTS), frozenset()
 
 def write(folder, goals, parts, version=GOAL_SET_VERSION):
     folder.mkdir(parents=True, exist_ok=True)
-    values = {part: {} if part in parts else None for part in PARTS}
+    values = {part: {} if part in parts else None for part in PARTS if part != "rendered"}
+    if "rendered" in parts:
+        values["mujoco"] = {"rendered": {}}
     values |= {"goal_set_version": version, "policy": {"episodes": goals}}
     (folder / "report.json").write_text(json.dumps(values))
 

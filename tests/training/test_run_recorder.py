@@ -11,6 +11,7 @@ from PIL import Image
 from jetbot_mjx import load_config, make_env
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -19,7 +20,7 @@ from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.training import run_recorder, session
 from jetbot_mjx.training.callbacks import Progress
 from jetbot_mjx.training.ppo_trainer import build_ppo
-from jetbot_mjx.viewers import offscreen, video
+from jetbot_mjx.viewers import video
 
 PARAMS = PolicyParams(normalizer=np.zeros(1), policy=np.ones(2), value=np.zeros(1))
 
@@ -143,14 +144,14 @@ def test_nothing_is_prepared_where_nothing_is_asked_for(recorder, tmp_path, monk
 
 
 def test_without_opengl_training_goes_on_after_one_line(recorder, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(offscreen, "_PROBE", "raise SystemExit(1) # {backend}")
+    monkeypatch.setattr(opengl, "_PROBE", "raise SystemExit(1) # {backend}")
     monkeypatch.delenv("MUJOCO_GL", raising=False)
-    offscreen.find_backend.cache_clear()
+    opengl.find_backend.cache_clear()
     try:
         with recorder("evaluation.video=true") as it:
             report(it, 0, 4096, 8192)
     finally:
-        offscreen.find_backend.cache_clear()
+        opengl.find_backend.cache_clear()
     told = [line for line in capsys.readouterr().out.splitlines() if "OpenGL" in line]
     assert len(told) == 1
     assert "evaluation.video: no videos are rendered" in told[0]
@@ -172,7 +173,7 @@ def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
     root, smoke_run, tmp_path, monkeypatch
 ):
     try:
-        offscreen.find_backend()
+        opengl.find_backend()
     except UserError as error:
         pytest.skip(str(error))
     monkeypatch.setattr(video.EvaluationVideo, "_SIDE", 64)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jetbot_mjx import render
+from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -21,7 +22,7 @@ ROBOTS = 6
 @pytest.fixture(scope="module")
 def needs_opengl():
     try:
-        offscreen.find_backend()
+        opengl.find_backend()
     except UserError as error:
         pytest.skip(str(error))
 

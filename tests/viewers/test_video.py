@@ -12,6 +12,7 @@ import pytest
 from PIL import Image, ImageDraw
 
 from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs import opengl
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.errors import UserError
@@ -33,7 +34,7 @@ DT = 1 / 60
 @pytest.fixture(scope="module")
 def needs_opengl():
     try:
-        offscreen.find_backend()
+        opengl.find_backend()
     except UserError as error:
         pytest.skip(str(error))
 

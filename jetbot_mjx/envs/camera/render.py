@@ -51,7 +51,7 @@ from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, wi
 from jetbot_mjx.envs.look_params import LookParams
 from jetbot_mjx.errors import UserError
 
-_GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
+GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 
 
 class Pose(NamedTuple):
@@ -218,7 +218,7 @@ class Camera:
         rays = bend_rays(frame.params, samples, footprint, self._farthest)
         channels = developed(frame.params, pixel_colour(scene, frame, *rays))
         if self.config.colour == "grey":
-            channels = [sum(weight * x for weight, x in zip(_GREY, channels, strict=True))]
+            channels = [sum(weight * x for weight, x in zip(GREY, channels, strict=True))]
         return [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
 
     def trace(

@@ -1,6 +1,5 @@
 """Our pictures beside those of `mujoco.Renderer`: outlines, colours, checkers, sky and light."""
 
-import importlib
 from unittest import mock
 
 import jax
@@ -15,9 +14,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from jetbot_mjx.config import CameraConfig, Config
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.opengl import context_class
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.viewers import offscreen
 
 SIDE = 224
 FOVY = 75.0
@@ -87,10 +86,10 @@ def two_planes():
 @pytest.fixture(scope="module")
 def opengl():
     try:
-        backend = importlib.import_module(f"mujoco.{offscreen.find_backend()}")
+        context = context_class()
     except UserError as error:
         pytest.skip(str(error))
-    with mock.patch.object(gl_context, "GLContext", backend.GLContext, create=True):
+    with mock.patch.object(gl_context, "GLContext", context, create=True):
         yield
 
 

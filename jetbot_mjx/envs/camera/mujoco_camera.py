@@ -1,0 +1,351 @@
+"""See through the robot's camera with MuJoCo's own renderer, in place of this package's.
+
+Lights, shadows, reflections, haze and sky box are those of OpenGL. A picture is rendered large,
+without distortion; its points are then taken along the rays of the lens, and every pixel is the
+mean of its area. Programs call back for the pictures of all robots, which the CPU's threads render,
+each in an OpenGL context of its own: a context belongs to the thread that made it.
+"""
+
+import concurrent.futures
+import copy
+import math
+import os
+import threading
+import weakref
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import mujoco
+import numpy as np
+from jaxtyping import Array, Float, UInt8
+
+from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.envs.camera.lens import pixel_grid
+from jetbot_mjx.envs.camera.render import GREY, Camera, Pose
+from jetbot_mjx.envs.camera.scenery import (
+    SCENERIES,
+    Appearance,
+    Scenery,
+    draw_scenery,
+    paint,
+    sky_side,
+)
+from jetbot_mjx.envs.opengl import context_class
+
+_SAMPLES = 4
+"""Points per side of a pixel; fewer for images above 64 pixels."""
+
+_MOST_PIXELS = 1024
+"""Largest side of a picture before it is reduced."""
+
+_NEAR = 0.005  # [m] near clipping plane
+_MOST_GEOMS = 1000
+
+
+class Lens(NamedTuple):
+    """A `Lens` holds how a large picture without distortion becomes an image."""
+
+    size: tuple[int, int]
+    """Height and width of the large picture [pixels]."""
+    span: tuple[float, float, float, float]
+    """Directions (x/z, y/z) at its borders: left, right, top, bottom."""
+    points: Float[np.ndarray, "h w s 2"] | None
+    """Row and column in the large picture of each pixel's points; None: all pixels of an area."""
+
+
+def make_lens(config: CameraConfig) -> Lens:
+    """Compute how the image of a camera is taken from a picture without distortion.
+
+    Args:
+      config: the camera section.
+    """
+    samples = max(1, min(_SAMPLES, 256 // max(config.width, config.height)))
+    finer = config.model_copy(update={"samples": samples})
+    grid = pixel_grid(finer)
+    rays, footprint = grid.expand(grid.columns)
+    shape = config.height, config.width
+    x, y = (
+        np.stack([np.broadcast_to(axis, shape) for axis in axes], -1).astype(float)
+        for axes in ([ray.x for ray in rays], [ray.y for ray in rays])
+    )
+    pitch_x, pitch_y = (
+        float(np.abs(step).min()) / samples for step in (footprint.right.x, footprint.down.y)
+    )
+    left, right = x.min() - pitch_x / 2, x.max() + pitch_x / 2
+    top, bottom = y.min() - pitch_y / 2, y.max() + pitch_y / 2
+    if not config.distortion and config.lens != "fisheye":
+        size = samples * config.height, samples * config.width
+        return Lens(size, (left, right, top, bottom), None)
+    height, width = (
+        min(math.ceil(extent / pitch), _MOST_PIXELS)
+        for extent, pitch in ((bottom - top, pitch_y), (right - left, pitch_x))
+    )
+    rows = (y - top) / (bottom - top) * height - 0.5
+    columns = (x - left) / (right - left) * width - 0.5
+    return Lens(
+        (height, width),
+        (left, right, top, bottom),
+        np.stack([rows.clip(0, height - 1), columns.clip(0, width - 1)], axis=-1),
+    )
+
+
+def reduce_picture(
+    picture: UInt8[np.ndarray, "H W 3"], lens: Lens, shape: tuple[int, int]
+) -> Float[np.ndarray, "h w 3"]:
+    """Return an image from the large picture: each pixel the mean of its points.
+
+    Args:
+      picture: the large picture, of the lens's size.
+      lens: the lens.
+      shape: height and width of the image [pixels].
+    """
+    if lens.points is None:
+        height, width = shape
+        parts = picture.reshape(height, len(picture) // height, width, -1, 3)
+        return parts.mean(axis=(1, 3))
+    at = np.floor(lens.points).astype(int)
+    down, right = np.moveaxis(lens.points - at, -1, 0)[..., None]
+    (row, column), (last_row, last_column) = np.moveaxis(at, -1, 0), np.array(lens.size) - 1
+    lower, further = np.minimum(row + 1, last_row), np.minimum(column + 1, last_column)
+    upper_points = (1.0 - right) * picture[row, column] + right * picture[row, further]
+    lower_points = (1.0 - right) * picture[lower, column] + right * picture[lower, further]
+    return ((1.0 - down) * upper_points + down * lower_points).mean(axis=2)
+
+
+class MujocoCamera(Camera):
+    """A `MujocoCamera` is a `Camera` whose images are `mujoco.Renderer`'s kind of pictures.
+
+    Like `Camera` it is pure in `render`; what robot i of a batch sees with varied appearance is the
+    scenery of number i modulo `SCENERIES`.
+    """
+
+    def __init__(
+        self,
+        config: CameraConfig,
+        model: mujoco.MjModel,
+        robot: str = "jetbot",
+        *,
+        appearance: Appearance = "plain",
+    ) -> None:
+        """Find an OpenGL, and compute the lens.
+
+        Args:
+          config: the camera section.
+          model: the compiled model with its visual elements, which is not modified.
+          robot: the name of the body that carries the camera, and is not drawn.
+          appearance: `plain` or `varied`.
+
+        Raises:
+          UserError: this machine has no OpenGL that works without a display; or as for `Camera`.
+        """
+        super().__init__(config, model, robot)
+        self._context_class = context_class()
+        self._lens = make_lens(config)
+        self._base = _without_robot(model, robot, self._lens)
+        self._mocap_ids = {
+            model.body(body).name: int(model.body_mocapid[body])
+            for body in range(model.nbody)
+            if model.body_mocapid[body] >= 0
+        }
+        self._sceneries: list[Scenery] = []
+        if appearance == "varied":
+            side = sky_side(model)
+            self._sceneries = [draw_scenery(number, side) for number in range(SCENERIES)]
+        self._own = threading.local()
+        self._pool = concurrent.futures.ThreadPoolExecutor(max(1, os.cpu_count() or 1))
+        self._last: dict[int, tuple[bytes, np.ndarray]] = {}
+
+    def render(
+        self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]
+    ) -> UInt8[Array, "h w c"]:
+        """Return the image, as `Camera.render` does.
+
+        Args:
+          pose: the pose of the camera.
+          mocap_positions: positions [m] of mocap bodies, world frame, by name.
+        """
+        return jax.pure_callback(
+            self.pictures,
+            jax.ShapeDtypeStruct(self.shape, np.uint8),
+            pose.position,
+            pose.rotation,
+            {name: mocap_positions[name] for name in mocap_positions if name in self._mocap_ids},
+            vmap_method="broadcast_all",
+        )
+
+    def pictures(
+        self,
+        positions: Float[Any, "*n 3"],
+        rotations: Float[Any, "*n 3 3"],
+        mocap_positions: Mapping[str, Float[Any, "*n 3"]],
+    ) -> UInt8[np.ndarray, "*n h w c"]:
+        """Return the images of any number of robots, on the host.
+
+        Args:
+          positions: optical centres [m], world frame.
+          rotations: axes of the images (right, down, forward) as columns.
+          mocap_positions: positions [m] of mocap bodies, world frame, by name.
+        """
+        batch = np.shape(positions)[:-1]
+        count = int(np.prod(batch))
+        places = np.asarray(positions, float).reshape(count, 3)
+        axes = np.asarray(rotations, float).reshape(count, 3, 3)
+        standing = self._base.body_pos[self._base.body_mocapid >= 0]
+        mocap = np.tile(standing, (count, 1, 1))
+        for name, values in mocap_positions.items():
+            mocap[:, self._mocap_ids[name]] = np.asarray(values, float).reshape(count, 3)
+        images = np.empty((count, *self.shape), np.uint8)
+        todo: dict[int, list[int]] = {}
+        for i in range(count):
+            # An ended episode is stepped again from the same state, and looks the same again.
+            key = places[i].tobytes() + axes[i].tobytes() + mocap[i].tobytes()
+            known = self._last.get(i)
+            if known is not None and known[0] == key:
+                images[i] = known[1]
+            else:
+                todo.setdefault(i % SCENERIES if self._sceneries else 0, []).append(i)
+                self._last[i] = key, images[i]
+
+        def draw(number: int, robots: list[int]) -> None:
+            for i in robots:
+                images[i] = self._draw(number, places[i], axes[i], mocap[i])
+
+        for done in [self._pool.submit(draw, *one) for one in todo.items()]:
+            done.result()
+        return images.reshape(*batch, *self.shape)
+
+    def picture(
+        self,
+        position_w: Float[np.ndarray, "3"],
+        quat: Float[np.ndarray, "4"],
+        mocap_positions: Mapping[str, Float[np.ndarray, "3"]],
+        scenery: int = 0,
+    ) -> UInt8[np.ndarray, "h w c"]:
+        """Return the image of one robot, on the host, in the calling thread.
+
+        Args:
+          position_w: position of the axle midpoint [m], world frame.
+          quat: attitude of the robot as a unit quaternion (w, x, y, z).
+          mocap_positions: positions [m] of mocap bodies, world frame, by name.
+          scenery: number of the scenery, with varied appearance.
+        """
+        body = np.empty(9)
+        mujoco.mju_quat2Mat(body, np.asarray(quat, float))
+        body = body.reshape(3, 3)
+        mocap = self._base.body_pos[self._base.body_mocapid >= 0]
+        for name, place in mocap_positions.items():
+            mocap[self._mocap_ids[name]] = place
+        position = np.asarray(position_w, float) + body @ self._mount_position
+        return self._draw(scenery % SCENERIES, position, body @ self._mount_rotation, mocap)
+
+    def _draw(
+        self,
+        number: int,
+        position: Float[np.ndarray, "3"],
+        rotation: Float[np.ndarray, "3 3"],
+        mocap: Float[np.ndarray, "nmocap 3"],
+    ) -> UInt8[np.ndarray, "h w c"]:
+        if not hasattr(self._own, "stage"):
+            self._own.stage = _Stage(self._context_class, copy.copy(self._base))
+        stage = self._own.stage
+        if self._sceneries:
+            stage.set_scenery(number, self._sceneries[number])
+        picture = stage.picture(position, rotation, mocap)
+        image = reduce_picture(picture, self._lens, self.shape[:2])
+        if self.config.colour == "grey":
+            image = image @ np.array(GREY)[:, None]
+        return np.floor(image + 0.5).astype(np.uint8)
+
+
+class _Stage:
+    """A `_Stage` renders large pictures, in the thread that made it."""
+
+    def __init__(self, context_class: Any, model: mujoco.MjModel) -> None:
+        self._model, self._data = model, mujoco.MjData(model)
+        self._data.mocap_quat[:] = model.body_quat[model.body_mocapid >= 0]
+        height, width = int(model.vis.global_.offheight), int(model.vis.global_.offwidth)
+        self._gl = context_class(width, height)
+        self._gl.make_current()
+        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
+        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
+        self._scene, self._option = mujoco.MjvScene(model, _MOST_GEOMS), mujoco.MjvOption()
+        self._scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
+        self._camera = mujoco.MjvCamera()
+        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
+        self._camera.fixedcamid = model.ncam - 1
+        self._rect = mujoco.MjrRect(0, 0, width, height)
+        self._buffer = np.empty((height, width, 3), np.uint8)
+        self._number: int | None = None
+        # Another context may be current when this one is collected, and would lose its textures.
+        weakref.finalize(self, _free, self._gl, self._context).atexit = False
+
+    def set_scenery(self, number: int, scenery: Scenery) -> None:
+        """Show a scenery, and upload its textures unless they are there."""
+        if number != self._number:
+            self._number = number
+            self._gl.make_current()
+            for texture in paint(self._model, scenery):
+                mujoco.mjr_uploadTexture(self._model, self._context, texture)
+
+    def picture(
+        self,
+        position: Float[np.ndarray, "3"],
+        rotation: Float[np.ndarray, "3 3"],
+        mocap: Float[np.ndarray, "nmocap 3"],
+    ) -> UInt8[np.ndarray, "H W 3"]:
+        """Render a picture; the array is overwritten by the next one."""
+        # A thread may have made several contexts.
+        self._gl.make_current()
+        model, data = self._model, self._data
+        data.mocap_pos[:] = mocap
+        mujoco.mj_kinematics(model, data)
+        mujoco.mj_comPos(model, data)
+        mujoco.mj_camlight(model, data)
+        eye = self._camera.fixedcamid
+        data.cam_xpos[eye] = position
+        # MuJoCo's cameras look along their negative z axis.
+        data.cam_xmat[eye] = (rotation * np.array([1.0, -1.0, -1.0])).reshape(-1)
+        all_geoms = mujoco.mjtCatBit.mjCAT_ALL
+        mujoco.mjv_updateScene(
+            model, data, self._option, None, self._camera, all_geoms, self._scene
+        )
+        mujoco.mjr_render(self._rect, self._scene, self._context)
+        mujoco.mjr_readPixels(self._buffer, None, self._rect, self._context)
+        # OpenGL's first row is the lowest.
+        return self._buffer[::-1]
+
+
+def _free(gl: Any, context: mujoco.MjrContext) -> None:
+    """Free what a stage holds in OpenGL."""
+    gl.make_current()
+    context.free()
+    gl.free()
+
+
+def _without_robot(model: mujoco.MjModel, robot: str, lens: Lens) -> mujoco.MjModel:
+    """Return a copy of a model whose last camera has a lens's frustum, without the robot's geoms.
+
+    Args:
+      model: the model, which has at least one camera.
+      robot: the name of the robot's body.
+      lens: the lens.
+    """
+    found = copy.copy(model)
+    root = model.body(robot).id
+    own = model.body_rootid[model.geom_bodyid] == model.body_rootid[root]
+    found.geom_rgba[own, 3] = 0.0
+    found.geom_matid[own] = -1
+    found.geom_group[own] = mujoco.mjNGROUP - 1
+    left, right, top, bottom = lens.span
+    eye = model.ncam - 1
+    found.cam_projection[eye] = mujoco.mjtProjection.mjPROJ_PERSPECTIVE
+    found.cam_sensorsize[eye] = right - left, bottom - top
+    found.cam_intrinsic[eye] = 1.0, 1.0, (left + right) / 2, (top + bottom) / 2
+    found.cam_resolution[eye] = lens.size[::-1]
+    found.vis.map.znear = _NEAR / model.stat.extent
+    # Each picture is reduced, which smooths edges as well as OpenGL's samples do, and faster.
+    found.vis.quality.offsamples = 0
+    found.vis.quality.shadowsize = 512
+    found.vis.global_.offheight, found.vis.global_.offwidth = lens.size
+    return found
