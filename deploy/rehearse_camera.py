@@ -21,7 +21,7 @@ from jetbot_mjx.deployment.simulated_camera import (
     camera_config,
 )
 from jetbot_mjx.deployment.simulated_jetbot import MotorModel, Pose, SimulatedJetBot
-from jetbot_mjx.envs.camera.scenery import Appearance
+from jetbot_mjx.envs.camera.scenery import SceneryKind
 
 FAULTS: tuple[Fault, ...] = ("frozen", "black")
 
@@ -71,7 +71,7 @@ class CameraRehearsal:
         calibration: Calibration,
         motors: MotorModel,
         camera: CameraModel,
-        appearance: Appearance = "plain",
+        appearance: SceneryKind = "plain",
         settings: CameraSettings | None = None,
     ) -> None:
         """Build robot and camera.

@@ -14,7 +14,7 @@ from jaxtyping import UInt8
 from jetbot_mjx.config import CameraConfig, PhysicsConfig
 from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
-from jetbot_mjx.envs.camera.scenery import Appearance
+from jetbot_mjx.envs.camera.scenery import SceneryKind
 from jetbot_mjx.envs.robot_model import REAL, make_mj_model
 from jetbot_mjx.envs.task import GOAL_HEIGHT
 
@@ -67,7 +67,7 @@ class SimulatedCamera:
         config: CameraConfig,
         model: CameraModel | None = None,
         *,
-        appearance: Appearance = "plain",
+        appearance: SceneryKind = "plain",
         seed: int = 0,
     ) -> None:
         """Build the scene.

@@ -30,7 +30,7 @@ from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
 from jetbot_mjx.config import RandomizationConfig, read_yaml
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
-from jetbot_mjx.envs.camera.scenery import Appearance
+from jetbot_mjx.envs.camera.scenery import SceneryKind
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.look_params import LookParams
@@ -61,7 +61,7 @@ Variant = tuple[RobotParams, LookParams]
 RENDERED_GOALS = 256
 """Number of the report's fixed goals that a policy drives to by MuJoCo's pictures."""
 
-_APPEARANCES: tuple[Appearance, ...] = ("plain", "varied")
+_SCENERY_KINDS: tuple[SceneryKind, ...] = ("plain", "varied")
 
 
 class Sweep(NamedTuple):
@@ -254,10 +254,10 @@ class MujocoEvaluator:
         if ranges is not None and ranges.drawn:
             envs.append(DomainRandomizationWrapper(simulator, ranges=ranges))
         self._evaluators = [Evaluator(one, networks, programs) for one in envs]
-        self._rendered: dict[Appearance, Evaluator] = {}
+        self._rendered: dict[SceneryKind, Evaluator] = {}
         if pictures and env.camera is not None:
             config, model = env.camera.config, env.mj_model
-            for name in _APPEARANCES:
+            for name in _SCENERY_KINDS:
                 camera = MujocoCamera(config, model, appearance=name)
                 own = Evaluator(simulator.with_camera(camera), networks, programs)
                 self._rendered[name] = own

@@ -22,16 +22,19 @@ from jaxtyping import Array, Float, UInt8
 
 from jetbot_mjx.config import CameraConfig
 from jetbot_mjx.envs.camera.lens import pixel_grid
+from jetbot_mjx.envs.camera.looks import PLAIN, Appearance
 from jetbot_mjx.envs.camera.render import GREY, Camera, Pose
 from jetbot_mjx.envs.camera.scenery import (
     SCENERIES,
-    Appearance,
     Scenery,
+    SceneryKind,
     draw_scenery,
     paint,
     sky_side,
 )
+from jetbot_mjx.envs.look_params import LookParams
 from jetbot_mjx.envs.opengl import context_class
+from jetbot_mjx.errors import UserError
 
 _SAMPLES = 4
 """Points per side of a pixel; fewer for images above 64 pixels."""
@@ -126,7 +129,7 @@ class MujocoCamera(Camera):
         model: mujoco.MjModel,
         robot: str = "jetbot",
         *,
-        appearance: Appearance = "plain",
+        appearance: SceneryKind = "plain",
     ) -> None:
         """Find an OpenGL, and compute the lens.
 
@@ -157,14 +160,26 @@ class MujocoCamera(Camera):
         self._last: dict[int, tuple[bytes, np.ndarray]] = {}
 
     def render(
-        self, pose: Pose, mocap_positions: Mapping[str, Float[Array, "3"]]
+        self,
+        pose: Pose,
+        mocap_positions: Mapping[str, Float[Array, "3"]],
+        appearance: Appearance = PLAIN,
     ) -> UInt8[Array, "h w c"]:
         """Return the image, as `Camera.render` does.
 
         Args:
           pose: the pose of the camera.
           mocap_positions: positions [m] of mocap bodies, world frame, by name.
+          appearance: the plain one.
+
+        Raises:
+          UserError: looks are drawn, which MuJoCo's pictures cannot show.
         """
+        if appearance is not PLAIN:
+            raise UserError(
+                "MuJoCo's own pictures show the scene as it is: leave the looks out of the"
+                f" randomization ({', '.join(LookParams._fields[:3])}, ...)"
+            )
         return jax.pure_callback(
             self.pictures,
             jax.ShapeDtypeStruct(self.shape, np.uint8),

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
-Appearance = Literal["plain", "varied"]
+SceneryKind = Literal["plain", "varied"]
 """`plain`: lights, floor and sky of the scene; `varied`: drawn ones."""
 
 SCENERIES = 16
