@@ -100,9 +100,7 @@ def read_log(path: Path) -> DriveLog:
             outcome = period.get("outcome") or outcome
             if "x" in period:
                 # A period that saw no new pose repeats the last.
-                pose_time = round(times[-1] - float(period["pose_age"]), 6)
-                pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
-                poses.setdefault(pose_time, pose)
+                poses.setdefault(*_parse_pose(period))
             pictures.append(read_picture(header, period, times[-1]))
             if "latency" in period:
                 latencies.append(float(period["latency"]))
@@ -130,6 +128,12 @@ def read_log(path: Path) -> DriveLog:
         stale_ticks=stale_ticks,
         pictures=tuple(picture for picture in pictures if picture is not None),
     )
+
+
+def _parse_pose(period: Mapping[str, Any]) -> tuple[float, tuple[float, ...]]:
+    """Return the time of a period's pose [s], and its x [m], y [m] and yaw [rad]."""
+    pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
+    return round(float(period["t"]) - float(period["pose_age"]), 6), pose
 
 
 def _read_lines(path: Path) -> list[str]:
