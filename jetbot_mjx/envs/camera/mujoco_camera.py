@@ -2,15 +2,19 @@
 
 Lights, shadows, reflections, haze and sky box are those of OpenGL. A picture is rendered large,
 without distortion; its points are then taken along the rays of the lens, and every pixel is the
-mean of its area. Programs call back for the pictures of all robots, which the CPU's threads render,
-each in an OpenGL context of its own: a context belongs to the thread that made it.
+mean of its area. Programs call back for the pictures of all robots.
+
+A context of OpenGL belongs to the thread in which it was made, and only that one can free it. So
+this process has one thread per core that renders, for all cameras and as long as it lives. A camera
+has a context in each of them; when it is collected, they are freed at the thread's next picture.
 """
 
+import collections
 import concurrent.futures
 import copy
+import functools
 import math
 import os
-import threading
 import weakref
 from collections.abc import Mapping
 from typing import Any, NamedTuple
@@ -155,8 +159,8 @@ class MujocoCamera(Camera):
         if appearance == "varied":
             side = sky_side(model)
             self._sceneries = [draw_scenery(number, side) for number in range(SCENERIES)]
-        self._own = threading.local()
-        self._pool = concurrent.futures.ThreadPoolExecutor(max(1, os.cpu_count() or 1))
+        self._stages: dict[int, _Stage] = {}
+        weakref.finalize(self, _discard, self._stages).atexit = False
         self._last: dict[int, tuple[bytes, np.ndarray]] = {}
 
     def render(
@@ -211,7 +215,8 @@ class MujocoCamera(Camera):
         for name, values in mocap_positions.items():
             mocap[:, self._mocap_ids[name]] = np.asarray(values, float).reshape(count, 3)
         images = np.empty((count, *self.shape), np.uint8)
-        todo: dict[int, list[int]] = {}
+        threads = _render_threads()
+        todo: dict[int, list[tuple[int, int]]] = {}
         for i in range(count):
             # An ended episode is stepped again from the same state, and looks the same again.
             key = places[i].tobytes() + axes[i].tobytes() + mocap[i].tobytes()
@@ -219,14 +224,16 @@ class MujocoCamera(Camera):
             if known is not None and known[0] == key:
                 images[i] = known[1]
             else:
-                todo.setdefault(i % SCENERIES if self._sceneries else 0, []).append(i)
+                number = i % SCENERIES if self._sceneries else i
+                todo.setdefault(number % len(threads), []).append((number, i))
                 self._last[i] = key, images[i]
 
-        def draw(number: int, robots: list[int]) -> None:
-            for i in robots:
-                images[i] = self._draw(number, places[i], axes[i], mocap[i])
+        def draw(thread: int, robots: list[tuple[int, int]]) -> None:
+            # In the order of their sceneries, so that each is uploaded once.
+            for number, i in sorted(robots):
+                images[i] = self._draw(thread, number, places[i], axes[i], mocap[i])
 
-        for done in [self._pool.submit(draw, *one) for one in todo.items()]:
+        for done in [threads[one].pool.submit(draw, one, robots) for one, robots in todo.items()]:
             done.result()
         return images.reshape(*batch, *self.shape)
 
@@ -237,7 +244,7 @@ class MujocoCamera(Camera):
         mocap_positions: Mapping[str, Float[np.ndarray, "3"]],
         scenery: int = 0,
     ) -> UInt8[np.ndarray, "h w c"]:
-        """Return the image of one robot, on the host, in the calling thread.
+        """Return the image of one robot, on the host.
 
         Args:
           position_w: position of the axle midpoint [m], world frame.
@@ -252,18 +259,25 @@ class MujocoCamera(Camera):
         for name, place in mocap_positions.items():
             mocap[self._mocap_ids[name]] = place
         position = np.asarray(position_w, float) + body @ self._mount_position
-        return self._draw(scenery % SCENERIES, position, body @ self._mount_rotation, mocap)
+        rotation, number = body @ self._mount_rotation, scenery % SCENERIES
+        pool = _render_threads()[0].pool
+        return pool.submit(self._draw, 0, number, position, rotation, mocap).result()
 
     def _draw(
         self,
+        thread: int,
         number: int,
         position: Float[np.ndarray, "3"],
         rotation: Float[np.ndarray, "3 3"],
         mocap: Float[np.ndarray, "nmocap 3"],
     ) -> UInt8[np.ndarray, "h w c"]:
-        if not hasattr(self._own, "stage"):
-            self._own.stage = _Stage(self._context_class, copy.copy(self._base))
-        stage = self._own.stage
+        """Draw one image; only the thread of that number may call it."""
+        discarded = _render_threads()[thread].discarded
+        while discarded:
+            discarded.pop().free()
+        if thread not in self._stages:
+            self._stages[thread] = _Stage(self._context_class, copy.copy(self._base))
+        stage = self._stages[thread]
         if self._sceneries:
             stage.set_scenery(number, self._sceneries[number])
         picture = stage.picture(position, rotation, mocap)
@@ -271,6 +285,27 @@ class MujocoCamera(Camera):
         if self.config.colour == "grey":
             image = image @ np.array(GREY)[:, None]
         return np.floor(image + 0.5).astype(np.uint8)
+
+
+class _RenderThread(NamedTuple):
+    """A `_RenderThread` is a thread in which OpenGL is called."""
+
+    pool: concurrent.futures.ThreadPoolExecutor
+    discarded: "collections.deque[_Stage]"
+    """What its next picture frees first; whoever collects a camera may hold any lock."""
+
+
+@functools.cache
+def _render_threads() -> list[_RenderThread]:
+    count = max(1, os.cpu_count() or 1)
+    pools = [concurrent.futures.ThreadPoolExecutor(1) for _ in range(count)]
+    return [_RenderThread(pool, collections.deque()) for pool in pools]
+
+
+def _discard(stages: "dict[int, _Stage]") -> None:
+    """Leave the stages of a camera that is collected to their threads."""
+    for thread, stage in stages.items():
+        _render_threads()[thread].discarded.append(stage)
 
 
 class _Stage:
@@ -292,8 +327,6 @@ class _Stage:
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._buffer = np.empty((height, width, 3), np.uint8)
         self._number: int | None = None
-        # Another context may be current when this one is collected, and would lose its textures.
-        weakref.finalize(self, _free, self._gl, self._context).atexit = False
 
     def set_scenery(self, number: int, scenery: Scenery) -> None:
         """Show a scenery, and upload its textures unless they are there."""
@@ -330,12 +363,11 @@ class _Stage:
         # OpenGL's first row is the lowest.
         return self._buffer[::-1]
 
-
-def _free(gl: Any, context: mujoco.MjrContext) -> None:
-    """Free what a stage holds in OpenGL."""
-    gl.make_current()
-    context.free()
-    gl.free()
+    def free(self) -> None:
+        """Free what OpenGL holds; another context may be current, and would lose its textures."""
+        self._gl.make_current()
+        self._context.free()
+        self._gl.free()
 
 
 def _without_robot(model: mujoco.MjModel, robot: str, lens: Lens) -> mujoco.MjModel:
