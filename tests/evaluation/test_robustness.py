@@ -163,11 +163,10 @@ def swept_looks():
     camera = {"width": 16, "height": 16, "samples": 1}
     task = {"observation": "camera", "episode_length": 12}
     network = {"cnn": "tiny", "policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}
-    config = parse_config({"task": task, "camera": camera, "ppo": {"network": network}})
+    ppo = {"network": network, "normalize_observations": False}
+    config = parse_config({"task": task, "camera": camera, "ppo": ppo})
     env = make_env(config)
-    networks = make_networks(
-        config.ppo.network, env.observation_size, env.action_size, normalize=False
-    )
+    networks = make_networks(config.ppo, env.observation_size, env.action_size)
     key = jax.random.PRNGKey(0)
     params = PolicyParams(None, networks.policy_network.init(key), None)
     values = {"motor_gain": (0.5, 1.0), "exposure": (0.0, 1.0), "camera_delay": (0.0, 9.0)}
@@ -191,8 +190,6 @@ def test_the_scripted_controller_does_not_see_the_looks(swept_looks):
 
 def test_a_policy_that_does_not_see_is_swept_without_looks():
     env = make_env(parse_config({"task": {"observation": "egocentric"}}))
-    networks = make_networks(
-        env.config.ppo.network, env.observation_size, env.action_size, normalize=False
-    )
+    networks = make_networks(env.config.ppo, env.observation_size, env.action_size)
     sweeper = Sweeper(env, networks, report_keys(1))
     assert tuple(one.name for one in sweeper._sweeps) == RobotParams._fields
