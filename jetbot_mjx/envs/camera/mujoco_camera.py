@@ -9,6 +9,7 @@ this process has one thread per core that renders, for all cameras and as long a
 has a context in each of them; when it is collected, they are freed at the thread's next picture.
 """
 
+import atexit
 import collections
 import concurrent.futures
 import copy
@@ -316,6 +317,7 @@ class _Stage:
         self._data.mocap_quat[:] = model.body_quat[model.body_mocapid >= 0]
         height, width = int(model.vis.global_.offheight), int(model.vis.global_.offwidth)
         self._gl = context_class(width, height)
+        _end_at_exit()
         self._gl.make_current()
         self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
         mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
@@ -327,6 +329,7 @@ class _Stage:
         self._rect = mujoco.MjrRect(0, 0, width, height)
         self._buffer = np.empty((height, width, 3), np.uint8)
         self._number: int | None = None
+        _stages.add(self)
 
     def set_scenery(self, number: int, scenery: Scenery) -> None:
         """Show a scenery, and upload its textures unless they are there."""
@@ -367,7 +370,23 @@ class _Stage:
         """Free what OpenGL holds; another context may be current, and would lose its textures."""
         self._gl.make_current()
         self._context.free()
+        self.end()
+
+    def end(self) -> None:
+        """End the context, from any thread, while Python still has all that this calls."""
+        _stages.discard(self)
         self._gl.free()
+        del self._gl
+
+
+_stages: "weakref.WeakSet[_Stage]" = weakref.WeakSet()
+"""All that have not ended."""
+
+
+@functools.cache
+def _end_at_exit() -> None:
+    """End all stages before EGL ends, whose own handler the first context has registered."""
+    atexit.register(lambda: [stage.end() for stage in list(_stages)])
 
 
 def _without_robot(model: mujoco.MjModel, robot: str, lens: Lens) -> mujoco.MjModel:

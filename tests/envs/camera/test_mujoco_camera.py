@@ -1,6 +1,8 @@
 """The camera through MuJoCo's renderer: the same directions, other light, and one line without."""
 
 import gc
+import subprocess
+import sys
 
 import jax
 import numpy as np
@@ -138,3 +140,22 @@ def test_a_camera_that_is_gone_takes_nothing_from_the_next(env, with_opengl):
     gc.collect()
     np.testing.assert_array_equal(second.picture(*place, cube, 3), wanted)
     assert np.abs(second.picture(*place, cube, 5).astype(int) - wanted).mean() > 2.0
+
+
+ONE_PICTURE = """
+import numpy as np
+from jetbot_mjx.config import CameraConfig, load_config
+from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
+from jetbot_mjx.envs.jetbot_env import make_env
+
+env = make_env(load_config("configs/jetbot_camera.yaml"))
+camera = MujocoCamera(CameraConfig(width=16, height=16), env.mj_model)
+camera.picture(np.array([0, 0, 0.03]), np.array([1.0, 0, 0, 0]), {"goal": np.array([0.5, 0, 0.05])})
+"""
+
+
+def test_a_program_that_has_drawn_ends_without_a_word(root, with_opengl):
+    done = subprocess.run(
+        [sys.executable, "-c", ONE_PICTURE], cwd=root, capture_output=True, text=True
+    )
+    assert (done.returncode, done.stderr) == (0, "")
