@@ -109,7 +109,6 @@ def read_log(path: Path) -> DriveLog:
         raise UserError(
             f"{path} is not a log of deploy/drive.py: line {number}: {reason}"
         ) from None
-
     if len(poses) < _LEAST_POSES:
         raise UserError(f"{path} has {len(poses)} poses: there is nothing to compare")
     if not np.isfinite(motors).all() or not np.isfinite(times).all() or np.any(np.diff(times) < 0):
