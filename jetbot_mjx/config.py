@@ -488,6 +488,10 @@ class PPOConfig(_Section):
     1e-6 for all, with which a policy overfits to the contact of its training simulator."""
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
+    update: Literal["auto", "fused", "xla"] = "auto"
+    """How the gradient of a minibatch is computed. `fused`: by two kernels for NVIDIA GPUs, with
+    products of bfloat16 and sums of float32; `xla`: by XLA; `auto`: by the kernels where the GPU
+    and the networks allow it."""
     network: NetworkConfig = NetworkConfig()
     """Network sizes."""
 
@@ -606,6 +610,7 @@ class Config(_Section):
         for is_set, setting, other_remedy in (
             (linear, "ppo.learning_rate_schedule = 'LINEAR'", ", or NONE or ADAPTIVE_KL"),
             (physical, "ppo.normalizer = 'physical'", ", or ppo.normalizer = 'brax'"),
+            (self.ppo.update == "fused", "ppo.update = 'fused'", ", or ppo.update = 'auto'"),
             (self.task.sees, f"task.observation = {self.task.observation!r}", ""),
             (self.deterministic, "deterministic = true", ""),
             (self.init_from is not None, "init_from", ""),

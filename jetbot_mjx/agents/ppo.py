@@ -57,10 +57,11 @@ from brax.training.types import Transition, UInt64
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.agents import gae
+from jetbot_mjx.agents import fused_update, gae
 from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
 from jetbot_mjx.config import PPOConfig
+from jetbot_mjx.errors import UserError
 
 # Pyright does not follow flax's dataclasses.
 _NetworkParams: Any = losses.PPONetworkParams
@@ -164,9 +165,30 @@ class PPO:
         self._make_policy = ppo_networks.make_inference_fn(any_networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
-        self._loss_and_gradient = gradients.loss_and_pgrad(
+        self._xla_loss_and_gradient = gradients.loss_and_pgrad(
             loss, pmap_axis_name=axis_name, has_aux=True
         )
+        self.fused: fused_update.FusedUpdate | None = None
+        """The kernels of the update; None: XLA compiles it."""
+        self.notice: str | None = None
+        """One line that says why an NVIDIA GPU does not run the kernels, if it does not."""
+        if config.update != "xla":
+            self._choose_update()
+
+    def _choose_update(self) -> None:
+        """Take the kernels of the update if the GPU can run them.
+
+        Raises:
+          UserError: `ppo.update` is `fused`, and it cannot.
+        """
+        sizes = self._env.observation_size, self._env.action_size
+        found = fused_update.choose(self.config, *sizes, self._axis)
+        if isinstance(found, fused_update.FusedUpdate):
+            self.fused = found
+        elif self.config.update == "fused":
+            raise UserError(f"ppo.update = fused: {found}: choose auto or xla")
+        elif jax.default_backend() == "gpu":
+            self.notice = f"ppo.update = xla, for the fused update cannot run: {found}"
 
     def init(self, key: UInt32[Array, "2"]) -> TrainState:
         """Return the training state before the first step.
@@ -360,6 +382,9 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
+        like = params, optimizer_state
+        if self.fused:
+            params, optimizer_state = self.fused.pack(like)
 
         def one_pass(carry: PyTree, _: None) -> tuple[PyTree, PyTree]:
             params, optimizer_state, key = carry
@@ -381,6 +406,8 @@ class PPO:
         (params, optimizer_state, _), metrics = jax.lax.scan(
             one_pass, (params, optimizer_state, key), length=self.config.num_updates_per_batch
         )
+        if self.fused:
+            params, optimizer_state = self.fused.unpack((params, optimizer_state), like)
         if self._axis is not None:
             metrics = jax.lax.pmean(metrics, self._axis)
         applied = metrics.pop("applied")
@@ -400,7 +427,8 @@ class PPO:
         """Apply one gradient step, or skip it if the gradient is not finite."""
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
-        (_, metrics), gradient = self._loss_and_gradient(params, normalizer, batch, loss_key)
+        compute = self.fused.loss_and_gradient if self.fused else self._xla_loss_and_gradient
+        (_, metrics), gradient = compute(params, normalizer, batch, loss_key)
         finite = jnp.isfinite(optax.tree.norm(gradient))
         # Adapt the step size to the KL divergence, and compute the update.
         before = params, optimizer_state

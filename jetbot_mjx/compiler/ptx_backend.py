@@ -72,24 +72,46 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     if kernel.table is not None:
         # A block computes all items of a robot.
         threads, blocks = _ITEM_THREADS, robots
-    architecture = _architecture()
+    architecture = target_architecture()
     text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
-    results = kernel.results(robots)
-    call = jax.ffi.ffi_call(_TARGET, results)
+    text = text.replace(_ROBOTS, str(robots))
+    return launch_ptx(_NAME, text, leaves, kernel.results(robots), (blocks, 1, 1), threads)
+
+
+def launch_ptx(
+    name: str,
+    text: str,
+    arguments: Sequence[Array],
+    results: Sequence[jax.ShapeDtypeStruct],
+    grid: tuple[int, int, int],
+    threads: int,
+    shared_memory: int = 0,
+) -> list[Array]:
+    """Launch a kernel, while JAX lowers a program for an NVIDIA GPU.
+
+    Args:
+      name: the name of the kernel.
+      text: its PTX. Its parameters are the addresses of the arguments, then of the results.
+      arguments: the arrays that it reads.
+      results: shapes and dtypes of the arrays that it writes.
+      grid: the number of blocks along each axis.
+      threads: the number of threads of a block.
+      shared_memory: dynamic shared memory of a block [bytes].
+
+    Returns:
+      The results.
+    """
+    sizes = {f"grid_{axis}": np.int64(n) for axis, n in zip("xyz", grid, strict=True)}
+    sizes |= {f"block_{axis}": np.int64(n) for axis, n in zip("xyz", (threads, 1, 1), strict=True)}
     return list(
-        call(
-            *leaves,
-            name=_NAME,
+        jax.ffi.ffi_call(_TARGET, list(results))(
+            *arguments,
+            name=name,
             kernel_type="ptx",
-            kernel_data=text.replace(_ROBOTS, str(robots)),
-            grid_x=np.int64(blocks),
-            grid_y=np.int64(1),
-            grid_z=np.int64(1),
-            block_x=np.int64(threads),
-            block_y=np.int64(1),
-            block_z=np.int64(1),
-            shared_mem_bytes=np.int64(0),
-            output_indices=tuple(range(len(leaves), len(leaves) + len(results))),
+            kernel_data=text,
+            **sizes,
+            shared_mem_bytes=np.int64(shared_memory),
+            output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
         )
     )
 
@@ -113,9 +135,18 @@ def compiled(kernel: Kernel, architecture: int) -> str:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
+    return assembled((kernel_text if kernel.table is None else map_kernel_text)(kernel), architecture)
+
+
+def assembled(text: str, architecture: int) -> str:
+    """Return the PTX of a module of LLVM IR.
+
+    Args:
+      text: the module.
+      architecture: the target architecture, as ten times the compute capability.
+    """
     binding = _binding()
-    write = kernel_text if kernel.table is None else map_kernel_text
-    module = binding.parse_assembly(write(kernel), binding.create_context())
+    module = binding.parse_assembly(text, binding.create_context())
     module.triple = _TRIPLE
     target = binding.Target.from_triple(_TRIPLE)
     machine = target.create_target_machine(
@@ -243,13 +274,18 @@ def _transfers(
 
 
 @functools.cache
-def _architecture() -> int:
-    """Return the newest supported architecture that all present GPUs can run."""
-    capability = min(
+def compute_capability() -> int:
+    """Return ten times the lowest compute capability of the present GPUs."""
+    return min(
         round(10 * float(device.compute_capability))
         for device in jax.local_devices(backend=PLATFORM)
     )
-    return max((x for x in _ARCHITECTURES if x <= capability), default=_ARCHITECTURES[0])
+
+
+def target_architecture() -> int:
+    """Return the newest supported architecture that all present GPUs can run."""
+    supported = [x for x in _ARCHITECTURES if x <= compute_capability()]
+    return max(supported, default=_ARCHITECTURES[0])
 
 
 @functools.cache

@@ -1,0 +1,271 @@
+"""Compute the gradient of PPO's loss on an NVIDIA GPU by two kernels instead of a hundred.
+
+Motivation: XLA passes the activations of every layer through memory between its kernels, and
+launches 140 of them for a minibatch. Here one kernel computes the values, XLA the advantages, and
+one kernel the gradient of both networks; docs/update.md explains them.
+
+Protocol: the parameters and Adam's moments are one vector each during an update (`pack`, `unpack`).
+Products round their operands to bfloat16; sums, parameters and Adam stay float32. The random keys
+are those of Brax's loss.
+"""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from brax.training.agents.ppo import losses
+from brax.training.types import Transition
+from jaxtyping import Array, Float, PyTree, UInt32
+
+from jetbot_mjx.agents import gae
+from jetbot_mjx.compiler import ppo_kernel, ppo_launch
+from jetbot_mjx.compiler.ppo_kernel import POLICY_METRICS, VALUE_METRICS, LossTerms, UpdateShape
+from jetbot_mjx.config import PPOConfig
+
+_NetworkParams: Any = losses.PPONetworkParams
+
+_PROBE_ERROR = 0.02
+"""Largest difference of a small gradient from XLA's, relative to its norm."""
+
+
+class _Place(NamedTuple):
+    """A `_Place` is where a parameter lies in the vector."""
+
+    network: str
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    start: int
+
+    @property
+    def stop(self) -> int:
+        return self.start + math.prod(self.shape)
+
+
+def shape_of(
+    config: PPOConfig, observation_size: int | Mapping[str, Any], action_size: int
+) -> UpdateShape | str:
+    """Return the networks as the kernels know them, or why the kernels cannot compute them.
+
+    Args:
+      config: the settings of PPO, of which those of the networks are used.
+      observation_size: the length of the observation, or the shapes of its parts.
+      action_size: the length of the action.
+    """
+    network = config.network
+    hidden = network.policy_hidden_layer_sizes
+    widths = {*hidden, *network.value_hidden_layer_sizes}
+    shape = UpdateShape(
+        observation_size if isinstance(observation_size, int) else 0,
+        max(widths),
+        len(hidden),
+        action_size,
+        network.distribution_type,
+        network.activation,
+    )
+    if not isinstance(observation_size, int):
+        return "it takes observations without images"
+    if observation_size > ppo_kernel.MOST_OBSERVATIONS:
+        return f"it takes at most {ppo_kernel.MOST_OBSERVATIONS} numbers, not {observation_size}"
+    if max(shape.outputs) > ppo_kernel.MOST_OUTPUTS:
+        return f"it takes at most {ppo_kernel.MOST_OUTPUTS} outputs, not {max(shape.outputs)}"
+    if hidden != network.value_hidden_layer_sizes or len(widths) > 1:
+        return "it takes two networks of the same hidden layers of one width"
+    if shape.width % 16 or shape.width > ppo_kernel.MOST_WIDTH:
+        return f"it takes layers of 16, 32, ... {ppo_kernel.MOST_WIDTH} units, not {shape.width}"
+    if shape.sums > ppo_kernel.MOST_SUMS:
+        return "the gradient of these networks does not fit in the registers of a block"
+    return shape
+
+
+def choose(
+    config: PPOConfig,
+    observation_size: int | Mapping[str, Any],
+    action_size: int,
+    axis_name: str | None,
+) -> "FusedUpdate | str":
+    """Return the fused update of a configuration, or why this process cannot run it.
+
+    Args:
+      config: the hyperparameters.
+      observation_size: the length of the observation, or the shapes of its parts.
+      action_size: the length of the action.
+      axis_name: the mesh axis over which gradients are averaged; None: none.
+    """
+    if jax.default_backend() != "gpu":
+        return f"it needs an NVIDIA GPU, and this is {jax.default_backend()}"
+    shape = shape_of(config, observation_size, action_size)
+    if isinstance(shape, str):
+        return shape
+    return ppo_launch.refusal(shape) or FusedUpdate(config, shape, axis_name)
+
+
+class FusedUpdate:
+    """A `FusedUpdate` computes losses and gradients of both networks, as vectors."""
+
+    def __init__(self, config: PPOConfig, shape: UpdateShape, axis_name: str | None) -> None:
+        """Prepare.
+
+        Args:
+          config: the hyperparameters.
+          shape: the networks, from `shape_of`.
+          axis_name: the mesh axis over which gradients are averaged; None: none.
+        """
+        self._config, self._shape, self._axis = config, shape, axis_name
+        self._places = _places(shape)
+        self._terms = LossTerms(
+            config.clipping_epsilon, config.entropy_cost, config.vf_loss_coefficient
+        )
+        mask = np.zeros(shape.size, bool)
+        for place in self._places:
+            mask[place.start : place.stop] = True
+        self._is_parameter = mask
+
+    def pack(self, tree: PyTree) -> PyTree:
+        """Return a tree with a vector in place of every `PPONetworkParams`."""
+
+        def vector(node: Any) -> Any:
+            if not isinstance(node, _NetworkParams):
+                return node
+            parts, end = [], 0
+            for place in self._places:
+                leaf = getattr(node, place.network)
+                for key in place.path:
+                    leaf = leaf[key]
+                parts += [jnp.zeros(place.start - end), leaf.reshape(-1)]
+                end = place.stop
+            return jnp.concatenate([*parts, jnp.zeros(self._shape.size - end)])
+
+        return jax.tree.map(vector, tree, is_leaf=lambda x: isinstance(x, _NetworkParams))
+
+    def unpack(self, tree: PyTree, like: PyTree) -> PyTree:
+        """Return a tree with `PPONetworkParams` in place of vectors, as in another tree."""
+
+        def params(node: Any, vector: Any) -> Any:
+            if not isinstance(node, _NetworkParams):
+                return vector
+            networks: dict[str, Any] = {"policy": {}, "value": {}}
+            for place in self._places:
+                inner = networks[place.network]
+                for key in place.path[:-1]:
+                    inner = inner.setdefault(key, {})
+                inner[place.path[-1]] = vector[place.start : place.stop].reshape(place.shape)
+            return _NetworkParams(**networks)
+
+        return jax.tree.map(params, like, tree, is_leaf=lambda x: isinstance(x, _NetworkParams))
+
+    def loss_and_gradient(
+        self,
+        params: Float[Array, " size"],
+        normalizer: Any,
+        batch: Transition,
+        key: UInt32[Array, "2"],
+    ) -> tuple[tuple[Array, dict[str, Array]], Float[Array, " size"]]:
+        """Compute Brax's PPO loss and its gradient.
+
+        Args:
+          params: the parameters, from `pack`.
+          normalizer: the statistics of the observations.
+          batch: the minibatch, of shape (unrolls, time, ...).
+          key: the key of the noise that estimates the entropy.
+
+        Returns:
+          The loss with its metrics under Brax's names, and the gradient as a vector.
+        """
+        config, shape = self._config, self._shape
+        mean, scale = jnp.zeros(shape.observations), jnp.ones(shape.observations)
+        if config.normalize_observations:
+            mean, scale = normalizer.mean, 1.0 / normalizer.std
+        samples = self._samples(params, mean, scale, batch, key)
+        result = ppo_launch.gradient(shape, self._terms, params, mean, scale, samples)
+        gradient = jnp.where(self._is_parameter, result, 0.0)
+        if self._axis is not None:
+            gradient = jax.lax.pmean(gradient, self._axis)
+        return self._metrics(result, len(samples.advantage)), gradient
+
+    def _samples(
+        self, params: Array, mean: Array, scale: Array, batch: Transition, key: Array
+    ) -> ppo_launch.Samples:
+        """Compute advantages and targets by the current values, and the noise."""
+        config, shape = self._config, self._shape
+        unrolls, time = batch.reward.shape
+        count = unrolls * time
+        observation = batch.observation.reshape(count, -1)
+        last = batch.next_observation[:, -1]
+        estimates = ppo_launch.values(shape, params, mean, scale, observation, last)
+        extras: Any = batch.extras
+        truncation = extras["state_extras"]["truncation"].T
+        targets, advantages = gae.compute_gae(
+            truncation,
+            (1 - batch.discount.T) * (1 - truncation),
+            batch.reward.T * config.reward_scaling,
+            estimates[:count].reshape(unrolls, time).T,
+            estimates[count:],
+            config.gae_lambda,
+            config.discounting,
+        )
+        if config.normalize_advantage:
+            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
+        collected = extras["policy_extras"]
+        distribution = collected["distribution_params"]
+        if shape.distribution == "normal":
+            distribution = jnp.concatenate(distribution, axis=-1)
+        # Brax draws the noise with time as the first axis.
+        noise = jax.random.normal(key, (time, unrolls, shape.actions))
+        return ppo_launch.Samples(
+            observation,
+            collected["raw_action"].reshape(count, -1),
+            collected["log_prob"].reshape(count),
+            distribution.reshape(count, -1),
+            noise.swapaxes(0, 1).reshape(count, -1),
+            advantages.T.reshape(count),
+            targets.T.reshape(count),
+        )
+
+    def _metrics(self, result: Array, samples: int) -> tuple[Array, dict[str, Array]]:
+        """Return the loss and the metrics from their sums."""
+        config, shape = self._config, self._shape
+        sums = {}
+        for names, end in ((POLICY_METRICS, shape.policy_size), (VALUE_METRICS, shape.size)):
+            sums |= {name: result[end - len(names) + i] for i, name in enumerate(names)}
+        mean = {name: total / samples for name, total in sums.items()}
+        losses = {
+            "policy_loss": mean["policy_loss"],
+            "v_loss": mean["value_loss"] * (0.5 * config.vf_loss_coefficient),
+            "entropy_loss": mean["entropy"] * -config.entropy_cost,
+        }
+        loss = sum(losses.values(), jnp.zeros(()))
+        return loss, {
+            **losses,
+            "total_loss": loss,
+            "kl_mean": mean["kl"],
+            "policy_dist_mean_std": mean["std"] / shape.actions,
+        }
+
+
+def _places(shape: UpdateShape) -> list[_Place]:
+    """Return where each parameter lies, in the order of the vector."""
+    normal, places, start = shape.distribution == "normal", [], 0
+
+    def add(network: str, path: tuple[str, ...], *sizes: int) -> None:
+        nonlocal start
+        places.append(_Place(network, ("params", *path), sizes, start))
+        start = places[-1].stop
+
+    for network, outputs, metrics in zip(
+        ("policy", "value"), shape.outputs, (POLICY_METRICS, VALUE_METRICS), strict=True
+    ):
+        by_mean = normal and network == "policy"
+        for layer, inputs in enumerate(shape.inputs):
+            path = (*(["MLP_0"] if by_mean else []), f"hidden_{layer}")
+            size = shape.width
+            if layer == shape.layers:
+                path, size = (("Dense_0",) if by_mean else path), outputs
+            add(network, (*path, "kernel"), inputs, size)
+            add(network, (*path, "bias"), size)
+        if by_mean:
+            add(network, ("std_param", "value"), shape.actions)
+        start += len(metrics)
+    return places
