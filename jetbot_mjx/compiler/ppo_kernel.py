@@ -237,7 +237,11 @@ class _Kernel:
         ) * 2
 
     def lanes(
-        self, name: str, stride: int, pattern: tuple[Value, Value], row: Value | int = 0,
+        self,
+        name: str,
+        stride: int,
+        pattern: tuple[Value, Value],
+        row: Value | int = 0,
         column: Value | int = 0,
     ) -> Value:
         """Return the lane's pointer into a matrix of bfloat16, from a row and a column on."""
@@ -341,9 +345,7 @@ class _Kernel:
             name, stride = self.source(layer)
             left = self.lanes(name, stride, self.row_first, self.row)
             right = self.lanes(f"weights{layer}", self.stride, self.row_first, 0, self.column)
-            biases = ir.shared(
-                (self.column + self.sum_column) * 4, self.bytes_of(f"biases{layer}")
-            )
+            biases = ir.shared((self.column + self.sum_column) * 4, self.bytes_of(f"biases{layer}"))
             sums = ir.product(
                 self._biases(biases, tiling.row_tiles, 2 * self.pairs),
                 steps,
@@ -369,7 +371,9 @@ class _Kernel:
 
     def _biases(self, pointer: Value, row_tiles: int, columns: int) -> Sums:
         ir = self.ir
-        pairs = [[ir.read(ir.moved(pointer, 32 * n + 4 * j)) for j in (0, 1)] for n in range(columns)]
+        pairs = [
+            [ir.read(ir.moved(pointer, 32 * n + 4 * j)) for j in (0, 1)] for n in range(columns)
+        ]
         return [[[*pair, *pair] for pair in pairs] for _ in range(row_tiles)]
 
     def _activate(self, sums: Sums, layer: int) -> None:
@@ -417,7 +421,9 @@ class _Kernel:
         ir = self.ir
         following = tile + self.blocks
         more = following < -(-self.samples // self.tiling.rows)
-        carry = f"%tile = phi i32 [{self.block.text}, %{self.before}], [{following.text}, %{ir.label}]"
+        carry = (
+            f"%tile = phi i32 [{self.block.text}, %{self.before}], [{following.text}, %{ir.label}]"
+        )
         self.last = ir.label
         ir.do(f"br i1 {more.text}, label %tiles, label %after")
         ir.begin("after")
@@ -691,9 +697,7 @@ class _GradientKernel(_Kernel):
             self._add_weights(layer)
             if layer:
                 name = f"layer{layer + 1}"
-                self._propagate(
-                    layer, name, self.stride, f"weights{layer}", self.stride, tiles
-                )
+                self._propagate(layer, name, self.stride, f"weights{layer}", self.stride, tiles)
 
     def _propagate(
         self, layer: int, errors: str, stride: int, weights: str, by: int, steps: int

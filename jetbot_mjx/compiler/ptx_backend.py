@@ -135,7 +135,9 @@ def compiled(kernel: Kernel, architecture: int) -> str:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
-    return assembled((kernel_text if kernel.table is None else map_kernel_text)(kernel), architecture)
+    return assembled(
+        (kernel_text if kernel.table is None else map_kernel_text)(kernel), architecture
+    )
 
 
 def assembled(text: str, architecture: int) -> str:

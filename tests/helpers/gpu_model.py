@@ -111,7 +111,9 @@ class Gpu:
     def _select(self, condition, kind, yes, no):
         condition, yes, no = self._get("i1", condition), self._get(kind, yes), self._get(kind, no)
         if kind.startswith("ptr"):
-            return tuple(np.where(condition, one, other) for one, other in zip(yes, no, strict=True))
+            return tuple(
+                np.where(condition, one, other) for one, other in zip(yes, no, strict=True)
+            )
         return np.where(condition, yes, no)
 
     def _phi(self, kind, one, one_label, other, other_label):
@@ -225,7 +227,10 @@ _INSTRUCTIONS = [
         (r"extractvalue \{.*\} (\S+), (\d+)", Gpu._extract),
         (r'call void asm sideeffect "bar.*', Gpu._nothing),
         (r'call \w+ asm "(\S+) [^"]*", "[^"]*"\((.*)\)', Gpu._assembly),
-        (r"call \{.*\} @llvm\.nvvm\.ldmatrix\S*x4(\.trans)?\.b16\.p3\(\S+ \S+ (\S+)\) #0", Gpu._matrices),
+        (
+            r"call \{.*\} @llvm\.nvvm\.ldmatrix\S*x4(\.trans)?\.b16\.p3\(\S+ \S+ (\S+)\) #0",
+            Gpu._matrices,
+        ),
         (r"call \{.*\} @llvm\.nvvm\.mma\S*bf16\((.*)\) #0", Gpu._mma),
     )
 ]
