@@ -18,11 +18,20 @@ import jax.numpy as jnp
 import numpy as np
 from brax.training.agents.ppo import losses
 from brax.training.types import Transition
-from jaxtyping import Array, Float, PyTree, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.agents import gae
-from jetbot_mjx.compiler import ppo_kernel, ppo_launch
-from jetbot_mjx.compiler.ppo_kernel import POLICY_METRICS, VALUE_METRICS, LossTerms, UpdateShape
+from jetbot_mjx.compiler.update import launch
+from jetbot_mjx.compiler.update.shapes import (
+    MOST_OBSERVATIONS,
+    MOST_OUTPUTS,
+    MOST_SUMS,
+    MOST_WIDTH,
+    POLICY_METRICS,
+    VALUE_METRICS,
+    LossTerms,
+    Minibatch,
+    UpdateShape,
+)
 from jetbot_mjx.config import PPOConfig
 
 _NetworkParams: Any = losses.PPONetworkParams
@@ -42,6 +51,15 @@ class _Place(NamedTuple):
     @property
     def stop(self) -> int:
         return self.start + math.prod(self.shape)
+
+
+class Collected(NamedTuple):
+    """A `Collected` holds the data of a training step as the kernels read it."""
+
+    rows: Float[Array, "unrolls time columns"]
+    """A row for each step, with the columns of `UpdateShape.columns`."""
+    last: Float[Array, "unrolls obs"]
+    """The observations after the last steps."""
 
 
 def shape_of(
@@ -67,15 +85,15 @@ def shape_of(
     )
     if not isinstance(observation_size, int):
         return "it takes observations without images"
-    if observation_size > ppo_kernel.MOST_OBSERVATIONS:
-        return f"it takes at most {ppo_kernel.MOST_OBSERVATIONS} numbers, not {observation_size}"
-    if max(shape.outputs) > ppo_kernel.MOST_OUTPUTS:
-        return f"it takes at most {ppo_kernel.MOST_OUTPUTS} outputs, not {max(shape.outputs)}"
+    if observation_size > MOST_OBSERVATIONS:
+        return f"it takes at most {MOST_OBSERVATIONS} numbers, not {observation_size}"
+    if max(shape.outputs) > MOST_OUTPUTS:
+        return f"it takes at most {MOST_OUTPUTS} outputs, not {max(shape.outputs)}"
     if hidden != network.value_hidden_layer_sizes or len(widths) > 1:
         return "it takes two networks of the same hidden layers of one width"
-    if shape.width % 16 or shape.width > ppo_kernel.MOST_WIDTH:
-        return f"it takes layers of 16, 32, ... {ppo_kernel.MOST_WIDTH} units, not {shape.width}"
-    if shape.sums > ppo_kernel.MOST_SUMS:
+    if shape.width % 16 or shape.width > MOST_WIDTH:
+        return f"it takes layers of 16, 32, ... {MOST_WIDTH} units, not {shape.width}"
+    if shape.sums > MOST_SUMS:
         return "the gradient of these networks does not fit in the registers of a block"
     return shape
 
@@ -99,7 +117,9 @@ def choose(
     shape = shape_of(config, observation_size, action_size)
     if isinstance(shape, str):
         return shape
-    return ppo_launch.refusal(shape) or FusedUpdate(config, shape, axis_name)
+    unrolls = config.batch_size * config.num_minibatches
+    batch = Minibatch(unrolls, config.batch_size, config.unroll_length)
+    return launch.refusal(shape, batch) or FusedUpdate(config, shape, axis_name)
 
 
 class FusedUpdate:
@@ -115,9 +135,7 @@ class FusedUpdate:
         """
         self._config, self._shape, self._axis = config, shape, axis_name
         self._places = _places(shape)
-        self._terms = LossTerms(
-            config.clipping_epsilon, config.entropy_cost, config.vf_loss_coefficient
-        )
+        self._terms = LossTerms(**{name: getattr(config, name) for name in LossTerms._fields})
         mask = np.zeros(shape.size, bool)
         for place in self._places:
             mask[place.start : place.stop] = True
@@ -156,11 +174,33 @@ class FusedUpdate:
 
         return jax.tree.map(params, like, tree, is_leaf=lambda x: isinstance(x, _NetworkParams))
 
+    def collected(self, data: Transition) -> Collected:
+        """Return the collected data as the kernels read it.
+
+        Args:
+          data: the unrolls, of shape (unrolls, time, ...).
+        """
+        extras: Any = data.extras
+        distribution = extras["policy_extras"]["distribution_params"]
+        if self._shape.distribution == "normal":
+            distribution = jnp.concatenate(distribution, axis=-1)
+        rows = [
+            data.observation,
+            extras["policy_extras"]["raw_action"],
+            extras["policy_extras"]["log_prob"][..., None],
+            distribution,
+            data.reward[..., None],
+            data.discount[..., None],
+            extras["state_extras"]["truncation"][..., None],
+        ]
+        return Collected(jnp.concatenate(rows, axis=-1), data.next_observation[:, -1])
+
     def loss_and_gradient(
         self,
         params: Float[Array, " size"],
         normalizer: Any,
-        batch: Transition,
+        collected: Collected,
+        unrolls: Int[Array, " unrolls"],
         key: UInt32[Array, "2"],
     ) -> tuple[tuple[Array, dict[str, Array]], Float[Array, " size"]]:
         """Compute Brax's PPO loss and its gradient.
@@ -168,61 +208,26 @@ class FusedUpdate:
         Args:
           params: the parameters, from `pack`.
           normalizer: the statistics of the observations.
-          batch: the minibatch, of shape (unrolls, time, ...).
+          collected: all data, from `collected`.
+          unrolls: the unrolls of the minibatch.
           key: the key of the noise that estimates the entropy.
 
         Returns:
           The loss with its metrics under Brax's names, and the gradient as a vector.
         """
-        config, shape = self._config, self._shape
+        shape, time = self._shape, collected.rows.shape[1]
         mean, scale = jnp.zeros(shape.observations), jnp.ones(shape.observations)
-        if config.normalize_observations:
+        if self._config.normalize_observations:
             mean, scale = normalizer.mean, 1.0 / normalizer.std
-        samples = self._samples(params, mean, scale, batch, key)
-        result = ppo_launch.gradient(shape, self._terms, params, mean, scale, samples)
+        # Brax draws the noise with time as the first axis.
+        noise = jax.random.normal(key, (time, unrolls.shape[0], shape.actions))
+        result = launch.gradient(
+            shape, self._terms, params, mean, scale, *collected, unrolls, noise
+        )
         gradient = jnp.where(self._is_parameter, result, 0.0)
         if self._axis is not None:
             gradient = jax.lax.pmean(gradient, self._axis)
-        return self._metrics(result, len(samples.advantage)), gradient
-
-    def _samples(
-        self, params: Array, mean: Array, scale: Array, batch: Transition, key: Array
-    ) -> ppo_launch.Samples:
-        """Compute advantages and targets by the current values, and the noise."""
-        config, shape = self._config, self._shape
-        unrolls, time = batch.reward.shape
-        count = unrolls * time
-        observation = batch.observation.reshape(count, -1)
-        last = batch.next_observation[:, -1]
-        estimates = ppo_launch.values(shape, params, mean, scale, observation, last)
-        extras: Any = batch.extras
-        truncation = extras["state_extras"]["truncation"].T
-        targets, advantages = gae.compute_gae(
-            truncation,
-            (1 - batch.discount.T) * (1 - truncation),
-            batch.reward.T * config.reward_scaling,
-            estimates[:count].reshape(unrolls, time).T,
-            estimates[count:],
-            config.gae_lambda,
-            config.discounting,
-        )
-        if config.normalize_advantage:
-            advantages = (advantages - advantages.mean()) / (advantages.std() + 1e-8)
-        collected = extras["policy_extras"]
-        distribution = collected["distribution_params"]
-        if shape.distribution == "normal":
-            distribution = jnp.concatenate(distribution, axis=-1)
-        # Brax draws the noise with time as the first axis.
-        noise = jax.random.normal(key, (time, unrolls, shape.actions))
-        return ppo_launch.Samples(
-            observation,
-            collected["raw_action"].reshape(count, -1),
-            collected["log_prob"].reshape(count),
-            distribution.reshape(count, -1),
-            noise.swapaxes(0, 1).reshape(count, -1),
-            advantages.T.reshape(count),
-            targets.T.reshape(count),
-        )
+        return self._metrics(result, unrolls.shape[0] * time), gradient
 
     def _metrics(self, result: Array, samples: int) -> tuple[Array, dict[str, Array]]:
         """Return the loss and the metrics from their sums."""

@@ -42,7 +42,7 @@ Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.
 google/brax v0.14.2, brax/training/agents/ppo.
 """
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -165,7 +165,7 @@ class PPO:
         self._make_policy = ppo_networks.make_inference_fn(any_networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
-        self._xla_loss_and_gradient = gradients.loss_and_pgrad(
+        self._loss_and_gradient = gradients.loss_and_pgrad(
             loss, pmap_axis_name=axis_name, has_aux=True
         )
         self.fused: fused_update.FusedUpdate | None = None
@@ -382,23 +382,30 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
-        like = params, optimizer_state
-        if self.fused:
-            params, optimizer_state = self.fused.pack(like)
+        unpacked, fused = (params, optimizer_state), self.fused
+        if fused:
+            params, optimizer_state = fused.pack(unpacked)
+            collected = fused.collected(data)
+
+        def loss_and_gradient(params: PyTree, batch: Any, key: Array) -> Any:
+            if fused:
+                return fused.loss_and_gradient(params, normalizer, collected, batch, key)
+            return self._loss_and_gradient(params, normalizer, batch, key)
 
         def one_pass(carry: PyTree, _: None) -> tuple[PyTree, PyTree]:
             params, optimizer_state, key = carry
             key, shuffle_key, minibatch_key = jax.random.split(key, 3)
-
             order = jax.random.permutation(shuffle_key, data.reward.shape[0])
 
             def minibatches(x: Array) -> Array:
-                return x[order].reshape((self.config.num_minibatches, -1, *x.shape[1:]))
+                return x.reshape((self.config.num_minibatches, -1, *x.shape[1:]))
 
+            # The kernels read the unrolls where they are.
+            shuffled = order if fused else jax.tree.map(lambda x: x[order], data)
             (params, optimizer_state, _), metrics = jax.lax.scan(
-                lambda carry, batch: self._minibatch_step(carry, batch, normalizer),
+                lambda carry, batch: self._minibatch_step(carry, batch, loss_and_gradient),
                 (params, optimizer_state, minibatch_key),
-                jax.tree.map(minibatches, data),
+                jax.tree.map(minibatches, shuffled),
             )
             return (params, optimizer_state, key), metrics
 
@@ -406,8 +413,8 @@ class PPO:
         (params, optimizer_state, _), metrics = jax.lax.scan(
             one_pass, (params, optimizer_state, key), length=self.config.num_updates_per_batch
         )
-        if self.fused:
-            params, optimizer_state = self.fused.unpack((params, optimizer_state), like)
+        if fused:
+            params, optimizer_state = fused.unpack((params, optimizer_state), unpacked)
         if self._axis is not None:
             metrics = jax.lax.pmean(metrics, self._axis)
         applied = metrics.pop("applied")
@@ -421,14 +428,13 @@ class PPO:
     def _minibatch_step(
         self,
         carry: tuple[PyTree, PyTree, UInt32[Array, "2"]],
-        batch: Transition,
-        normalizer: running_statistics.RunningStatisticsState,
+        batch: Any,
+        loss_and_gradient: Callable[..., Any],
     ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
         """Apply one gradient step, or skip it if the gradient is not finite."""
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
-        compute = self.fused.loss_and_gradient if self.fused else self._xla_loss_and_gradient
-        (_, metrics), gradient = compute(params, normalizer, batch, loss_key)
+        (_, metrics), gradient = loss_and_gradient(params, batch, loss_key)
         finite = jnp.isfinite(optax.tree.norm(gradient))
         # Adapt the step size to the KL divergence, and compute the update.
         before = params, optimizer_state

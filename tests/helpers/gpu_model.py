@@ -1,4 +1,4 @@
-"""A model in NumPy of the GPU on which kernels of `tensor_core` run: all threads of a block in step.
+"""A model in NumPy of the GPU that runs kernels of `tensor_core`: all threads of a block in step.
 
 It executes the text of a kernel, instruction by instruction, for every block after the other. Races
 between threads cannot show here, but wrong places and wrong arithmetic do.
@@ -9,7 +9,6 @@ import re
 import ml_dtypes
 import numpy as np
 
-THREADS = 256
 SHARED = 232_448
 
 _ARITHMETIC = {
@@ -32,6 +31,7 @@ _FUNCTIONS = {
     "ex2.approx.ftz.f32": np.exp2,
     "lg2.approx.ftz.f32": np.log2,
     "rcp.approx.ftz.f32": np.reciprocal,
+    "sqrt.approx.ftz.f32": np.sqrt,
     "tanh.approx.f32": np.tanh,
 }
 _OPERATION = "|".join(_ARITHMETIC)
@@ -46,6 +46,7 @@ class Gpu:
     """A GPU with the arrays that a kernel is given."""
 
     def __init__(self, text, arrays):
+        self.threads = int(re.search(r'"maxntidx", i32 (\d+)', text)[1])
         body = text.partition("entry:\n")[2].partition("\n}")[0]
         self.lines = [line.strip() for line in body.splitlines()]
         self.labels = {line[:-1]: i for i, line in enumerate(self.lines) if line.endswith(":")}
@@ -57,15 +58,15 @@ class Gpu:
             for network in range(networks):
                 for block in range(blocks):
                     grid = {"ctaid.x": block, "ctaid.y": network, "ctaid.z": seed}
-                    self._block({**grid, "nctaid.x": blocks, "tid.x": np.arange(THREADS)})
+                    self._block({**grid, "nctaid.x": blocks, "tid.x": np.arange(self.threads)})
 
     def _block(self, registers):
         self.special = registers
-        zero = np.zeros(THREADS, int)
+        zero = np.zeros(self.threads, int)
         self.values = {f"%a{i}": (zero + i, zero) for i in range(len(self.arrays))}
         # What was not written is not a number.
         self.memory = np.full(SHARED // 4, 0x7FFF7FFF, np.uint32)
-        self.active = [np.ones(THREADS, bool)]
+        self.active = [np.ones(self.threads, bool)]
         self.label, self.before, at = "entry", "", 0
         while self.lines[at] != "ret void":
             at = self._step(self.lines[at], at)
@@ -95,8 +96,8 @@ class Gpu:
         if kind == "float":
             bits = int(text, 16) if text.startswith("0x") else None
             number = float(text) if bits is None else np.uint64(bits).view(np.float64)
-            return np.full(THREADS, number, np.float32)
-        return np.full(THREADS, int(text) & 0xFFFFFFFF, np.uint32)
+            return np.full(self.threads, number, np.float32)
+        return np.full(self.threads, int(text) & 0xFFFFFFFF, np.uint32)
 
     def _execute(self, what):
         with np.errstate(all="ignore"):
@@ -121,10 +122,10 @@ class Gpu:
         return self._get(kind, one if self.before == one_label else other)
 
     def _special(self, name):
-        return np.full(THREADS, 0, np.uint32) + np.asarray(self.special[name], np.uint32)
+        return np.full(self.threads, 0, np.uint32) + np.asarray(self.special[name], np.uint32)
 
     def _shared(self, base, offset):
-        start = np.zeros(THREADS, int) if base == "@shared" else self.values[base]
+        start = np.zeros(self.threads, int) if base == "@shared" else self.values[base]
         return start + self._get("i32", offset).astype(int)
 
     def _element(self, base, index):
@@ -144,9 +145,9 @@ class Gpu:
         on = self.active[-1]
         self.memory[self.values[pointer][on] // 4] = words[on]
 
-    def _load(self, pointer):
+    def _load(self, kind, pointer):
         arrays, places = self.values[pointer]
-        result = np.zeros(THREADS, np.float32)
+        result = np.zeros(self.threads, np.float32 if kind == "float" else np.uint32)
         for number in np.unique(arrays):
             on = self.active[-1] & (arrays == number)
             assert (places[on] >= 0).all()
@@ -190,7 +191,7 @@ class Gpu:
             words = words.astype(np.uint32)
             return (words << 16).view(np.float32), (words & 0xFFFF0000).view(np.float32)
 
-        warps, lane = THREADS // 32, np.arange(32)
+        warps, lane = self.threads // 32, np.arange(32)
         g, t = lane // 4, lane % 4 * 2
         a = np.zeros((warps, 16, 16), np.float32)
         b = np.zeros((warps, 16, 8), np.float32)
@@ -220,7 +221,7 @@ _INSTRUCTIONS = [
         (r"getelementptr float, ptr addrspace\(1\) (\S+), i(?:32|64) (\S+)", Gpu._element),
         (r"load (\w+), ptr addrspace\(3\) (\S+), align 4", Gpu._load_shared),
         (r"store (\w+) (\S+), ptr addrspace\(3\) (\S+), align 4", Gpu._store_shared),
-        (r"load float, ptr addrspace\(1\) (\S+)", Gpu._load),
+        (r"load (\w+), ptr addrspace\(1\) (\S+)", Gpu._load),
         (r"store float (\S+), ptr addrspace\(1\) (\S+)", Gpu._store),
         (r"zext i32 (\S+) to i64", lambda gpu, value: gpu.values[value]),
         (r"bitcast i32 (\S+) to float", Gpu._bitcast),

@@ -176,6 +176,10 @@ class IrWriter:
         """Return 1 / x."""
         return self.assembly("rcp.approx.ftz.f32", x)
 
+    def sqrt(self, x: Value) -> Value:
+        """Return the square root."""
+        return self.assembly("sqrt.approx.ftz.f32", x)
+
     def tanh(self, x: Value) -> Value:
         """Return the hyperbolic tangent."""
         return self.assembly("tanh.approx.f32", x)
@@ -217,10 +221,10 @@ class IrWriter:
 
     # Memory: addresses in shared memory are bytes; global arrays are of floats.
 
-    def shared(self, place: Value, offset: int = 0) -> Value:
+    def shared(self, place: Value | int, offset: int = 0) -> Value:
         """Return the pointer to a byte of shared memory."""
-        kind = "ptr addrspace(3)"
-        pointer = self.let(f"getelementptr i8, {kind} @shared, i32 {place.text}", kind)
+        kind, text = "ptr addrspace(3)", place.text if isinstance(place, Value) else place
+        pointer = self.let(f"getelementptr i8, {kind} @shared, i32 {text}", kind)
         return self.moved(pointer, offset)
 
     def moved(self, pointer: Value, offset: int) -> Value:
@@ -250,9 +254,9 @@ class IrWriter:
         kind = "ptr addrspace(1)"
         return self.let(f"getelementptr float, {kind} {array.text}, i64 {place.text}", kind)
 
-    def fetch(self, array: Value, index: Value) -> Value:
-        """Return an element of a global array."""
-        return self.let(f"load float, ptr addrspace(1) {self.element(array, index).text}", "float")
+    def fetch(self, array: Value, index: Value, kind: str = "float") -> Value:
+        """Return an element of a global array of floats or of integers of 32 bits."""
+        return self.let(f"load {kind}, ptr addrspace(1) {self.element(array, index).text}", kind)
 
     def put(self, value: Value, array: Value, index: Value) -> None:
         """Store an element of a global array."""

@@ -1,0 +1,169 @@
+"""Write the kernel that computes values, advantages and value targets of a minibatch.
+
+A tile holds whole unrolls, each followed by its last observation. When the values of all rows are
+in shared memory, one thread an unroll runs backwards through it by the equation of
+`jetbot_mjx.agents.gae`. The sums of the advantages and of their squares, a pair for each block, are
+all that their normalisation needs.
+"""
+
+from jetbot_mjx.compiler.update.network import NetworkKernel
+from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling
+from jetbot_mjx.compiler.update.tensor_core import LANES, Value
+
+
+def tile_count(tiling: Tiling, batch: Minibatch) -> int:
+    """Return the number of tiles of a minibatch."""
+    return -(-batch.unrolls // (tiling.rows // (batch.time + 1)))
+
+
+def advantages_text(tiling: Tiling, batch: Minibatch, terms: LossTerms) -> str:
+    """Write the kernel.
+
+    Its arguments are the parameters, mean and 1 / std of the observations, the collected rows,
+    the last observations, and the unrolls of the minibatch; its results the advantages, the
+    targets, and for each block the sums of the advantages and of their squares.
+
+    Args:
+      tiling: the division of the work.
+      batch: the minibatch.
+      terms: the constants of the loss.
+
+    Returns:
+      The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
+    """
+    return _AdvantageKernel(tiling, batch, terms).write()
+
+
+class _AdvantageKernel(NetworkKernel):
+    def __init__(self, tiling: Tiling, batch: Minibatch, terms: LossTerms) -> None:
+        super().__init__(tiling, batch, tile_count(tiling, batch))
+        self.terms = terms
+        self.per_tile = tiling.rows // (batch.time + 1)
+
+    def write(self) -> str:
+        ir, shape, batch = self.ir, self.shape, self.batch
+        self.prepare()
+        seed = ir.register("ctaid.z")
+        sizes = [shape.size, shape.observations, shape.observations]
+        sizes += [batch.collected * batch.time * shape.columns["size"]]
+        sizes += [batch.collected * shape.observations, batch.unrolls, batch.samples, batch.samples]
+        self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
+        part = seed * self.blocks + self.block
+        self.statistics = ir.row(Value(ir, "%a8", "ptr addrspace(1)"), part, 2)
+        params = ir.element(self.arrays[0], ir.constant(shape.policy_size, "i32"))
+        self.load_network(params, ir.constant(1, "i32"), self.arrays[1], self.arrays[2])
+        ir.synchronize()
+        tile = self.begin_tiles()
+        total, squares = (Value(ir, name, "float") for name in ("%total", "%squares"))
+        advantage = self._tile(tile)
+        ir.synchronize()
+        ends = total + advantage, squares + advantage * advantage
+        self.end_tiles(tile, [(total, ends[0]), (squares, ends[1])])
+        self._store_statistics(*ends)
+        return self.text(9)
+
+    def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
+        """Return the unroll of a row of a tile, which may not exist, and the step in it."""
+        length = self.batch.time + 1
+        return tile * self.per_tile + row // length, row % length
+
+    def _row(self, unroll: Value, step: Value) -> tuple[Value, Value]:
+        """Return the unroll among the collected ones, and the pointer to the row of its step."""
+        ir, time = self.ir, self.batch.time
+        kept = ir.minimum(unroll, self.batch.unrolls - 1)
+        collected = ir.fetch(self.arrays[5], kept, "i32")
+        sample = collected * time + ir.minimum(step, time - 1)
+        return collected, ir.row(self.arrays[3], sample, self.shape.columns["size"])
+
+    def _tile(self, tile: Value) -> Value:
+        """Compute a tile; return the thread's advantage, or 0 if it has none."""
+        ir, shape, time = self.ir, self.shape, self.batch.time
+        rows = self.tiling.rows
+        own = ir.minimum(self.thread, rows - 1)
+        unroll, step = self._unroll(tile, own)
+        _, start = self._row(unroll, step)
+        reward, discount, truncation = (
+            ir.fetch(start, ir.constant(shape.columns[name], "i32"))
+            for name in ("reward", "discount", "truncation")
+        )
+
+        def observation(row: Value) -> Value:
+            unroll, step = self._unroll(tile, row)
+            collected, start = self._row(unroll, step)
+            last = ir.row(self.arrays[4], collected, shape.observations)
+            return ir.select(step < time, start, last)
+
+        self.load_observations(observation)()
+        ir.synchronize()
+        self._store_values()
+        ir.synchronize()
+        # The differences, for all steps at once.
+        kept = 1.0 - truncation
+        termination = (1.0 - discount) * kept
+        future = (1.0 - termination) * self.terms.discounting
+        reward = reward * self.terms.reward_scaling
+        value, following = self._read("values", own), self._read("values", own, 1)
+        self._write((reward + future * following - value) * kept, "deltas", own)
+        self._write(future * kept * self.terms.gae_lambda, "factors", own)
+        ir.synchronize()
+        with ir.when(self.thread < self.per_tile):
+            self._accumulate()
+        ir.synchronize()
+        advantage = (reward + future * self._read("targets", own, 1) - value) * kept
+        # Rows beyond the unrolls, and those of the last observations, have none.
+        beyond = ir.constant(self.batch.unrolls, "i32")
+        unroll = ir.select(own < self.per_tile * (time + 1), unroll, beyond)
+        unroll = ir.select(step < time, unroll, beyond)
+        there = ir.select(self.thread < rows, unroll, beyond) < beyond
+        with ir.when(there):
+            place = unroll * time + step
+            ir.put(advantage, self.arrays[6], place)
+            ir.put(self._read("targets", own), self.arrays[7], place)
+        return ir.select(there, advantage, 0.0)
+
+    def _store_values(self) -> None:
+        """Write the forward pass, and store the first output of each row."""
+        ir = self.ir
+        pointer = ir.shared((self.row + self.sum_row) * 4, self.bytes_of("values"))
+        sums = self.forward()
+        with ir.when(self.sum_column.equals(0)):
+            for m, (four,) in enumerate(sums):
+                ir.write(four[0], ir.moved(pointer, 64 * m))
+                ir.write(four[2], ir.moved(pointer, 64 * m + 32))
+
+    def _accumulate(self) -> None:
+        """Run backwards through an unroll, and store its value targets."""
+        ir, time = self.ir, self.batch.time
+        first = self.thread * (time + 1)
+        total = ir.constant(0.0)
+        self._write(self._read("values", first, time), "targets", first, time)
+        for step in reversed(range(time)):
+            factor = self._read("factors", first, step)
+            total = factor * total + self._read("deltas", first, step)
+            self._write(total + self._read("values", first, step), "targets", first, step)
+
+    def _read(self, name: str, row: Value, offset: int = 0) -> Value:
+        return self.ir.read(self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset))
+
+    def _write(self, value: Value, name: str, row: Value, offset: int = 0) -> None:
+        self.ir.write(value, self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset))
+
+    def _store_statistics(self, *sums: Value) -> None:
+        """Add up the threads' sums in a fixed order, and store those of the block."""
+        ir, threads = self.ir, self.tiling.threads
+        for i, value in enumerate(sums):
+            self._write(value, "statistics", self.thread, threads * i)
+        ir.synchronize()
+        lanes = 2 * threads
+        with ir.when(self.thread < LANES):
+            for i in range(2):
+                total = ir.constant(0.0)
+                for j in range(threads // LANES):
+                    total += self._read("statistics", self.thread, threads * i + LANES * j)
+                self._write(total, "statistics", self.thread, lanes + LANES * i)
+        ir.synchronize()
+        with ir.when(self.thread < 2):
+            total = ir.constant(0.0)
+            for j in range(LANES):
+                total += self._read("statistics", self.thread * LANES, lanes + j)
+            ir.put(total, self.statistics, self.thread)

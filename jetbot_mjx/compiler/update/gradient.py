@@ -1,0 +1,439 @@
+"""Write the kernel that computes the gradient of both networks by PPO's loss.
+
+A block has 256 threads, serves one network (`ctaid.y`: 0 the policy, 1 the values), and loops over
+tiles of samples. Weights and activations are in shared memory as bfloat16, all sums are float32,
+and the sums of the gradient stay in registers until the last tile.
+"""
+
+import math
+
+from jetbot_mjx.compiler.update.network import NetworkKernel
+from jetbot_mjx.compiler.update.shapes import (
+    MOST_OUTPUTS,
+    PAD,
+    POLICY_METRICS,
+    VALUE_METRICS,
+    LossTerms,
+    Minibatch,
+    Tiling,
+    padded,
+)
+from jetbot_mjx.compiler.update.tensor_core import LANES, TILE, IrWriter, Sums, Value
+
+_MIN_STD = 0.001
+_HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
+_ONES = 0x3F803F80
+"""Two ones in bfloat16."""
+
+
+def tile_count(tiling: Tiling, batch: Minibatch) -> int:
+    """Return the number of tiles of a minibatch."""
+    return -(-batch.samples // tiling.rows)
+
+
+def gradient_text(tiling: Tiling, batch: Minibatch, terms: LossTerms, parts: int) -> str:
+    """Write the kernel.
+
+    Its arguments are the parameters, mean and 1 / std of the observations, the collected rows, the
+    unrolls of the minibatch, the noise, of shape (time, unrolls, action), and the results of the
+    kernel of the advantages; its result is a vector for each block, whose sum is the gradient.
+
+    Args:
+      tiling: the division of the work.
+      batch: the minibatch.
+      terms: the constants of the loss.
+      parts: the number of blocks of the kernel of the advantages.
+
+    Returns:
+      The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
+    """
+    return _GradientKernel(tiling, batch, terms, parts).write()
+
+
+class _GradientKernel(NetworkKernel):
+    def __init__(self, tiling: Tiling, batch: Minibatch, terms: LossTerms, parts: int) -> None:
+        super().__init__(tiling, batch, tile_count(tiling, batch))
+        self.terms, self.parts = terms, parts
+        self.width, self.shares = self.shape.width, self.shape.shares
+
+    def write(self) -> str:
+        ir, shape, batch = self.ir, self.shape, self.batch
+        self.prepare()
+        self.network, seed = ir.register("ctaid.y"), ir.register("ctaid.z")
+        self.is_policy = self.network.equals(0)
+        sizes = [shape.size, shape.observations, shape.observations]
+        sizes += [batch.collected * batch.time * shape.columns["size"], batch.unrolls]
+        sizes += [batch.samples * shape.actions, batch.samples, batch.samples, 2 * self.parts]
+        self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
+        part = seed * self.blocks + self.block
+        start = self.network * shape.policy_size
+        parts = ir.row(Value(ir, "%a9", "ptr addrspace(1)"), part, shape.size)
+        self.part = ir.element(parts, start)
+        self.params = ir.element(self.arrays[0], start)
+        self.outputs = ir.select(
+            self.is_policy, ir.constant(shape.outputs[0], "i32"), ir.constant(1, "i32")
+        )
+        self.load_network(self.params, self.outputs, self.arrays[1], self.arrays[2])
+        self._clear()
+        if self.terms.normalize_advantage:
+            self._load_statistics()
+        ir.synchronize()
+        tile = self.begin_tiles()
+        self._begin_sums()
+        self._load_tile(tile)
+        ir.synchronize()
+        self._store_outputs(self.forward())
+        ir.synchronize()
+        with ir.when(self.thread < self.tiling.rows):
+            self._loss(tile)
+        ir.synchronize()
+        self._backward()
+        ir.synchronize()
+        self.end_tiles(tile, list(zip(self.begun, self._all_sums(), strict=True)))
+        self._store_gradient()
+        return self.text(10)
+
+    def _clear(self) -> None:
+        ir = self.ir
+        zero = ir.constant(0, "i32")
+        for name, following in (("errors", "extras"), ("slots", "size")):
+            for i in self.each((self.bytes_of(following) - self.bytes_of(name)) // 4):
+                ir.write(zero, ir.shared(i * 4, self.bytes_of(name)))
+
+    def _load_statistics(self) -> None:
+        """Compute the mean of the advantages and 1 / std from the sums of all blocks."""
+        ir, place = self.ir, self.bytes_of("statistics")
+        with ir.when(self.thread < LANES):
+            for i in range(2):
+                total = ir.constant(0.0)
+                for j in range(0, self.parts, LANES):
+                    part = self.thread + j
+                    value = ir.fetch(self.arrays[8], ir.minimum(part, self.parts - 1) * 2 + i)
+                    total += ir.select(part < self.parts, value, 0.0)
+                ir.write(total, ir.shared(self.thread * 4, place + 4 * LANES * i))
+        ir.synchronize()
+        with ir.when(self.thread < 1):
+            totals = []
+            for i in range(2):
+                total = ir.constant(0.0)
+                for j in range(LANES):
+                    total += ir.read(ir.shared(place + 4 * (LANES * i + j)))
+                totals.append(total * (1 / self.batch.samples))
+            mean, square = totals
+            variance = square - mean * mean
+            variance = ir.select(variance < 0.0, ir.constant(0.0), variance)
+            ir.write(mean, ir.shared(place + 4 * 2 * LANES))
+            scale = ir.reciprocal(ir.sqrt(variance) + 1e-8)
+            ir.write(scale, ir.shared(place + 4 * (2 * LANES + 1)))
+
+    def _load_tile(self, tile: Value) -> None:
+        """Copy a tile's observations and what else the loss reads to shared memory."""
+        ir, time, columns = self.ir, self.batch.time, self.shape.columns
+
+        def place(row: Value) -> tuple[Value, Value, Value, Value]:
+            sample = ir.minimum(tile * self.tiling.rows + row, self.batch.samples - 1)
+            unroll, step = sample // time, sample % time
+            collected = ir.fetch(self.arrays[4], unroll, "i32")
+            start = ir.row(self.arrays[3], collected * time + step, columns["size"])
+            return sample, unroll, step, start
+
+        own = ir.minimum(self.thread, self.tiling.rows - 1)
+        sample, unroll, step, start = place(own)
+        first, last = columns["raw_action"], columns["reward"]
+        extras = [ir.fetch(start, ir.constant(i, "i32")) for i in range(first, last)]
+        noise = (step * self.batch.unrolls + unroll) * self.shape.actions
+        extras += [ir.fetch(self.arrays[5], noise + i) for i in range(self.shape.actions)]
+        extras += [ir.fetch(self.arrays[i], sample) for i in (6, 7)]
+        self.load_observations(lambda row: place(row)[3])()
+        pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
+        for i, value in enumerate(extras):
+            ir.write(value, ir.moved(pointer, 4 * i))
+
+    # The sums of the gradient are carried from tile to tile.
+
+    def _begin_sums(self) -> None:
+        def zeros(rows: int, columns: int, name: str) -> Sums:
+            return [
+                [
+                    [Value(self.ir, f"%{name}.{m}.{n}.{i}", "float") for i in range(4)]
+                    for n in range(columns)
+                ]
+                for m in range(rows)
+            ]
+
+        self.weight_sums = [
+            zeros(share.row_tiles, 2 * share.pairs, f"w{i}") for i, share in enumerate(self.shares)
+        ]
+        self.bias_sums = [zeros(1, 1, f"b{i}") for i in range(self.shape.layers)]
+        self.head_sums = zeros(1, 1, "h")
+        self.begun = self._all_sums()
+
+    def _all_sums(self) -> list[Value]:
+        groups = [*self.weight_sums, *self.bias_sums, self.head_sums]
+        return [x for group in groups for row in group for four in row for x in four]
+
+    def _store_outputs(self, sums: Sums) -> None:
+        """Store the outputs of the network in shared memory, a row for each sample."""
+        ir, stride = self.ir, 4 * (MOST_OUTPUTS + 1)
+        pointer = ir.shared(
+            (self.row + self.sum_row) * stride + self.sum_column * 4, self.bytes_of("outputs")
+        )
+        for m, (four,) in enumerate(sums):
+            for i, value in enumerate(four):
+                ir.write(value, ir.moved(pointer, stride * (TILE * m + 8 * (i // 2)) + 4 * (i % 2)))
+
+    def _extra(self, index: int) -> Value:
+        """Return a number that the loss of the thread's sample reads."""
+        return self.ir.read(self.ir.moved(self.extras, 4 * index))
+
+    def _loss(self, tile: Value) -> None:
+        """Write the derivative of the loss by the outputs of one sample, a thread for each."""
+        ir = self.ir
+        self.is_there = tile * self.tiling.rows + self.thread < self.batch.samples
+        self.own = ir.shared(self.thread * (4 * (MOST_OUTPUTS + 1)), self.bytes_of("outputs"))
+        self.extras = ir.shared(self.thread * (4 * self.tiling.extras), self.bytes_of("extras"))
+        with ir.when(self.is_policy):
+            self._policy_loss()
+        with ir.when(self.network.equals(1)):
+            error = ir.read(self.own) - self._extra(self.tiling.extras - 1)
+            slope = error * (self.terms.vf_loss_coefficient / self.batch.samples)
+            self._store_errors([slope], [error * error])
+
+    def _policy_loss(self) -> None:
+        ir, shape, terms, samples = self.ir, self.shape, self.terms, self.batch.samples
+        actions, count = range(shape.actions), shape.actions
+        tanh = shape.distribution == "tanh_normal"
+        if tanh:
+            raw = [ir.read(ir.moved(self.own, 4 * (count + i))) for i in actions]
+            scale = [ir.softplus(x) + _MIN_STD for x in raw]
+        else:
+            raw = []
+            place = ir.constant(shape.policy_size - len(POLICY_METRICS) - count, "i32")
+            scale = [ir.fetch(self.params, place + i) for i in actions]
+        mean = [ir.read(ir.moved(self.own, 4 * i)) for i in actions]
+        inverse, log_scale = [ir.reciprocal(x) for x in scale], [ir.log(x) for x in scale]
+        action = [self._extra(i) for i in actions]
+        noise = [self._extra(3 * count + 1 + i) for i in actions]
+        distance = [(action[i] - mean[i]) * inverse[i] for i in actions]
+        # The clipped surrogate objective.
+        log_ratio = self._extra(count) * -1.0
+        for i in actions:
+            log_ratio += distance[i] * distance[i] * -0.5 - log_scale[i] - _HALF_LOG_TWO_PI
+            if tanh:
+                log_ratio -= _log_slope(ir, action[i])
+        ratio, advantage = ir.exp(log_ratio), self._advantage()
+        low, high = ir.constant(1 - terms.clipping_epsilon), 1 + terms.clipping_epsilon
+        clipped = ir.select(ratio < low, low, ir.minimum(ratio, high)) * advantage
+        surrogate = ratio * advantage
+        by_log = ir.select(surrogate <= clipped, surrogate * (-1 / samples), 0.0)
+        # The entropy, of a sample of the current policy.
+        weight = -terms.entropy_cost / samples
+        entropy = ir.constant(0.0)
+        by_mean, by_scale = [], []
+        for i in actions:
+            entropy += log_scale[i] + (0.5 + _HALF_LOG_TWO_PI)
+            pull, push = by_log * distance[i] * inverse[i], inverse[i] * weight
+            if tanh:
+                sample = noise[i] * scale[i] + mean[i]
+                entropy += _log_slope(ir, sample)
+                slope = (ir.sigmoid(sample * -2.0) * 4.0 - 2.0) * weight
+                pull, push = pull + slope, push + slope * noise[i]
+            by_mean.append(pull)
+            by_scale.append(by_log * (distance[i] * distance[i] - 1.0) * inverse[i] + push)
+        divergence = self._divergence(mean, scale, inverse, tanh=tanh)
+        spread = sum(scale[1:], scale[0])
+        metrics = [ir.minimum(surrogate, clipped) * -1.0, entropy, divergence, spread]
+        if tanh:
+            by_raw = [x * ir.sigmoid(z) for x, z in zip(by_scale, raw, strict=True)]
+            self._store_errors([*by_mean, *by_raw], metrics)
+        else:
+            self._store_errors(by_mean, [*by_scale, *metrics])
+
+    def _advantage(self) -> Value:
+        """Return the advantage of the thread's sample, normalised if configured."""
+        advantage = self._extra(self.tiling.extras - 2)
+        if not self.terms.normalize_advantage:
+            return advantage
+        place = self.bytes_of("statistics") + 4 * 2 * LANES
+        mean, scale = (self.ir.read(self.ir.shared(place + 4 * i)) for i in (0, 1))
+        return (advantage - mean) * scale
+
+    def _divergence(
+        self, mean: list[Value], scale: list[Value], inverse: list[Value], *, tanh: bool
+    ) -> Value:
+        """Return the KL divergence of the current distribution from that of the collection."""
+        ir, count = self.ir, self.shape.actions
+        total = ir.constant(0.0)
+        for i in range(count):
+            old_mean, old_scale = (self._extra(count + 1 + i + count * j) for j in (0, 1))
+            if tanh:
+                old_scale = ir.softplus(old_scale) + _MIN_STD
+            difference = old_mean - mean[i]
+            square = (old_scale * old_scale + difference * difference) * 0.5
+            log = ir.log(scale[i] * ir.reciprocal(old_scale) + 1e-5)
+            total += log + square * inverse[i] * inverse[i] - 0.5
+        return total
+
+    def _store_errors(self, slopes: list[Value], sums: list[Value]) -> None:
+        """Store a sample's derivatives by the outputs, and add them and the sums to their slots."""
+        ir = self.ir
+        kept = [ir.select(self.is_there, x, 0.0) for x in (*slopes, *sums)]
+        errors = ir.shared(self.thread * (2 * (TILE + PAD)), self.bytes_of("errors"))
+        zero = ir.constant(0.0)
+        padded = [*kept[: len(slopes)], zero]
+        for i in range(0, len(slopes), 2):
+            ir.write(ir.pack(padded[i], padded[i + 1]), ir.moved(errors, 2 * i))
+        slots = ir.shared(self.thread * 4, self.bytes_of("slots"))
+        for i, value in enumerate(kept):
+            place = ir.moved(slots, 4 * i * (self.tiling.rows + 1))
+            ir.write(ir.read(place) + value, place)
+
+    def _backward(self) -> None:
+        """Add a tile's gradient of all weights to the sums, from the last layer to the first."""
+        ir, shape, tiling = self.ir, self.shape, self.tiling
+        samples, tiles = tiling.rows // TILE, self.width // TILE
+        # The head's weights: the activations, transposed, times the errors.
+        column = ir.minimum(self.warp, tiles - 1) * TILE
+        left = self.lanes(f"layer{shape.layers}", self.stride, self.column_first, 0, column)
+        right = self.lanes("errors", TILE + PAD, self.row_first)
+        self.head_sums = ir.product(
+            self.head_sums,
+            samples,
+            lambda _, k: ir.matrices(left, 32 * k * self.stride, transposed=True),
+            lambda _, k: ir.matrices(right, 32 * k * (TILE + PAD), transposed=True),
+        )
+        self._propagate(shape.layers, "errors", TILE + PAD, "head", TILE + PAD, 1)
+        for layer in reversed(range(shape.layers)):
+            self._add_weights(layer)
+            if layer:
+                name = f"layer{layer + 1}"
+                self._propagate(layer, name, self.stride, f"weights{layer}", self.stride, tiles)
+
+    def _propagate(
+        self, layer: int, errors: str, stride: int, weights: str, by: int, steps: int
+    ) -> None:
+        """Replace a layer's activations by the derivatives before its activation function."""
+        ir, tiling = self.ir, self.tiling
+        left = self.lanes(errors, stride, self.row_first, self.row)
+        right = self.lanes(weights, by, self.column_first, self.column)
+        zero = ir.constant(0.0)
+        sums = ir.product(
+            [[[zero] * 4 for _ in range(2 * self.pairs)] for _ in range(tiling.row_tiles)],
+            steps,
+            lambda row, k: ir.matrices(left, 32 * row * stride + 32 * k, transposed=False),
+            lambda pair, k: ir.matrices(right, 32 * pair * by + 32 * k, transposed=False),
+        )
+        kind = self.shape.activation
+        name = f"slopes{layer}" if kind == "swish" else f"layer{layer}"
+        values = ir.shared(self.place, self.bytes_of(name))
+        pairs = []
+        for offset, low, high in self.halves(sums):
+            first, second = ir.unpack(ir.read(ir.moved(values, offset), "i32"))
+            low, high = _slope(ir, kind, first, low), _slope(ir, kind, second, high)
+            pairs.append((offset, ir.pack(low, high)))
+        # The gradient of the weights above has read the activations before they are replaced.
+        ir.synchronize()
+        pointer = ir.shared(self.place, self.bytes_of(f"layer{layer}"))
+        for offset, pair in pairs:
+            ir.write(pair, ir.moved(pointer, offset))
+        ir.synchronize()
+
+    def _add_weights(self, layer: int) -> None:
+        """Add a tile's gradient of a layer's weights and biases, transposed: (outputs, inputs)."""
+        ir = self.ir
+        samples = self.tiling.rows // TILE
+        name, stride = self.source(layer)
+        errors = f"layer{layer + 1}"
+        row, column = self._share_of_warp(layer)
+        left = self.lanes(errors, self.stride, self.column_first, 0, row)
+        right = self.lanes(name, stride, self.row_first, 0, column)
+        self.weight_sums[layer] = ir.product(
+            self.weight_sums[layer],
+            samples,
+            lambda m, k: ir.matrices(left, 32 * k * self.stride + 32 * m, transposed=True),
+            lambda pair, k: ir.matrices(right, 32 * k * stride + 32 * pair, transposed=True),
+        )
+        # The biases: the same with ones in place of the layer's inputs.
+        tiles = self.width // TILE
+        place = ir.minimum(self.warp, tiles - 1) * TILE
+        own = self.lanes(errors, self.stride, self.column_first, 0, place)
+        one = ir.constant(_ONES, "i32")
+        self.bias_sums[layer] = ir.product(
+            self.bias_sums[layer],
+            samples,
+            lambda _, k: ir.matrices(own, 32 * k * self.stride, transposed=True),
+            lambda *_: [one] * 4,
+        )
+
+    def _share_of_warp(self, layer: int) -> tuple[Value, Value]:
+        """Return the first row (output) and column (input) of the warp's share of a gradient."""
+        share = self.shares[layer]
+        columns = padded(self.shape.inputs[layer]) // TILE
+        row = self.ir.minimum(
+            self.warp % share.groups * share.row_tiles, self.width // TILE - share.row_tiles
+        )
+        column = self.ir.minimum(self.warp // share.groups * share.pairs, columns - share.pairs)
+        return row * TILE, column * TILE
+
+    def _store_gradient(self) -> None:
+        """Store the block's sums."""
+        ir, shape, offset = self.ir, self.shape, 0
+        for layer, inputs in enumerate(shape.inputs[:-1]):
+            row, column = self._share_of_warp(layer)
+            output, first = row + self.sum_row, column + self.sum_column
+            for m, sums in enumerate(self.weight_sums[layer]):
+                for n, four in enumerate(sums):
+                    for i, value in enumerate(four):
+                        at = first + (8 * n + i % 2)
+                        place = at * self.width + output + (offset + TILE * m + 8 * (i // 2))
+                        if inputs % TILE:
+                            with ir.when(at < inputs):
+                                ir.put(value, self.part, place)
+                        else:
+                            ir.put(value, self.part, place)
+            offset += inputs * self.width
+            ((four,),) = self.bias_sums[layer]
+            place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row + offset
+            with ir.when(self.sum_column.equals(0)):
+                ir.put(four[0], self.part, place)
+                ir.put(four[2], self.part, place + 8)
+            offset += self.width
+        self._store_head(offset)
+
+    def _store_head(self, offset: int) -> None:
+        """Store the sums of the last layer, and of what the slots hold."""
+        ir, shape = self.ir, self.shape
+        ((four,),) = self.head_sums
+        row = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
+        for i, value in enumerate(four):
+            column = self.sum_column + i % 2
+            place = (row + 8 * (i // 2)) * self.outputs + column + offset
+            with ir.when(column < self.outputs):
+                ir.put(value, self.part, place)
+        count = ir.select(
+            self.is_policy,
+            ir.constant(shape.slots, "i32"),
+            ir.constant(1 + len(VALUE_METRICS), "i32"),
+        )
+        with ir.when(self.thread < count):
+            first = ir.shared(self.thread * (4 * (self.tiling.rows + 1)), self.bytes_of("slots"))
+            total = ir.constant(0.0)
+            for i in range(self.tiling.rows):
+                total += ir.read(ir.moved(first, 4 * i))
+            ir.put(total, self.part, self.outputs * self.width + self.thread + offset)
+
+
+def _log_slope(ir: IrWriter, x: Value) -> Value:
+    """Return log(1 - tanh(x)^2), as Brax computes it."""
+    return (math.log(2.0) - x - ir.softplus(x * -2.0)) * 2.0
+
+
+def _slope(ir: IrWriter, activation: str, value: Value, factor: Value) -> Value:
+    """Return a factor times the slope of an activation, by its value or, of `swish`, its slope."""
+    if activation == "tanh":
+        return factor * (1.0 - value * value)
+    if activation == "relu":
+        return ir.select(ir.constant(0.0) < value, factor, 0.0)
+    if activation == "elu":
+        return ir.select(value < 0.0, factor * (value + 1.0), factor)
+    return factor * value
