@@ -36,9 +36,6 @@ from jetbot_mjx.config import PPOConfig
 
 _NetworkParams: Any = losses.PPONetworkParams
 
-_PROBE_ERROR = 0.02
-"""Largest difference of a small gradient from XLA's, relative to its norm."""
-
 
 class _Place(NamedTuple):
     """A `_Place` is where a parameter lies in the vector."""
@@ -102,6 +99,7 @@ def choose(
     config: PPOConfig,
     observation_size: int | Mapping[str, Any],
     action_size: int,
+    device_count: int,
     axis_name: str | None,
 ) -> "FusedUpdate | str":
     """Return the fused update of a configuration, or why this process cannot run it.
@@ -110,6 +108,7 @@ def choose(
       config: the hyperparameters.
       observation_size: the length of the observation, or the shapes of its parts.
       action_size: the length of the action.
+      device_count: the number of devices that share a minibatch.
       axis_name: the mesh axis over which gradients are averaged; None: none.
     """
     if jax.default_backend() != "gpu":
@@ -117,8 +116,8 @@ def choose(
     shape = shape_of(config, observation_size, action_size)
     if isinstance(shape, str):
         return shape
-    unrolls = config.batch_size * config.num_minibatches
-    batch = Minibatch(unrolls, config.batch_size, config.unroll_length)
+    unrolls = config.batch_size // device_count
+    batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
     return launch.refusal(shape, batch) or FusedUpdate(config, shape, axis_name)
 
 

@@ -57,7 +57,7 @@ from brax.training.types import Transition, UInt64
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.agents import fused_update, gae
+from jetbot_mjx.agents import fused_update, gae, update_probe
 from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
 from jetbot_mjx.config import PPOConfig
@@ -168,27 +168,31 @@ class PPO:
         self._loss_and_gradient = gradients.loss_and_pgrad(
             loss, pmap_axis_name=axis_name, has_aux=True
         )
-        self.fused: fused_update.FusedUpdate | None = None
-        """The kernels of the update; None: XLA compiles it."""
         self.notice: str | None = None
-        """One line that says why an NVIDIA GPU does not run the kernels, if it does not."""
+        """One line that says why this GPU does not run the kernels of the update, or None."""
+        self._fused: fused_update.FusedUpdate | None = None
         if config.update != "xla":
-            self._choose_update()
+            sizes = self._env.observation_size, self._env.action_size
+            found = fused_update.choose(config, *sizes, device_count, axis_name)
+            if isinstance(found, fused_update.FusedUpdate):
+                self._fused = found
+            else:
+                self._refuse_fused(found)
 
-    def _choose_update(self) -> None:
-        """Take the kernels of the update if the GPU can run them.
+    def _refuse_fused(self, reason: str) -> None:
+        """Let XLA compile the update.
+
+        Args:
+          reason: why the kernels cannot run.
 
         Raises:
-          UserError: `ppo.update` is `fused`, and it cannot.
+          UserError: `ppo.update` requests the kernels.
         """
-        sizes = self._env.observation_size, self._env.action_size
-        found = fused_update.choose(self.config, *sizes, self._axis)
-        if isinstance(found, fused_update.FusedUpdate):
-            self.fused = found
-        elif self.config.update == "fused":
-            raise UserError(f"ppo.update = fused: {found}: choose auto or xla")
-        elif jax.default_backend() == "gpu":
-            self.notice = f"ppo.update = xla, for the fused update cannot run: {found}"
+        self._fused = None
+        if self.config.update == "fused":
+            raise UserError(f"ppo.update = fused: {reason}: choose auto or xla")
+        if jax.default_backend() == "gpu":
+            self.notice = f"ppo.update = xla: {reason}"
 
     def init(self, key: UInt32[Array, "2"]) -> TrainState:
         """Return the training state before the first step.
@@ -382,7 +386,9 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
-        unpacked, fused = (params, optimizer_state), self.fused
+        if self._fused and not update_probe.runs_correctly():
+            self._refuse_fused("the fused update failed its check on this GPU")
+        unpacked, fused = (params, optimizer_state), self._fused
         if fused:
             params, optimizer_state = fused.pack(unpacked)
             collected = fused.collected(data)
@@ -417,11 +423,11 @@ class PPO:
             params, optimizer_state = fused.unpack((params, optimizer_state), unpacked)
         if self._axis is not None:
             metrics = jax.lax.pmean(metrics, self._axis)
-        applied = metrics.pop("applied")
+        *losses_, applied = jnp.moveaxis(metrics, -1, 0)
         count = jnp.maximum(applied.sum(), 1.0)
         means = {
-            name: jnp.where(applied > 0, metrics[brax_name], 0.0).sum() / count
-            for brax_name, name in LOSSES.items()
+            name: jnp.where(applied > 0, values, 0.0).sum() / count
+            for name, values in zip(LOSSES.values(), losses_, strict=True)
         }
         return params, optimizer_state, {**means, "nonfinite_updates": (1.0 - applied).sum()}
 
@@ -430,8 +436,12 @@ class PPO:
         carry: tuple[PyTree, PyTree, UInt32[Array, "2"]],
         batch: Any,
         loss_and_gradient: Callable[..., Any],
-    ) -> tuple[PyTree, dict[str, Float[Array, ""]]]:
-        """Apply one gradient step, or skip it if the gradient is not finite."""
+    ) -> tuple[PyTree, Float[Array, " metrics"]]:
+        """Apply one gradient step, or skip it if the gradient is not finite.
+
+        Returns:
+          The new carry; the metrics of `LOSSES`, and whether the step was applied.
+        """
         params, optimizer_state, key = carry
         key, loss_key = jax.random.split(key)
         (_, metrics), gradient = loss_and_gradient(params, batch, loss_key)
@@ -454,12 +464,11 @@ class PPO:
         params, optimizer_state = jax.tree.map(
             lambda new, old: jnp.where(finite, new, old), after, before
         )
-        metrics = {
-            **metrics,
-            "learning_rate": optimizer_state[-1].hyperparams["learning_rate"],
-            "applied": finite.astype(jnp.float32),
-        }
-        return (params, optimizer_state, key), metrics
+        rate = optimizer_state[-1].hyperparams["learning_rate"]
+        metrics = {**metrics, "learning_rate": rate}
+        # One vector: XLA stores each array of a scan by a kernel of its own.
+        row = jnp.stack([*(metrics[name] for name in LOSSES), finite.astype(jnp.float32)])
+        return (params, optimizer_state, key), row
 
     def _loss(
         self,

@@ -252,6 +252,8 @@ def _train(training: Training) -> Result:
                 return _COMPLETE
             if training.warm_start:
                 messages.append(training.warm_start.describe())
+            if training.ppo.notice:
+                messages.append(training.ppo.notice)
             recorder.begin("\n".join([*messages, _headline(config, training.run_dir)]))
             return _RESUMES if resumption else _BEGINS
 

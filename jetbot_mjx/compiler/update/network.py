@@ -233,7 +233,7 @@ class NetworkKernel:
     def halves(self, sums: Sums) -> list[tuple[int, Value, Value]]:
         """Return the bytes from the lane's place, and the two neighbouring sums that are there."""
         return [
-            (2 * self.stride * (TILE * m + 8 * half) + 16 * n, *four[2 * half :][:2])
+            (2 * self.stride * (TILE * m + 8 * half) + 16 * n, four[2 * half], four[2 * half + 1])
             for m, row in enumerate(sums)
             for n, four in enumerate(row)
             for half in (0, 1)

@@ -1,0 +1,120 @@
+"""Check the kernels of PPO's update on this process's GPU before a training relies on them.
+
+The check is a small gradient, compared with central differences of the loss in NumPy, since XLA
+would take longer to compile one than a training takes to begin.
+"""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.compiler.update import launch
+from jetbot_mjx.compiler.update.shapes import LossTerms, UpdateShape
+
+_SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh")
+_TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0, normalize_advantage=False)
+_UNROLLS, _TIME = 8, 4
+_MOST_ERROR = 0.05
+"""Largest difference of the gradients, relative to their norm; products are of bfloat16."""
+_STEP = 1e-4
+
+
+@functools.cache
+def runs_correctly() -> bool:
+    """Return whether the kernels compute a small gradient correctly."""
+    if not ptx_backend.is_available():
+        return False
+    rng = np.random.default_rng(0)
+    params = 0.3 * rng.standard_normal(_SHAPE.size)
+    rows = rng.standard_normal((_UNROLLS, _TIME, _SHAPE.columns["size"]))
+    rows[..., _SHAPE.columns["discount"] :] = 1.0, 0.0
+    last = rng.standard_normal((_UNROLLS, _SHAPE.observations))
+    noise = rng.standard_normal((_TIME, _UNROLLS, _SHAPE.actions))
+    mean, scale, _ = _outputs(params, rows)
+    rows[..., _SHAPE.columns["log_prob"]] = _log_prob(mean, scale, rows)
+    estimates = _estimates(params, rows, last)
+    expected = np.zeros(_SHAPE.size)
+    for i in range(_SHAPE.size):
+        shift = _STEP * (np.arange(_SHAPE.size) == i)
+        higher, lower = (_loss(x, rows, noise, estimates) for x in (params + shift, params - shift))
+        expected[i] = (higher - lower) / (2 * _STEP)
+    statistics = np.zeros(_SHAPE.observations), np.ones(_SHAPE.observations)
+    arrays = [np.asarray(x, np.float32) for x in (params, *statistics, rows, last)]
+    order = np.arange(_UNROLLS, dtype=np.int32)
+    # Run the probe at once, because the caller may be tracing another function.
+    device = jax.local_devices(backend=ptx_backend.PLATFORM)[0]
+    with jax.ensure_compile_time_eval(), jax.default_device(device):
+        arguments = [jnp.asarray(x) for x in (*arrays, order, np.asarray(noise, np.float32))]
+        try:
+            result = jax.jit(functools.partial(launch.gradient, _SHAPE, _TERMS))(*arguments)
+        except jax.errors.JaxRuntimeError:
+            return False
+        # Beside the gradient, the vector has the sums of the metrics, on which nothing depends.
+        ours = np.where(expected == 0, 0, np.asarray(result, np.float64))
+    return bool(np.linalg.norm(ours - expected) <= _MOST_ERROR * np.linalg.norm(expected))
+
+
+def _network(params: np.ndarray, outputs: int, x: np.ndarray) -> np.ndarray:
+    """Return the outputs of the network whose parameters come first."""
+    inputs, width, start = _SHAPE.observations, _SHAPE.width, 0
+    for size in (width, outputs):
+        weights = params[start : start + inputs * size].reshape(inputs, size)
+        start += inputs * size
+        x = x @ weights + params[start : start + size]
+        start, inputs = start + size, size
+        x = np.tanh(x) if size == width else x
+    return x
+
+
+def _outputs(params: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return mean and standard deviation of the actions, and the values."""
+    observation = rows[..., : _SHAPE.observations]
+    mean, raw = np.split(_network(params, _SHAPE.outputs[0], observation), 2, axis=-1)
+    values = _network(params[_SHAPE.policy_size :], 1, observation)[..., 0]
+    return mean, np.logaddexp(raw, 0) + 0.001, values
+
+
+def _log_slope(x: np.ndarray) -> np.ndarray:
+    return 2 * (np.log(2) - x - np.logaddexp(-2 * x, 0))
+
+
+def _log_prob(mean: np.ndarray, scale: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    start = _SHAPE.columns["raw_action"]
+    action = rows[..., start : start + _SHAPE.actions]
+    normal = -0.5 * ((action - mean) / scale) ** 2 - np.log(scale) - 0.5 * np.log(2 * np.pi)
+    return (normal - _log_slope(action)).sum(-1)
+
+
+def _estimates(
+    params: np.ndarray, rows: np.ndarray, last: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return advantages and value targets of unrolls in which no episode ends."""
+    following = _network(params[_SHAPE.policy_size :], 1, last)[..., 0]
+    values, reward = _outputs(params, rows)[2], rows[..., _SHAPE.columns["reward"]]
+    ahead = np.concatenate([values[:, 1:], following[:, None]], axis=1)
+    deltas, total = reward + _TERMS.discounting * ahead - values, 0.0
+    targets = values.copy()
+    for t in reversed(range(_TIME)):
+        total = deltas[:, t] + _TERMS.discounting * _TERMS.gae_lambda * total
+        targets[:, t] += total
+    ahead = np.concatenate([targets[:, 1:], following[:, None]], axis=1)
+    return reward + _TERMS.discounting * ahead - values, targets
+
+
+def _loss(
+    params: np.ndarray,
+    rows: np.ndarray,
+    noise: np.ndarray,
+    estimates: tuple[np.ndarray, np.ndarray],
+) -> float:
+    """Return PPO's loss near the policy of the collection, where nothing is clipped."""
+    mean, scale, values = _outputs(params, rows)
+    advantages, targets = estimates
+    log_ratio = _log_prob(mean, scale, rows) - rows[..., _SHAPE.columns["log_prob"]]
+    sample = noise.swapaxes(0, 1) * scale + mean
+    entropy = (0.5 + 0.5 * np.log(2 * np.pi) + np.log(scale) + _log_slope(sample)).sum(-1)
+    terms = -np.exp(log_ratio) * advantages - _TERMS.entropy_cost * entropy
+    return float(np.mean(terms + 0.5 * _TERMS.vf_loss_coefficient * (targets - values) ** 2))
