@@ -48,6 +48,9 @@ COMMANDS = [
     Command(f"{_RUN}.train {_GPU} --run-dir {{runs}}/xla --set physics.impl=xla"),
     Command(f"{_RUN}.train {_GPU} --run-dir {{runs}}/ptx --set physics.impl=ptx"),
     Command(f"{_RUN}.train {_GPU} --run-dir {{runs}}/cpus --set physics.impl=llvm", expected=2),
+    Command(f"{_RUN}.train {_GPU} --run-dir {{runs}}/fused --set ppo.update=fused"),
+    Command(f"{_RUN}.train {_GPU} --run-dir {{runs}}/several --set ppo.update=fused --seeds 4"),
+    Command(f"{_RUN}.train {_GPU} --run-dir {{runs}}/unfused --set ppo.update=xla"),
     Command(f"{_RUN}.train --config configs/smoke.yaml --seeds 2 --run-dir {{runs}}/two"),
     Command(
         f"{_RUN}.train --config configs/real_jetbot.yaml --run-dir {{runs}}/real {_SHORT}"

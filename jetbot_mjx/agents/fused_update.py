@@ -34,7 +34,8 @@ from jetbot_mjx.compiler.update.shapes import (
 )
 from jetbot_mjx.config import PPOConfig
 
-_NetworkParams: Any = losses.PPONetworkParams
+NetworkParams: Any = losses.PPONetworkParams
+"""Parameters of both networks, in the fields `policy` and `value`."""
 
 
 class _Place(NamedTuple):
@@ -144,7 +145,7 @@ class FusedUpdate:
         """Return a tree with a vector in place of every `PPONetworkParams`."""
 
         def vector(node: Any) -> Any:
-            if not isinstance(node, _NetworkParams):
+            if not isinstance(node, NetworkParams):
                 return node
             parts, end = [], 0
             for place in self._places:
@@ -155,13 +156,13 @@ class FusedUpdate:
                 end = place.stop
             return jnp.concatenate([*parts, jnp.zeros(self._shape.size - end)])
 
-        return jax.tree.map(vector, tree, is_leaf=lambda x: isinstance(x, _NetworkParams))
+        return jax.tree.map(vector, tree, is_leaf=lambda x: isinstance(x, NetworkParams))
 
     def unpack(self, tree: PyTree, like: PyTree) -> PyTree:
         """Return a tree with `PPONetworkParams` in place of vectors, as in another tree."""
 
         def params(node: Any, vector: Any) -> Any:
-            if not isinstance(node, _NetworkParams):
+            if not isinstance(node, NetworkParams):
                 return vector
             networks: dict[str, Any] = {"policy": {}, "value": {}}
             for place in self._places:
@@ -169,9 +170,9 @@ class FusedUpdate:
                 for key in place.path[:-1]:
                     inner = inner.setdefault(key, {})
                 inner[place.path[-1]] = vector[place.start : place.stop].reshape(place.shape)
-            return _NetworkParams(**networks)
+            return NetworkParams(**networks)
 
-        return jax.tree.map(params, like, tree, is_leaf=lambda x: isinstance(x, _NetworkParams))
+        return jax.tree.map(params, like, tree, is_leaf=lambda x: isinstance(x, NetworkParams))
 
     def collected(self, data: Transition) -> Collected:
         """Return the collected data as the kernels read it.

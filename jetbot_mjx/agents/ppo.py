@@ -25,13 +25,15 @@ Protocol of a training step:
    them into `num_minibatches` and applies one step of Adam to each minibatch.
 
 Networks, action distribution, loss, running statistics, unrolls, gradients and the ADAPTIVE_KL rule
-are Brax's, and so is the order of the random keys. On one device and with `normalizer: brax`, every
-step equals a step of `brax.training.agents.ppo.train`. The deviations from Brax are:
+are Brax's, and so is the order of the random keys. On one device and with `normalizer: brax` and
+`update: xla`, every step equals a step of `brax.training.agents.ppo.train`. The deviations from
+Brax are:
 
 - An update with a non-finite gradient is skipped and counted.
 - The first non-finite environment state is returned as a `NanDump`.
 - `normalizer: physical` bounds the standard deviation from below by the observation's scale.
 - `learning_rate_schedule: LINEAR` lowers the step size to zero over the training.
+- `update: fused` computes the same loss with products of bfloat16, on NVIDIA GPUs.
 - GAE is unrolled, and of the next observations only those that the loss needs are stored.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`

@@ -284,6 +284,11 @@ def compute_capability() -> int:
     )
 
 
+def processor_count() -> int:
+    """Return the number of multiprocessors of a GPU."""
+    return jax.local_devices(backend=PLATFORM)[0].core_count
+
+
 def target_architecture() -> int:
     """Return the newest supported architecture that all present GPUs can run."""
     supported = [x for x in _ARCHITECTURES if x <= compute_capability()]

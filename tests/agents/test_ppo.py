@@ -39,7 +39,8 @@ SIZE = 4096  # environment steps in one training step of configs/smoke.yaml
 
 @pytest.fixture(scope="module")
 def smoke(root):
-    return load_config(root / "configs" / "smoke.yaml")
+    # With XLA's update on a GPU too, which can be compared with Brax number by number.
+    return load_config(root / "configs" / "smoke.yaml", ["ppo.update=xla"])
 
 
 @contextlib.contextmanager

@@ -1,7 +1,8 @@
 """A model in NumPy of the GPU that runs kernels of `tensor_core`: all threads of a block in step.
 
-It executes the text of a kernel, instruction by instruction, for every block after the other. Races
-between threads cannot show here, but wrong places and wrong arithmetic do.
+It executes the text of a kernel, instruction by instruction, for every block after the other, and
+complains where two threads access a number in shared memory, one of them to change it, with no
+barrier between them: on a GPU, the result would depend on which comes first.
 """
 
 import re
@@ -42,6 +43,60 @@ def rounded(x):
     return np.asarray(x, np.float32).astype(ml_dtypes.bfloat16).astype(np.float32)
 
 
+class Races:
+    """Who accessed each number of shared memory when, in barriers of the accessing warp.
+
+    A warp knows of another one what that one did before the last barrier of both. Of its own lanes
+    it knows what they did before its last barrier.
+    """
+
+    def __init__(self, threads):
+        warps = threads // 32
+        self.lane, self.warp = np.arange(threads), np.arange(threads) // 32
+        self.time = np.ones(warps, int)
+        self.known = np.zeros((warps, warps), int)
+        self.writer = np.full(SHARED // 2, -1)
+        self.written = np.zeros(SHARED // 2, int)
+        # The last reader of each warp; -2 if there were several lanes.
+        self.reader = np.full((SHARED // 2, warps), -1, np.int16)
+        self.read = np.zeros((SHARED // 2, warps), np.int32)
+
+    def barrier(self, warps):
+        """Let some warps wait for each other."""
+        for warp in warps:
+            self.known[warp, warps] = self.time[warps]
+        everything = self.known[warps].max(0)
+        self.known[warps] = everything
+        self.time[warps] += 1
+
+    def load(self, threads, places):
+        """Threads read halves of words."""
+        writer, warp = self.writer[places], self.warp[threads]
+        other = (writer >= 0) & (writer != threads)
+        known = self.known[warp, np.where(other, writer, 0) // 32]
+        assert not (other & (self.written[places] > known)).any(), "read while it is written"
+        same = self.read[places, warp] == self.time[warp]
+        several = same & (self.reader[places, warp] != threads)
+        self.reader[places, warp] = np.where(several, -2, threads)
+        self.read[places, warp] = self.time[warp]
+        # Lanes that read one number together.
+        clashing = self.reader[places, warp] != threads
+        self.reader[places[clashing], warp[clashing]] = -2
+
+    def store(self, threads, places, *, changed):
+        """Threads write halves of words; writing what is there already disturbs nobody."""
+        threads, places = threads[changed], places[changed]
+        warp = self.warp[threads]
+        writer = self.writer[places]
+        other = (writer >= 0) & (writer != threads)
+        known = self.known[warp, np.where(other, writer, 0) // 32]
+        assert not (other & (self.written[places] > known)).any(), "two threads write it"
+        late = self.read[places] > self.known[warp]
+        late[np.arange(len(places)), warp] &= self.reader[places, warp] != threads
+        assert not late.any(), "written while it is read"
+        self.writer[places], self.written[places] = threads, self.time[warp]
+
+
 class Gpu:
     """A GPU with the arrays that a kernel is given."""
 
@@ -67,6 +122,7 @@ class Gpu:
         # What was not written is not a number.
         self.memory = np.full(SHARED // 4, 0x7FFF7FFF, np.uint32)
         self.active = [np.ones(self.threads, bool)]
+        self.races = Races(self.threads)
         self.label, self.before, at = "entry", "", 0
         while self.lines[at] != "ret void":
             at = self._step(self.lines[at], at)
@@ -136,14 +192,24 @@ class Gpu:
         place = self.values[pointer]
         assert (place % 4 == 0).all()
         on = self.active[-1]
+        self._note(self.races.load, on, place)
         words = np.where(on, self.memory[np.where(on, place // 4, 0)], 0).astype(np.uint32)
         return words.view(np.float32) if kind == "float" else words
 
     def _store_shared(self, kind, value, pointer):
         words = self._get(kind, value)
         words = np.asarray(words, np.float32 if kind == "float" else np.uint32).view(np.uint32)
-        on = self.active[-1]
-        self.memory[self.values[pointer][on] // 4] = words[on]
+        on, place = self.active[-1], self.values[pointer]
+        written, unchanged = words[on], self.memory[place[on] // 4] == words[on]
+        self._note(self.races.store, on, place, changed=np.repeat(~unchanged, 2))
+        self.memory[place[on] // 4] = written
+        # Threads that write one number together must agree.
+        assert (self.memory[place[on] // 4] == written).all(), "two threads write it"
+
+    def _note(self, access, on, place, **options):
+        """Note an access to words, which are two halves each."""
+        threads = np.repeat(self.races.lane[on], 2)
+        access(threads, (place[on][:, None] // 2 + np.arange(2)).reshape(-1), **options)
 
     def _load(self, kind, pointer):
         arrays, places = self.values[pointer]
@@ -174,7 +240,9 @@ class Gpu:
         """Four matrices of 8 x 8 numbers, whose rows the lanes of each warp point at."""
         place = self.values[pointer].reshape(-1, 4, 8)
         assert (place % 16 == 0).all()
-        numbers = self.memory.view(np.uint16)[place[..., None] // 2 + np.arange(8)]
+        places = place[..., None] // 2 + np.arange(8)
+        self.races.load(np.repeat(self.races.lane, 8), places.reshape(-1))
+        numbers = self.memory.view(np.uint16)[places]
         if transposed:
             numbers = numbers.swapaxes(2, 3)
         pairs = np.ascontiguousarray(numbers).view(np.uint32)
@@ -206,8 +274,23 @@ class Gpu:
         c = c + a @ b
         return [c[:, g + 8 * (i // 2), t + i % 2].reshape(-1) for i in range(4)]
 
-    def _nothing(self, *_):
+    def _barrier(self, text):
         assert self.active[-1].all(), "some threads do not come to the barrier"
+        warps = np.arange(self.threads // 32)
+        if "bar.sync 0" in text:
+            self.races.barrier(warps)
+        elif "bar.warp" in text:
+            for warp in warps:
+                self.races.barrier(warps[warp : warp + 1])
+        else:
+            count, name = re.search(r"bar.sync \$0, (\d+).*i32 (\S+)\)", text).groups()
+            group = self.values[name].reshape(-1, 32)
+            assert (group == group[:, :1]).all()
+            for number in np.unique(group):
+                members = warps[group[:, 0] == number]
+                assert 0 < number < 16
+                assert 32 * len(members) == int(count)
+                self.races.barrier(members)
 
 
 _INSTRUCTIONS = [
@@ -226,7 +309,7 @@ _INSTRUCTIONS = [
         (r"zext i32 (\S+) to i64", lambda gpu, value: gpu.values[value]),
         (r"bitcast i32 (\S+) to float", Gpu._bitcast),
         (r"extractvalue \{.*\} (\S+), (\d+)", Gpu._extract),
-        (r'call void asm sideeffect "bar.*', Gpu._nothing),
+        (r'(call void asm sideeffect "bar.*)', Gpu._barrier),
         (r'call \w+ asm "(\S+) [^"]*", "[^"]*"\((.*)\)', Gpu._assembly),
         (
             r"call \{.*\} @llvm\.nvvm\.ldmatrix\S*x4(\.trans)?\.b16\.p3\(\S+ \S+ (\S+)\) #0",

@@ -10,6 +10,9 @@ from jetbot_mjx.compiler.update.network import NetworkKernel
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling
 from jetbot_mjx.compiler.update.tensor_core import LANES, Value
 
+NAME = "ppo_advantages"
+"""Name of the kernel."""
+
 
 def tile_count(tiling: Tiling, batch: Minibatch) -> int:
     """Return the number of tiles of a minibatch."""
@@ -55,12 +58,12 @@ class _AdvantageKernel(NetworkKernel):
         ir.synchronize()
         tile = self.begin_tiles()
         total, squares = (Value(ir, name, "float") for name in ("%total", "%squares"))
+        # The next tile overwrites nothing that is read after this one's last barrier.
         advantage = self._tile(tile)
-        ir.synchronize()
         ends = total + advantage, squares + advantage * advantage
         self.end_tiles(tile, [(total, ends[0]), (squares, ends[1])])
         self._store_statistics(*ends)
-        return self.text(9)
+        return self.text(NAME, 9)
 
     def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
         """Return the unroll of a row of a tile, which may not exist, and the step in it."""

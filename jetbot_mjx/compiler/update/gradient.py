@@ -20,6 +20,9 @@ from jetbot_mjx.compiler.update.shapes import (
 )
 from jetbot_mjx.compiler.update.tensor_core import LANES, TILE, IrWriter, Sums, Value
 
+NAME = "ppo_gradient"
+"""Name of the kernel."""
+
 _MIN_STD = 0.001
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 _ONES = 0x3F803F80
@@ -91,7 +94,7 @@ class _GradientKernel(NetworkKernel):
         ir.synchronize()
         self.end_tiles(tile, list(zip(self.begun, self._all_sums(), strict=True)))
         self._store_gradient()
-        return self.text(10)
+        return self.text(NAME, 10)
 
     def _clear(self) -> None:
         ir = self.ir

@@ -21,7 +21,6 @@ from jaxtyping import Array, Float, Int
 from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.update import advantages, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
-from jetbot_mjx.compiler.update.network import NAME
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling, UpdateShape
 
 _LEAST_CAPABILITY = 80
@@ -135,12 +134,12 @@ def _lowered(*arguments: Array, shape: UpdateShape, terms: LossTerms) -> Array:
     params, mean, scale, rows, last, unrolls, noise = flat
     size = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
     # Share the multiprocessors among all policies.
-    processors = jax.local_devices(backend=ptx_backend.PLATFORM)[0].core_count
-    most = max(1, processors // policies)
+    most = max(1, ptx_backend.processor_count() // policies)
     tiling = shapes.advantage_tiling(shape, size, most, _shared_memory())
     assert tiling is not None
     parts = min(most, advantages.tile_count(tiling, size))
     estimates = _launch(
+        advantages.NAME,
         functools.partial(advantages.advantages_text, tiling, size, terms),
         tiling,
         [params, mean, scale, rows, last, unrolls],
@@ -152,6 +151,7 @@ def _lowered(*arguments: Array, shape: UpdateShape, terms: LossTerms) -> Array:
     assert tiling is not None
     blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
     (vectors,) = _launch(
+        gradient_kernel.NAME,
         functools.partial(gradient_kernel.gradient_text, tiling, size, terms, parts),
         tiling,
         [params, mean, scale, rows, unrolls, noise, *estimates],
@@ -169,6 +169,7 @@ mlir.register_lowering(
 
 
 def _launch(
+    name: str,
     write: Callable[[], str],
     tiling: Tiling,
     arguments: Sequence[Array],
@@ -177,7 +178,7 @@ def _launch(
 ) -> list[Array]:
     """Launch the kernel that a function writes as LLVM IR."""
     return ptx_backend.launch_ptx(
-        NAME,
+        name,
         ptx_backend.assembled(write(), ptx_backend.target_architecture()),
         arguments,
         [jax.ShapeDtypeStruct(shape, np.float32) for shape in results],

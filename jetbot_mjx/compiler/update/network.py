@@ -12,9 +12,6 @@ from jetbot_mjx.compiler.update.tensor_core import (
     Value,
 )
 
-NAME = "update"
-"""Name of the kernels."""
-
 
 class NetworkKernel:
     """A `NetworkKernel` writes what the kernels share: a loop over tiles, and a forward pass."""
@@ -239,17 +236,22 @@ class NetworkKernel:
             for half in (0, 1)
         ]
 
-    def text(self, arguments: int) -> str:
-        """Return the module."""
+    def text(self, name: str, arguments: int) -> str:
+        """Return the module.
+
+        Args:
+          name: the name of the kernel.
+          arguments: the number of its arrays.
+        """
         parameters = ", ".join(f"ptr addrspace(1) %a{i}" for i in range(arguments))
         body = "\n  ".join(self.ir.lines)
         carried = "\n  ".join(self.carries)
         return (
-            f"{DECLARATIONS}define ptx_kernel void @{NAME}({parameters}) {{\nentry:\n  "
+            f"{DECLARATIONS}define ptx_kernel void @{name}({parameters}) {{\nentry:\n  "
             + body.replace("CARRIES", carried)
             + "\n  ret void\n}\nattributes #0 = { convergent nounwind }\n"
             "!nvvm.annotations = !{!0}\n"
-            f'!0 = !{{ptr @{NAME}, !"maxntidx", i32 {self.tiling.threads}}}\n'
+            f'!0 = !{{ptr @{name}, !"maxntidx", i32 {self.tiling.threads}}}\n'
         )
 
     def begin_tiles(self) -> Value:

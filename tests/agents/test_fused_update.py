@@ -1,0 +1,208 @@
+"""The fused update: what networks it takes, its vectors, and on a GPU its gradient and launches."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import Wrapper
+from brax.training.acme import running_statistics
+from brax.training.types import Transition
+
+from jetbot_mjx.agents import fused_update, update_probe
+from jetbot_mjx.agents.networks import make_networks
+from jetbot_mjx.agents.ppo import PPO
+from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.config import ConfigError, load_config, parse_config
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.training import session
+
+on_a_gpu = pytest.mark.skipif(not ptx_backend.is_available(), reason="there is no NVIDIA GPU")
+
+OBSERVATIONS, ACTIONS = 5, 2
+
+
+def config(**ppo):
+    network = ppo.pop("network", {})
+    hidden = ppo.pop("hidden", [32, 32])
+    sizes = {"policy_hidden_layer_sizes": hidden, "value_hidden_layer_sizes": hidden}
+    values = {"num_envs": 64, "batch_size": 16, "num_minibatches": 4, "unroll_length": 4}
+    return parse_config({"ppo": {**values, **ppo, "network": {**sizes, **network}}})
+
+
+class Sizes(Wrapper):
+    """An environment that has sizes and nothing else."""
+
+    observation_size, action_size = OBSERVATIONS, ACTIONS
+    observation_min_std = np.zeros(OBSERVATIONS)
+
+
+def make_ppo(settings):
+    return PPO(settings.ppo, Sizes(None), make_networks(settings.ppo, OBSERVATIONS, ACTIONS))
+
+
+@pytest.mark.parametrize(
+    ("changes", "sizes", "reason"),
+    [
+        ({}, ({"pixels/camera": (8, 8, 3)}, 2), "without images"),
+        ({}, (65, 2), "at most 64 numbers, not 65"),
+        ({}, (16, 5), "at most 8 outputs, not 10"),
+        ({"hidden": [64, 32]}, (16, 2), "hidden layers of one width"),
+        ({"network": {"value_hidden_layer_sizes": [32]}}, (16, 2), "the same hidden layers"),
+        ({"hidden": [40, 40]}, (16, 2), "16, 32, ... 128 units, not 40"),
+        ({"hidden": [144]}, (16, 2), "16, 32, ... 128 units, not 144"),
+        ({"hidden": [128] * 4}, (16, 2), "does not fit in the registers"),
+    ],
+)
+def test_it_says_which_networks_it_cannot_compute(changes, sizes, reason):
+    found = fused_update.shape_of(config(**changes).ppo, *sizes)
+    assert isinstance(found, str)
+    assert reason in found
+
+
+@pytest.mark.cpu
+def test_a_cpu_takes_xla_and_does_not_mention_it():
+    assert make_ppo(config()).notice is None
+
+
+@pytest.mark.cpu
+def test_requested_on_a_cpu_it_is_an_error_of_one_line(root, tmp_path):
+    config = load_config(root / "configs" / "smoke.yaml", ["ppo.update=fused"])
+    with pytest.raises(UserError) as caught:
+        session.run(config, tmp_path / "run")
+    assert str(caught.value) == (
+        "ppo.update = fused: it needs an NVIDIA GPU, and this is cpu: choose auto or xla"
+    )
+    assert not (tmp_path / "run").exists()
+
+
+def test_brax_trainer_does_not_know_it():
+    with pytest.raises(
+        ConfigError, match=r"ppo\.update = 'fused' is not known to trainer = 'brax'"
+    ):
+        parse_config(
+            {
+                "trainer": "brax",
+                "ppo": {
+                    "update": "fused",
+                    "learning_rate_schedule": "NONE",
+                    "normalizer": "brax",
+                },
+            }
+        )
+
+
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+def test_vectors_become_the_same_parameters(distribution):
+    settings = config(network={"distribution_type": distribution}, update="xla")
+    ppo = make_ppo(settings)
+    keys = jax.random.split(jax.random.PRNGKey(0))
+    params = fused_update.NetworkParams(
+        policy=ppo.networks.policy_network.init(keys[0]),
+        value=ppo.networks.value_network.init(keys[1]),
+    )
+    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, None)
+    tree = params, ppo._optimizer.init(params)
+    packed = fused.pack(tree)
+    assert packed[0].shape == (shape.size,)
+    # All numbers are there once, and nothing else.
+    total = sum(float(jnp.abs(x).sum()) for x in jax.tree.leaves(params))
+    np.testing.assert_allclose(jnp.abs(packed[0]).sum(), total, rtol=1e-5)
+    again = fused.unpack(packed, tree)
+    assert jax.tree.structure(again) == jax.tree.structure(tree)
+    jax.tree.map(np.testing.assert_array_equal, again, tree)
+
+
+def minibatch(rng, settings, networks):
+    """Random unrolls with ratios far from the ends of the clip range, parameters and statistics."""
+    ppo = settings.ppo
+    steps = ppo.batch_size, ppo.unroll_length
+
+    def normal(*shape):
+        return jnp.asarray(rng.normal(size=shape), jnp.float32)
+
+    keys = jax.random.split(jax.random.PRNGKey(1))
+    params = fused_update.NetworkParams(
+        policy=networks.policy_network.init(keys[0]), value=networks.value_network.init(keys[1])
+    )
+    statistics = running_statistics.init_state(jax.ShapeDtypeStruct((OBSERVATIONS,), jnp.float32))
+    statistics = statistics.replace(mean=normal(OBSERVATIONS), std=jnp.full(OBSERVATIONS, 1.5))
+    observation, raw_action = normal(*steps, OBSERVATIONS), normal(*steps, ACTIONS)
+    with jax.default_matmul_precision("highest"):
+        parameters = networks.policy_network.apply(statistics, params.policy, observation)
+    distribution = networks.parametric_action_distribution
+    log_prob = distribution.log_prob(parameters, raw_action)
+    batch = Transition(
+        observation=observation,
+        action=jnp.tanh(raw_action),
+        reward=normal(*steps),
+        discount=jnp.asarray(rng.choice([0.0, 1.0], p=[0.1, 0.9], size=steps), jnp.float32),
+        next_observation=normal(steps[0], 1, OBSERVATIONS),
+        extras={
+            "policy_extras": {
+                "raw_action": raw_action,
+                "log_prob": log_prob + jnp.asarray(rng.choice([-0.7, 0.0, 0.7], size=steps)),
+                "distribution_params": parameters,
+            },
+            "state_extras": {
+                "truncation": jnp.asarray(rng.choice([0.0, 1.0], p=[0.9, 0.1], size=steps))
+            },
+        },
+    )
+    return params, statistics, jax.tree.map(lambda x: x.astype(jnp.float32), batch)
+
+
+@on_a_gpu
+def test_the_probe_agrees():
+    assert update_probe.runs_correctly()
+
+
+@on_a_gpu
+@pytest.mark.parametrize("activation", ["tanh", "relu", "elu", "swish"])
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+@pytest.mark.parametrize("hidden", [[128, 128, 128], [48, 48], [64]], ids=str)
+def test_the_gradient_is_xlas(hidden, distribution, activation):
+    settings = config(
+        hidden=hidden,
+        batch_size=512,
+        num_envs=2048,
+        unroll_length=12,
+        update="fused",
+        network={"distribution_type": distribution, "activation": activation},
+    )
+    ppo = make_ppo(settings)
+    params, statistics, batch = minibatch(np.random.default_rng(0), settings, ppo.networks)
+    key = jax.random.PRNGKey(2)
+    with jax.default_matmul_precision("highest"):
+        (_, metrics), expected = ppo._loss_and_gradient(params, statistics, batch, key)
+    fused = ppo._fused
+    order = jnp.asarray(np.random.default_rng(1).permutation(settings.ppo.batch_size))
+
+    @jax.jit
+    def ours(params):
+        shuffled = jax.tree.map(lambda x: x[order], fused.collected(batch))
+        vector = fused.pack(params)
+        return fused.loss_and_gradient(vector, statistics, shuffled, jnp.argsort(order), key)
+
+    (_, found), gradient = ours(params)
+    error = jnp.linalg.norm(gradient - fused.pack(expected)) / jnp.linalg.norm(gradient)
+    assert error < 0.02
+    for name, value in found.items():
+        np.testing.assert_allclose(value, metrics[name], rtol=0.02, atol=2e-3, err_msg=name)
+
+
+@on_a_gpu
+def test_several_policies_take_the_same_launches():
+    settings = config(update="fused")
+    ppo = make_ppo(settings)
+    fused, key = ppo._fused, jax.random.PRNGKey(2)
+    made = [minibatch(np.random.default_rng(seed), settings, ppo.networks) for seed in range(3)]
+    order = jnp.arange(settings.ppo.batch_size)
+
+    def gradient(params, statistics, batch):
+        collected = fused.collected(batch)
+        return fused.loss_and_gradient(fused.pack(params), statistics, collected, order, key)[1]
+
+    together = jax.jit(jax.vmap(gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
+    for one, ours in zip(made, together, strict=True):
+        np.testing.assert_allclose(ours, jax.jit(gradient)(*one), rtol=1e-4, atol=1e-6)
