@@ -58,6 +58,10 @@ class Collected(NamedTuple):
     """A row for each step, with the columns of `UpdateShape.columns`."""
     last: Float[Array, "unrolls obs"]
     """The observations after the last steps."""
+    mean: Float[Array, " obs"]
+    """What is subtracted from the observations."""
+    scale: Float[Array, " obs"]
+    """What they are then multiplied by."""
 
 
 def shape_of(
@@ -174,11 +178,12 @@ class FusedUpdate:
 
         return jax.tree.map(params, like, tree, is_leaf=lambda x: isinstance(x, NetworkParams))
 
-    def collected(self, data: Transition) -> Collected:
+    def collected(self, data: Transition, normalizer: Any) -> Collected:
         """Return the collected data as the kernels read it.
 
         Args:
           data: the unrolls, of shape (unrolls, time, ...).
+          normalizer: the statistics of the observations.
         """
         extras: Any = data.extras
         distribution = extras["policy_extras"]["distribution_params"]
@@ -193,12 +198,16 @@ class FusedUpdate:
             data.discount[..., None],
             extras["state_extras"]["truncation"][..., None],
         ]
-        return Collected(jnp.concatenate(rows, axis=-1), data.next_observation[:, -1])
+        size = self._shape.observations
+        mean, scale = jnp.zeros(size), jnp.ones(size)
+        if self._config.normalize_observations:
+            mean, scale = normalizer.mean, 1.0 / normalizer.std
+        last = data.next_observation[:, -1]
+        return Collected(jnp.concatenate(rows, axis=-1), last, mean, scale)
 
     def loss_and_gradient(
         self,
         params: Float[Array, " size"],
-        normalizer: Any,
         collected: Collected,
         unrolls: Int[Array, " unrolls"],
         key: UInt32[Array, "2"],
@@ -207,7 +216,6 @@ class FusedUpdate:
 
         Args:
           params: the parameters, from `pack`.
-          normalizer: the statistics of the observations.
           collected: all data, from `collected`.
           unrolls: the unrolls of the minibatch.
           key: the key of the noise that estimates the entropy.
@@ -216,13 +224,11 @@ class FusedUpdate:
           The loss with its metrics under Brax's names, and the gradient as a vector.
         """
         shape, time = self._shape, collected.rows.shape[1]
-        mean, scale = jnp.zeros(shape.observations), jnp.ones(shape.observations)
-        if self._config.normalize_observations:
-            mean, scale = normalizer.mean, 1.0 / normalizer.std
         # Brax draws the noise with time as the first axis.
         noise = jax.random.normal(key, (time, unrolls.shape[0], shape.actions))
+        rows, last, mean, scale = collected
         result = launch.gradient(
-            shape, self._terms, params, mean, scale, *collected, unrolls, noise
+            shape, self._terms, params, mean, scale, rows, last, unrolls, noise
         )
         gradient = jnp.where(self._is_parameter, result, 0.0)
         if self._axis is not None:

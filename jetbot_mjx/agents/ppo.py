@@ -393,17 +393,24 @@ class PPO:
         unpacked, fused = (params, optimizer_state), self._fused
         if fused:
             params, optimizer_state = fused.pack(unpacked)
-            collected = fused.collected(data)
+            collected = fused.collected(data, normalizer)
 
         def loss_and_gradient(params: PyTree, batch: Any, key: Array) -> Any:
             if fused:
-                return fused.loss_and_gradient(params, normalizer, collected, batch, key)
+                return fused.loss_and_gradient(params, collected, batch, key)
             return self._loss_and_gradient(params, normalizer, batch, key)
 
-        def one_pass(carry: PyTree, _: None) -> tuple[PyTree, PyTree]:
-            params, optimizer_state, key = carry
+        def draw(key: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
             key, shuffle_key, minibatch_key = jax.random.split(key, 3)
-            order = jax.random.permutation(shuffle_key, data.reward.shape[0])
+            return key, (shuffle_key, minibatch_key)
+
+        # Shuffle for all passes at once: a GPU takes as long for one.
+        passes, unrolls = self.config.num_updates_per_batch, data.reward.shape[0]
+        _, (shuffle_keys, minibatch_keys) = jax.lax.scan(draw, key, length=passes)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
+
+        def one_pass(carry: PyTree, drawn: tuple[Array, Array]) -> tuple[PyTree, PyTree]:
+            order, minibatch_key = drawn
 
             def minibatches(x: Array) -> Array:
                 return x.reshape((self.config.num_minibatches, -1, *x.shape[1:]))
@@ -412,14 +419,14 @@ class PPO:
             shuffled = order if fused else jax.tree.map(lambda x: x[order], data)
             (params, optimizer_state, _), metrics = jax.lax.scan(
                 lambda carry, batch: self._minibatch_step(carry, batch, loss_and_gradient),
-                (params, optimizer_state, minibatch_key),
+                (*carry, minibatch_key),
                 jax.tree.map(minibatches, shuffled),
             )
-            return (params, optimizer_state, key), metrics
+            return (params, optimizer_state), metrics
 
         # Make the passes, and average the metrics over the applied updates of all devices.
-        (params, optimizer_state, _), metrics = jax.lax.scan(
-            one_pass, (params, optimizer_state, key), length=self.config.num_updates_per_batch
+        (params, optimizer_state), metrics = jax.lax.scan(
+            one_pass, (params, optimizer_state), (orders, minibatch_keys)
         )
         if fused:
             params, optimizer_state = fused.unpack((params, optimizer_state), unpacked)

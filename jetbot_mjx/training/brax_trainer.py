@@ -36,7 +36,7 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
       env: the environment, unwrapped.
       recorder: the callback, which is invoked before the first step and after every interval.
     """
-    ppo = config.ppo.model_dump(exclude={"network", "normalizer"})
+    ppo = config.ppo.model_dump(exclude={"network", "normalizer", "update"})
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
     latest: dict[str, Any] = {}
     # Brax annotates it as a function of the environment alone, but passes four arguments.

@@ -1,5 +1,7 @@
 """The fused update: what networks it takes, its vectors, and on a GPU its gradient and launches."""
 
+import re
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -152,6 +154,30 @@ def minibatch(rng, settings, networks):
     return params, statistics, jax.tree.map(lambda x: x.astype(jnp.float32), batch)
 
 
+@pytest.mark.parametrize("policies", [1, 3])
+def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
+    pytest.importorskip("llvmlite")
+    monkeypatch.setattr(ptx_backend, "compute_capability", lambda: 90)
+    monkeypatch.setattr(ptx_backend, "processor_count", lambda: 132)
+    settings = config(update="xla")
+    networks = make_ppo(settings).networks
+    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, None)
+    one = minibatch(np.random.default_rng(0), settings, networks)
+    order = jnp.arange(settings.ppo.batch_size)
+
+    def gradient(params, statistics, batch):
+        collected = fused.collected(batch, statistics)
+        key = jax.random.PRNGKey(0)
+        return fused.loss_and_gradient(fused.pack(params), collected, order, key)[1]
+
+    made = jax.tree.map(lambda x: jnp.stack([x] * policies), one)
+    traced = jax.jit(jax.vmap(gradient)).trace(*made)
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("custom_call @__gpu$xla.gpu.ptx") == 2
+    assert re.findall(r"grid_z = (\d+)", text) == [str(policies)] * 2
+
+
 @on_a_gpu
 def test_the_probe_agrees():
     assert update_probe.runs_correctly()
@@ -180,9 +206,8 @@ def test_the_gradient_is_xlas(hidden, distribution, activation):
 
     @jax.jit
     def ours(params):
-        shuffled = jax.tree.map(lambda x: x[order], fused.collected(batch))
-        vector = fused.pack(params)
-        return fused.loss_and_gradient(vector, statistics, shuffled, jnp.argsort(order), key)
+        shuffled = fused.collected(jax.tree.map(lambda x: x[order], batch), statistics)
+        return fused.loss_and_gradient(fused.pack(params), shuffled, jnp.argsort(order), key)
 
     (_, found), gradient = ours(params)
     error = jnp.linalg.norm(gradient - fused.pack(expected)) / jnp.linalg.norm(gradient)
@@ -200,8 +225,8 @@ def test_several_policies_take_the_same_launches():
     order = jnp.arange(settings.ppo.batch_size)
 
     def gradient(params, statistics, batch):
-        collected = fused.collected(batch)
-        return fused.loss_and_gradient(fused.pack(params), statistics, collected, order, key)[1]
+        collected = fused.collected(batch, statistics)
+        return fused.loss_and_gradient(fused.pack(params), collected, order, key)[1]
 
     together = jax.jit(jax.vmap(gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
     for one, ours in zip(made, together, strict=True):
