@@ -7,6 +7,11 @@
 
 from pathlib import Path
 
+from jetbot_mjx.imports import install_lazy_imports
+
+# Before anything imports MJX, which prints a line about each of its parts that is missing.
+install_lazy_imports()
+
 ROOT = Path(__file__).resolve().parents[1]
 """The folder of the repository."""
 

@@ -42,6 +42,8 @@ class FaultCase(NamedTuple):
     stopped_after: float
     """Time from the last good picture until both motors stood at zero [s]; infinite: they did
     not."""
+    in_time: bool
+    """Whether that was within the watchdog's time and a control period."""
     resumed: bool
     """Whether the motors turned again when pictures came again."""
 
@@ -155,7 +157,8 @@ class CameraRehearsal:
 
         goal = 1.5 * math.cos(bearing), 1.5 * math.sin(bearing)
         self.drive(goal, at + _LASTS + 1.0, log=log)
-        return FaultCase(kind, stopped, resumed)
+        allowed = self._settings.stale_after + self._policy.spec["control_period"] + 1e-6
+        return FaultCase(kind, stopped, stopped <= allowed, resumed)
 
     def search(self, timeout: float, seed: int = 0) -> Search:
         """Drive without a cube first, and let it appear beside the robot.
@@ -178,6 +181,21 @@ class CameraRehearsal:
         x, y, yaw = np.array(path).T
         turned = abs(float(np.unwrap(yaw)[-1] - yaw[0]))
         return Search(turned, float(np.hypot(x, y).max()), outcome.reached)
+
+
+def passed(
+    outcomes: list[Outcome], faults: list[FaultCase], searches: list[Search], share: float
+) -> bool:
+    """Return whether every fault stopped the motors, and a share of goals and searches succeeded.
+
+    Args:
+      outcomes: Drives to goals.
+      faults: Drives with a broken camera.
+      searches: Drives that began without a cube.
+      share: Share of the goals, and of the searches, that must be reached.
+    """
+    good = ([one.reached for one in outcomes], [one.good for one in searches])
+    return all(one.in_time for one in faults) and all(sum(one) >= share * len(one) for one in good)
 
 
 def summary(outcomes: list[Outcome], faults: list[FaultCase], searches: list[Search]) -> str:

@@ -3,9 +3,6 @@
 `benchmarks/steps_per_second.py` is the command; this module neither prints nor parses.
 """
 
-# First, because MJX prints when Brax imports it.
-import jetbot_mjx  # noqa: F401  isort: skip
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple

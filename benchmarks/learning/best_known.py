@@ -15,9 +15,6 @@ Source: R. Y. Rubinstein, The Cross-Entropy Method for Combinatorial and Continu
 Methodology and Computing in Applied Probability 1 (1999), 127-190, doi:10.1023/A:1010091220143.
 """
 
-# First, because MJX prints when Brax imports it.
-import jetbot_mjx  # noqa: F401  isort: skip
-
 import json
 import sys
 import time

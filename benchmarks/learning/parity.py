@@ -44,9 +44,6 @@ Sources: R. A. Fisher, The Design of Experiments (1935), section 21;
 Student, Biometrika 6 (1908), 1-25, doi:10.1093/biomet/6.1.1.
 """
 
-# First, because MJX prints when Brax imports it.
-import jetbot_mjx  # noqa: F401  isort: skip
-
 import argparse
 import itertools
 import math

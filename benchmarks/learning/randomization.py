@@ -32,12 +32,14 @@ from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
-from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, Sweeper, as_json
+from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, Sweeper, SweepResult
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.run_dir import seed_folders
 from jetbot_mjx.training import session
 
 SETTINGS = ("nominal", "randomised")
+_EASY = 0.99
+"""Success rate above which a parameter is only named."""
 _COLOURS = {"nominal": "tab:orange", "randomised": "C0"}
 
 
@@ -71,14 +73,22 @@ class PolicyEvaluator:
           folder: The run folder of one seed.
 
         Returns:
-          The metrics as JSON: summaries under `preset` and `ranges`, and `sweep` as in a report.
+          The metrics as JSON: summaries under `preset` and `ranges`, and under `sweep` the success
+          rates of policy and scripted controller at each value of each parameter.
         """
         params = load_checkpoint(folder, "last").params
         metrics: dict[str, Any] = {
             name: summarize(one.run(params, self._keys), self._dt)._asdict()
             for name, one in self._evaluators.items()
         }
-        return {**metrics, "sweep": as_json(self._sweeper.run(params))["quantities"]}
+        return {**metrics, "sweep": [_sweep_row(one) for one in self._sweeper.run(params)]}
+
+
+def _sweep_row(result: SweepResult) -> dict[str, Any]:
+    rates = {
+        name: [one.success_rate for one in getattr(result, name)] for name in ("policy", "scripted")
+    }
+    return {**result.sweep._asdict(), "nominal": result.sweep.nominal, **rates}
 
 
 def run(config: Config, folder: Path, evaluator: PolicyEvaluator) -> Iterator[dict[str, Any]]:
@@ -112,7 +122,8 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
     Returns:
       A Markdown table: success on the preset, under the full ranges, and at the value of each
-      parameter that is hardest for the policies of that setting.
+      parameter that is hardest for the policies of that setting; then the parameters of which
+      no value is hard.
     """
     lines = [
         "| success, mean (worst seed) | nominal | randomised |",
@@ -124,7 +135,10 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             for setting in SETTINGS
         ]
         lines.append(f"| {title} | {' | '.join(cells)} |")
+    hard = _hard(rows)
     for index, quantity in enumerate(rows[0]["sweep"]):
+        if index not in hard:
+            continue
         cells = []
         for setting in SETTINGS:
             rates = _rates(_rows_of(rows, setting), index)
@@ -132,7 +146,18 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
             where = f" at {quantity['values'][at]:g}" if len(rates) and rates.min() < 1 else ""
             cells.append(f"{_cell(rates[:, at] if len(rates) else [])}{where}")
         lines.append(f"| {quantity['label']}, its hardest value | {' | '.join(cells)} |")
-    return "\n".join(lines)
+    return "\n".join([*lines, "", _easy(rows)])
+
+
+def _hard(rows: Sequence[dict[str, Any]]) -> list[int]:
+    """Return the indices of the parameters of which some value is hard for some policy."""
+    count = len(rows[0]["sweep"])
+    return [index for index in range(count) if _rates(rows, index).min() < _EASY]
+
+
+def _easy(rows: Sequence[dict[str, Any]]) -> str:
+    labels = [one["label"] for i, one in enumerate(rows[0]["sweep"]) if i not in _hard(rows)]
+    return f"Every policy has {_EASY:.0%} or more at every value of: {'; '.join(labels)}."
 
 
 def _rows_of(rows: Sequence[dict[str, Any]], setting: str) -> list[dict[str, Any]]:
@@ -141,9 +166,7 @@ def _rows_of(rows: Sequence[dict[str, Any]], setting: str) -> list[dict[str, Any
 
 def _rates(rows: Sequence[dict[str, Any]], index: int) -> np.ndarray:
     """Return success by seed and value of one parameter."""
-    return np.array(
-        [[one["success_rate"] for one in row["sweep"][index]["policy"]] for row in rows]
-    )
+    return np.array([row["sweep"][index]["policy"] for row in rows])
 
 
 def _cell(rates: Sequence[float] | np.ndarray) -> str:
@@ -151,22 +174,28 @@ def _cell(rates: Sequence[float] | np.ndarray) -> str:
 
 
 def plot(rows: Sequence[dict[str, Any]]) -> Figure:
-    """Plot success over every parameter: means over the seeds, with bands from worst to best.
+    """Plot success over every parameter that is hard for some policy.
 
     Args:
       rows: The rows of all policies.
 
     Returns:
-      The figure.
+      The figure: means over the seeds, with bands from worst to best.
     """
-    quantities = rows[0]["sweep"]
+    hard = _hard(rows)
     columns = 4
-    lines = -(-len(quantities) // columns)
+    lines = max(1, -(-len(hard) // columns))
     figure = Figure(figsize=(3.2 * columns, 2.5 * lines), layout="constrained")
-    for index, quantity in enumerate(quantities):
-        axes = figure.add_subplot(lines, columns, index + 1)
-        scripted = [one["success_rate"] for one in quantity["scripted"]]
-        axes.plot(quantity["values"], scripted, color="tab:gray", linewidth=1, label="scripted")
+    for place, index in enumerate(hard):
+        quantity = rows[0]["sweep"][index]
+        axes = figure.add_subplot(lines, columns, place + 1)
+        axes.plot(
+            quantity["values"],
+            quantity["scripted"],
+            color="tab:gray",
+            linewidth=1,
+            label="scripted",
+        )
         for setting in SETTINGS:
             rates = _rates(_rows_of(rows, setting), index)
             if not len(rates):
@@ -186,7 +215,7 @@ def plot(rows: Sequence[dict[str, Any]]) -> Figure:
         axes.set(ylim=(-0.03, 1.03), title=quantity["label"], xlabel=f"[{quantity['unit']}]")
         axes.yaxis.set_major_formatter(PercentFormatter(1.0))
         axes.grid(alpha=0.3)
-        if index == 0:
+        if place == 0:
             axes.legend(fontsize="small", loc="lower right")
     return figure
 

@@ -13,7 +13,7 @@ from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.viewers import live
 
 NAMES = ("camera_real", "jetbot_camera", "jetbot_egocentric", "real_jetbot")
-LONGER = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
+CHANGED = {"camera_real": {"seed": 1}, "jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
 """What a run that comes with the package changes of its configuration."""
 
 
@@ -30,7 +30,7 @@ def test_there_is_a_run_for_each_of_four_configurations(runs):
 @pytest.mark.parametrize("name", NAMES)
 def test_it_was_trained_by_the_configuration_of_its_name(name, root):
     trained = load_config(PRETRAINED / name / "config.yaml")
-    changed = [f"{key}={value}" for key, value in LONGER.get(name, {}).items()]
+    changed = [f"{key}={value}" for key, value in CHANGED.get(name, {}).items()]
     assert trained == load_config(root / "configs" / f"{name}.yaml", changed)
     assert load_checkpoint(PRETRAINED / name).config == trained
 

@@ -388,9 +388,12 @@ def test_faults_stop_it_in_time_and_without_a_cube_it_turns(with_opengl):
     cases = found.faults(2)
     assert [case.kind for case in cases] == ["frozen", "black"]
     assert max(case.stopped_after for case in cases) <= camera_sense.FRAME_STALE_AFTER + PERIOD
-    assert all(case.resumed for case in cases)
+    assert all(case.resumed and case.in_time for case in cases)
     search = found.search(12.0)
     assert search.good
+    assert rehearse_camera.passed([], cases, [search], 1.0)
+    assert not rehearse_camera.passed([], [cases[0]._replace(in_time=False)], [search], 1.0)
+    assert not rehearse_camera.passed([], cases, [search._replace(reached=False)], 1.0)
     text = rehearse_camera.summary([], cases, [search])
     assert "1 of 1 turned until they saw it" in text
 

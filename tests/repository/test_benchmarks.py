@@ -420,15 +420,10 @@ def test_the_cost_of_randomization_is_the_median_over_the_rounds():
 
 
 def evaluated(setting, seed, rates):
+    one = {"unit": "1", "values": [0.4, 1.0], "nominal": 1.0, "scripted": [1.0, 1.0]}
     sweep = [
-        {
-            "label": "friction",
-            "unit": "1",
-            "values": [0.4, 1.0],
-            "nominal": 1.0,
-            "policy": [{"success_rate": rate} for rate in rates],
-            "scripted": [{"success_rate": 1.0}] * 2,
-        }
+        {**one, "label": "mass", "policy": [0.99, 1.0]},
+        {**one, "label": "friction", "policy": list(rates)},
     ]
     one = {"success_rate": rates[-1]}
     return {"setting": setting, "seed": seed, "preset": one, "ranges": one, "sweep": sweep}
@@ -441,6 +436,7 @@ def test_both_settings_are_tabulated_with_mean_and_worst_seed():
     assert "| friction, its hardest value | 60.00% (50.00%) at 0.4 | - |" in table
     rows.append(evaluated("randomised", "0", (0.9, 1.0)))
     assert "| 90.00% (90.00%) at 0.4 |" in randomization.table(rows)
+    assert table.endswith("Every policy has 99% or more at every value of: mass.")
     (axes,) = randomization.plot(rows).axes
     lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}
     assert lines["nominal"] == pytest.approx([0.6, 1.0])
