@@ -44,6 +44,7 @@ Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.
 google/brax v0.14.2, brax/training/agents/ppo.
 """
 
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -195,6 +196,13 @@ class PPO:
             raise UserError(f"ppo.update = fused: {reason}: choose auto or xla")
         if jax.default_backend() == "gpu":
             self.notice = f"ppo.update = xla: {reason}"
+
+    def _checked_fused(self) -> fused_update.FusedUpdate | None:
+        """Return the kernels of the update after a check on this GPU; None: XLA compiles it."""
+        if self._fused and not update_probe.runs_correctly():
+            self._refuse_fused("the fused update failed its check on this GPU")
+            print(self.notice, file=sys.stderr)
+        return self._fused
 
     def init(self, key: UInt32[Array, "2"]) -> TrainState:
         """Return the training state before the first step.
@@ -388,9 +396,7 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
-        if self._fused and not update_probe.runs_correctly():
-            self._refuse_fused("the fused update failed its check on this GPU")
-        unpacked, fused = (params, optimizer_state), self._fused
+        unpacked, fused = (params, optimizer_state), self._checked_fused()
         if fused:
             params, optimizer_state = fused.pack(unpacked)
             collected = fused.collected(data, normalizer)
@@ -399,15 +405,6 @@ class PPO:
             if fused:
                 return fused.loss_and_gradient(params, collected, batch, key)
             return self._loss_and_gradient(params, normalizer, batch, key)
-
-        def draw(key: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
-            key, shuffle_key, minibatch_key = jax.random.split(key, 3)
-            return key, (shuffle_key, minibatch_key)
-
-        # Shuffle for all passes at once: a GPU takes as long for one.
-        passes, unrolls = self.config.num_updates_per_batch, data.reward.shape[0]
-        _, (shuffle_keys, minibatch_keys) = jax.lax.scan(draw, key, length=passes)
-        orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
 
         def one_pass(carry: PyTree, drawn: tuple[Array, Array]) -> tuple[PyTree, PyTree]:
             order, minibatch_key = drawn
@@ -424,21 +421,40 @@ class PPO:
             )
             return (params, optimizer_state), metrics
 
-        # Make the passes, and average the metrics over the applied updates of all devices.
         (params, optimizer_state), metrics = jax.lax.scan(
-            one_pass, (params, optimizer_state), (orders, minibatch_keys)
+            one_pass, (params, optimizer_state), self._draw_passes(key, data.reward.shape[0])
         )
         if fused:
             params, optimizer_state = fused.unpack((params, optimizer_state), unpacked)
+        return params, optimizer_state, self._mean_metrics(metrics)
+
+    def _draw_passes(self, key: Array, unrolls: int) -> tuple[Array, Array]:
+        """Draw the order of the unrolls in each pass, and the key of its minibatches."""
+
+        def draw(key: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
+            key, shuffle_key, minibatch_key = jax.random.split(key, 3)
+            return key, (shuffle_key, minibatch_key)
+
+        # Shuffle for all passes at once: a GPU takes about as long for one.
+        _, (shuffle_keys, minibatch_keys) = jax.lax.scan(
+            draw, key, length=self.config.num_updates_per_batch
+        )
+        orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
+        return orders, minibatch_keys
+
+    def _mean_metrics(
+        self, metrics: Float[Array, "passes minibatches metrics"]
+    ) -> dict[str, Float[Array, ""]]:
+        """Average the metrics over the applied updates of all devices."""
         if self._axis is not None:
             metrics = jax.lax.pmean(metrics, self._axis)
-        *losses_, applied = jnp.moveaxis(metrics, -1, 0)
+        *columns, applied = jnp.moveaxis(metrics, -1, 0)
         count = jnp.maximum(applied.sum(), 1.0)
         means = {
             name: jnp.where(applied > 0, values, 0.0).sum() / count
-            for name, values in zip(LOSSES.values(), losses_, strict=True)
+            for name, values in zip(LOSSES.values(), columns, strict=True)
         }
-        return params, optimizer_state, {**means, "nonfinite_updates": (1.0 - applied).sum()}
+        return {**means, "nonfinite_updates": (1.0 - applied).sum()}
 
     def _minibatch_step(
         self,

@@ -124,7 +124,7 @@ def test_a_programs_platform_decides(step, monkeypatch):
     if llvm_backend.is_available():
         assert launches(*arguments, platforms=("cpu",)) == 1
     monkeypatch.setattr(ptx_backend, "is_available", lambda: True)
-    monkeypatch.setattr(ptx_backend, "_architecture", lambda: 90)
+    monkeypatch.setattr(ptx_backend, "target_architecture", lambda: 90)
     assert launches(*arguments, platforms=("cuda",)) == 1
     monkeypatch.setattr(ptx_backend, "is_available", lambda: False)
     assert launches(*arguments, platforms=("cuda",)) == 0
