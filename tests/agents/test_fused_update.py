@@ -9,11 +9,14 @@ import pytest
 from brax.envs import Wrapper
 from brax.training.acme import running_statistics
 from brax.training.types import Transition
+from gpu_model import Gpu
 
 from jetbot_mjx.agents import fused_update, update_probe
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.compiler.update import advantages, gradient, launch
+from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.training import session
@@ -166,16 +169,48 @@ def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
     one = minibatch(np.random.default_rng(0), settings, networks)
     order = jnp.arange(settings.ppo.batch_size)
 
-    def gradient(params, statistics, batch):
+    def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
         key = jax.random.PRNGKey(0)
         return fused.loss_and_gradient(fused.pack(params), collected, order, key)[1]
 
     made = jax.tree.map(lambda x: jnp.stack([x] * policies), one)
-    traced = jax.jit(jax.vmap(gradient)).trace(*made)
+    traced = jax.jit(jax.vmap(one_gradient)).trace(*made)
     text = traced.lower(lowering_platforms=("cuda",)).as_text()
     assert text.count("custom_call @__gpu$xla.gpu.ptx") == 2
     assert re.findall(r"grid_z = (\d+)", text) == [str(policies)] * 2
+
+
+def modelled(shape, terms, *arrays):
+    """`launch.gradient` on the model of a GPU, for one policy."""
+
+    def run(*arrays):
+        params, mean, scale, rows, last, unrolls, noise = (np.array(x) for x in arrays)
+        batch = Minibatch(len(rows), len(unrolls), rows.shape[1])
+        tiling = Tiling(shape, 64, 1, 16)
+        blocks = min(2, advantages.tile_count(tiling, batch))
+        sizes = batch.samples, batch.samples, (blocks, 2)
+        estimates = [np.full(size, np.nan, np.float32) for size in sizes]
+        text = advantages.advantages_text(tiling, batch, terms)
+        Gpu(text, [params, mean, scale, rows, last, unrolls, *estimates]).run(blocks)
+        tiling = Tiling(shape, 32, 1)
+        vector = np.full((1, shape.size), np.nan, np.float32)
+        text = gradient.gradient_text(tiling, batch, terms, blocks)
+        Gpu(text, [params, mean, scale, rows, unrolls, noise, *estimates, vector]).run(1, 2)
+        return vector[0]
+
+    result = jax.ShapeDtypeStruct((shape.size,), np.float32)
+    return jax.pure_callback(run, result, *arrays)
+
+
+@pytest.mark.cpu
+def test_the_probe_agrees_with_the_model(monkeypatch):
+    monkeypatch.setattr(launch, "gradient", modelled)
+    monkeypatch.setattr(ptx_backend, "is_available", lambda: True)
+    monkeypatch.setattr(ptx_backend, "PLATFORM", "cpu")
+    assert update_probe.runs_correctly.__wrapped__()
+    monkeypatch.setattr(launch, "gradient", lambda *arrays: 1.1 * modelled(*arrays))
+    assert not update_probe.runs_correctly.__wrapped__()
 
 
 @on_a_gpu
@@ -183,34 +218,50 @@ def test_the_probe_agrees():
     assert update_probe.runs_correctly()
 
 
+@pytest.mark.cpu
+@pytest.mark.parametrize("normalizes", [True, False])
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+def test_the_models_gradient_is_xlas(monkeypatch, distribution, normalizes):
+    monkeypatch.setattr(launch, "gradient", modelled)
+    settings = config(
+        network={"distribution_type": distribution},
+        normalize_observations=normalizes,
+        unroll_length=6,
+    )
+    assert_gradient_is_xlas(settings)
+
+
 @on_a_gpu
 @pytest.mark.parametrize("activation", ["tanh", "relu", "elu", "swish"])
 @pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
 @pytest.mark.parametrize("hidden", [[128, 128, 128], [48, 48], [64]], ids=str)
 def test_the_gradient_is_xlas(hidden, distribution, activation):
+    network = {"distribution_type": distribution, "activation": activation}
     settings = config(
-        hidden=hidden,
-        batch_size=512,
-        num_envs=2048,
-        unroll_length=12,
-        update="fused",
-        network={"distribution_type": distribution, "activation": activation},
+        hidden=hidden, batch_size=512, num_envs=2048, unroll_length=12, network=network
     )
+    assert_gradient_is_xlas(settings)
+
+
+def assert_gradient_is_xlas(settings):
+    """A minibatch's gradient and metrics, from unrolls in another order among all."""
     ppo = make_ppo(settings)
     params, statistics, batch = minibatch(np.random.default_rng(0), settings, ppo.networks)
     key = jax.random.PRNGKey(2)
     with jax.default_matmul_precision("highest"):
         (_, metrics), expected = ppo._loss_and_gradient(params, statistics, batch, key)
-    fused = ppo._fused
+    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, None)
     order = jnp.asarray(np.random.default_rng(1).permutation(settings.ppo.batch_size))
 
     @jax.jit
     def ours(params):
         shuffled = fused.collected(jax.tree.map(lambda x: x[order], batch), statistics)
-        return fused.loss_and_gradient(fused.pack(params), shuffled, jnp.argsort(order), key)
+        places = jnp.argsort(order).astype(jnp.int32)
+        return fused.loss_and_gradient(fused.pack(params), shuffled, places, key)
 
-    (_, found), gradient = ours(params)
-    error = jnp.linalg.norm(gradient - fused.pack(expected)) / jnp.linalg.norm(gradient)
+    (_, found), vector = ours(params)
+    error = jnp.linalg.norm(vector - fused.pack(expected)) / jnp.linalg.norm(vector)
     assert error < 0.02
     for name, value in found.items():
         np.testing.assert_allclose(value, metrics[name], rtol=0.02, atol=2e-3, err_msg=name)
@@ -224,10 +275,10 @@ def test_several_policies_take_the_same_launches():
     made = [minibatch(np.random.default_rng(seed), settings, ppo.networks) for seed in range(3)]
     order = jnp.arange(settings.ppo.batch_size)
 
-    def gradient(params, statistics, batch):
+    def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
         return fused.loss_and_gradient(fused.pack(params), collected, order, key)[1]
 
-    together = jax.jit(jax.vmap(gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
+    together = jax.jit(jax.vmap(one_gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
     for one, ours in zip(made, together, strict=True):
-        np.testing.assert_allclose(ours, jax.jit(gradient)(*one), rtol=1e-4, atol=1e-6)
+        np.testing.assert_allclose(ours, jax.jit(one_gradient)(*one), rtol=1e-4, atol=1e-6)
