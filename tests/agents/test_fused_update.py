@@ -1,5 +1,6 @@
 """The fused update: what networks it takes, its vectors, and on a GPU its gradient and launches."""
 
+import dataclasses
 import re
 
 import jax
@@ -243,10 +244,59 @@ def test_the_gradient_is_xlas(hidden, distribution, activation):
     assert_gradient_is_xlas(settings)
 
 
+def rounded(x):
+    return x.astype(jnp.bfloat16).astype(jnp.float32)
+
+
+@jax.custom_vjp
+def dense(x, layer, is_last):
+    """A layer whose products, forward and backward, have operands of bfloat16."""
+    return rounded(x) @ rounded(layer["kernel"]) + layer["bias"]
+
+
+def dense_backward(kept, slope):
+    x, layer, is_last = kept
+    errors = rounded(slope)
+    flat = errors.reshape(-1, errors.shape[-1])
+    kernel = rounded(x).reshape(-1, x.shape[-1]).T @ flat
+    bias = (slope if is_last else errors).reshape(flat.shape).sum(0)
+    return errors @ rounded(layer["kernel"]).T, {"kernel": kernel, "bias": bias}, None
+
+
+dense.defvjp(lambda *given: (dense(*given), given), dense_backward)
+
+
+def rounding(settings, networks):
+    """The same networks with such products."""
+    activation = getattr(jax.nn, settings.ppo.network.activation)
+
+    def apply(statistics, params, x):
+        if settings.ppo.normalize_observations:
+            x = (x - statistics.mean) / statistics.std
+        tree = params["params"]
+        layers = [*tree.get("MLP_0", {}).values()]
+        layers += [tree[name] for name in sorted(tree) if name.startswith(("hidden", "Dense"))]
+        for layer in layers[:-1]:
+            x = activation(dense(x, layer, None))
+        x = dense(x, layers[-1], True)
+        if "std_param" in tree:
+            return x, jnp.broadcast_to(tree["std_param"]["value"], x.shape)
+        return x
+
+    policy = dataclasses.replace(networks.policy_network, apply=apply)
+    value = dataclasses.replace(networks.value_network, apply=lambda *x: apply(*x)[..., 0])
+    return dataclasses.replace(networks, policy_network=policy, value_network=value)
+
+
 def assert_gradient_is_xlas(settings):
-    """A minibatch's gradient and metrics, from unrolls in another order among all."""
+    """A minibatch's gradient and metrics, from unrolls in another order among all.
+
+    XLA rounds to bfloat16 where the kernels do. Without that, gradients of policies far from that
+    of the collection differ by more, for its rounded parameters are those of another policy.
+    """
     ppo = make_ppo(settings)
     params, statistics, batch = minibatch(np.random.default_rng(0), settings, ppo.networks)
+    ppo.networks = rounding(settings, ppo.networks)
     key = jax.random.PRNGKey(2)
     with jax.default_matmul_precision("highest"):
         (_, metrics), expected = ppo._loss_and_gradient(params, statistics, batch, key)
@@ -262,9 +312,9 @@ def assert_gradient_is_xlas(settings):
 
     (_, found), vector = ours(params)
     error = jnp.linalg.norm(vector - fused.pack(expected)) / jnp.linalg.norm(vector)
-    assert error < 0.02
+    assert error < 0.01
     for name, value in found.items():
-        np.testing.assert_allclose(value, metrics[name], rtol=0.02, atol=2e-3, err_msg=name)
+        np.testing.assert_allclose(value, metrics[name], rtol=0.01, atol=1e-3, err_msg=name)
 
 
 @on_a_gpu
