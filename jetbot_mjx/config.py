@@ -490,7 +490,7 @@ class PPOConfig(_Section):
     """Normalise advantages within a minibatch."""
     update: Literal["auto", "fused", "xla"] = "auto"
     """How the gradient of a minibatch is computed. `fused`: by two kernels for NVIDIA GPUs, with
-    products of bfloat16 and sums of float32; `xla`: by XLA; `auto`: by the kernels where the GPU
+    products of float16 and sums of float32; `xla`: by XLA; `auto`: by the kernels where the GPU
     and the networks allow it."""
     network: NetworkConfig = NetworkConfig()
     """Network sizes."""

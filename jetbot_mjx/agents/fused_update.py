@@ -5,7 +5,7 @@ launches 140 of them for a minibatch. Here one kernel computes the values, XLA t
 one kernel the gradient of both networks; docs/update.md explains them.
 
 Protocol: the parameters and Adam's moments are one vector each during an update (`pack`, `unpack`).
-Products round their operands to bfloat16; sums, parameters and Adam stay float32. The random keys
+Products round their operands to float16; sums, parameters and Adam stay float32. The random keys
 are those of Brax's loss.
 """
 

@@ -33,7 +33,7 @@ Brax are:
 - The first non-finite environment state is returned as a `NanDump`.
 - `normalizer: physical` bounds the standard deviation from below by the observation's scale.
 - `learning_rate_schedule: LINEAR` lowers the step size to zero over the training.
-- `update: fused` computes the same loss with products of bfloat16, on NVIDIA GPUs.
+- `update: fused` computes the same loss with products of float16, on NVIDIA GPUs.
 - GAE is unrolled, and of the next observations only those that the loss needs are stored.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`

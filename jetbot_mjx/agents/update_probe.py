@@ -17,8 +17,8 @@ from jetbot_mjx.compiler.update.shapes import LossTerms, UpdateShape
 _SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh")
 _TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0, normalize_advantage=False)
 _UNROLLS, _TIME = 8, 4
-_MOST_ERROR = 0.05
-"""Largest difference of the gradients, relative to their norm; products are of bfloat16."""
+_MOST_ERROR = 0.01
+"""Largest difference of the gradients, relative to their norm; products are of float16."""
 _STEP = 1e-4
 
 

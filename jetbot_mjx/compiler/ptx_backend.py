@@ -140,19 +140,21 @@ def compiled(kernel: Kernel, architecture: int) -> str:
     )
 
 
-def assembled(text: str, architecture: int) -> str:
+def assembled(text: str, architecture: int, version: int | None = None) -> str:
     """Return the PTX of a module of LLVM IR.
 
     Args:
       text: the module.
       architecture: the target architecture, as ten times the compute capability.
+      version: ten times the version of PTX; None: the oldest that knows the architecture.
     """
+    version = version or (70 if architecture < 90 else 80)
     binding = _binding()
     module = binding.parse_assembly(text, binding.create_context())
     module.triple = _TRIPLE
     target = binding.Target.from_triple(_TRIPLE)
     machine = target.create_target_machine(
-        cpu=f"sm_{architecture}", features="+ptx70" if architecture < 90 else "+ptx80", opt=_LEVEL
+        cpu=f"sm_{architecture}", features=f"+ptx{version}", opt=_LEVEL
     )
     return machine.emit_assembly(module)
 

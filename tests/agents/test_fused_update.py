@@ -245,12 +245,12 @@ def test_the_gradient_is_xlas(hidden, distribution, activation):
 
 
 def rounded(x):
-    return x.astype(jnp.bfloat16).astype(jnp.float32)
+    return x.astype(jnp.float16).astype(jnp.float32)
 
 
 @jax.custom_vjp
 def dense(x, layer, is_last):
-    """A layer whose products, forward and backward, have operands of bfloat16."""
+    """A layer whose products, forward and backward, have operands of float16."""
     return rounded(x) @ rounded(layer["kernel"]) + layer["bias"]
 
 
@@ -291,7 +291,7 @@ def rounding(settings, networks):
 def assert_gradient_is_xlas(settings):
     """A minibatch's gradient and metrics, from unrolls in another order among all.
 
-    XLA rounds to bfloat16 where the kernels do. Without that, gradients of policies far from that
+    XLA rounds to float16 where the kernels do. Without that, gradients of policies far from that
     of the collection differ by more, for its rounded parameters are those of another policy.
     """
     ppo = make_ppo(settings)

@@ -7,7 +7,6 @@ barrier between them: on a GPU, the result would depend on which comes first.
 
 import re
 
-import ml_dtypes
 import numpy as np
 
 SHARED = 232_448
@@ -36,11 +35,6 @@ _FUNCTIONS = {
     "tanh.approx.f32": np.tanh,
 }
 _OPERATION = "|".join(_ARITHMETIC)
-
-
-def rounded(x):
-    """Numbers rounded to bfloat16."""
-    return np.asarray(x, np.float32).astype(ml_dtypes.bfloat16).astype(np.float32)
 
 
 class Races:
@@ -226,14 +220,21 @@ class Gpu:
         assert (place[on] >= 0).all()
         self.arrays[arrays[0]][place[on]] = self._get("float", value)[on]
 
+    def _halves(self, value):
+        return np.asarray(self._get("i32", value), np.uint32)[:, None].view(np.float16)
+
+    def _half(self, value, index):
+        return self.values[value][:, int(index)]
+
     def _bitcast(self, value):
         return np.asarray(self.values[value], np.uint32).view(np.float32)
 
     def _assembly(self, name, operands):
         given = [self._get("float", x.split()[1]) for x in operands.split(", ")]
-        if name == "cvt.rn.bf16x2.f32":
-            high, low = (rounded(x).view(np.uint32) for x in given)
-            return (high & 0xFFFF0000) | (low >> 16)
+        if name == "cvt.rn.satfinite.f16x2.f32":
+            most = np.finfo(np.float16).max
+            high, low = (np.clip(x, -most, most).astype(np.float16) for x in given)
+            return np.stack([low, high], axis=-1).view(np.uint32)[:, 0]
         return _FUNCTIONS[name](given[0])
 
     def _matrices(self, transposed, pointer):
@@ -252,12 +253,8 @@ class Gpu:
         return self.values[value][int(index)]
 
     def _mma(self, operands):
-        given = [self._get(*x.split()) for x in operands.split(", ")]
+        given = [self._get(*x.rsplit(" ", 1)) for x in operands.split(", ")]
         left, right, sums = given[:4], given[4:6], given[6:]
-
-        def halves(words):
-            words = words.astype(np.uint32)
-            return (words << 16).view(np.float32), (words & 0xFFFF0000).view(np.float32)
 
         warps, lane = self.threads // 32, np.arange(32)
         g, t = lane // 4, lane % 4 * 2
@@ -265,11 +262,11 @@ class Gpu:
         b = np.zeros((warps, 16, 8), np.float32)
         c = np.zeros((warps, 16, 8), np.float32)
         for i in range(4):
-            for j, half in enumerate(halves(left[i])):
+            for j, half in enumerate(left[i].T):
                 a[:, g + 8 * (i % 2), t + 8 * (i // 2) + j] = half.reshape(warps, 32)
             c[:, g + 8 * (i // 2), t + i % 2] = sums[i].reshape(warps, 32)
         for i in range(2):
-            for j, half in enumerate(halves(right[i])):
+            for j, half in enumerate(right[i].T):
                 b[:, t + 8 * i + j, g] = half.reshape(warps, 32)
         c = c + a @ b
         return [c[:, g + 8 * (i // 2), t + i % 2].reshape(-1) for i in range(4)]
@@ -308,6 +305,9 @@ _INSTRUCTIONS = [
         (r"store float (\S+), ptr addrspace\(1\) (\S+)", Gpu._store),
         (r"zext i32 (\S+) to i64", lambda gpu, value: gpu.values[value]),
         (r"bitcast i32 (\S+) to float", Gpu._bitcast),
+        (r"bitcast i32 (\S+) to <2 x half>", Gpu._halves),
+        (r"extractelement <2 x half> (\S+), i32 (\d)", Gpu._half),
+        (r"fpext half (\S+) to float", lambda gpu, value: gpu.values[value].astype(np.float32)),
         (r"extractvalue \{.*\} (\S+), (\d+)", Gpu._extract),
         (r'(call void asm sideeffect "bar.*)', Gpu._barrier),
         (r'call \w+ asm "(\S+) [^"]*", "[^"]*"\((.*)\)', Gpu._assembly),
@@ -315,6 +315,6 @@ _INSTRUCTIONS = [
             r"call \{.*\} @llvm\.nvvm\.ldmatrix\S*x4(\.trans)?\.b16\.p3\(\S+ \S+ (\S+)\) #0",
             Gpu._matrices,
         ),
-        (r"call \{.*\} @llvm\.nvvm\.mma\S*bf16\((.*)\) #0", Gpu._mma),
+        (r"call \{.*\} @llvm\.nvvm\.mma\S*f32\((.*)\) #0", Gpu._mma),
     )
 ]

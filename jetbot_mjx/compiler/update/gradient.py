@@ -1,7 +1,7 @@
 """Write the kernel that computes the gradient of both networks by PPO's loss.
 
 A block has 256 threads, serves one network (`ctaid.y`: 0 the policy, 1 the values), and loops over
-tiles of samples. Weights and activations are in shared memory as bfloat16, all sums are float32,
+tiles of samples. Weights and activations are in shared memory as float16, all sums are float32,
 and the sums of the gradient stay in registers until the last tile.
 """
 
@@ -25,8 +25,12 @@ NAME = "ppo_gradient"
 
 _MIN_STD = 0.001
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
-_ONES = 0x3F803F80
-"""Two ones in bfloat16."""
+_ONES = 0x3C003C00
+"""Two ones in float16."""
+
+_MEAN_SCALE = 1 / 16
+"""Derivatives by the outputs are those of the sum over this fraction of the samples: of the mean
+over many, they would be too small for float16."""
 
 
 def tile_count(tiling: Tiling, batch: Minibatch) -> int:
@@ -58,6 +62,7 @@ class _GradientKernel(NetworkKernel):
         super().__init__(tiling, batch, tile_count(tiling, batch))
         self.terms, self.parts = terms, parts
         self.width, self.shares = self.shape.width, self.shape.shares
+        self.error_scale = batch.samples * _MEAN_SCALE
 
     def write(self) -> str:
         ir, shape, batch = self.ir, self.shape, self.batch
@@ -283,7 +288,7 @@ class _GradientKernel(NetworkKernel):
         kept = [ir.select(self.is_there, x, 0.0) for x in (*slopes, *sums)]
         errors = ir.shared(self.thread * (2 * (TILE + PAD)), self.bytes_of("errors"))
         zero = ir.constant(0.0)
-        padded = [*kept[: len(slopes)], zero]
+        padded = [*(x * self.error_scale for x in kept[: len(slopes)]), zero]
         for i in range(0, len(slopes), 2):
             ir.write(ir.pack(padded[i], padded[i + 1]), ir.moved(errors, 2 * i))
         slots = ir.shared(self.thread * 4, self.bytes_of("slots"))
@@ -378,6 +383,10 @@ class _GradientKernel(NetworkKernel):
         column = self.ir.minimum(self.warp // share.groups * share.pairs, columns - share.pairs)
         return row * TILE, column * TILE
 
+    def _put_sum(self, value: Value, place: Value) -> None:
+        """Store a sum of products with errors."""
+        self.ir.put(value * (1 / self.error_scale), self.part, place)
+
     def _store_gradient(self) -> None:
         """Store the block's sums."""
         ir, shape, offset = self.ir, self.shape, 0
@@ -391,15 +400,15 @@ class _GradientKernel(NetworkKernel):
                         place = at * self.width + output + (offset + TILE * m + 8 * (i // 2))
                         if inputs % TILE:
                             with ir.when(at < inputs):
-                                ir.put(value, self.part, place)
+                                self._put_sum(value, place)
                         else:
-                            ir.put(value, self.part, place)
+                            self._put_sum(value, place)
             offset += inputs * self.width
             ((four,),) = self.bias_sums[layer]
             place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row + offset
             with ir.when(self.sum_column.equals(0)):
-                ir.put(four[0], self.part, place)
-                ir.put(four[2], self.part, place + 8)
+                self._put_sum(four[0], place)
+                self._put_sum(four[2], place + 8)
             offset += self.width
         self._store_head(offset)
 
@@ -412,7 +421,7 @@ class _GradientKernel(NetworkKernel):
             column = self.sum_column + i % 2
             place = (row + 8 * (i // 2)) * self.outputs + column + offset
             with ir.when(column < self.outputs):
-                ir.put(value, self.part, place)
+                self._put_sum(value, place)
         count = ir.select(
             self.is_policy,
             ir.constant(shape.slots, "i32"),

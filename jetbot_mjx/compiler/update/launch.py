@@ -24,7 +24,10 @@ from jetbot_mjx.compiler.update import gradient as gradient_kernel
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling, UpdateShape
 
 _LEAST_CAPABILITY = 80
-"""Ten times the compute capability of the first GPUs with products of bfloat16."""
+"""Ten times the compute capability of the first GPUs with products of float16."""
+
+PTX_VERSION = 81
+"""Ten times the first version of PTX whose conversions to float16 saturate."""
 
 _SHARED_MEMORY = {
     80: 166_912,
@@ -179,7 +182,7 @@ def _launch(
     """Launch the kernel that a function writes as LLVM IR."""
     return ptx_backend.launch_ptx(
         name,
-        ptx_backend.assembled(write(), ptx_backend.target_architecture()),
+        ptx_backend.assembled(write(), ptx_backend.target_architecture(), PTX_VERSION),
         arguments,
         [jax.ShapeDtypeStruct(shape, np.float32) for shape in results],
         grid,

@@ -82,7 +82,7 @@ class NetworkKernel:
         row: Value | int = 0,
         column: Value | int = 0,
     ) -> Value:
-        """Return the lane's pointer into a matrix of bfloat16, from a row and a column on."""
+        """Return the lane's pointer into a matrix of float16, from a row and a column on."""
         place = (pattern[0] + row) * (2 * stride) + (pattern[1] + column) * 2
         return self.ir.shared(place, self.bytes_of(name))
 

@@ -1,7 +1,7 @@
 """Write LLVM IR for the tensor cores of NVIDIA GPUs.
 
 `IrWriter` appends instructions to a function, and `Value` lets Python's operators append them. The
-products are those of `mma.sync.m16n8k16`: a warp multiplies 16 x 16 bfloat16 numbers by 16 x 8 and
+products are those of `mma.sync.m16n8k16`: a warp multiplies 16 x 16 float16 numbers by 16 x 8 and
 adds the result to 16 x 8 float32 sums, of which each lane holds four:
 
     lane = 4 g + t:  sums (g, 2t), (g, 2t + 1), (g + 8, 2t), (g + 8, 2t + 1)
@@ -23,11 +23,11 @@ TILE = 16
 
 _QUAD = "{i32, i32, i32, i32}"
 _SUMS = "{float, float, float, float}"
-_MMA = "@llvm.nvvm.mma.m16n8k16.row.col.bf16"
+_MMA = "@llvm.nvvm.mma.m16n8k16.row.col.f32.f32"
 _LDMATRIX = "@llvm.nvvm.ldmatrix.sync.aligned.m8n8.x4"
 
 DECLARATIONS = f"""\
-declare {_SUMS} {_MMA}({", ".join(["i32"] * 6 + ["float"] * 4)})
+declare {_SUMS} {_MMA}({", ".join(["<2 x half>"] * 6 + ["float"] * 4)})
 declare {_QUAD} {_LDMATRIX}.b16.p3(ptr addrspace(3))
 declare {_QUAD} {_LDMATRIX}.trans.b16.p3(ptr addrspace(3))
 declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
@@ -263,20 +263,28 @@ class IrWriter:
         place = self.element(array, index)
         self.do(f"store float {value.text}, ptr addrspace(1) {place.text}")
 
-    # Pairs of bfloat16.
+    # Pairs of float16.
 
     def pack(self, low: Value, high: Value) -> Value:
-        """Round two floats to a pair of bfloat16, the first in the lower half."""
-        return self.assembly("cvt.rn.bf16x2.f32", high, low, result="i32")
+        """Round two floats to a pair of float16, the first in the lower half.
+
+        What is too large becomes the largest number; what is no number stays so.
+        """
+        return self.assembly("cvt.rn.satfinite.f16x2.f32", high, low, result="i32")
 
     def unpack(self, pair: Value) -> tuple[Value, Value]:
-        """Return a pair of bfloat16 as floats."""
-        low = self.let(f"shl i32 {pair.text}, 16")
-        high = self.let(f"and i32 {pair.text}, -65536")
-        return (
-            self.let(f"bitcast i32 {low.text} to float", "float"),
-            self.let(f"bitcast i32 {high.text} to float", "float"),
+        """Return a pair of float16 as floats."""
+        halves = self._halves(pair)
+        low, high = (
+            self.let(f"extractelement <2 x half> {halves.text}, i32 {i}", "half") for i in (0, 1)
         )
+        return (
+            self.let(f"fpext half {low.text} to float", "float"),
+            self.let(f"fpext half {high.text} to float", "float"),
+        )
+
+    def _halves(self, pair: Value) -> Value:
+        return self.let(f"bitcast i32 {pair.text} to <2 x half>", "<2 x half>")
 
     # Products.
 
@@ -311,7 +319,8 @@ class IrWriter:
         self, sums: Sequence[Value], left: Sequence[Value], right: Sequence[Value]
     ) -> list[Value]:
         """Return the sums of one product of 16 x 16 by 16 x 8 numbers added to sums."""
-        given = [f"{value.type} {value.text}" for value in (*left, *right, *sums)]
+        halves = [self._halves(pair) for pair in (*left, *right)]
+        given = [f"{value.type} {value.text}" for value in (*halves, *sums)]
         return self._parts(f"call {_SUMS} {_MMA}({', '.join(given)}) #0", _SUMS, "float")
 
     def _parts(self, call: str, struct_type: str, kind: str) -> list[Value]:
