@@ -108,6 +108,7 @@ def test_a_policy_takes_what_it_was_trained_on_and_nothing_else(run):
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_policy_is_evaluated_in_its_environment(run, capsys):
     checkpoint = load_checkpoint(run, "last")
     env = checkpoint.make_env()
