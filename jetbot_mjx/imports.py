@@ -150,6 +150,7 @@ _COMET = types.ModuleType("tensorboardX.comet_utils")
 _COMET.CometLogger = None  # pyright: ignore[reportAttributeAccessIssue]
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
+    "brax.io.image": lambda: standing_in("PIL.Image", LazyModule("PIL.Image")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
     # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `opengl.find_backend` reports

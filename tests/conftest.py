@@ -1,6 +1,7 @@
 """Shared fixtures: the CPU, a compilation cache in the work tree, environments built once."""
 
 import fcntl
+import gc
 import os
 import signal
 import socket
@@ -17,8 +18,14 @@ os.environ.setdefault("JAX_PLATFORMS", "cpu")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" / "tests"))
 # Ours alone whatever the umask, or the commands would not use it.
 Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(mode=0o700, parents=True, exist_ok=True)
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+# Small programs too: a process of the tests compiles a hundred of them before it begins.
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
+# The level at which the package compiles its own programs on a CPU: most programs run once, for
+# moments, and two that a test compares stay comparable.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
 os.environ.setdefault("MPLBACKEND", "agg")
+# Traces and their caches are millions of objects that stay: look through them less often.
+gc.set_threshold(20_000, 20, 10)
 # A shell lets its background jobs ignore Ctrl-C: tests that press it would wait for ever.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -31,6 +38,7 @@ os.environ["PYTHONPATH"] = os.pathsep.join(_PATHS)
 
 import jax
 import pytest
+from unpainted import unpainted
 
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs import program_key
@@ -104,6 +112,13 @@ def unused_port() -> Callable[[], int]:
             return taken.getsockname()[1]
 
     return find
+
+
+@pytest.fixture
+def blank_figures():
+    """No figure of a report is painted."""
+    with unpainted():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -30,6 +30,7 @@ import contextlib
 import json
 import math
 import os
+import struct
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -37,7 +38,6 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
 import jax
-from PIL import Image
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
@@ -164,6 +164,9 @@ def _line(env_steps: int, timestamp: float, metrics: MetricValues) -> str:
 _SUMMARY: Any = vars(summary_pb2)["Summary"]
 _EVENT: Any = vars(event_pb2)["Event"]
 
+_GIF_SIZE_AT = 6
+"""Byte of a GIF at which its width and height begin, two bytes each."""
+
 
 _LAYOUT = {
     "success": {
@@ -258,10 +261,9 @@ class TensorBoardSink:
         self._writer.write_event(event)
 
     def _add_video(self, env_steps: int, timestamp: float, mp4: Path) -> None:
-        path = mp4.with_suffix(".gif")
-        with Image.open(path) as gif:
-            size = {"width": gif.width, "height": gif.height, "colorspace": 3}
-        shown = _SUMMARY.Image(**size, encoded_image_string=path.read_bytes())
+        gif = mp4.with_suffix(".gif").read_bytes()
+        width, height = struct.unpack_from("<HH", gif, _GIF_SIZE_AT)
+        shown = _SUMMARY.Image(width=width, height=height, colorspace=3, encoded_image_string=gif)
         summary = _SUMMARY(value=[_SUMMARY.Value(tag=VIDEO_TAG, image=shown)])
         self._writer.write_event(_EVENT(wall_time=timestamp, step=env_steps, summary=summary))
 

@@ -5,7 +5,7 @@ import dataclasses
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from jetbot_mjx.agents.networks import PolicyParams
 from jetbot_mjx.agents.ppo import NanDump
@@ -33,7 +33,9 @@ from jetbot_mjx.runs.sb3_tags import aliases
 from jetbot_mjx.runs.wandb_sink import WandbSink
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.console import Phase, Terminal
-from jetbot_mjx.viewers.video import EvaluationVideo
+
+if TYPE_CHECKING:
+    from jetbot_mjx.viewers.video import EvaluationVideo
 
 
 @dataclasses.dataclass
@@ -114,7 +116,7 @@ class RunRecorder(TrainerCallback):
     config: Config
     seeds: Sequence["SeedRecorder"]
     evaluate: Callable[[PolicyParams], Summary]
-    video: EvaluationVideo | None
+    video: "EvaluationVideo | None"
     terminal: Terminal
     clock: CompileClock
 
@@ -346,7 +348,7 @@ class SeedRecorder:
         }
         self._store.save(progress.env_steps, trees, about, evaluation.get("success_rate"))
 
-    def render(self, video: EvaluationVideo, progress: Progress) -> None:
+    def render(self, video: "EvaluationVideo", progress: Progress) -> None:
         """Render a video of the policy into the run folder, and log it."""
         name = checkpoint_path(self.run_dir, progress.env_steps).name
         path = self.run_dir / "videos" / name / EVALUATION_VIDEO

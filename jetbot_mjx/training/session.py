@@ -59,7 +59,6 @@ from jetbot_mjx.training.run_recorder import (
     open_sinks,
 )
 from jetbot_mjx.training.warm_start import WarmStart, make_warm_start
-from jetbot_mjx.viewers.video import EvaluationVideo
 
 _COMPLETE, _BEGINS, _RESUMES = range(3)
 """What the run folder holds: a complete run, none, or one that can be resumed."""
@@ -300,7 +299,12 @@ def open_recorder(
     # Prepare the evaluation.
     evaluate = _evaluation(training)
     networks, programs = training.ppo.networks, training.programs
-    video = EvaluationVideo(env, networks, programs) if config.evaluation.video else None
+    video = None
+    if config.evaluation.video:
+        # Only here: its libraries for images take a tenth of a training's imports.
+        from jetbot_mjx.viewers.video import EvaluationVideo
+
+        video = EvaluationVideo(env, networks, programs)
     # Open the terminal and the logs where the stored run ends.
     resumed = resumption or Resumption(0, [], [{} for _ in run_dirs], [])
     histories = [

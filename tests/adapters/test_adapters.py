@@ -406,7 +406,10 @@ def test_without_a_display_one_line_names_the_other_way(monkeypatch):
 NEAR = {"episode_length": 128, "success_radius": 0.4}
 TASKS = [
     pytest.param({"task": NEAR}, id="world"),
-    pytest.param({"task": {**NEAR, "observation": "egocentric"}}, id="egocentric"),
+    # The observation of most of the examples.
+    pytest.param(
+        {"task": {**NEAR, "observation": "egocentric"}}, id="egocentric", marks=pytest.mark.slow
+    ),
     pytest.param({"task": NEAR, "robot": {"preset": "real"}}, id="real", marks=pytest.mark.slow),
     *(pytest.param(path, id=path.stem) for path in sorted((ROOT / "examples").glob("*.yaml"))),
 ]

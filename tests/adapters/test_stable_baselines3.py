@@ -101,7 +101,7 @@ def test_a_step_before_the_first_reset_is_refused():
             act()
 
 
-@pytest.mark.parametrize("task", ["gates", "pillars"])
+@pytest.mark.parametrize("task", ["gates", pytest.param("pillars", marks=pytest.mark.slow)])
 def test_a_batch_is_that_of_gymnasium(task, root, monkeypatch):
     """Also where a goal advances, and where solid bodies stand."""
     monkeypatch.syspath_prepend(str(root / "examples"))

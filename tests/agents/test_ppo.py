@@ -579,8 +579,6 @@ def lines(run_dir):
 
 def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, monkeypatch):
     config = with_ppo(smoke, num_timesteps=131_072, checkpoint_interval=32_768)
-    clean = session.run(config, tmp_path / "clean")
-
     sound = losses.compute_ppo_loss
 
     def now_and_then(params, normalizer, data, key, **settings):
@@ -599,10 +597,7 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
     assert episodes > 500
     assert 0.001 < worlds / episodes < 0.02
     assert 2 <= updates <= 30  # of 512
-    for name in ("train/nonfinite_envs", "train/nonfinite_updates"):
-        assert sum(line.get(name, 0) for line in lines(tmp_path / "clean")) == 0
-    assert clean.best.success_rate > 0.9
-    assert spoiled.best.success_rate > clean.best.success_rate - 0.1
+    assert spoiled.best.success_rate > 0.85  # sound, it is above 0.95
 
     files = sorted((tmp_path / "spoiled" / "nan_dumps").glob("*.npz"))
     assert 1 <= len(files) <= worlds
@@ -645,6 +640,8 @@ def test_a_training_compiles_its_step_once_and_nothing_later(smoke, glide, tmp_p
         jax.monitoring.unregister_event_duration_listener(listen)
     assert len(after_report) == 4
     assert sum("advance" in name for name in compiled) == 1
+    for name in ("train/nonfinite_envs", "train/nonfinite_updates"):
+        assert [line[name] for line in lines(tmp_path / "run")[1:]] == [0, 0, 0]
     # Report 0 is made before the first call; with report 1 all has run once.
     assert after_report[1] == after_report[-1] == len(compiled), compiled[after_report[1] :]
 

@@ -11,6 +11,7 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
+from unpainted import unpainted
 
 from jetbot_mjx import cli, evaluate
 from jetbot_mjx.errors import UserError
@@ -170,6 +171,7 @@ def test_the_markdown_shows_the_figures_beside_it(judged):
         assert len({line.count("|") for line in table.strip().splitlines()}) == 1
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monkeypatch):
     run_dir, _, (first, _), _ = judged
 
@@ -209,6 +211,7 @@ def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monke
     assert not (tmp_path / "robustness.png").exists()
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_path):
     run_dir, _, (first, _), _ = judged
     code, said = judge(run_dir, "--simulator", "mujoco", "--output", tmp_path)
@@ -242,6 +245,7 @@ def test_another_simulator_that_there_is_not_is_refused(judged, capfd):
     assert "argument --simulator: invalid choice: 'isaac'" in capfd.readouterr().err
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_ranges_of_a_file_are_judged_beside_the_preset(judged, tmp_path):
     run_dir, _, (first, _), _ = judged
     ranges = tmp_path / "ranges.yaml"
@@ -282,6 +286,7 @@ def test_figures_are_drawn_for_light_and_dark_surroundings(judged):
     assert Image.open(folder / "by_goal.png").convert("RGB").getpixel((0, 0)) == (255, 255, 255)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_target_that_is_missed_costs_exit_code_1(judged):
     run_dir, _, _, _ = judged
     code, said = judge(run_dir, "--checkpoint", "0", "--min-success", "0.5")
@@ -309,7 +314,8 @@ def still(smoke_run, tmp_path_factory):
 def hopeless(still, tmp_path_factory):
     """That policy's report, written elsewhere than into the run folder."""
     folder = tmp_path_factory.mktemp("hopeless") / "out"
-    return evaluate_run(still, episodes=EPISODES, output=folder)
+    with unpainted():
+        return evaluate_run(still, episodes=EPISODES, output=folder)
 
 
 def test_a_policy_that_reaches_nothing_gets_its_report(hopeless, still):
@@ -330,6 +336,7 @@ def test_a_policy_that_reaches_nothing_gets_its_report(hopeless, still):
     assert set(files(hopeless.folder)) == PAGES | FIGURES - {"learning_curve.png"}
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_long_list_of_failures_is_cut_on_the_pages_alone(hopeless, tmp_path, monkeypatch):
     monkeypatch.setattr(html_report, "LISTED_FAILURES", 5)
     html_report.write_report(hopeless._replace(folder=tmp_path))
@@ -355,7 +362,8 @@ def several(smoke_run, still, tmp_path_factory):
                 shutil.rmtree(checkpoint)
     shutil.copytree(still, folder / "still")
     runs = folder / "five", folder / "still"
-    return folder, *judge(*runs, "--min-success", "0.01", "--simulator", "mujoco")
+    with unpainted():
+        return folder, *judge(*runs, "--min-success", "0.01", "--simulator", "mujoco")
 
 
 def test_runs_are_compared_beside_their_own_reports(several):
@@ -404,6 +412,7 @@ def test_the_comparison_tells_the_numbers_of_its_json_file(several):
     assert all((home / link).is_file() for link in links)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_seeds_of_one_run_are_a_comparison_without_a_pair(several, tmp_path, monkeypatch):
     run = several[0] / "five"
     written = {path: path.stat().st_mtime_ns for path in run.rglob("evaluations/*/report.json")}

@@ -60,8 +60,8 @@ from jetbot_mjx.imports import install_lazy_imports
 install_lazy_imports()
 {then}
 import jetbot_mjx.training.session
-heavy = ["glfw", "jaxopt", "scipy.optimize", "scipy.spatial", "tensorboardX.comet_utils",
-    "torch", "trimesh"]
+heavy = ["PIL.Image", "glfw", "jaxopt", "scipy.optimize", "scipy.spatial",
+    "tensorboardX.comet_utils", "torch", "trimesh"]
 print(*[name for name in heavy if name in sys.modules])
 from brax.generalized import constraint
 print(constraint.jaxopt.ProjectedGradient.__name__)

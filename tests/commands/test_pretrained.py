@@ -35,11 +35,14 @@ def test_it_was_trained_by_the_configuration_of_its_name(name, root):
     assert load_checkpoint(PRETRAINED / name).config == trained
 
 
+@pytest.mark.parametrize("episodes", [256, pytest.param(1024, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
-def test_it_reaches_the_goals_of_the_report(name, runs):
-    assert evaluate.main([str(runs[NAMES.index(name)]), "--min-success", "0.99"]) == 0
-    (report,) = runs[NAMES.index(name)].glob("evaluations/*/report.json")
-    assert json.loads(report.read_text("utf-8"))["policy"]["episodes"] == 1024
+@pytest.mark.usefixtures("blank_figures")
+def test_it_reaches_the_goals_of_the_report(name, episodes, runs):
+    run = runs[NAMES.index(name)]
+    assert evaluate.main([str(run), "--min-success", "0.99", "--episodes", str(episodes)]) == 0
+    (report,) = run.glob("evaluations/*/report.json")
+    assert json.loads(report.read_text("utf-8"))["policy"]["episodes"] == episodes
 
 
 def test_it_acts():

@@ -193,6 +193,7 @@ def test_wrong_settings_are_refused(load, override, message):
         make_env(load(override))
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_training_and_evaluation_run_end_to_end(load, env, tmp_path):
     with gliding.everywhere():
         result = session.run(load(*TINY), tmp_path / "run")

@@ -37,7 +37,7 @@ def execute(root, tmp_path_factory):
         patch.setenv("JETBOT_CONFIG", str(root / "configs" / "smoke.yaml"))
         patch.setenv("JETBOT_RUN_DIR", str(folder / "run"))
         # As many as are rendered, whose program is the same.
-        patch.setenv("JETBOT_EPISODES", "3")
+        patch.setenv("JETBOT_EPISODES", "1")
         patch.setenv("JETBOT_OWN_DIR", str(folder / "own"))
         patch.setenv("JETBOT_OVERRIDES", " ".join(SHORT))
         # Nothing of the user's own Jupyter, and nothing left in it.
@@ -76,8 +76,8 @@ def gliding_profile(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def trained(execute):
-    return execute("02_train")
+def trained(execute, gliding_profile):
+    return execute("02_train", gliding_profile)
 
 
 @pytest.fixture(scope="module")
@@ -116,8 +116,10 @@ def test_training_notebook_runs(trained):
     assert "best policy" in text(trained)
 
 
-def test_evaluation_notebook_shows_the_run_of_the_training_notebook(execute, trained):
-    notebook = execute("03_evaluate_and_render")
+def test_evaluation_notebook_shows_the_run_of_the_training_notebook(
+    execute, gliding_profile, trained
+):
+    notebook = execute("03_evaluate_and_render", gliding_profile)
     assert images(notebook) == ["image/png", "image/png", "image/gif"]
     assert "scripted" in text(notebook)
 

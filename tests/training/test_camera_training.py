@@ -29,6 +29,8 @@ SETTINGS = {
     "tensorboard": False,
     "task": {"observation": "camera+egocentric", "episode_length": 24},
     "camera": {"width": 16, "height": 16, "samples": 1, "frames": 2, "colour": "grey"},
+    # Some of the looks; what remains of an episode, such as late images, is part of its state.
+    "randomization": {"exposure": [0.8, 1.2], "camera_delay": [0, 2], "frame_drop": [0.0, 0.2]},
     "ppo": {
         "num_timesteps": 3 * STEP,
         "num_envs": 16,
@@ -108,6 +110,7 @@ def test_a_policy_takes_what_it_was_trained_on_and_nothing_else(run):
         assert "\n" not in str(error.value)
 
 
+@pytest.mark.usefixtures("blank_figures")
 def test_a_policy_is_evaluated_in_its_environment(run, capsys):
     checkpoint = load_checkpoint(run, "last")
     env = checkpoint.make_env()

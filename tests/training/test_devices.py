@@ -52,7 +52,7 @@ def told(on_one):
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"
     answer = on_one.with_name("told.json")
     done = subprocess.run(
-        [sys.executable, __file__, str(on_one), str(on_one.with_name("eight")), str(answer)],
+        [sys.executable, "-c", TELLER, str(on_one), str(on_one.with_name("eight")), str(answer)],
         env={**os.environ, "JAX_PLATFORMS": "cpu", "XLA_FLAGS": flags.strip()},
         capture_output=True,
         text=True,
@@ -61,8 +61,13 @@ def told(on_one):
     return json.loads(answer.read_text())
 
 
-def tell(one, eight, answer):
+TELLER = f"import sys; {gliding.LAZILY}; import test_devices as t; t.tell(*sys.argv[1:])"
+
+
+@gliding.everywhere()
+def tell(*paths):
     """The other process: everything that eight devices are needed for."""
+    one, eight, answer = map(Path, paths)
     config = load_config(SMOKE)
     known = {"device_count": jax.device_count(), "averaging": averaging()}
     known |= trained_program(config)
@@ -240,8 +245,3 @@ def test_what_eight_devices_saved_goes_on_on_one(told, on_one):
     assert lines(run_dir)[-1]["env_steps"] == 65_536 + SIZE
     state = jax.tree.leaves(load_checkpoint(run_dir, "last").params)
     assert all(jnp.all(jnp.isfinite(leaf)) for leaf in state)
-
-
-if __name__ == "__main__":
-    with gliding.everywhere():
-        tell(*map(Path, sys.argv[1:]))

@@ -49,6 +49,8 @@ class Sent(GoalTask):
 
 # The other processes: the training command, one training step a call, telling what it holds.
 
+TELLER = f"import sys; {gliding.LAZILY}; import test_distributed as t; t.tell(*sys.argv[1:])"
+
 
 def tell(interrupted, *arguments):
     ppo_trainer.next_chunk = lambda steps, seconds, wanted: 1
@@ -80,7 +82,7 @@ def start(arguments, *, interrupted=False, **variables):
     environment = {name: value for name, value in os.environ.items() if name not in VARIABLES}
     flag = "interrupted" if interrupted else "-"
     return subprocess.Popen(
-        [sys.executable, __file__, flag, *map(str, arguments)],
+        [sys.executable, "-c", TELLER, flag, *map(str, arguments)],
         env={**environment, "JAX_PLATFORMS": "cpu", **variables},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
@@ -355,7 +357,3 @@ def test_processes_that_do_not_come_are_not_waited_for_without_end(tmp_path, unu
     assert len(process.stderr.splitlines()) == 1
     assert "not all processes have connected at 127.0.0.1" in process.stderr
     assert "within 1 s" in process.stderr
-
-
-if __name__ == "__main__":
-    tell(*sys.argv[1:])

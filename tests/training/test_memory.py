@@ -40,7 +40,10 @@ MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
     [
         ([], "learning"),
         (MANY, "learning"),
-        ([*MANY, "physics.impl=xla"], "collecting"),
+        # MJX without the kernel, which compiles so long.
+        pytest.param(
+            [*MANY, "physics.impl=xla"], "collecting", marks=pytest.mark.slow, id="collecting"
+        ),
     ],
 )
 def test_xla_sets_aside_what_was_told(root, settings, fullest):

@@ -53,6 +53,7 @@ def dwell_in_calls(seconds):
     CompiledTrainer.compile = compile
 
 {before_imports}
+{lazily}
 import gliding
 from jetbot_mjx import cli, train
 from jetbot_mjx.training import session as training
@@ -68,6 +69,7 @@ with gliding.everywhere():
 def training(run_dir, before_training="", before_imports="", notice=300):
     program = DRIVER.replace("{tests}", repr(str(Path(__file__).parents[1] / "helpers")))
     program = program.replace("{before_training}", before_training)
+    program = program.replace("{lazily}", gliding.LAZILY)
     program = program.replace("{before_imports}", before_imports)
     return torture.Process(run_dir, [*SETTINGS, f"preemption_notice={notice}"], ["-c", program])
 

@@ -93,7 +93,7 @@ def events(monkeypatch, tmp_path):
             found.append(("save", env_steps, run_dir.name, lines(run_dir)))
             super().save(env_steps, *arguments)
 
-    monkeypatch.setattr(session, "EvaluationVideo", Film)
+    monkeypatch.setattr(video, "EvaluationVideo", Film)
     monkeypatch.setattr(run_recorder, "CheckpointStore", CheckpointStore)
     monkeypatch.setattr(run_recorder, "find_backend", lambda: "egl")
     return found
@@ -136,7 +136,7 @@ def test_nothing_is_prepared_where_nothing_is_asked_for(recorder, tmp_path, monk
     def refuse(*arguments):
         raise AssertionError("this was not asked for")
 
-    for module, name in ((session, "EvaluationVideo"), (run_recorder, "find_backend")):
+    for module, name in ((video, "EvaluationVideo"), (run_recorder, "find_backend")):
         monkeypatch.setattr(module, name, refuse)
     with recorder() as it:
         report(it, 0)

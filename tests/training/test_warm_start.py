@@ -2,6 +2,7 @@
 
 import shutil
 
+import gliding
 import jax
 import numpy as np
 import pytest
@@ -155,6 +156,7 @@ def test_brax_s_trainer_cannot():
         )
 
 
+@gliding.everywhere()
 def test_a_training_begins_with_it_and_resumes_without_it(tmp_path, capsys):
     copied = tmp_path / "source"
     shutil.copytree(load_checkpoint(SOURCE).run_dir, copied)

@@ -1,5 +1,6 @@
 """Trials side by side are the trainings that they would be alone."""
 
+import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +31,12 @@ VALUES = (
     {"ppo.learning_rate": 1e-2, "ppo.discounting": 0.9},
     {"ppo.learning_rate": 1e-3, "ppo.discounting": 0.95},
 )
+
+
+@pytest.fixture(scope="module", autouse=True)
+def glide():
+    with gliding.everywhere():
+        yield
 
 
 @pytest.fixture(scope="module")

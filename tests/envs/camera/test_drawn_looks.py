@@ -196,6 +196,8 @@ def test_looks_without_a_camera_are_refused_by_the_wrapper_too(world_env, ranges
         DomainRandomizationWrapper(world_env, look_params=LookParams(exposure=jnp.float32(1.0)))
 
 
+# The fast suite resumes with some of the looks drawn, and with everything but looks.
+@pytest.mark.slow
 def test_a_training_resumes_to_the_bit_with_all_looks_drawn(ranges, tmp_path):
     layers = {f"{name}_hidden_layer_sizes": [8] for name in ("policy", "value")}
     ppo = {"num_envs": 8, "batch_size": 8, "num_minibatches": 1, "unroll_length": 4}

@@ -102,7 +102,8 @@ def test_what_has_not_moved_is_not_rendered_again(env, with_opengl, monkeypatch)
 
 
 def test_a_policy_is_evaluated_by_both_appearances(with_opengl):
-    settings = ["camera.width=32", "camera.height=32", "task.episode_length=25"]
+    settings = ["camera.width=16", "camera.height=16", "task.episode_length=25"]
+    settings += ["ppo.network.cnn=tiny"]
     config = load_config("configs/jetbot_camera.yaml", [*settings, "camera.frames=2"])
     env = make_env(config)
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
