@@ -41,8 +41,9 @@ import pytest
 from unpainted import unpainted
 
 from jetbot_mjx.config import Config, parse_config
-from jetbot_mjx.envs import program_key
+from jetbot_mjx.envs import opengl, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.errors import UserError
 
 OWN_TASKS = program_key.TRUSTED
 # Tests replace parts of the package, of which programs that were kept would know nothing.
@@ -112,6 +113,15 @@ def unused_port() -> Callable[[], int]:
             return taken.getsockname()[1]
 
     return find
+
+
+@pytest.fixture
+def with_opengl():
+    """Skips the test where there is no OpenGL."""
+    try:
+        opengl.find_backend()
+    except UserError as error:
+        pytest.skip(str(error))
 
 
 @pytest.fixture

@@ -82,8 +82,9 @@ class ProgramCache:
         if program is not None:
             return program
         began = time.perf_counter()
+        lowered = trace().lower()
+        # Tracing may have found small programs in JAX's cache, which do not count.
         with _CacheHits() as hits:
-            lowered = trace().lower()
             program = lowered.compile(compiler_options=self._options)
         # On a CPU, XLA cannot serialize a program that it loaded: functions would be missing.
         if self._folder and not (hits.count and jax.default_backend() == "cpu"):

@@ -301,7 +301,7 @@ def open_recorder(
     networks, programs = training.ppo.networks, training.programs
     video = None
     if config.evaluation.video:
-        # Only here: its libraries for images take a tenth of a training's imports.
+        # Only here, because it imports libraries for images that no other training needs.
         from jetbot_mjx.viewers.video import EvaluationVideo
 
         video = EvaluationVideo(env, networks, programs)

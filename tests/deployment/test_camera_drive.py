@@ -15,7 +15,6 @@ from jetbot_mjx.deployment.drive_pictures import picture_strip
 from jetbot_mjx.deployment.policy_spec import _image
 from jetbot_mjx.deployment.simulated_camera import CameraModel, camera_config
 from jetbot_mjx.deployment.simulated_jetbot import MotorModel, SimulatedJetBot
-from jetbot_mjx.envs import opengl
 from jetbot_mjx.envs.camera import lens
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -356,14 +355,6 @@ def test_a_picture_of_another_size_is_no_log(tmp_path):
 
 
 # In the SimulatedJetBot.
-
-
-@pytest.fixture
-def with_opengl():
-    try:
-        opengl.find_backend()
-    except UserError as error:
-        pytest.skip(str(error))
 
 
 def rehearsal(appearance="plain", camera=None, **settings):

@@ -269,9 +269,9 @@ def film(run_dir, steps):
 
 
 def videos(folder):
-    """(step, bytes) of every picture in the one event file of a folder."""
+    """(step, bytes, size) of every picture in the one event file of a folder."""
     return [
-        (event.step, value.image.encoded_image_string)
+        (event.step, value.image.encoded_image_string, (value.image.width, value.image.height))
         for event in events(folder)
         for value in event.summary.value
         if value.tag == "eval/video"
@@ -286,11 +286,11 @@ def test_tensorboard_plays_the_videos_of_evaluations_and_keeps_them_on_resume(tm
         sink.write_video(steps, path)
     sink.close()
     gifs = {steps: path.with_suffix(".gif").read_bytes() for steps, path in paths.items()}
-    assert videos(folder) == list(gifs.items())
+    assert videos(folder) == [(steps, gif, (8, 4)) for steps, gif in gifs.items()]
     assert gifs[0].startswith(b"GIF")
     # A training that resumes before the last one makes that anew.
     TensorBoardSink(folder, HISTORY).close()
-    assert videos(folder) == [(0, gifs[0]), (512, gifs[512])]
+    assert videos(folder) == [(steps, gifs[steps], (8, 4)) for steps in (0, 512)]
 
 
 def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):

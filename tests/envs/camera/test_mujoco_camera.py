@@ -10,7 +10,6 @@ import pytest
 
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import CameraConfig, load_config
-from jetbot_mjx.envs import opengl
 from jetbot_mjx.envs.camera import mujoco_camera
 from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
 from jetbot_mjx.envs.camera.render import Camera
@@ -35,14 +34,6 @@ GOALS = np.array([[0.5, 0.0, 0.05], [0.3, 0.12, 0.05], [0.25, -0.1, 0.05]], np.f
 @pytest.fixture(scope="module")
 def env():
     return make_env(load_config("configs/jetbot_camera.yaml"))
-
-
-@pytest.fixture
-def with_opengl():
-    try:
-        opengl.find_backend()
-    except UserError as error:
-        pytest.skip(str(error))
 
 
 def images(camera, env, goals=GOALS):
