@@ -81,6 +81,9 @@ _Scalar = bool | int | Annotated[float, Field(allow_inf_nan=False)] | Text
 Count = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**31)]
 Steps = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**53)]
 Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
+InnerAction = Annotated[
+    tuple[Annotated[float, Field(gt=-1, lt=1)], ...], Field(strict=False, min_length=1)
+]
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False), AfterValidator(_float32)]
 NonNegative = Annotated[float, Field(ge=0, allow_inf_nan=False), AfterValidator(_float32)]
 Fraction = Annotated[float, Field(ge=0, le=1, allow_inf_nan=False)]
@@ -429,6 +432,10 @@ class NetworkConfig(_Section):
     """Activation between the layers."""
     distribution_type: Literal["normal", "tanh_normal"] = "tanh_normal"
     """Action distribution; `normal` leaves clipping to the environment, as SB3 does."""
+    initial_action: InnerAction | None = None
+    """Action around which an untrained policy acts, within (-1, 1); null: the zero action. Where
+    left and right are as good as each other, as for a camera that sees no cube, a policy that
+    begins between the two may stay there."""
     cnn: Literal["nature", "small", "tiny"] = "small"
     """Convolutions in front of the hidden layers, for `task.observation: camera`. `nature`: those
     of SB3's `CnnPolicy`, 603 k parameters at 64×64; `small` and `tiny`: for 32×32."""

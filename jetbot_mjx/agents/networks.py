@@ -1,5 +1,6 @@
 """Build Brax's policy and value networks, name their parameters, and run inference."""
 
+import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
@@ -16,6 +17,7 @@ from jaxtyping import Array, Float, UInt32
 from jetbot_mjx.agents.vision import VisionNetworks, is_image, make_vision_networks
 from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import NetworkConfig, PPOConfig
+from jetbot_mjx.errors import InvalidError
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
     "tanh": nn.tanh,
@@ -65,13 +67,49 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
       A function of (observation_size, action_size, preprocess_observations_fn=...) and of further
       arguments of `brax.training.agents.ppo.networks.make_ppo_networks`.
     """
-    return functools.partial(
+    make = functools.partial(
         ppo_networks.make_ppo_networks,
         policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
         value_hidden_layer_sizes=config.value_hidden_layer_sizes,
         activation=_ACTIVATIONS[config.activation],
         distribution_type=config.distribution_type,
     )
+    if config.initial_action is None:
+        return make
+    action = config.initial_action
+
+    def make_biased(observation_size: Any, action_size: int, **arguments: Any) -> Any:
+        if len(action) != action_size:
+            raise InvalidError(
+                f"ppo.network.initial_action = {list(action)} is wrong: an action has"
+                f" {action_size} numbers"
+            )
+        networks: Any = make(observation_size, action_size, **arguments)
+        # A mean of the normal distribution is bounded by its tanh, or by nothing.
+        is_bounded = config.distribution_type == "tanh_normal"
+        mean = np.arctanh(action) if is_bounded else np.asarray(action)
+        policy = networks.policy_network
+        return networks.replace(
+            policy_network=dataclasses.replace(
+                policy, init=lambda key: _with_mean(policy.init(key), mean)
+            )
+        )
+
+    return make_biased
+
+
+def _with_mean(params: Any, mean: np.ndarray) -> Any:
+    """Return a policy network's parameters with a bias of its last layer's first outputs.
+
+    Args:
+      params: Brax's parameters, whose last layer has biases of zero.
+      mean: the biases of the first outputs, the mean of the action's distribution.
+    """
+    layers = params["params"]
+    # With `normal`, Brax has the hidden layers in a module of their own, in front of `Dense_0`.
+    last = "Dense_0" if "Dense_0" in layers else f"hidden_{len(layers) - 1}"
+    bias = layers[last]["bias"].at[: len(mean)].set(mean)
+    return {"params": {**layers, last: {**layers[last], "bias": bias}}}
 
 
 def make_networks(
