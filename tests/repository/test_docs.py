@@ -214,10 +214,14 @@ def with_value(key, value):
     return parse_config(value)
 
 
-@pytest.mark.parametrize("key", [key for key in DEFAULTS if " least " in SETTINGS[key][1]])
+# Of a number, not of a list's length.
+LOWER_BOUND = re.compile(r", at least ([\d.e-]+)")
+
+
+@pytest.mark.parametrize("key", [key for key in DEFAULTS if LOWER_BOUND.search(SETTINGS[key][1])])
 def test_a_lower_bound_is_the_one_that_holds(key):
     kind = SETTINGS[key][1]
-    bound = float(re.findall(r"at least ([\d.e-]+)", kind)[-1])
+    bound = float(LOWER_BOUND.findall(kind)[-1])
     below = int(bound) - 1 if "whole" in kind else bound - 1e-7
     with pytest.raises(ConfigError, match=r"greater than or equal|at least"):
         with_value(key, [below] if "list" in kind else below)
