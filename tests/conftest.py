@@ -20,9 +20,8 @@ os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(ROOT / ".cache" / "jax" /
 Path(os.environ["JAX_COMPILATION_CACHE_DIR"]).mkdir(mode=0o700, parents=True, exist_ok=True)
 # Small programs too: a process of the tests compiles a hundred of them before it begins.
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
-# The level at which the package compiles its own programs on a CPU: most programs run once, for
-# moments, and two that a test compares stay comparable.
-os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=1")
+# Most programs run once, for moments; and all are compiled alike, so that two stay comparable.
+os.environ.setdefault("XLA_FLAGS", "--xla_backend_optimization_level=0")
 os.environ.setdefault("MPLBACKEND", "agg")
 # Traces and their caches are millions of objects that stay: look through them less often.
 gc.set_threshold(20_000, 20, 10)
