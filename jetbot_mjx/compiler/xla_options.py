@@ -1,8 +1,9 @@
 """Choose XLA's compiler options, and pass only those that the installed version knows.
 
 On a CPU, most of the time before the first training step is spent on compilation, and optimisation
-level 1 shortens it; a level that XLA_FLAGS names is left alone. Do not turn off the fusion emitters to save even more: at level 2 without them,
-the same program has returned different bits from one call to the next.
+level 1 shortens it; a level that XLA_FLAGS names is left alone. Do not turn off the fusion emitters
+to save even more: at level 2 without them, the same program has returned different bits from one
+call to the next, and a program that uses its intermediate results often can grow without end.
 """
 
 import contextlib
