@@ -53,13 +53,14 @@ OWN_TASKS = program_key.TRUSTED
 program_key.TRUSTED = frozenset()
 
 _LONGEST = (
-    "test_notebooks",
     "test_ppo",
-    "test_resume",
+    "test_pretrained",
+    "test_notebooks",
     "test_distributed",
-    "test_train",
-    "test_devices",
+    "test_resume",
+    "test_adapters",
     "test_preemption",
+    "test_devices",
     "test_torture",
 )
 
