@@ -1,12 +1,14 @@
 """Choose XLA's compiler options, and pass only those that the installed version knows.
 
 On a CPU, most of the time before the first training step is spent on compilation, and optimisation
-level 1 shortens it. Do not turn off the fusion emitters to save even more: at level 2 without them,
-the same program has returned different bits from one call to the next.
+level 1 shortens it; a level that XLA_FLAGS names is left alone. Do not turn off the fusion emitters
+to save even more: at level 2 without them, the same program has returned different bits from one
+call to the next, and a program that uses its intermediate results often can grow without end.
 """
 
 import contextlib
 import functools
+import os
 from collections.abc import Iterator
 from typing import Any
 
@@ -36,7 +38,9 @@ def compiler_options(config: Config) -> Options:
     """
     wanted = dict(_DETERMINISTIC) if config.deterministic else {}
     if jax.default_backend() == "cpu":
-        wanted |= {name: value for name, value in _QUICK.items() if _is_known(name, value)}
+        flags = os.environ.get("XLA_FLAGS", "")
+        chosen = {name: value for name, value in _QUICK.items() if name not in flags}
+        wanted |= {name: value for name, value in chosen.items() if _is_known(name, value)}
     return wanted
 
 

@@ -35,9 +35,9 @@ def test_it_was_trained_by_the_configuration_of_its_name(name, root):
     assert load_checkpoint(PRETRAINED / name).config == trained
 
 
-@pytest.mark.parametrize("episodes", [256, pytest.param(1024, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("episodes", [128, pytest.param(1024, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("name", NAMES)
-@pytest.mark.usefixtures("blank_figures")
+@pytest.mark.usefixtures("blank_figures", "optimized")
 def test_it_reaches_the_goals_of_the_report(name, episodes, runs):
     run = runs[NAMES.index(name)]
     assert evaluate.main([str(run), "--min-success", "0.99", "--episodes", str(episodes)]) == 0

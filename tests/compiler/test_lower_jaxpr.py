@@ -21,8 +21,10 @@ VECTOR = jax.ShapeDtypeStruct((4,), jnp.float32)
 
 def in_full_precision(function, x):
     """What JAX makes of it for every robot, without a GPU's TF32."""
+    # Without these, XLA writes an operand out anew for every use of it: in `large`, without end.
+    options = {"xla_cpu_use_fusion_emitters": True}
     with jax.default_matmul_precision("highest"):
-        return jax.jit(jax.vmap(function))(x)
+        return jax.jit(jax.vmap(function), compiler_options=options)(x)
 
 
 INDICES = jnp.array([[2, 1], [0, 3], [2, 9]])

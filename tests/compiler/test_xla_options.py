@@ -8,6 +8,7 @@ from jetbot_mjx.config import parse_config
 
 
 def test_what_xla_knows_reaches_it_and_what_it_does_not_know_is_left_out(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
     monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setattr(
         xla_options, "_QUICK", {"xla_backend_optimization_level": 2, "xla_no_such_thing": True}
@@ -16,6 +17,14 @@ def test_what_xla_knows_reaches_it_and_what_it_does_not_know_is_left_out(monkeyp
     assert options == {"xla_backend_optimization_level": 2}
     double = jax.jit(lambda x: 2 * x, compiler_options=options)
     assert float(double(jnp.ones(()))) == 2.0
+
+
+def test_a_level_of_the_users_own_is_left_alone(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    assert compiler_options(parse_config({})) == {"xla_backend_optimization_level": 1}
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3")
+    assert compiler_options(parse_config({})) == {}
 
 
 def test_another_refusal_is_not_taken_for_not_knowing():

@@ -25,20 +25,18 @@ def undisturbed(tmp_path_factory):
     return torture.finish(tmp_path_factory.mktemp("torture") / "undisturbed", LONGER, TRAINER)
 
 
-def test_a_training_killed_six_times_ends_as_if_it_had_never_been(template, undisturbed, tmp_path):
+def test_a_training_killed_again_and_again_ends_as_if_it_had_never_been(
+    template, undisturbed, tmp_path
+):
     rng = random.Random(4)
     aims = [
         Aim("started", rng.uniform(0.2, 2.5)),
-        Aim("saving", rng.uniform(0.0, 0.03)),
-        Aim("saved", rng.uniform(0.0, 0.5)),
         Aim("saving", rng.uniform(0.0, 0.03), 2),
-        Aim("trained", rng.uniform(0.0, 1.0)),
-        Aim("started", rng.uniform(0.2, 2.5)),
+        Aim("saved", rng.uniform(0.0, 0.5)),
     ]
     run = tmp_path / "run"
     phases = [torture.kill(run, LONGER, aim, template, TRAINER).phase for aim in aims]
-    assert phases.count(torture.SAVING) >= 2, phases
-    assert torture.BEFORE_FIRST in phases
+    assert {torture.BEFORE_FIRST, torture.SAVING} <= set(phases), phases
     assert checkpoint_steps(run)[-1] > 0, "the last start must be from the middle"
     killed = torture.finish(run, LONGER, TRAINER)
     assert torture.differences(undisturbed, killed) == []

@@ -113,7 +113,7 @@ def apart(one, other):
     return 1e3 * distance, np.degrees(turned)
 
 
-@pytest.fixture(scope="module", params=[1.0, 0.4])
+@pytest.fixture(scope="module")
 def on_floor(request, driver):
     """Physics on a floor of some friction, and the same in C MuJoCo, converged."""
     env, _ = driver
@@ -122,6 +122,16 @@ def on_floor(request, driver):
     return request.param, mjx.put_model(mj_model), converged(copy.copy(mj_model))
 
 
+@pytest.mark.parametrize(
+    ("driver", "on_floor"),
+    [
+        ("isaac", 1.0),
+        ("real", 0.4),
+        pytest.param("isaac", 0.4, marks=pytest.mark.slow),
+        pytest.param("real", 1.0, marks=pytest.mark.slow),
+    ],
+    indirect=True,
+)
 def test_mjx_follows_c_mujoco(driver, on_floor):
     env, drive = driver
     friction, mjx_model, reference = on_floor

@@ -91,7 +91,8 @@ class Page:
         if self._session:
             message["sessionId"] = self._session
         self._connection.send(json.dumps(message))
-        while True:
+        deadline = time.monotonic() + 120
+        while time.monotonic() < deadline:  # its events come all the same
             answer = json.loads(self._connection.recv(timeout=30))
             if answer.get("method") == "Network.requestWillBeSent":
                 self.requested.append(answer["params"]["request"]["url"])
@@ -100,6 +101,7 @@ class Page:
             if answer.get("id") == number:
                 assert "error" not in answer, answer
                 return answer["result"]
+        raise AssertionError(f"Chromium does not answer {method}")
 
 
 @contextlib.contextmanager
