@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from run_program import evaluate
 
-from jetbot_mjx.compiler import lower_jaxpr
+from jetbot_mjx.compiler import lower_jaxpr, xla_options
 from jetbot_mjx.compiler.lower_jaxpr import MAX_UNROLLED_OPERATIONS, MIN_BRANCH_OPERATIONS
 from jetbot_mjx.compiler.scalar_ir import Expr, UnsupportedError
 from jetbot_mjx.compiler.schedule import PlacedBranch, PlacedLoop
@@ -22,7 +22,8 @@ VECTOR = jax.ShapeDtypeStruct((4,), jnp.float32)
 def in_full_precision(function, x):
     """What JAX makes of it for every robot, without a GPU's TF32."""
     # Without these, XLA writes an operand out anew for every use of it: in `large`, without end.
-    options = {"xla_cpu_use_fusion_emitters": True}
+    emitters = ("xla_cpu_use_fusion_emitters", True)
+    options = dict([emitters]) if xla_options._is_known(*emitters) else {}
     with jax.default_matmul_precision("highest"):
         return jax.jit(jax.vmap(function), compiler_options=options)(x)
 
