@@ -20,7 +20,7 @@ import numpy as np
 from motors import Calibration, DriveError
 from observations import Reading
 from poses import Odometry
-from undistort import LensCalibration, Reducer, distort
+from undistort import LensCalibration, Reducer, distort_once
 
 FRAME_STALE_AFTER = 0.25
 """[s] Four pictures at 20 a second may be lost. The motors are at zero within a control period
@@ -101,11 +101,11 @@ def floor_arc(spec: dict, distance: float) -> tuple:
     before = np.maximum(depth, 1e-6)
     x, y = np.dot(points, right) / before, np.dot(points, np.cross(ahead, right)) / before
     lens = LensCalibration((1, 1), (), tuple(camera["distortion"]), camera["lens"] == "fisheye")
-    x, y = distort(x, y, calibration=lens)
+    x, y, once = distort_once(x, y, calibration=lens)
     matrix = camera["matrix"]
     columns = np.rint(x * matrix["fx"] + matrix["cx"]).astype(int)
     rows = np.rint(y * matrix["fy"] + matrix["cy"]).astype(int)
-    seen = (depth > 0) & (columns >= 0) & (columns < image["width"])
+    seen = once & (depth > 0) & (columns >= 0) & (columns < image["width"])
     seen &= (rows >= 0) & (rows < image["height"])
     if seen.sum() < _LEAST_POINTS:
         raise DriveError(

@@ -49,6 +49,17 @@ distortion_coefficients: !!opencv-matrix
    data: [ {numbers} ]
 """
 
+# Not as OpenCV writes it: the only list in brackets is another matrix.
+NO_BRACKETS = (
+    YAML.split("distortion")[0].format(more="")
+    + """distortion_coefficients:
+   data:
+   - 0.1
+rectification_matrix:
+   data: [1, 0, 0, 0]
+"""
+)
+
 
 def make_policy(act, **camera):
     spec = {
@@ -170,6 +181,8 @@ def test_a_calibration_of_opencv_is_read_and_bends_as_the_package_unbends(tmp_pa
         (YAML.format(more="", count=2, numbers="1, x"), "lacks|could not convert"),
         (YAML.format(more="", count=1, numbers="0").replace("image_width", "w"), "image_width"),
         (YAML.format(more="", count=9, numbers="0,0,0,0,0,0,0,0,1"), "takes 8 coefficients"),
+        (NO_BRACKETS, r"lacks distortion_coefficients with its data in \[\.\.\.\]"),
+        ("cameraResolution: [0, 0]\n" + YAML.format(more="", count=1, numbers="0"), "0 x 0 pixels"),
     ],
 )
 def test_what_is_no_calibration_is_told_in_one_line(tmp_path, text, said):
@@ -187,6 +200,21 @@ def test_a_lens_of_the_policys_own_is_not_taken_out_twice():
     image = make_policy(ahead).spec["image"]
     with pytest.raises(motors.DriveError, match=r"shows .*% of what"):
         undistort.Reducer(image, (224, 224), calibration._replace(matrix=(300.0, 300.0, 112, 112)))
+
+
+def test_a_lens_whose_polynomial_turns_back_shows_nothing_twice():
+    image = make_policy(ahead).spec["image"]
+    matrix = 250.0, 250.0, 320.0, 240.0
+    # The calibration of the middle of a wide lens: r (1 - 0.3 r²) turns at r = 1.05.
+    calibration = undistort.LensCalibration((640, 480), matrix, (-0.3,), False)
+    with pytest.raises(motors.DriveError, match=r"shows .*% of what"):
+        undistort.Reducer(image, (224, 224), calibration)
+    x, y, once = undistort.distort_once(
+        np.array([0.0, 0.5, -1.0, 1.2, 1.7]), np.zeros(5), calibration=calibration
+    )
+    np.testing.assert_array_equal(once, [True, True, True, False, False])
+    np.testing.assert_allclose(x, [0.0, 0.4625, -0.7, 0.703, 0.703], atol=1e-3)
+    assert not y.any()
 
 
 # The watchdog.
