@@ -125,6 +125,9 @@ class FakeCamera:
             if self.fault == "black":
                 rng = np.random.default_rng(int(1e3 * self.clock.now()))
                 return rng.integers(0, 9, (224, 224, 3), np.uint8)
+            if self.fault == "too small":
+                rng = np.random.default_rng(int(1e3 * self.clock.now()))
+                return rng.integers(99, 200, (31, 224, 3), np.uint8)
             return None if self.fault == "missing" else np.zeros((224, 224), np.float32)
         rng = np.random.default_rng(int(self.clock.now() / PERIOD + 1e-6))
         noise = rng.integers(-3, 4, (224, 224, 3))
@@ -220,7 +223,7 @@ def test_a_lens_whose_polynomial_turns_back_shows_nothing_twice():
 # The watchdog.
 
 
-@pytest.mark.parametrize("fault", ["frozen", "black", "missing", "of another shape"])
+@pytest.mark.parametrize("fault", ["frozen", "black", "missing", "of another shape", "too small"])
 def test_a_camera_that_fails_stops_the_motors_in_time_and_is_believed_again(fault):
     clock = Clock()
     outcome, lines = by_camera(make_policy(ahead), FakeCamera(clock, fault), clock)
@@ -273,8 +276,9 @@ def test_the_goal_is_reached_where_it_stands_on_the_floor_near_the_axle():
     assert columns.min() < 13 < 18 < columns.max()
     with pytest.raises(motors.DriveError, match="does not see the floor"):
         camera_sense.floor_arc(policy.spec, 0.01)
-    with pytest.raises(motors.DriveError, match="is grey"):
-        camera_sense.colour_share(np.zeros((1, 3), np.uint8), (90, 90, 90))
+    for grey in ((90, 90, 90), (0, 0, 0)):
+        with pytest.raises(motors.DriveError, match="is grey"):
+            camera_sense.colour_share(np.zeros((1, 3), np.uint8), grey)
     for colour, share in ((RED, 1.0), (FLOOR, 0.0), ((60, 5, 5), 1.0), ((20, 0, 0), 0.0)):
         pixels = np.array([colour], np.uint8)
         assert camera_sense.colour_share(pixels, camera_sense.GOAL_COLOUR) == share
@@ -330,6 +334,7 @@ def test_the_robots_own_camera_drives_and_is_stopped(folder, monkeypatch, capsys
     [
         (["--camera"], "no camera here"),
         (["--camera", "--tracker", "9870"], "two senses"),
+        (["--camera", "--tracker-key", "nowhere"], "--tracker-key and --camera are two senses"),
         (["--goal", "1", "0"], "this policy sees: drive with --camera"),
         (["--goal", "1", "0", "--undistort", "x"], "--undistort is about pictures"),
         (["--camera", "--undistort", "nowhere.yaml"], "nowhere.yaml: No such file"),
@@ -342,6 +347,25 @@ def test_mistakes_are_told_in_one_line(folder, arguments, said, monkeypatch, cap
     assert drive.main([str(folder), "--dry-run", *arguments]) == 2
     error = capsys.readouterr().err
     assert said in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda image: image.pop("height"), "policy.json lacks image.height"),
+        (lambda image: image.pop("camera"), "policy.json lacks image.camera"),
+        (lambda image: image["camera"].pop("matrix"), "policy.json lacks image.camera.matrix"),
+        (lambda image: image.update(frames=2), "policy.py lacks stack"),
+    ],
+)
+def test_a_damaged_policy_is_told_in_one_line(folder, change, said, capsys):
+    spec = json.loads((folder / "policy.json").read_text())
+    change(spec["image"])
+    (folder / "policy.json").write_text(json.dumps(spec))
+    assert drive.main([str(folder), "--dry-run", "--camera"]) == 2
+    error = capsys.readouterr().err
+    assert f"is not an exported policy: {said}" in error
     assert error.count("\n") == 1
 
 
