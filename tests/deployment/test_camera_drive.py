@@ -417,6 +417,12 @@ def rehearsal(appearance="plain", camera=None, **settings):
     return rehearse_camera.CameraRehearsal(policy, calibration, model, camera, appearance)
 
 
+@pytest.mark.parametrize("name", ["faults", "searches"])
+def test_fewer_than_no_drives_is_a_mistake(folder, name, capsys):
+    assert rehearse.main([str(folder), "--camera", f"--{name}", "-3"]) == 2
+    assert capsys.readouterr().err == f"error: --{name} -3: give at least 0\n"
+
+
 def test_a_policy_that_steers_by_sight_reaches_its_goals_through_latency_and_losses(with_opengl):
     outcomes = [
         rehearsal("varied").drive(goal, 12.0, number)
