@@ -406,6 +406,28 @@ def test_a_picture_of_another_size_is_no_log(tmp_path):
         read_log(path)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda header: header["image"].pop("camera"), "lacks 'camera'"),
+        (lambda header: header["image"]["camera"]["matrix"].pop("fx"), "lacks 'fx'"),
+        (lambda header: header["image"]["camera"].update(lens="none"), "lens Input should be"),
+        (lambda header: header.update(goal=[float("nan"), 0.0]), "its goal is [nan, 0.0]"),
+    ],
+)
+def test_a_damaged_header_is_told_in_one_line(tmp_path, change, said):
+    path = tmp_path / "drive.jsonl"
+    write_log(path, (0.6, 0.0), timeout=0.2)
+    first, *others = path.read_text().splitlines()
+    header = json.loads(first)
+    change(header)
+    path.write_text("\n".join([json.dumps(header), *others]))
+    with pytest.raises(UserError, match=r"is not a log of deploy/drive\.py: line 1: ") as caught:
+        read_log(path)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 # In the SimulatedJetBot.
 
 
