@@ -3,9 +3,9 @@
 It needs Python 3.6 and NumPy. A camera has `value`, the newest picture as NVIDIA's `jetbot.Camera`
 has it: uint8 of shape [height, width, 3], blue, green, red, the first row above.
 
-A picture counts if it is one, differs from the one before (the noise of a sensor makes no two
-alike), and is not black. While the newest that counts is older than `stale_after` the motors stand
-still, and the robot drives on when the next one comes.
+A picture counts if it is one, is at least as large as the policy's image, differs from the one
+before (the noise of a sensor makes no two alike), and is not black. While the newest that counts is
+older than `stale_after` the motors stand still, and the robot drives on when the next one comes.
 
 A policy that sees does not know its distance from the goal. The goal is reached when it stands on
 the floor `arrive_within` metres from the axle: the image shows its colour where the floor at that
@@ -20,7 +20,7 @@ import numpy as np
 from motors import Calibration, DriveError
 from observations import Reading
 from poses import Odometry
-from undistort import LensCalibration, Reducer, distort
+from undistort import LensCalibration, Reducer, distort_once
 
 FRAME_STALE_AFTER = 0.25
 """[s] Four pictures at 20 a second may be lost. The motors are at zero within a control period
@@ -101,11 +101,11 @@ def floor_arc(spec: dict, distance: float) -> tuple:
     before = np.maximum(depth, 1e-6)
     x, y = np.dot(points, right) / before, np.dot(points, np.cross(ahead, right)) / before
     lens = LensCalibration((1, 1), (), tuple(camera["distortion"]), camera["lens"] == "fisheye")
-    x, y = distort(x, y, calibration=lens)
+    x, y, once = distort_once(x, y, calibration=lens)
     matrix = camera["matrix"]
     columns = np.rint(x * matrix["fx"] + matrix["cx"]).astype(int)
     rows = np.rint(y * matrix["fy"] + matrix["cy"]).astype(int)
-    seen = (depth > 0) & (columns >= 0) & (columns < image["width"])
+    seen = once & (depth > 0) & (columns >= 0) & (columns < image["width"])
     seen &= (rows >= 0) & (rows < image["height"])
     if seen.sum() < _LEAST_POINTS:
         raise DriveError(
@@ -130,7 +130,7 @@ def colour_share(pixels: np.ndarray, colour: tuple) -> float:
     values = pixels.astype(np.float32)
     towards = np.asarray(colour, np.float32) / max(float(sum(colour)), 1e-6) - np.float32(1 / 3)
     length = float(np.dot(towards, towards))
-    if length < _LEAST_CHROMA**2:
+    if not sum(colour) or length < _LEAST_CHROMA**2:
         raise DriveError(f"--goal-colour {' '.join(map(str, colour))} is grey: the goal needs one")
     chroma = values / np.maximum(values.sum(axis=1, keepdims=True), 1.0) - np.float32(1 / 3)
     counts = (np.dot(chroma, towards) > 0.5 * length) & (values.max(axis=1) >= _DIM)
@@ -218,15 +218,16 @@ class CameraSense:
             and picture.dtype == np.uint8
             and picture.ndim == 3
             and picture.shape[2] == 3
-            and picture.size
         ):
             return "missing"
+        shape = picture.shape[:2]
+        if shape[0] < self._image_spec["height"] or shape[1] < self._image_spec["width"]:
+            return "too small"
         if self._before is not None and np.array_equal(picture, self._before):
             return "no new picture"
         self._before = picture.copy()
         if picture.mean() < _BLACK:
             return "black"
-        shape = picture.shape[:2]
         if shape not in self._reducers:
             self._reducers = {shape: Reducer(self._image_spec, shape, self._settings.lens)}
         # The camera's channels are blue, green, red.

@@ -59,6 +59,10 @@ _NEEDED = (
 )
 """Keys of `policy.json` that a drive needs."""
 
+_NEEDED_OF_IMAGE = ("height", "width", "grey", "frames", "camera")
+_NEEDED_OF_CAMERA = ("position", "pitch_down_degrees", "lens", "matrix", "distortion")
+"""Those of its entries `image` and `image.camera`, of a policy that sees."""
+
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
 
 Log = Callable[[dict], Any]
@@ -138,6 +142,11 @@ def load_policy(folder: str) -> Policy:
             spec = json.load(file)
         path = os.path.join(folder, "policy.py")
         missing = [name for name in _NEEDED if name not in spec]
+        if "image" in spec:
+            image = spec["image"]
+            missing += ["image." + name for name in _NEEDED_OF_IMAGE if name not in image]
+            camera = image.get("camera", {})
+            missing += ["image.camera." + name for name in _NEEDED_OF_CAMERA if name not in camera]
         if missing:
             raise DriveError(f"{folder} is not an exported policy: policy.json lacks {missing[0]}")
         if "numpy" not in spec["files"] or not os.path.isfile(path):
@@ -146,10 +155,20 @@ def load_policy(folder: str) -> Policy:
             source = file.read()
         module = types.ModuleType("policy")
         exec(compile(source, path, "exec"), module.__dict__)
-        return Policy(module.__dict__["act"], spec, module.__dict__.get("stack"))
+        policy = Policy(module.__dict__["act"], spec, module.__dict__.get("stack"))
+        if policy.stack is None and "image" in spec and spec["image"]["frames"] > 1:
+            raise DriveError(f"{folder} is not an exported policy: policy.py lacks stack")
+        return policy
     except OSError as error:
         raise DriveError(f"{folder} is not an exported policy: {error.strerror}")
-    except (ValueError, LookupError, TypeError, SyntaxError, RecursionError) as error:
+    except (
+        AttributeError,
+        LookupError,
+        RecursionError,
+        SyntaxError,
+        TypeError,
+        ValueError,
+    ) as error:
         raise DriveError(f"{folder} is not an exported policy: {error}")
     except ImportError as error:
         raise DriveError(f"{path} cannot be run here: {error}")
@@ -471,8 +490,10 @@ def _sense(options: argparse.Namespace, policy: Policy, calibration: Calibration
         settings = Settings(tuple(options.goal), options.timeout, stale_after, within)
         poses = _pose_source(options, calibration)
         return PoseSense(poses, policy.spec, settings), poses, settings
-    if options.tracker is not None:
-        raise DriveError("--tracker and --camera are two senses: give one")
+    for name in ("tracker", "tracker_host", "tracker_key"):
+        if getattr(options, name) is not None:
+            flag = name.replace("_", "-")
+            raise DriveError(f"--{flag} and --camera are two senses: give one")
     given = {
         "stale_after": options.stale_after,
         "arrive_within": options.arrive_within,

@@ -220,8 +220,9 @@ def main(arguments: list[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     try:
-        if options.goals < 1:
-            raise DriveError(f"--goals {options.goals}: give at least 1")
+        for name, least in (("goals", 1), ("faults", 0), ("searches", 0)):
+            if getattr(options, name) < least:
+                raise DriveError(f"--{name} {getattr(options, name)}: give at least {least}")
         policy = load_policy(options.policy)
         began = time.monotonic()
         delay = options.delay

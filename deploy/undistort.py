@@ -14,6 +14,9 @@ from motors import DriveError
 _LEAST_COVERED = 0.75
 """Least share of the image's points that must lie in the picture."""
 
+_TURN_STEPS = 64
+"""Steps from the optical axis to a direction in which a polynomial that turns back is found."""
+
 _MATRIX = ("camera_matrix", "cameraMatrix", "Camera_Matrix", "K")
 _DISTORTION = ("distortion_coefficients", "dist_coeffs", "distCoeffs", "Distortion_Coefficients")
 _DISTORTION += ("D",)
@@ -67,11 +70,15 @@ def read_lens(path: str) -> LensCalibration:
 
 
 def _numbers(text: str, names: tuple, path: str) -> list:
+    # Only these keys may stand before the list: the next one with a list is another matrix.
+    before = r"(?:[^\[:]|\b(?:rows|cols|dt|data):)*?"
     found = re.search(
-        r"^\s*(?:" + "|".join(names) + r"):[^\[]*?(?:data:\s*)?\[([^\]]*)\]", text, re.MULTILINE
+        r"^\s*(?:" + "|".join(names) + "):" + before + r"\[([^\]]*)\]", text, re.MULTILINE
     )
     if found is None:
-        raise DriveError(f"--undistort {path} is not a calibration: it lacks {names[0]}")
+        raise DriveError(
+            f"--undistort {path} is not a calibration: it lacks {names[0]} with its data in [...]"
+        )
     try:
         return [float(one) for one in found.group(1).replace(",", " ").split()]
     except ValueError as error:
@@ -80,14 +87,14 @@ def _numbers(text: str, names: tuple, path: str) -> list:
 
 def _size(text: str, path: str) -> tuple:
     pair = re.search(r"^\s*cameraResolution:\s*\[\s*(\d+),?\s+(\d+)", text, re.MULTILINE)
-    if pair is not None:
-        return int(pair.group(1)), int(pair.group(2))
-    sides = []
-    for name in ("image_width", "image_height"):
+    sides = [] if pair is None else [int(pair.group(1)), int(pair.group(2))]
+    for name in () if pair else ("image_width", "image_height"):
         found = re.search(r"^\s*" + name + r":\s*(\d+)", text, re.MULTILINE | re.IGNORECASE)
-        if found is None or int(found.group(1)) < 1:
+        if found is None:
             raise DriveError(f"--undistort {path} is not a calibration: it lacks {name}")
         sides.append(int(found.group(1)))
+    if min(sides) < 1:
+        raise DriveError(f"--undistort {path}: pictures of {sides[0]} x {sides[1]} pixels are none")
     return sides[0], sides[1]
 
 
@@ -158,13 +165,13 @@ def _points(image: dict, shape: tuple, calibration: LensCalibration) -> tuple:
     down, right = (one.reshape(-1) for one in np.meshgrid(offsets, offsets, indexing="ij"))
     x = (np.arange(image["width"])[None, :, None] + right - matrix["cx"]) / matrix["fx"]
     y = (np.arange(image["height"])[:, None, None] + down - matrix["cy"]) / matrix["fy"]
-    x, y = distort(*np.broadcast_arrays(x, y), calibration=calibration)
+    x, y, once = distort_once(*np.broadcast_arrays(x, y), calibration=calibration)
     fx, fy, cx, cy = calibration.matrix
     # The origin is the middle of the first pixel, and stays half a pixel from the corner.
     scale_x, scale_y = width / calibration.size[0], height / calibration.size[1]
     columns = (x * fx + cx + 0.5) * scale_x - 0.5
     rows = (y * fy + cy + 0.5) * scale_y - 0.5
-    inside = (columns > -1) & (columns < width) & (rows > -1) & (rows < height)
+    inside = once & (columns > -1) & (columns < width) & (rows > -1) & (rows < height)
     if not inside.mean() >= _LEAST_COVERED:
         raise DriveError(
             f"--undistort: the picture shows {inside.mean():.0%} of what the policy was trained to"
@@ -177,6 +184,30 @@ def _between(at: np.ndarray, count: int) -> tuple:
     at = np.clip(at, 0, count - 1)
     low = np.floor(at).astype(int)
     return low, np.minimum(low + 1, count - 1), (at - low)[..., None].astype(np.float32)
+
+
+def distort_once(x: np.ndarray, y: np.ndarray, *, calibration: LensCalibration) -> tuple:
+    """Return where a lens shows a direction, if its polynomial shows no nearer one there.
+
+    Beyond the directions of its calibration a polynomial may turn back towards the middle, where
+    the lens shows something else.
+
+    Args:
+      x: Direction x/z, to the right.
+      y: Direction y/z, down.
+      calibration: The lens.
+
+    Returns:
+      x and y before the camera matrix, and whether the polynomial has not turned; where it has,
+      x and y are those at the turn.
+    """
+    found_x, found_y = np.zeros_like(x), np.zeros_like(y)
+    once = np.ones(x.shape, bool)
+    for part in np.linspace(0.0, 1.0, _TURN_STEPS + 1)[1:]:
+        bent_x, bent_y = distort(part * x, part * y, calibration=calibration)
+        once &= np.hypot(bent_x, bent_y) >= np.hypot(found_x, found_y)
+        found_x, found_y = np.where(once, bent_x, found_x), np.where(once, bent_y, found_y)
+    return found_x, found_y, once
 
 
 def distort(x: np.ndarray, y: np.ndarray, *, calibration: LensCalibration) -> tuple:

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 
 from jetbot_mjx.deployment.drive_pictures import LoggedPicture, picture_strip, read_picture
+from jetbot_mjx.deployment.simulated_camera import camera_config
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, replayed
 from jetbot_mjx.errors import UserError
 
@@ -86,9 +87,7 @@ def read_log(path: Path) -> DriveLog:
     pictures: list[LoggedPicture | None] = []
     outcome, stale_ticks, number = "interrupted", 0, 1
     try:
-        header = json.loads(lines[0])
-        calibration = _parse_calibration(header)
-        goal_w = _parse_goal(header)
+        header, calibration, goal_w = _parse_header(lines[0])
         for number, text in enumerate(lines[1:], start=2):
             if number == len(lines) and not text.endswith("}"):
                 break  # The drive ended while this line was written.
@@ -105,7 +104,8 @@ def read_log(path: Path) -> DriveLog:
             if "latency" in period:
                 latencies.append(float(period["latency"]))
     except (ValueError, TypeError, LookupError, AttributeError) as error:
-        reason = f"lacks {error}" if isinstance(error, KeyError) else str(error)
+        text = " ".join(str(error).split())  # a wrong camera is told in several lines
+        reason = f"lacks {text}" if isinstance(error, KeyError) else text
         raise UserError(
             f"{path} is not a log of deploy/drive.py: line {number}: {reason}"
         ) from None
@@ -129,6 +129,15 @@ def read_log(path: Path) -> DriveLog:
     )
 
 
+def _parse_header(text: str) -> tuple[Any, MotorModel, tuple[float, float] | None]:
+    """Return the header, its calibration and its goal, and check its camera."""
+    header = json.loads(text)
+    calibration, goal_w = _parse_calibration(header), _parse_goal(header)
+    if "image" in header:
+        camera_config(header["image"])
+    return header, calibration, goal_w
+
+
 def _parse_pose(period: Mapping[str, Any]) -> tuple[float, tuple[float, ...]]:
     """Return the time of a period's pose [s], and its x [m], y [m] and yaw [rad]."""
     pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
@@ -149,6 +158,8 @@ def _parse_goal(header: Any) -> tuple[float, float] | None:
     if header["goal"] is None and "image" in header:
         return None
     x, y = map(float, header["goal"])
+    if not np.isfinite([x, y]).all():
+        raise ValueError(f"its goal is {header['goal']}")
     return x, y
 
 

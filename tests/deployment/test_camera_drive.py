@@ -49,6 +49,17 @@ distortion_coefficients: !!opencv-matrix
    data: [ {numbers} ]
 """
 
+# Not as OpenCV writes it: the only list in brackets is another matrix.
+NO_BRACKETS = (
+    YAML.split("distortion")[0].format(more="")
+    + """distortion_coefficients:
+   data:
+   - 0.1
+rectification_matrix:
+   data: [1, 0, 0, 0]
+"""
+)
+
 
 def make_policy(act, **camera):
     spec = {
@@ -114,6 +125,9 @@ class FakeCamera:
             if self.fault == "black":
                 rng = np.random.default_rng(int(1e3 * self.clock.now()))
                 return rng.integers(0, 9, (224, 224, 3), np.uint8)
+            if self.fault == "too small":
+                rng = np.random.default_rng(int(1e3 * self.clock.now()))
+                return rng.integers(99, 200, (31, 224, 3), np.uint8)
             return None if self.fault == "missing" else np.zeros((224, 224), np.float32)
         rng = np.random.default_rng(int(self.clock.now() / PERIOD + 1e-6))
         noise = rng.integers(-3, 4, (224, 224, 3))
@@ -170,6 +184,8 @@ def test_a_calibration_of_opencv_is_read_and_bends_as_the_package_unbends(tmp_pa
         (YAML.format(more="", count=2, numbers="1, x"), "lacks|could not convert"),
         (YAML.format(more="", count=1, numbers="0").replace("image_width", "w"), "image_width"),
         (YAML.format(more="", count=9, numbers="0,0,0,0,0,0,0,0,1"), "takes 8 coefficients"),
+        (NO_BRACKETS, r"lacks distortion_coefficients with its data in \[\.\.\.\]"),
+        ("cameraResolution: [0, 0]\n" + YAML.format(more="", count=1, numbers="0"), "0 x 0 pixels"),
     ],
 )
 def test_what_is_no_calibration_is_told_in_one_line(tmp_path, text, said):
@@ -189,10 +205,25 @@ def test_a_lens_of_the_policys_own_is_not_taken_out_twice():
         undistort.Reducer(image, (224, 224), calibration._replace(matrix=(300.0, 300.0, 112, 112)))
 
 
+def test_a_lens_whose_polynomial_turns_back_shows_nothing_twice():
+    image = make_policy(ahead).spec["image"]
+    matrix = 250.0, 250.0, 320.0, 240.0
+    # The calibration of the middle of a wide lens: r (1 - 0.3 r²) turns at r = 1.05.
+    calibration = undistort.LensCalibration((640, 480), matrix, (-0.3,), False)
+    with pytest.raises(motors.DriveError, match=r"shows .*% of what"):
+        undistort.Reducer(image, (224, 224), calibration)
+    x, y, once = undistort.distort_once(
+        np.array([0.0, 0.5, -1.0, 1.2, 1.7]), np.zeros(5), calibration=calibration
+    )
+    np.testing.assert_array_equal(once, [True, True, True, False, False])
+    np.testing.assert_allclose(x, [0.0, 0.4625, -0.7, 0.703, 0.703], atol=1e-3)
+    assert not y.any()
+
+
 # The watchdog.
 
 
-@pytest.mark.parametrize("fault", ["frozen", "black", "missing", "of another shape"])
+@pytest.mark.parametrize("fault", ["frozen", "black", "missing", "of another shape", "too small"])
 def test_a_camera_that_fails_stops_the_motors_in_time_and_is_believed_again(fault):
     clock = Clock()
     outcome, lines = by_camera(make_policy(ahead), FakeCamera(clock, fault), clock)
@@ -245,8 +276,9 @@ def test_the_goal_is_reached_where_it_stands_on_the_floor_near_the_axle():
     assert columns.min() < 13 < 18 < columns.max()
     with pytest.raises(motors.DriveError, match="does not see the floor"):
         camera_sense.floor_arc(policy.spec, 0.01)
-    with pytest.raises(motors.DriveError, match="is grey"):
-        camera_sense.colour_share(np.zeros((1, 3), np.uint8), (90, 90, 90))
+    for grey in ((90, 90, 90), (0, 0, 0)):
+        with pytest.raises(motors.DriveError, match="is grey"):
+            camera_sense.colour_share(np.zeros((1, 3), np.uint8), grey)
     for colour, share in ((RED, 1.0), (FLOOR, 0.0), ((60, 5, 5), 1.0), ((20, 0, 0), 0.0)):
         pixels = np.array([colour], np.uint8)
         assert camera_sense.colour_share(pixels, camera_sense.GOAL_COLOUR) == share
@@ -302,6 +334,7 @@ def test_the_robots_own_camera_drives_and_is_stopped(folder, monkeypatch, capsys
     [
         (["--camera"], "no camera here"),
         (["--camera", "--tracker", "9870"], "two senses"),
+        (["--camera", "--tracker-key", "nowhere"], "--tracker-key and --camera are two senses"),
         (["--goal", "1", "0"], "this policy sees: drive with --camera"),
         (["--goal", "1", "0", "--undistort", "x"], "--undistort is about pictures"),
         (["--camera", "--undistort", "nowhere.yaml"], "nowhere.yaml: No such file"),
@@ -314,6 +347,25 @@ def test_mistakes_are_told_in_one_line(folder, arguments, said, monkeypatch, cap
     assert drive.main([str(folder), "--dry-run", *arguments]) == 2
     error = capsys.readouterr().err
     assert said in error
+    assert error.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda image: image.pop("height"), "policy.json lacks image.height"),
+        (lambda image: image.pop("camera"), "policy.json lacks image.camera"),
+        (lambda image: image["camera"].pop("matrix"), "policy.json lacks image.camera.matrix"),
+        (lambda image: image.update(frames=2), "policy.py lacks stack"),
+    ],
+)
+def test_a_damaged_policy_is_told_in_one_line(folder, change, said, capsys):
+    spec = json.loads((folder / "policy.json").read_text())
+    change(spec["image"])
+    (folder / "policy.json").write_text(json.dumps(spec))
+    assert drive.main([str(folder), "--dry-run", "--camera"]) == 2
+    error = capsys.readouterr().err
+    assert f"is not an exported policy: {said}" in error
     assert error.count("\n") == 1
 
 
@@ -354,6 +406,28 @@ def test_a_picture_of_another_size_is_no_log(tmp_path):
         read_log(path)
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        (lambda header: header["image"].pop("camera"), "lacks 'camera'"),
+        (lambda header: header["image"]["camera"]["matrix"].pop("fx"), "lacks 'fx'"),
+        (lambda header: header["image"]["camera"].update(lens="none"), "lens Input should be"),
+        (lambda header: header.update(goal=[float("nan"), 0.0]), "its goal is [nan, 0.0]"),
+    ],
+)
+def test_a_damaged_header_is_told_in_one_line(tmp_path, change, said):
+    path = tmp_path / "drive.jsonl"
+    write_log(path, (0.6, 0.0), timeout=0.2)
+    first, *others = path.read_text().splitlines()
+    header = json.loads(first)
+    change(header)
+    path.write_text("\n".join([json.dumps(header), *others]))
+    with pytest.raises(UserError, match=r"is not a log of deploy/drive\.py: line 1: ") as caught:
+        read_log(path)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
 # In the SimulatedJetBot.
 
 
@@ -363,6 +437,12 @@ def rehearsal(appearance="plain", camera=None, **settings):
     camera = camera or CameraModel()
     policy = make_policy(servo, **settings)
     return rehearse_camera.CameraRehearsal(policy, calibration, model, camera, appearance)
+
+
+@pytest.mark.parametrize("name", ["faults", "searches"])
+def test_fewer_than_no_drives_is_a_mistake(folder, name, capsys):
+    assert rehearse.main([str(folder), "--camera", f"--{name}", "-3"]) == 2
+    assert capsys.readouterr().err == f"error: --{name} -3: give at least 0\n"
 
 
 def test_a_policy_that_steers_by_sight_reaches_its_goals_through_latency_and_losses(with_opengl):
