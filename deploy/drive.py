@@ -59,6 +59,9 @@ _NEEDED = (
 )
 """Keys of `policy.json` that a drive needs."""
 
+_NUMBERS = ("rest_height", "goal_height", "success_radius", "control_period")
+"""Those of them that are one number."""
+
 _NEEDED_OF_IMAGE = ("height", "width", "grey", "frames", "camera")
 _NEEDED_OF_CAMERA = ("position", "pitch_down_degrees", "lens", "matrix", "distortion")
 """Those of its entries `image` and `image.camera`, of a policy that sees."""
@@ -141,14 +144,9 @@ def load_policy(folder: str) -> Policy:
         with open(os.path.join(folder, "policy.json"), encoding="utf-8") as file:
             spec = json.load(file)
         path = os.path.join(folder, "policy.py")
-        missing = [name for name in _NEEDED if name not in spec]
-        if "image" in spec:
-            image = spec["image"]
-            missing += ["image." + name for name in _NEEDED_OF_IMAGE if name not in image]
-            camera = image.get("camera", {})
-            missing += ["image.camera." + name for name in _NEEDED_OF_CAMERA if name not in camera]
-        if missing:
-            raise DriveError(f"{folder} is not an exported policy: policy.json lacks {missing[0]}")
+        flaw = _flaw(spec)
+        if flaw:
+            raise DriveError(f"{folder} is not an exported policy: policy.json {flaw}")
         if "numpy" not in spec["files"] or not os.path.isfile(path):
             raise DriveError(f"{folder} has no policy.py: export it with --format numpy")
         with open(path, encoding="utf-8") as file:
@@ -172,6 +170,24 @@ def load_policy(folder: str) -> Policy:
         raise DriveError(f"{folder} is not an exported policy: {error}")
     except ImportError as error:
         raise DriveError(f"{path} cannot be run here: {error}")
+
+
+def _flaw(spec: dict) -> Optional[str]:
+    """Return what a drive needs and does not find in a policy spec, or None."""
+    missing = [name for name in _NEEDED if name not in spec]
+    if "image" in spec:
+        image = spec["image"]
+        missing += ["image." + name for name in _NEEDED_OF_IMAGE if name not in image]
+        camera = image.get("camera", {})
+        missing += ["image.camera." + name for name in _NEEDED_OF_CAMERA if name not in camera]
+    if missing:
+        return f"lacks {missing[0]}"
+    for name in _NUMBERS:
+        if not (type(spec[name]) in (int, float) and math.isfinite(spec[name])):
+            return f"has {name} = {spec[name]!r}: it should be a finite number"
+    if spec["control_period"] <= 0:
+        return f"has control_period = {spec['control_period']!r}: it should be above 0"
+    return None
 
 
 def arrival_radius(spec: dict) -> float:

@@ -28,6 +28,9 @@ from jetbot_mjx.deployment.simulated_camera import CameraModel
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, SimulatedJetBot
 from jetbot_mjx.errors import UserError
 
+_RATE = 60.0
+"""Poses per second."""
+
 
 class Camera:
     """A simulated camera that sends the datagrams of a tracker."""
@@ -138,14 +141,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--dead-band", type=float, default=nominal.dead_band[0], help="motor value (default: 0.12)"
     )
+    parser.add_argument("--rate", type=at_least(1.0), help=f"poses per second (default: {_RATE:g})")
     parser.add_argument(
-        "--rate", type=at_least(1.0), default=60.0, help="poses per second (default: 60)"
-    )
-    parser.add_argument(
-        "--noise",
-        type=at_least(0.0),
-        default=0.0,
-        help="standard deviation of a pose [m] (default: 0)",
+        "--noise", type=at_least(0.0), help="standard deviation of a pose [m] (default: 0)"
     )
     parser.add_argument(
         "--timeout",
@@ -223,6 +221,9 @@ def main(arguments: list[str] | None = None) -> int:
         for name, least in (("goals", 1), ("faults", 0), ("searches", 0)):
             if getattr(options, name) < least:
                 raise DriveError(f"--{name} {getattr(options, name)}: give at least {least}")
+        for name in ("rate", "noise"):
+            if options.camera and getattr(options, name) is not None:
+                raise DriveError(f"--{name} is of poses, which --camera has not: leave it out")
         policy = load_policy(options.policy)
         began = time.monotonic()
         delay = options.delay
@@ -238,8 +239,8 @@ def main(arguments: list[str] | None = None) -> int:
             policy,
             draw_goals(options.goals),
             motors=motors,
-            rate=options.rate,
-            noise=options.noise,
+            rate=options.rate or _RATE,
+            noise=options.noise or 0.0,
             timeout=options.timeout,
         )
     except (DriveError, UserError) as error:

@@ -1,6 +1,7 @@
 """A drive by camera: pictures are reduced, watched and logged; a SimulatedCamera rehearses it."""
 
 import json
+import math
 import sys
 import types
 from pathlib import Path
@@ -353,15 +354,24 @@ def test_mistakes_are_told_in_one_line(folder, arguments, said, monkeypatch, cap
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda image: image.pop("height"), "policy.json lacks image.height"),
-        (lambda image: image.pop("camera"), "policy.json lacks image.camera"),
-        (lambda image: image["camera"].pop("matrix"), "policy.json lacks image.camera.matrix"),
-        (lambda image: image.update(frames=2), "policy.py lacks stack"),
+        (lambda spec: spec["image"].pop("height"), "policy.json lacks image.height"),
+        (lambda spec: spec["image"].pop("camera"), "policy.json lacks image.camera"),
+        (
+            lambda spec: spec["image"]["camera"].pop("matrix"),
+            "policy.json lacks image.camera.matrix",
+        ),
+        (lambda spec: spec["image"].update(frames=2), "policy.py lacks stack"),
+        (
+            lambda spec: spec.update(control_period=0),
+            "policy.json has control_period = 0: it should",
+        ),
+        (lambda spec: spec.update(control_period=math.nan), "policy.json has control_period = nan"),
+        (lambda spec: spec.update(rest_height="x"), "policy.json has rest_height = 'x': it should"),
     ],
 )
 def test_a_damaged_policy_is_told_in_one_line(folder, change, said, capsys):
     spec = json.loads((folder / "policy.json").read_text())
-    change(spec["image"])
+    change(spec)
     (folder / "policy.json").write_text(json.dumps(spec))
     assert drive.main([str(folder), "--dry-run", "--camera"]) == 2
     error = capsys.readouterr().err
@@ -443,6 +453,13 @@ def rehearsal(appearance="plain", camera=None, **settings):
 def test_fewer_than_no_drives_is_a_mistake(folder, name, capsys):
     assert rehearse.main([str(folder), "--camera", f"--{name}", "-3"]) == 2
     assert capsys.readouterr().err == f"error: --{name} -3: give at least 0\n"
+
+
+@pytest.mark.parametrize("name", ["rate", "noise"])
+def test_poses_have_no_place_beside_a_camera(folder, name, capsys):
+    assert rehearse.main([str(folder), "--camera", f"--{name}", "30"]) == 2
+    said = f"error: --{name} is of poses, which --camera has not: leave it out\n"
+    assert capsys.readouterr().err == said
 
 
 def test_a_policy_that_steers_by_sight_reaches_its_goals_through_latency_and_losses(with_opengl):
