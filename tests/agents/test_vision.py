@@ -81,13 +81,18 @@ UNROLLS, TIME = 3, 4
 HIDDEN = (16, 8)
 
 
-class NoEnv(Wrapper):
-    """Stands where the loss needs no environment."""
+class Sizes(Wrapper):
+    """Stands where the loss needs no environment but its sizes."""
 
-    observation_min_std = None
+    observation_min_std, action_size = None, 2
 
-    def __init__(self):
+    def __init__(self, shapes):
         super().__init__(None)
+        self._shapes = shapes
+
+    @property
+    def observation_size(self):
+        return self._shapes
 
 
 def make_ppo(shapes, **network):
@@ -95,7 +100,7 @@ def make_ppo(shapes, **network):
     sizes = {"policy_hidden_layer_sizes": HIDDEN, "value_hidden_layer_sizes": HIDDEN}
     config = parse_config({"ppo": {"network": network | sizes}})
     networks = make_networks(config.ppo, shapes, 2)
-    return PPO(config.ppo, NoEnv(), networks)
+    return PPO(config.ppo, Sizes(shapes), networks)
 
 
 def make_batch(shapes, seed=0):
