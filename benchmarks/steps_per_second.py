@@ -153,6 +153,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Check all arguments before minutes of measuring.
     options = _parser().parse_args(arguments)
     config = load_config(options.config, options.overrides)
+    cli.divide_cpu(config.cpu_devices)
     sizes = Sizes(options.repeats, options.unroll, options.training_steps)
     num_envs = options.num_envs or [config.ppo.num_envs]
     rates = [rate for rate in MEASUREMENTS if rate not in options.skip]

@@ -172,6 +172,19 @@ def require_device() -> None:
         ) from None
 
 
+def divide_cpu(devices: int | None) -> None:
+    """Divide the CPU into devices, if JAX has not begun yet; a training refuses another number.
+
+    Args:
+      devices: the setting `cpu_devices`; None: leave it to JAX.
+    """
+    import jax
+
+    if devices is not None:
+        with contextlib.suppress(RuntimeError):
+            jax.config.update("jax_num_cpu_devices", devices)
+
+
 def wake_device() -> None:
     """Start to initialise the device in a thread, while the host continues.
 

@@ -555,6 +555,10 @@ class Config(_Section):
     `brax.training.agents.ppo.train.train`, which cannot resume."""
     deterministic: bool = False
     """Whether a GPU computes bit-identical results for a seed, more slowly; a CPU always does."""
+    cpu_devices: Count | None = None
+    """Devices that the CPU is divided into, each with its share of the environments, which can be
+    faster on several cores; results depend on it. null: as JAX has them, one as a rule. A GPU is
+    not divided."""
     init_from: str | None = None
     """A run whose networks and normaliser to begin with, instead of those of the seed: its folder,
     or a name such as `pretrained:jetbot_egocentric`. The observation may differ."""
@@ -671,6 +675,22 @@ class Config(_Section):
                     f"{key} = {now.get(key)!r} is not what the run began with,"
                     f" {then.get(key)!r}: only {', '.join(CHANGEABLE_ON_RESUME)} may change"
                 )
+
+    def check_cpu_devices(self, local_device_count: int) -> None:
+        """Raise an error if JAX has divided the CPU otherwise.
+
+        Args:
+          local_device_count: devices of this process, CPUs.
+
+        Raises:
+          ConfigError: `cpu_devices` is another number.
+        """
+        if self.cpu_devices not in (None, local_device_count):
+            raise ConfigError(
+                f"cpu_devices = {self.cpu_devices}: JAX has begun with {local_device_count}: call"
+                f" jax.config.update('jax_num_cpu_devices', {self.cpu_devices}) before its first"
+                " computation, or leave the setting out"
+            )
 
     def check_devices(self, device_count: int) -> None:
         """Raise an error if the environments cannot be divided evenly among the devices.

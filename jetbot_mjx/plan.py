@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = cli.config_of(options)
     with cli.exit_on_interrupt():
         from jetbot_mjx.training.memory_plan import memory_table, plan_memory
+    cli.divide_cpu(config.cpu_devices)
     cli.prepare_device()
     plan = plan_memory(config, options.memory)
     print(memory_table(plan))

@@ -70,6 +70,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Import the large modules while the GPU initialises, and load the programs during the rest.
     with cli.exit_on_interrupt():
         from jetbot_mjx.training import distributed, preemption
+    cli.divide_cpu(config.cpu_devices)
     if options.distributed:
         distributed.check(config)
         distributed.join()

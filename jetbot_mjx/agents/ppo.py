@@ -49,10 +49,11 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
+import jax.flatten_util
 import jax.numpy as jnp
 import optax
 from brax.envs import Env
-from brax.training import acting, gradients
+from brax.training import acting
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, optimizer
 from brax.training.agents.ppo import networks as ppo_networks
@@ -168,9 +169,17 @@ class PPO:
         self._make_policy = ppo_networks.make_inference_fn(any_networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
-        self._loss_and_gradient = gradients.loss_and_pgrad(
-            loss, pmap_axis_name=axis_name, has_aux=True
-        )
+        value_and_gradient = jax.value_and_grad(loss, has_aux=True)
+
+        def mean_gradient(*arguments: Any) -> Any:
+            value, gradient = value_and_gradient(*arguments)
+            if axis_name is None:
+                return value, gradient
+            # One vector: CPUs wait for each other in every mean.
+            vector, unravel = jax.flatten_util.ravel_pytree(gradient)
+            return value, unravel(jax.lax.pmean(vector, axis_name))
+
+        self._loss_and_gradient = mean_gradient
         self.notice: str | None = None
         """One line that says why this GPU does not run the kernels of the update, or None."""
         self._fused: fused_update.FusedUpdate | None = None

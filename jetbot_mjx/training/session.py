@@ -145,11 +145,13 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
     Raises:
       UserError: the folder holds something else, belongs to another training or cannot be
         written; the task cannot be built; the environments cannot be divided among the devices,
-        or the devices have too little memory.
+        the CPU is divided otherwise, or the devices have too little memory.
     """
     # Refuse what cannot be trained before anything is built.
     if jax.process_count() > 1:
         distributed.check(config)
+    if jax.default_backend() == "cpu":
+        config.check_cpu_devices(jax.local_device_count())
     config.check_devices(jax.device_count())
     check_tracking(config)
     # Build every object once.

@@ -58,6 +58,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     config = cli.config_of(options)
+    cli.divide_cpu(config.cpu_devices)
     cli.wake_device()
     with exit_on_interrupt():
         from jetbot_mjx.runs.metrics import process_seconds

@@ -18,7 +18,7 @@ from test_ppo import OBS, SIZE, TINY, beginning, furthest, lines, made_up, with_
 
 from jetbot_mjx import train
 from jetbot_mjx.agents.ppo import PPO
-from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
+from jetbot_mjx.config import ConfigError, RandomizationConfig, load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.runs.checkpoint import load_checkpoint
@@ -44,6 +44,13 @@ def on_one(tmp_path_factory):
     run_dir = tmp_path_factory.mktemp("devices") / "one"
     session.run(with_ppo(load_config(SMOKE), num_timesteps=SIZE, checkpoint_interval=SIZE), run_dir)
     return run_dir
+
+
+@pytest.mark.cpu
+def test_a_cpu_that_is_divided_otherwise_is_refused_before_a_folder_is_made(tmp_path):
+    with pytest.raises(ConfigError, match="cpu_devices = 5: JAX has begun with 1"):
+        session.run(load_config(SMOKE, ["cpu_devices=5"]), tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.fixture(scope="module")

@@ -111,8 +111,8 @@ class Ended:
 def alone(tmp_path_factory):
     """The same training by one process with two devices, and the folder it left."""
     run_dir = tmp_path_factory.mktemp("distributed") / "alone"
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=2"
-    ended = Ended(start(["--config", SMOKE, "--run-dir", run_dir, *SETTINGS], XLA_FLAGS=flags))
+    divided = ["--set", "cpu_devices=2"]
+    ended = Ended(start(["--config", SMOKE, "--run-dir", run_dir, *SETTINGS, *divided]))
     assert ended.code == 0, ended.err
     return ended, run_dir
 
