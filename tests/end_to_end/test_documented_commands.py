@@ -149,10 +149,12 @@ def smaller(words):
 
 def run(command, arguments):
     """Calls a command as the terminal would; returns its exit code."""
-    words = smaller(arguments)
-    if command == "train" and words and Path(f"configs/{words[0]}.yaml").exists():
+    # The latest run is that of whichever page came before, and may hold several seeds.
+    words = ["runs/mine" if word == "latest" else word for word in smaller(arguments)]
+    small = Path(f"configs/{words[0]}.yaml") if words else Path()
+    if command == "train" and small.is_file() and "--init-from" not in words:
         # By its name a configuration has the size that it is shipped with.
-        words[0] = f"configs/{words[0]}.yaml"
+        words[0] = str(small)
     return COMMANDS[command].main(words)
 
 
