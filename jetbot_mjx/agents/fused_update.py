@@ -1,8 +1,8 @@
 """Compute the gradient of PPO's loss on an NVIDIA GPU by two kernels instead of a hundred.
 
 Motivation: XLA passes the activations of every layer through memory between its kernels, and
-launches 140 of them for a minibatch. Here one kernel computes the values, XLA the advantages, and
-one kernel the gradient of both networks; docs/update.md explains them.
+launches 140 of them for a minibatch. Here one kernel computes values and advantages, and another
+the gradient of both networks; docs/update.md explains them.
 
 Protocol: the parameters and Adam's moments are one vector each during an update (`pack`, `unpack`).
 Products round their operands to float16; sums, parameters and Adam stay float32. The random keys
