@@ -175,6 +175,8 @@ class PPO:
             value, gradient = value_and_gradient(*arguments)
             if axis_name is None:
                 return value, gradient
+            if device_count == 1:
+                return value, jax.lax.pmean(gradient, axis_name)
             # One vector: CPUs wait for each other in every mean.
             vector, unravel = jax.flatten_util.ravel_pytree(gradient)
             return value, unravel(jax.lax.pmean(vector, axis_name))
