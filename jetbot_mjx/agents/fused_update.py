@@ -20,6 +20,7 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
+from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.compiler.update.shapes import (
     MOST_OBSERVATIONS,
@@ -123,27 +124,36 @@ def choose(
         return shape
     unrolls = config.batch_size // device_count
     batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
-    return launch.refusal(shape, batch) or FusedUpdate(config, shape, axis_name)
+    return launch.refusal(shape, batch) or FusedUpdate(config, shape, batch, axis_name)
 
 
 class FusedUpdate:
     """A `FusedUpdate` computes losses and gradients of both networks, as vectors."""
 
-    def __init__(self, config: PPOConfig, shape: UpdateShape, axis_name: str | None) -> None:
+    def __init__(
+        self, config: PPOConfig, shape: UpdateShape, batch: Minibatch, axis_name: str | None
+    ) -> None:
         """Prepare.
 
         Args:
           config: the hyperparameters.
           shape: the networks, from `shape_of`.
+          batch: a minibatch on one device.
           axis_name: the mesh axis over which gradients are averaged; None: none.
         """
-        self._config, self._shape, self._axis = config, shape, axis_name
+        self._config, self._shape, self._batch, self._axis = config, shape, batch, axis_name
         self._places = _places(shape)
         self._terms = LossTerms(**{name: getattr(config, name) for name in LossTerms._fields})
         mask = np.zeros(shape.size, bool)
         for place in self._places:
             mask[place.start : place.stop] = True
         self._is_parameter = mask
+
+    def prepare(self, policies: int) -> None:
+        """Begin to compile the kernels for a number of policies that train at once."""
+        # Try the back end first: LLVM does one thing at a time, and physics waits for this.
+        if ptx_backend.is_available():
+            launch.prepare(self._shape, self._terms, self._batch, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`."""

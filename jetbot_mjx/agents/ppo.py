@@ -208,12 +208,28 @@ class PPO:
         if jax.default_backend() == "gpu":
             self.notice = f"ppo.update = xla: {reason}"
 
-    def _checked_fused(self) -> fused_update.FusedUpdate | None:
-        """Return the kernels of the update after a check on this GPU; None: XLA compiles it."""
-        if self._fused and not update_probe.runs_correctly():
-            self._refuse_fused("the fused update failed its check on this GPU")
-            print(self.notice, file=sys.stderr)
-        return self._fused
+    def prepare(self, policies: int) -> None:
+        """Begin to compile the kernels of the update, before `advance` is traced.
+
+        Args:
+          policies: the number of policies that are trained at once.
+        """
+        if self._fused:
+            self._fused.prepare(policies)
+
+    def check(self) -> bool:
+        """Return whether `advance`, as it was traced, computes correctly on this GPU.
+
+        If not, XLA compiles the update when `advance` is traced again.
+
+        Raises:
+          UserError: `ppo.update` requests the kernels.
+        """
+        if self._fused is None or update_probe.runs_correctly():
+            return True
+        self._refuse_fused("the fused update failed its check on this GPU")
+        print(self.notice, file=sys.stderr)
+        return False
 
     def init(self, key: UInt32[Array, "2"]) -> TrainState:
         """Return the training state before the first step.
@@ -407,7 +423,7 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
-        unpacked, fused = (params, optimizer_state), self._checked_fused()
+        unpacked, fused = (params, optimizer_state), self._fused
         if fused:
             params, optimizer_state = fused.pack(unpacked)
             collected = fused.collected(data, normalizer)

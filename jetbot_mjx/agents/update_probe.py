@@ -7,7 +7,6 @@ would take longer to compile one than a training takes to begin.
 import functools
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jetbot_mjx.compiler import ptx_backend
@@ -44,10 +43,8 @@ def runs_correctly() -> bool:
     statistics = np.zeros(_SHAPE.observations), np.ones(_SHAPE.observations)
     arrays = [np.asarray(x, np.float32) for x in (params, *statistics, rows, last)]
     order = np.arange(_UNROLLS, dtype=np.int32)
-    # Run the probe at once, because the caller may be tracing another function.
-    device = jax.local_devices(backend=ptx_backend.PLATFORM)[0]
-    with jax.ensure_compile_time_eval(), jax.default_device(device):
-        arguments = [jnp.asarray(x) for x in (*arrays, order, np.asarray(noise, np.float32))]
+    with jax.default_device(jax.local_devices(backend=ptx_backend.PLATFORM)[0]):
+        arguments = jax.device_put((*arrays, order, np.asarray(noise, np.float32)))
         try:
             result = jax.jit(functools.partial(launch.gradient, _SHAPE, _TERMS))(*arguments)
         except jax.errors.JaxRuntimeError:

@@ -3,6 +3,7 @@
 They cost nothing in the program, because every index is a constant when the function is lowered.
 """
 
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -17,16 +18,15 @@ ScalarArray = np.ndarray
 
 def full_array(shape: Sequence[int], make: Callable[[], Scalar]) -> ScalarArray:
     """Return an array of the given shape whose elements are results of `make`."""
-    array = np.empty(shape, object)
-    for place in np.ndindex(*shape):
-        array[place] = make()
-    return array
+    return scalar_array((make() for _ in range(math.prod(shape))), shape)
 
 
 def scalar_array(scalars: Iterable[Scalar], shape: Sequence[int]) -> ScalarArray:
     """Return an array of the given shape from its elements in row-major order."""
-    elements = iter(list(scalars))
-    return full_array(shape, lambda: next(elements))
+    elements = list(scalars)
+    array = np.empty(len(elements), object)
+    array[:] = elements
+    return array.reshape(shape)
 
 
 def constant_array(array: Any) -> ScalarArray:

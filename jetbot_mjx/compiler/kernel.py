@@ -113,6 +113,10 @@ class Backend(Protocol):
         """Return whether JAX has the platform and every requirement of the back end is met."""
         ...
 
+    def prepare(self, kernel: Kernel) -> None:
+        """Begin to compile a kernel in a thread, before a program is lowered that launches it."""
+        ...
+
     def launch(self, kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
         """Run a kernel; JAX calls this while it lowers a program for the platform.
 

@@ -18,6 +18,7 @@ import jax
 from jaxtyping import Array
 
 from jetbot_mjx.compiler import ffi_wrapper
+from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Kernel, cached_bytes, runs_correctly
 
 IMPL: str = "llvm"
@@ -79,11 +80,20 @@ def kernel_text(kernel: Kernel) -> str:
     return ffi_wrapper.kernel_text(kernel, lanes=host.lanes, name=_NAME, machine=host.machine)
 
 
+def prepare(kernel: Kernel) -> None:
+    """Begin to compile a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
+    in_background(lambda: _compiled(kernel))
+
+
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
-    text = kernel.text(IMPL, lambda: kernel_text(kernel))
     results = kernel.results(leaves[0].shape[0])
-    return list(jax.ffi.ffi_call(_registered(text), results)(*leaves))
+    return list(jax.ffi.ffi_call(_compiled(kernel), results)(*leaves))
+
+
+def _compiled(kernel: Kernel) -> str:
+    """Return the name under which XLA calls a kernel, which is compiled on first use."""
+    return _registered(kernel.text(IMPL, lambda: kernel_text(kernel)))
 
 
 def _registered(text: str) -> str:

@@ -548,18 +548,20 @@ def _matched(
         if parts is None:
             # The two have no common operation, so the expressions that contain them differ.
             return None
-        missing = [
-            part
-            for part in parts
-            if not is_same(*part) and _pair_key(part) not in known.keys() | found.keys()
-        ]
+        operands, missing = [], []
+        for part in parts:
+            key_of_part = None if is_same(*part) else _pair_key(part)
+            if key_of_part is None:
+                operands.append(part[0])
+            elif key_of_part in known:
+                operands.append(known[key_of_part])
+            elif key_of_part in found:
+                operands.append(found[key_of_part])
+            else:
+                missing.append(part)
         if missing:
             pending += missing
             continue
-        operands = [
-            a if is_same(a, b) else known.get(_pair_key((a, b)), found.get(_pair_key((a, b))))
-            for a, b in parts
-        ]
         found[key] = graph.repeat(pair[1], operands)
         pending.pop()
     return found[_pair_key((before, after))]

@@ -22,8 +22,9 @@ import jax
 from jax.experimental import serialize_executable
 
 from jetbot_mjx.compiler import llvm_backend
+from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once, write_private
-from jetbot_mjx.compiler.xla_options import Options
+from jetbot_mjx.compiler.xla_options import UNTUNED, Options
 
 _UNUSED_DAYS = 30
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
@@ -41,9 +42,12 @@ class ProgramCache:
           key: everything that the programs depend on.
         """
         self._options = options
+        self._untuned = UNTUNED if jax.default_backend() == "gpu" else {}
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
         self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
+        # Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
+        self._tracing = threading.Lock()
 
     def prefetch(self, *names: str) -> None:
         """Start to load programs in threads, and return at once."""
@@ -68,12 +72,23 @@ class ProgramCache:
         prefetched = self._prefetched.pop(name, None)
         return prefetched.result() if prefetched else _load(self._path(name))
 
-    def compile(self, name: str, trace: Callable[[], jax.stages.Traced]) -> jax.stages.Compiled:
+    def compile(
+        self,
+        name: str,
+        trace: Callable[[], jax.stages.Traced],
+        check: Callable[[], bool] = lambda: True,
+        *,
+        tune: bool = False,
+    ) -> jax.stages.Compiled:
         """Return a program, and compile it if it is not cached.
 
         Args:
           name: name of the program.
           trace: a function that traces the program.
+          check: a function that returns whether what was traced can be used; if not, the program is
+            traced again. It runs while XLA compiles, and not at all if the program is cached.
+          tune: whether XLA may time kernels on a GPU to choose the fastest, for a program that runs
+            for most of the time.
 
         Returns:
           The program, which takes arguments of the shapes and shardings it was traced with.
@@ -81,14 +96,62 @@ class ProgramCache:
         program = self.find(name)
         if program is not None:
             return program
+        lowered = self._lower(trace)
+        usable = in_background(check).result
+        program = self._compile(name, *lowered, usable, tune=tune)
+        return program if usable() else self._compile(name, *self._lower(trace), tune=tune)
+
+    def compile_later(
+        self, name: str, trace: Callable[[], jax.stages.Traced]
+    ) -> Callable[[], jax.stages.Compiled]:
+        """Trace a program now if it is not cached, and compile it in a thread.
+
+        Args:
+          name: name of the program.
+          trace: a function that traces the program.
+
+        Returns:
+          A function that waits for the program, as `compile` returns it.
+        """
+        program = self.find(name)
+        if program is not None:
+            return lambda: program
+        lowered = self._lower(trace)
+        return in_background(lambda: self._compile(name, *lowered)).result
+
+    def _lower(self, trace: Callable[[], jax.stages.Traced]) -> tuple[jax.stages.Lowered, float]:
+        """Return a lowered program, and the seconds that this took."""
+        with self._tracing:
+            began = time.perf_counter()
+            return trace().lower(), time.perf_counter() - began
+
+    def _compile(
+        self,
+        name: str,
+        lowered: jax.stages.Lowered,
+        seconds: float,
+        usable: Callable[[], bool] = lambda: True,
+        *,
+        tune: bool = False,
+    ) -> jax.stages.Compiled:
+        """Compile a program and write it to the folder.
+
+        Args:
+          name: name of the program.
+          lowered: the program.
+          seconds: time that it took to trace and lower it [s].
+          usable: a function that returns whether to write it.
+          tune: whether XLA may time kernels.
+        """
+        options = self._options if tune else {**self._options, **self._untuned}
         began = time.perf_counter()
-        lowered = trace().lower()
         # Tracing may have found small programs in JAX's cache, which do not count.
         with _CacheHits() as hits:
-            program = lowered.compile(compiler_options=self._options)
+            program = lowered.compile(compiler_options=options)
         # On a CPU, XLA cannot serialize a program that it loaded: functions would be missing.
-        if self._folder and not (hits.count and jax.default_backend() == "cpu"):
-            seconds = time.perf_counter() - began
+        loaded = hits.count and jax.default_backend() == "cpu"
+        if self._folder and not loaded and usable():
+            seconds += time.perf_counter() - began
             _save(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
         return program
 

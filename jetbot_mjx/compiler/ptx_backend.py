@@ -6,6 +6,8 @@ whether the installed version has it. Each thread runs the whole program for one
 intermediate values in registers.
 """
 
+import contextlib
+import ctypes
 import functools
 import importlib
 import math
@@ -18,6 +20,7 @@ import jax
 import numpy as np
 from jaxtyping import Array
 
+from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
 
@@ -64,6 +67,11 @@ def is_available() -> bool:
     return runs_correctly(launch, device, robots=2)
 
 
+def prepare(kernel: Kernel) -> None:
+    """Begin to compile a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
+    in_background(lambda: _text(kernel))
+
+
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     robots = leaves[0].shape[0]
@@ -72,10 +80,14 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     if kernel.table is not None:
         # A block computes all items of a robot.
         threads, blocks = _ITEM_THREADS, robots
-    architecture = target_architecture()
-    text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
-    text = text.replace(_ROBOTS, str(robots))
+    text = _text(kernel).replace(_ROBOTS, str(robots))
     return launch_ptx(_NAME, text, leaves, kernel.results(robots), (blocks, 1, 1), threads)
+
+
+def _text(kernel: Kernel) -> str:
+    """Return the PTX of a kernel for the present GPUs, which is compiled on first use."""
+    architecture = target_architecture()
+    return kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
 
 
 def launch_ptx(
@@ -101,6 +113,7 @@ def launch_ptx(
     Returns:
       The results.
     """
+    _assemble_ahead(text)
     sizes = {f"grid_{axis}": np.int64(n) for axis, n in zip("xyz", grid, strict=True)}
     sizes |= {f"block_{axis}": np.int64(n) for axis, n in zip("xyz", (threads, 1, 1), strict=True)}
     return list(
@@ -114,6 +127,29 @@ def launch_ptx(
             output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
         )
     )
+
+
+@functools.cache
+def _assemble_ahead(text: str) -> None:
+    """Let the driver assemble PTX in a thread, while XLA compiles the rest of the program.
+
+    The driver keeps the result in its own cache on disk, from which XLA's first launch takes it.
+    """
+    device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
+
+    def load() -> None:
+        # If this fails, the first launch takes longer.
+        with contextlib.suppress(OSError, AttributeError):
+            cuda = ctypes.CDLL("libcuda.so.1")
+            context, module = ctypes.c_void_p(), ctypes.c_void_p()
+            if cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device):
+                return
+            cuda.cuCtxSetCurrent(context)
+            if not cuda.cuModuleLoadData(ctypes.byref(module), text.encode()):
+                cuda.cuModuleUnload(module)
+            cuda.cuDevicePrimaryCtxRelease_v2(device)
+
+    in_background(load)
 
 
 def threads_in_block(robots: int) -> int:

@@ -165,10 +165,11 @@ class ExprGraph:
         """
         if op not in EVALUATE:
             raise UnsupportedError(f"the operation {op}")
-        if all(is_constant(x) for x in operands):
+        recorded = [x for x in operands if isinstance(x, Expr)]
+        if not recorded:
             with np.errstate(all="ignore"):
                 return np.asarray(EVALUATE[op](*operands))[()]
-        operand_dtype = next(x.dtype for x in operands if not is_constant(x))
+        operand_dtype = recorded[0].dtype
         if operand_dtype not in (_FLOAT, _INT, _BOOL):
             raise UnsupportedError(f"{op} of {operand_dtype}")
         if simplify := _SIMPLIFY.get(op):

@@ -20,8 +20,11 @@ Options = dict[str, Any]
 
 _QUICK: Options = {"xla_backend_optimization_level": 1}
 
-# Use no atomics, and do not choose kernels by timing them.
-_DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, "xla_gpu_autotune_level": 0}
+UNTUNED: Options = {"xla_gpu_autotune_level": 0}
+"""Choose no kernels by timing them, which takes a second on a GPU."""
+
+# Use no atomics, and have each process choose the same kernels.
+_DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, **UNTUNED}
 
 
 def compiler_options(config: Config) -> Options:

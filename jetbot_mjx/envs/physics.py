@@ -7,6 +7,7 @@ import contextlib
 import copy
 import functools
 import threading
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -26,6 +27,12 @@ from jetbot_mjx.errors import UserError
 
 _PLATFORMS = {"gpu": "cuda"}
 """Names of lowering platforms, where they differ from those of JAX's devices."""
+
+
+def _platform() -> str:
+    """Return the lowering platform of JAX's default device."""
+    device: str = jax.local_devices()[0].platform
+    return _PLATFORMS.get(device, device)
 
 
 class Physics:
@@ -79,8 +86,7 @@ class Physics:
     @property
     def impl(self) -> str:
         """Implementation that JAX's default device runs: `physics.impl`, with `auto` resolved."""
-        device = jax.local_devices()[0].platform
-        platform = _PLATFORMS.get(device, device)
+        platform = _platform()
         impls = [x.IMPL for x in self._backends() if platform == x.PLATFORM]
         return "xla" if not impls or self._kernel_step() is None else impls[0]
 
@@ -164,19 +170,24 @@ class Physics:
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
-    def _backends(self) -> list[kernel.Backend]:
-        """Return the back ends that the configuration allows and this process has."""
-        return [x for x in BACKENDS if self._config.impl in ("auto", x.IMPL) and x.is_available()]
+    def _backends(self) -> Iterator[kernel.Backend]:
+        """Find the back ends that the configuration allows and this process has."""
+        allowed = (x for x in BACKENDS if self._config.impl in ("auto", x.IMPL))
+        return (x for x in allowed if x.is_available())
 
     def _kernel_step(self) -> kernel.Step | None:
         """Return an environment step as one kernel; None: XLA compiles it on all platforms."""
-        if not self._backends():
+        if not any(self._backends()):
             return None
         # Programs are traced in several threads; only one of them lowers the kernel.
         with self._lock:
             if self._kernel is None:
                 try:
-                    self._kernel = kernel.as_step(self._lower())
+                    lowered = self._lower()
+                    self._kernel = kernel.as_step(lowered)
+                    for backend in BACKENDS:
+                        if _platform() == backend.PLATFORM and backend.is_available():
+                            backend.prepare(lowered)
                 except UnsupportedError as error:
                     self._kernel = error
         if not isinstance(self._kernel, UnsupportedError):

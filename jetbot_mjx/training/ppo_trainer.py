@@ -18,10 +18,8 @@ Protocol:
     Only the first process invokes the callback for reports; the others receive what it returned.
 """
 
-import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Future
 from typing import Any, Self
 
 import jax
@@ -31,6 +29,7 @@ from jaxtyping import Array, UInt32
 
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
+from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
@@ -116,13 +115,16 @@ class CompiledTrainer:
 
     def init(self) -> TrainState:
         """Return the state before the first step, on the devices."""
-        program = self._compiled_init
-        if program is None:
-            jitted = jax.jit(
-                self._init, in_shardings=self._replicated, out_shardings=self._shardings
-            )
-            program = self._programs.compile("init", lambda: jitted.trace(self._seeds))
-        return program(self._seeds)
+        return self.init_later()()
+
+    def init_later(self) -> Callable[[], TrainState]:
+        """Begin to compile the program of `init`, and return a function that does the rest."""
+        found = self._compiled_init
+        if found is not None:
+            return lambda: found(self._seeds)
+        jitted = jax.jit(self._init, in_shardings=self._replicated, out_shardings=self._shardings)
+        program = self._programs.compile_later("init", lambda: jitted.trace(self._seeds))
+        return lambda: program()(self._seeds)
 
     def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
         return jax.vmap(lambda seed: self.ppo.init(jax.random.PRNGKey(seed)))(seeds)
@@ -158,7 +160,7 @@ class CompiledTrainer:
           A function of (state, training steps, whether to restart the sums). It donates the memory
           of the state to its result. The dumps that it returns have the axes (devices, seeds).
         """
-        program = self._programs.compile("advance", self.trace)
+        program = self._programs.compile("advance", self.trace, self.ppo.check, tune=True)
 
         def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, NanDump]:
             return program(state, np.int32(steps), np.bool_(restart))
@@ -167,6 +169,7 @@ class CompiledTrainer:
 
     def trace(self) -> jax.stages.Traced:
         """Trace the training step for all devices, without compiling it."""
+        self.ppo.prepare(len(self._seeds))
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
             state, nan_dump = jax.vmap(self.ppo.advance, in_axes=(0, None, None))(
@@ -212,9 +215,11 @@ def train(
       states: the state of each seed to start from, on the host; None: that of its seed.
       resumes: whether these states were reported before.
     """
-    # Compile in the background while the initial policy is evaluated.
-    compiling = _in_background(trainer.compile)
-    state = trainer.init() if states is None else trainer.put(states)
+    # Trace one program while XLA compiles the one before: that of the first state, that of the
+    # training steps, and, in the report, that of the evaluation.
+    init = trainer.init_later() if states is None else lambda: trainer.put(states)
+    compiling = in_background(trainer.compile)
+    state = init()
     done = env_steps(states[0]) // trainer.ppo.config.steps_per_training_step if states else 0
     if not resumes and not _report(trainer, recorder, state, 0.0):
         return
@@ -318,20 +323,6 @@ def next_chunk(steps: int, seconds: float, wanted: float) -> int:
       wanted: the desired duration of a call [s].
     """
     return max(1, int(steps * wanted / max(seconds, 1e-6)))
-
-
-def _in_background(function: Callable[[], Any]) -> Future[Any]:
-    """Compute a function's result in a thread, for which the process does not wait at its end."""
-    future: Future[Any] = Future()
-
-    def run() -> None:
-        try:
-            future.set_result(function())
-        except BaseException as error:  # `result` raises it in the caller's thread.
-            future.set_exception(error)
-
-    threading.Thread(target=run, daemon=True).start()
-    return future
 
 
 def env_steps(state: TrainState) -> int:

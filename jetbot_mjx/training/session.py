@@ -336,8 +336,8 @@ def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
     # Compile the keys as one program; operation by operation they would be half a dozen.
     episodes = training.config.evaluation.episodes
     jitted = jax.jit(training_keys, static_argnums=0)
-    keys = programs.compile(f"{episodes} keys", lambda: jitted.trace(episodes))()
-    return lambda params: summarize(evaluator.run(params, keys), env.dt)
+    keys = programs.compile_later(f"{episodes} keys", lambda: jitted.trace(episodes))
+    return lambda params: summarize(evaluator.run(params, keys()()), env.dt)
 
 
 def _check_folder(config: Config, run_dir: Path) -> None:

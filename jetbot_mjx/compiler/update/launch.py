@@ -8,7 +8,8 @@ a vector each, which XLA adds up in a fixed order.
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from concurrent.futures import Future
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -19,6 +20,7 @@ from jax.interpreters import batching, mlir
 from jaxtyping import Array, Float, Int
 
 from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.update import advantages, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling, UpdateShape
@@ -129,6 +131,69 @@ def _batch(
 batching.primitive_batchers[_gradient_p] = _batch
 
 
+class _Kernel(NamedTuple):
+    """A `_Kernel` is one of the two kernels, ready to launch."""
+
+    name: str
+    text: Future[str]
+    """Its PTX."""
+    grid: tuple[int, int, int]
+    threads: int
+    shared_memory: int
+    """Dynamic shared memory of a block [bytes]."""
+
+    def launch(
+        self, arguments: Sequence[Array], *results: tuple[int, ...]
+    ) -> list[Float[Array, "..."]]:
+        """Run the kernel, and return float32 arrays of the given shapes."""
+        like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in results]
+        return ptx_backend.launch_ptx(
+            self.name,
+            self.text.result(),
+            arguments,
+            like,
+            self.grid,
+            self.threads,
+            self.shared_memory,
+        )
+
+
+@functools.cache
+def prepare(
+    shape: UpdateShape, terms: LossTerms, size: Minibatch, policies: int
+) -> tuple[_Kernel, _Kernel]:
+    """Divide the work among the blocks, and begin to compile both kernels to PTX.
+
+    Args:
+      shape: the networks.
+      terms: the constants of the loss.
+      size: the minibatch.
+      policies: the number of policies that share the GPU.
+
+    Returns:
+      The kernels of the advantages and of the gradient.
+    """
+
+    def kernel(name: str, write: Callable[[], str], tiling: Tiling, x: int, y: int) -> _Kernel:
+        architecture = ptx_backend.target_architecture()
+        text = in_background(lambda: ptx_backend.assembled(write(), architecture, PTX_VERSION))
+        return _Kernel(name, text, (x, y, policies), tiling.threads, tiling.layout["size"])
+
+    # Share the multiprocessors among all policies.
+    most = max(1, ptx_backend.processor_count() // policies)
+    tiling = shapes.advantage_tiling(shape, size, most, _shared_memory())
+    assert tiling is not None
+    parts = min(most, advantages.tile_count(tiling, size))
+    write = functools.partial(advantages.advantages_text, tiling, size, terms)
+    first = kernel(advantages.NAME, write, tiling, parts, 1)
+    # Half of the blocks compute the policy's gradient, and half the values'.
+    tiling = shapes.gradient_tiling(shape, _shared_memory())
+    assert tiling is not None
+    blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
+    write = functools.partial(gradient_kernel.gradient_text, tiling, size, terms, parts)
+    return first, kernel(gradient_kernel.NAME, write, tiling, blocks, 2)
+
+
 def _lowered(*arguments: Array, shape: UpdateShape, terms: LossTerms) -> Array:
     """Launch the kernels, while JAX lowers a program for an NVIDIA GPU."""
     batch = arguments[0].shape[:-1]
@@ -136,30 +201,14 @@ def _lowered(*arguments: Array, shape: UpdateShape, terms: LossTerms) -> Array:
     flat = [x.reshape(policies, *x.shape[depth:]) for x in arguments]
     params, mean, scale, rows, last, unrolls, noise = flat
     size = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
-    # Share the multiprocessors among all policies.
-    most = max(1, ptx_backend.processor_count() // policies)
-    tiling = shapes.advantage_tiling(shape, size, most, _shared_memory())
-    assert tiling is not None
-    parts = min(most, advantages.tile_count(tiling, size))
-    estimates = _launch(
-        advantages.NAME,
-        functools.partial(advantages.advantages_text, tiling, size, terms),
-        tiling,
-        [params, mean, scale, rows, last, unrolls],
-        [(policies, size.samples), (policies, size.samples), (policies, parts, 2)],
-        (parts, 1, policies),
+    first, second = prepare(shape, terms, size, policies)
+    parts, blocks = first.grid[0], second.grid[0]
+    samples = policies, size.samples
+    estimates = first.launch(
+        [params, mean, scale, rows, last, unrolls], samples, samples, (policies, parts, 2)
     )
-    # Half of the blocks compute the policy's gradient, and half the values'.
-    tiling = shapes.gradient_tiling(shape, _shared_memory())
-    assert tiling is not None
-    blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
-    (vectors,) = _launch(
-        gradient_kernel.NAME,
-        functools.partial(gradient_kernel.gradient_text, tiling, size, terms, parts),
-        tiling,
-        [params, mean, scale, rows, unrolls, noise, *estimates],
-        [(policies, blocks, shape.size)],
-        (blocks, 2, policies),
+    (vectors,) = second.launch(
+        [params, mean, scale, rows, unrolls, noise, *estimates], (policies, blocks, shape.size)
     )
     return vectors.sum(1).reshape(*batch, shape.size)
 
@@ -169,26 +218,6 @@ mlir.register_lowering(
     mlir.lower_fun(_lowered, multiple_results=False),
     platform=ptx_backend.PLATFORM,
 )
-
-
-def _launch(
-    name: str,
-    write: Callable[[], str],
-    tiling: Tiling,
-    arguments: Sequence[Array],
-    results: Sequence[tuple[int, ...]],
-    grid: tuple[int, int, int],
-) -> list[Array]:
-    """Launch the kernel that a function writes as LLVM IR."""
-    return ptx_backend.launch_ptx(
-        name,
-        ptx_backend.assembled(write(), ptx_backend.target_architecture(), PTX_VERSION),
-        arguments,
-        [jax.ShapeDtypeStruct(shape, np.float32) for shape in results],
-        grid,
-        tiling.threads,
-        tiling.layout["size"],
-    )
 
 
 def _shared_memory() -> int:

@@ -1,0 +1,22 @@
+"""Compute in a thread of its own what the process need not wait for."""
+
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import TypeVar
+
+_Result = TypeVar("_Result")
+
+
+def in_background(function: Callable[[], _Result]) -> Future[_Result]:
+    """Compute a function's result in a thread, for which the process does not wait at its end."""
+    future: Future[_Result] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:  # `result` raises it in the caller's thread.
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future
