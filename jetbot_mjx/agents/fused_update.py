@@ -122,26 +122,28 @@ def choose(
     shape = shape_of(config, observation_size, action_size)
     if isinstance(shape, str):
         return shape
-    unrolls = config.batch_size // device_count
-    batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
-    return launch.refusal(shape, batch) or FusedUpdate(config, shape, batch, axis_name)
+    fused = FusedUpdate(config, shape, device_count, axis_name)
+    return launch.refusal(shape, fused.batch) or fused
 
 
 class FusedUpdate:
     """A `FusedUpdate` computes losses and gradients of both networks, as vectors."""
 
     def __init__(
-        self, config: PPOConfig, shape: UpdateShape, batch: Minibatch, axis_name: str | None
+        self, config: PPOConfig, shape: UpdateShape, device_count: int, axis_name: str | None
     ) -> None:
         """Prepare.
 
         Args:
           config: the hyperparameters.
           shape: the networks, from `shape_of`.
-          batch: a minibatch on one device.
+          device_count: the number of devices that share a minibatch.
           axis_name: the mesh axis over which gradients are averaged; None: none.
         """
-        self._config, self._shape, self._batch, self._axis = config, shape, batch, axis_name
+        self._config, self._shape, self._axis = config, shape, axis_name
+        unrolls = config.batch_size // device_count
+        self.batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
+        """A minibatch on one device."""
         self._places = _places(shape)
         self._terms = LossTerms(**{name: getattr(config, name) for name in LossTerms._fields})
         mask = np.zeros(shape.size, bool)
@@ -153,7 +155,7 @@ class FusedUpdate:
         """Begin to compile the kernels for a number of policies that train at once."""
         # Try the back end first: LLVM does one thing at a time, and physics waits for this.
         if ptx_backend.is_available():
-            launch.prepare(self._shape, self._terms, self._batch, policies)
+            launch.prepare(self._shape, self._terms, self.batch, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`."""

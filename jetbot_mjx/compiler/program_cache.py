@@ -152,7 +152,9 @@ class ProgramCache:
         loaded = hits.count and jax.default_backend() == "cpu"
         if self._folder and not loaded and usable():
             seconds += time.perf_counter() - began
-            _save(self._path(name), program, llvm_backend.kernels_in(lowered.as_text()), seconds)
+            # Only programs for CPUs call kernels by name, and their text takes a while to write.
+            text = lowered.as_text() if jax.default_backend() == "cpu" else ""
+            _save(self._path(name), program, llvm_backend.kernels_in(text), seconds)
         return program
 
     def _path(self, name: str) -> Path:

@@ -135,11 +135,11 @@ def _assemble_ahead(text: str) -> None:
 
     The driver keeps the result in its own cache on disk, from which XLA's first launch takes it.
     """
-    device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
 
     def load() -> None:
-        # If this fails, the first launch takes longer.
-        with contextlib.suppress(OSError, AttributeError):
+        # If this fails, or there is no GPU here, the first launch takes longer.
+        with contextlib.suppress(OSError, AttributeError, RuntimeError):
+            device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
             cuda = ctypes.CDLL("libcuda.so.1")
             context, module = ctypes.c_void_p(), ctypes.c_void_p()
             if cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device):

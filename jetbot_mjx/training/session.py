@@ -6,12 +6,13 @@ modules receive what they need as required arguments.
 """
 
 import contextlib
+import functools
 import importlib.util
 import pickle
 import tempfile
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -333,11 +334,15 @@ def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
     """
     env, programs = training.env, training.programs
     evaluator = Evaluator(maybe_randomize(env), training.ppo.networks, programs)
-    # Compile the keys as one program; operation by operation they would be half a dozen.
     episodes = training.config.evaluation.episodes
-    jitted = jax.jit(training_keys, static_argnums=0)
-    keys = programs.compile_later(f"{episodes} keys", lambda: jitted.trace(episodes))
-    return lambda params: summarize(evaluator.run(params, keys()()), env.dt)
+
+    @functools.cache
+    def keys() -> Any:
+        # Compile one program; operation by operation they would be half a dozen.
+        jitted = jax.jit(training_keys, static_argnums=0)
+        return programs.compile(f"{episodes} keys", lambda: jitted.trace(episodes))()
+
+    return lambda params: summarize(evaluator.run(params, keys()), env.dt)
 
 
 def _check_folder(config: Config, run_dir: Path) -> None:

@@ -107,7 +107,7 @@ def test_vectors_become_the_same_parameters(distribution):
         value=ppo.networks.value_network.init(keys[1]),
     )
     shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
-    fused = fused_update.FusedUpdate(settings.ppo, shape, None)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
     tree = params, ppo._optimizer.init(params)
     packed = fused.pack(tree)
     assert packed[0].shape == (shape.size,)
@@ -166,7 +166,7 @@ def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
     settings = config(update="xla")
     networks = make_ppo(settings).networks
     shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
-    fused = fused_update.FusedUpdate(settings.ppo, shape, None)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
     one = minibatch(np.random.default_rng(0), settings, networks)
     order = jnp.arange(settings.ppo.batch_size)
 
@@ -301,7 +301,7 @@ def assert_gradient_is_xlas(settings):
     with jax.default_matmul_precision("highest"):
         (_, metrics), expected = ppo._loss_and_gradient(params, statistics, batch, key)
     shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
-    fused = fused_update.FusedUpdate(settings.ppo, shape, None)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
     order = jnp.asarray(np.random.default_rng(1).permutation(settings.ppo.batch_size))
 
     @jax.jit
