@@ -52,6 +52,10 @@ _LEVEL = 3
 _ROBOTS = "ROBOTS"
 """Placeholder in the PTX for the number of robots."""
 
+_FULL_BLOCKS = 2**31 - 1
+"""Number of robots in the PTX if the blocks have no more threads than robots: the same text serves
+all these numbers, and the driver assembles it once."""
+
 _ARCHITECTURES = (70, 80, 90)
 """Target architectures, as ten times the compute capability; newer GPUs run PTX of older ones."""
 
@@ -69,25 +73,27 @@ def is_available() -> bool:
 
 def prepare(kernel: Kernel) -> None:
     """Begin to compile a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
-    in_background(lambda: _text(kernel))
+    in_background(lambda: assemble_ahead(_text(kernel, _FULL_BLOCKS)))
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     robots = leaves[0].shape[0]
     threads = threads_in_block(robots)
-    blocks = math.ceil(robots / threads)
+    blocks, rest = divmod(robots, threads)
     if kernel.table is not None:
         # A block computes all items of a robot.
-        threads, blocks = _ITEM_THREADS, robots
-    text = _text(kernel).replace(_ROBOTS, str(robots))
+        threads, blocks, rest = _ITEM_THREADS, robots, 0
+    text = _text(kernel, robots if rest else _FULL_BLOCKS)
+    blocks += rest > 0
     return launch_ptx(_NAME, text, leaves, kernel.results(robots), (blocks, 1, 1), threads)
 
 
-def _text(kernel: Kernel) -> str:
+def _text(kernel: Kernel, robots: int) -> str:
     """Return the PTX of a kernel for the present GPUs, which is compiled on first use."""
     architecture = target_architecture()
-    return kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
+    text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
+    return text.replace(_ROBOTS, str(robots))
 
 
 def launch_ptx(
@@ -113,7 +119,7 @@ def launch_ptx(
     Returns:
       The results.
     """
-    _assemble_ahead(text)
+    assemble_ahead(text)
     sizes = {f"grid_{axis}": np.int64(n) for axis, n in zip("xyz", grid, strict=True)}
     sizes |= {f"block_{axis}": np.int64(n) for axis, n in zip("xyz", (threads, 1, 1), strict=True)}
     return list(
@@ -130,10 +136,13 @@ def launch_ptx(
 
 
 @functools.cache
-def _assemble_ahead(text: str) -> None:
+def assemble_ahead(text: str) -> None:
     """Let the driver assemble PTX in a thread, while XLA compiles the rest of the program.
 
     The driver keeps the result in its own cache on disk, from which XLA's first launch takes it.
+
+    Args:
+      text: the PTX.
     """
 
     def load() -> None:

@@ -18,8 +18,9 @@ Protocol:
     Only the first process invokes the callback for reports; the others receive what it returned.
 """
 
+import contextlib
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
 
 import jax
@@ -123,7 +124,8 @@ class CompiledTrainer:
         if found is not None:
             return lambda: found(self._seeds)
         jitted = jax.jit(self._init, in_shardings=self._replicated, out_shardings=self._shardings)
-        program = self._programs.compile_later("init", lambda: jitted.trace(self._seeds))
+        with _random_bits_by_kernel():
+            program = self._programs.compile_later("init", lambda: jitted.trace(self._seeds))
         return lambda: program()(self._seeds)
 
     def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
@@ -170,11 +172,22 @@ class CompiledTrainer:
     def trace(self) -> jax.stages.Traced:
         """Trace the training step for all devices, without compiling it."""
         self.ppo.prepare(len(self._seeds))
+        if jax.default_backend() == "gpu":
+            in_background(_load_blas)
+
+        # CPUs multiply the matrices of a batch faster.
+        alone = len(self._seeds) == 1 and jax.default_backend() == "gpu"
 
         def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
-            state, nan_dump = jax.vmap(self.ppo.advance, in_axes=(0, None, None))(
-                state, steps, restart
-            )
+            if alone:
+                # A batch of one would be traced a second time, as a batch.
+                one = jax.tree.map(lambda x: x[0], state)
+                result = self.ppo.advance(one, steps, restart)
+                state, nan_dump = jax.tree.map(lambda x: x[None], result)
+            else:
+                state, nan_dump = jax.vmap(self.ppo.advance, in_axes=(0, None, None))(
+                    state, steps, restart
+                )
             return state, jax.tree.map(lambda x: x[None], nan_dump)
 
         sharded = jax.shard_map(
@@ -194,6 +207,31 @@ class CompiledTrainer:
         )
         scalars = (np.zeros((), np.int32), np.zeros((), bool))
         return jitted.trace(self._shapes, *scalars)
+
+
+@contextlib.contextmanager
+def _random_bits_by_kernel() -> Iterator[None]:
+    """Lower draws of random bits on GPUs to JAX's kernel inside the context, with the same result.
+
+    As JAX does it by default, a draw is a hundred operations, which XLA fuses with those around
+    them. That is faster, but a program that runs once takes a second longer to compile.
+    """
+    option = "jax_threefry_gpu_kernel_lowering"
+    before = jax.config.values.get(option)
+    if before is None:
+        # This JAX does not have the option.
+        yield
+        return
+    jax.config.update(option, True)
+    try:
+        yield
+    finally:
+        jax.config.update(option, before)
+
+
+def _load_blas() -> None:
+    """Have XLA load the libraries for matrix products, which takes it half a second."""
+    jax.jit(lambda x: x @ x).trace(jax.ShapeDtypeStruct((128, 128), np.float32)).lower().compile()
 
 
 def train(

@@ -214,6 +214,23 @@ def test_the_probe_agrees_with_the_model(monkeypatch):
     assert not update_probe.runs_correctly.__wrapped__()
 
 
+@pytest.mark.cpu
+def test_kernels_that_fail_their_check_are_left_to_xla(monkeypatch, capsys):
+    monkeypatch.setattr(update_probe, "runs_correctly", lambda: False)
+    ppo = make_ppo(config(update="xla"))
+    assert ppo.check()
+    ppo.config, ppo._fused = config(update="auto").ppo, object()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert not ppo.check()
+    assert ppo._fused is None
+    assert capsys.readouterr().err == (
+        "ppo.update = xla: the fused update failed its check on this GPU\n"
+    )
+    ppo.config, ppo._fused = config(update="fused").ppo, object()
+    with pytest.raises(UserError, match=r"ppo\.update = fused: .* choose auto or xla"):
+        ppo.check()
+
+
 @on_a_gpu
 def test_the_probe_agrees():
     assert update_probe.runs_correctly()

@@ -3,7 +3,9 @@
 import os
 import subprocess
 import sys
+import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import gliding
@@ -69,6 +71,58 @@ def test_a_program_that_was_fetched_ahead_is_that_program(kept):
     ahead.prefetch("double", "another")
     assert ahead.find("another") is None
     assert twice(ahead.compile("double", never)) == [0.0, 2.0, 4.0]
+
+
+def test_what_fails_its_check_is_traced_again_and_only_that_is_kept(folder):
+    factors = iter([3, 2])
+
+    def trace():
+        factor = next(factors)
+        return jax.jit(lambda x: {"twice": factor * x}).trace(jnp.ones(3))
+
+    cache = ProgramCache({}, folder, KEY)
+    assert twice(cache.compile("double", trace, lambda: False)) == [0.0, 2.0, 4.0]
+    assert twice(ProgramCache({}, folder, KEY).compile("double", never)) == [0.0, 2.0, 4.0]
+
+
+def test_a_check_that_fails_with_an_error_keeps_nothing(folder):
+    def check():
+        raise RuntimeError("no")
+
+    with pytest.raises(RuntimeError, match="no"):
+        ProgramCache({}, folder, KEY).compile("double", double, check)
+    assert not list(folder.glob("program-*"))
+
+
+def test_a_program_compiles_while_the_next_one_is_traced(folder, monkeypatch):
+    cache, traced = ProgramCache({}, folder, KEY), threading.Event()
+    compile_ = cache._compile
+
+    def compile_late(*arguments, **options):
+        assert traced.wait(60)
+        return compile_(*arguments, **options)
+
+    monkeypatch.setattr(cache, "_compile", compile_late)
+    program = cache.compile_later("double", double)
+    double()
+    traced.set()
+    assert twice(program()) == [0.0, 2.0, 4.0]
+    assert twice(ProgramCache({}, folder, KEY).compile_later("double", never)()) == [0.0, 2.0, 4.0]
+
+
+def test_two_threads_trace_one_after_the_other(folder):
+    cache, inside, most = ProgramCache({}, folder, KEY), [], []
+
+    def trace():
+        inside.append(0)
+        most.append(len(inside))
+        time.sleep(0.05)
+        inside.pop()
+        return double()
+
+    with ThreadPoolExecutor(3) as pool:
+        list(pool.map(lambda name: cache.compile(name, trace), "abc"))
+    assert most == [1, 1, 1]
 
 
 @pytest.mark.parametrize(

@@ -176,8 +176,15 @@ def prepare(
 
     def kernel(name: str, write: Callable[[], str], tiling: Tiling, x: int, y: int) -> _Kernel:
         architecture = ptx_backend.target_architecture()
-        text = in_background(lambda: ptx_backend.assembled(write(), architecture, PTX_VERSION))
-        return _Kernel(name, text, (x, y, policies), tiling.threads, tiling.layout["size"])
+
+        def compiled() -> str:
+            text = ptx_backend.assembled(write(), architecture, PTX_VERSION)
+            ptx_backend.assemble_ahead(text)
+            return text
+
+        return _Kernel(
+            name, in_background(compiled), (x, y, policies), tiling.threads, tiling.layout["size"]
+        )
 
     # Share the multiprocessors among all policies.
     most = max(1, ptx_backend.processor_count() // policies)
