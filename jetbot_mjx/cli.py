@@ -97,8 +97,10 @@ def run_command(
         it opened: JAX takes a second to release a GPU, and a compiler's thread, which cannot be
         interrupted, may abort the process.
     """
-    # Prepare the process: its memory, its output, its imports and its signals.
+    # Prepare the process: its memory, its threads, its output, its imports and its signals.
     gc.set_threshold(*_GARBAGE_THRESHOLDS)
+    # JAX computes. NumPy would start a thread for every core, which takes longer than its import.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):
         # A character that the terminal cannot show must not fail a command that has finished.
         if isinstance(stream, io.TextIOWrapper):
