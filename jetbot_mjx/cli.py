@@ -35,8 +35,12 @@ USER_ERROR = 2
 INTERRUPTED = 130
 
 _GARBAGE_THRESHOLDS = 100_000, 50, 100
-"""Thresholds of Python's garbage collector. With its own, which begin at 700 objects, it takes a
-third of the time that imports and JAX's tracing take, and finds nothing."""
+"""Thresholds of Python's garbage collector during the start of a command. With its own, which begin
+at 700 objects, it takes a third of the time that imports and JAX's tracing take, and finds nothing.
+"""
+
+_START_SECONDS = 60
+"""Time after which the collector works as usual, for commands that run for long [s]."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -98,7 +102,11 @@ def run_command(
         interrupted, may abort the process.
     """
     # Prepare the process: its memory, its threads, its output, its imports and its signals.
+    usual = gc.get_threshold()
     gc.set_threshold(*_GARBAGE_THRESHOLDS)
+    timer = threading.Timer(_START_SECONDS, gc.set_threshold, usual)
+    timer.daemon = True
+    timer.start()
     # JAX computes. NumPy would start a thread for every core, which takes longer than its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     for stream in (sys.stdout, sys.stderr):

@@ -20,7 +20,6 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.compiler.update.shapes import (
     MOST_OBSERVATIONS,
@@ -153,9 +152,7 @@ class FusedUpdate:
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        # Try the back end first: LLVM does one thing at a time, and physics waits for this.
-        if ptx_backend.is_available():
-            launch.prepare(self._shape, self._terms, self.batch, policies)
+        launch.prepare(self._shape, self._terms, self.batch, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`."""

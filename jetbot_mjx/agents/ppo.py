@@ -64,6 +64,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 from jetbot_mjx.agents import fused_update, gae, update_probe
 from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
+from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.errors import UserError
 
@@ -213,9 +214,18 @@ class PPO:
 
         Args:
           policies: the number of policies that are trained at once.
+
+        Raises:
+          UserError: `ppo.update` requests the kernels, and XLA cannot launch them.
         """
-        if self._fused:
+        if self._fused is None:
+            return
+        # Try the back end first: LLVM does one thing at a time, and physics waits for this.
+        if ptx_backend.is_available():
             self._fused.prepare(policies)
+        else:
+            self._refuse_fused(f"it needs {ptx_backend.NEEDS}")
+            print(self.notice, file=sys.stderr)
 
     def check(self) -> bool:
         """Return whether `advance`, as it was traced, computes correctly on this GPU.

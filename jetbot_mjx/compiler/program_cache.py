@@ -24,7 +24,7 @@ from jax.experimental import serialize_executable
 from jetbot_mjx.compiler import llvm_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once, write_private
-from jetbot_mjx.compiler.xla_options import UNTUNED, Options
+from jetbot_mjx.compiler.xla_options import Options, untuned_options
 
 _UNUSED_DAYS = 30
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
@@ -42,7 +42,6 @@ class ProgramCache:
           key: everything that the programs depend on.
         """
         self._options = options
-        self._untuned = UNTUNED if jax.default_backend() == "gpu" else {}
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
         self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
@@ -98,8 +97,16 @@ class ProgramCache:
             return program
         lowered = self._lower(trace)
         usable = in_background(check).result
-        program = self._compile(name, *lowered, usable, tune=tune)
-        return program if usable() else self._compile(name, *self._lower(trace), tune=tune)
+        try:
+            program = self._compile(name, *lowered, usable, tune=tune)
+        except jax.errors.JaxRuntimeError:
+            # What fails its check may also fail to compile.
+            if usable():
+                raise
+            program = None
+        if program is not None and usable():
+            return program
+        return self._compile(name, *self._lower(trace), tune=tune)
 
     def compile_later(
         self, name: str, trace: Callable[[], jax.stages.Traced]
@@ -143,7 +150,7 @@ class ProgramCache:
           usable: a function that returns whether to write it.
           tune: whether XLA may time kernels.
         """
-        options = self._options if tune else {**self._options, **self._untuned}
+        options = self._options if tune else {**self._options, **untuned_options()}
         began = time.perf_counter()
         # Tracing may have found small programs in JAX's cache, which do not count.
         with _CacheHits() as hits:

@@ -20,11 +20,11 @@ Options = dict[str, Any]
 
 _QUICK: Options = {"xla_backend_optimization_level": 1}
 
-UNTUNED: Options = {"xla_gpu_autotune_level": 0}
-"""Choose no kernels by timing them, which takes a second on a GPU."""
+# Choose no kernels by timing them.
+_UNTUNED: Options = {"xla_gpu_autotune_level": 0}
 
-# Use no atomics, and have each process choose the same kernels.
-_DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, **UNTUNED}
+# Use no atomics either, so that each process gets the same bits.
+_DETERMINISTIC: Options = {"xla_gpu_deterministic_ops": True, **_UNTUNED}
 
 
 def compiler_options(config: Config) -> Options:
@@ -40,11 +40,22 @@ def compiler_options(config: Config) -> Options:
       JaxRuntimeError: `deterministic` needs an option that XLA does not know.
     """
     wanted = dict(_DETERMINISTIC) if config.deterministic else {}
-    if jax.default_backend() == "cpu":
-        flags = os.environ.get("XLA_FLAGS", "")
-        chosen = {name: value for name, value in _QUICK.items() if name not in flags}
-        wanted |= {name: value for name, value in chosen.items() if _is_known(name, value)}
-    return wanted
+    return {**wanted, **_possible(_QUICK)} if jax.default_backend() == "cpu" else wanted
+
+
+def untuned_options() -> Options:
+    """Return options with which XLA times no kernels on a GPU, which takes it a second."""
+    return _possible(_UNTUNED) if jax.default_backend() == "gpu" else {}
+
+
+def _possible(options: Options) -> Options:
+    """Return the options that XLA knows and that XLA_FLAGS does not name."""
+    flags = os.environ.get("XLA_FLAGS", "")
+    return {
+        name: value
+        for name, value in options.items()
+        if name not in flags and _is_known(name, value)
+    }
 
 
 @functools.cache

@@ -31,8 +31,10 @@ _PLATFORMS = {"gpu": "cuda"}
 
 def _platform() -> str:
     """Return the lowering platform of JAX's default device."""
-    device: str = jax.local_devices()[0].platform
-    return _PLATFORMS.get(device, device)
+    settings: Any = jax.config
+    device = settings.jax_default_device or jax.local_devices()[0]
+    platform = device if isinstance(device, str) else device.platform
+    return _PLATFORMS.get(platform, platform)
 
 
 class Physics:

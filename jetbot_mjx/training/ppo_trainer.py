@@ -172,7 +172,7 @@ class CompiledTrainer:
     def trace(self) -> jax.stages.Traced:
         """Trace the training step for all devices, without compiling it."""
         self.ppo.prepare(len(self._seeds))
-        if jax.default_backend() == "gpu":
+        if jax.default_backend() == "gpu" and jax.process_count() == 1:
             in_background(_load_blas)
 
         # CPUs multiply the matrices of a batch faster.
@@ -214,12 +214,13 @@ def _random_bits_by_kernel() -> Iterator[None]:
     """Lower draws of random bits on GPUs to JAX's kernel inside the context, with the same result.
 
     As JAX does it by default, a draw is a hundred operations, which XLA fuses with those around
-    them. That is faster, but a program that runs once takes a second longer to compile.
+    them. That is faster, but a program that runs once takes a second longer to compile. No other
+    thread may lower programs meanwhile.
     """
     option = "jax_threefry_gpu_kernel_lowering"
     before = jax.config.values.get(option)
-    if before is None:
-        # This JAX does not have the option.
+    if before is None or jax.default_backend() != "gpu":
+        # This JAX does not have the option, or there is no GPU.
         yield
         return
     jax.config.update(option, True)

@@ -231,6 +231,18 @@ def test_kernels_that_fail_their_check_are_left_to_xla(monkeypatch, capsys):
         ppo.check()
 
 
+@pytest.mark.cpu
+def test_without_a_back_end_xla_computes_the_update(monkeypatch, capsys):
+    monkeypatch.setattr(ptx_backend, "is_available", lambda: False)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    ppo = make_ppo(config(update="xla"))
+    ppo.config, ppo._fused = config(update="auto").ppo, object()
+    ppo.prepare(1)
+    assert ppo._fused is None
+    assert ppo.check()
+    assert capsys.readouterr().err.startswith("ppo.update = xla: it needs an NVIDIA GPU, llvmlite")
+
+
 @on_a_gpu
 def test_the_probe_agrees():
     assert update_probe.runs_correctly()

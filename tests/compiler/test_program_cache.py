@@ -85,6 +85,25 @@ def test_what_fails_its_check_is_traced_again_and_only_that_is_kept(folder):
     assert twice(ProgramCache({}, folder, KEY).compile("double", never)) == [0.0, 2.0, 4.0]
 
 
+@pytest.mark.parametrize("usable", [True, False])
+def test_what_does_not_compile_is_traced_again_if_it_fails_its_check(folder, monkeypatch, usable):
+    cache = ProgramCache({}, folder, KEY)
+    compile_, attempts = cache._compile, []
+
+    def compile_at_second(*arguments, **options):
+        attempts.append(0)
+        if len(attempts) == 1:
+            raise jax.errors.JaxRuntimeError("unknown target")
+        return compile_(*arguments, **options)
+
+    monkeypatch.setattr(cache, "_compile", compile_at_second)
+    if usable:
+        with pytest.raises(jax.errors.JaxRuntimeError, match="unknown target"):
+            cache.compile("double", double)
+    else:
+        assert twice(cache.compile("double", double, lambda: False)) == [0.0, 2.0, 4.0]
+
+
 def test_a_check_that_fails_with_an_error_keeps_nothing(folder):
     def check():
         raise RuntimeError("no")

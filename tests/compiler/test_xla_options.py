@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import pytest
 
 from jetbot_mjx.compiler import xla_options
-from jetbot_mjx.compiler.xla_options import compiler_options
+from jetbot_mjx.compiler.xla_options import compiler_options, untuned_options
 from jetbot_mjx.config import parse_config
 
 
@@ -41,3 +41,13 @@ def test_determinism_forbids_atomics_and_timing():
     options = compiler_options(parse_config({"deterministic": True}))
     assert options["xla_gpu_deterministic_ops"] is True
     assert options["xla_gpu_autotune_level"] == 0
+
+
+def test_only_gpus_time_kernels_and_the_users_level_is_left_alone(monkeypatch):
+    monkeypatch.delenv("XLA_FLAGS", raising=False)
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
+    assert untuned_options() == {}
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert untuned_options() == {"xla_gpu_autotune_level": 0}
+    monkeypatch.setenv("XLA_FLAGS", "--xla_gpu_autotune_level=4")
+    assert untuned_options() == {}
