@@ -187,8 +187,8 @@ class Physics:
                 try:
                     lowered = self._lower()
                     self._kernel = kernel.as_step(lowered)
-                    for backend in BACKENDS:
-                        if _platform() == backend.PLATFORM and backend.is_available():
+                    for backend in self._backends():
+                        if _platform() == backend.PLATFORM:
                             backend.prepare(lowered)
                 except UnsupportedError as error:
                     self._kernel = error
