@@ -33,7 +33,8 @@ Brax are:
 - The first non-finite environment state is returned as a `NanDump`.
 - `normalizer: physical` bounds the standard deviation from below by the observation's scale.
 - `learning_rate_schedule: LINEAR` lowers the step size to zero over the training.
-- `update: fused` computes the same loss with products of float16, on NVIDIA GPUs.
+- `update: fused` computes the same loss with kernels of this package, on GPUs with products of
+  float16.
 - GAE is unrolled, and of the next observations only those that the loss needs are stored.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`
@@ -64,7 +65,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 from jetbot_mjx.agents import fused_update, gae, update_probe
 from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
-from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.errors import UserError
 
@@ -184,7 +185,7 @@ class PPO:
 
         self._loss_and_gradient = mean_gradient
         self.notice: str | None = None
-        """One line that says why this GPU does not run the kernels of the update, or None."""
+        """One line that says why the kernels of the update do not run, or None."""
         self._fused: fused_update.FusedUpdate | None = None
         if config.update != "xla":
             sizes = self._env.observation_size, self._env.action_size
@@ -206,8 +207,7 @@ class PPO:
         self._fused = None
         if self.config.update == "fused":
             raise UserError(f"ppo.update = fused: {reason}: choose auto or xla")
-        if jax.default_backend() == "gpu":
-            self.notice = f"ppo.update = xla: {reason}"
+        self.notice = f"ppo.update = xla: {reason}"
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels of the update, before `advance` is traced.
@@ -221,14 +221,15 @@ class PPO:
         if self._fused is None:
             return
         # Try the back end first: LLVM does one thing at a time, and physics waits for this.
-        if ptx_backend.is_available():
+        backend = launch.backend()
+        if backend.is_available():
             self._fused.prepare(policies)
         else:
-            self._refuse_fused(f"it needs {ptx_backend.NEEDS}")
+            self._refuse_fused(f"it needs {backend.NEEDS}")
             print(self.notice, file=sys.stderr)
 
     def check(self) -> bool:
-        """Return whether `advance`, as it was traced, computes correctly on this GPU.
+        """Return whether `advance`, as it was traced, computes correctly on this machine.
 
         If not, XLA compiles the update when `advance` is traced again.
 

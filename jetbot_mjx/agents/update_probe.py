@@ -1,4 +1,4 @@
-"""Check the kernels of PPO's update on this process's GPU before a training relies on them.
+"""Check the kernels of PPO's update on this machine before a training relies on them.
 
 The check is a small gradient, compared with central differences of the loss in NumPy, since XLA
 would take longer to compile one than a training takes to begin.
@@ -9,7 +9,6 @@ import functools
 import jax
 import numpy as np
 
-from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.compiler.update.shapes import LossTerms, UpdateShape
 
@@ -17,14 +16,15 @@ _SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh")
 _TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0, normalize_advantage=False)
 _UNROLLS, _TIME = 8, 4
 _MOST_ERROR = 0.01
-"""Largest difference of the gradients, relative to their norm; products are of float16."""
+"""Largest difference of the gradients, relative to their norm; GPUs have products of float16."""
 _STEP = 1e-4
 
 
 @functools.cache
 def runs_correctly() -> bool:
     """Return whether the kernels compute a small gradient correctly."""
-    if not ptx_backend.is_available():
+    backend = launch.backend()
+    if not backend.is_available():
         return False
     rng = np.random.default_rng(0)
     params = 0.3 * rng.standard_normal(_SHAPE.size)
@@ -43,7 +43,7 @@ def runs_correctly() -> bool:
     statistics = np.zeros(_SHAPE.observations), np.ones(_SHAPE.observations)
     arrays = [np.asarray(x, np.float32) for x in (params, *statistics, rows, last)]
     order = np.arange(_UNROLLS, dtype=np.int32)
-    with jax.default_device(jax.local_devices(backend=ptx_backend.PLATFORM)[0]):
+    with jax.default_device(jax.local_devices(backend=backend.PLATFORM)[0]):
         arguments = jax.device_put((*arrays, order, np.asarray(noise, np.float32)))
         try:
             result = jax.jit(functools.partial(launch.gradient, _SHAPE, _TERMS))(*arguments)

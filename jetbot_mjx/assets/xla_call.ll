@@ -5,6 +5,7 @@
 ; robots in all, the addresses of arguments and results.
 %Job = type { i64, i64, i64, i64, i64, [$arrays x ptr] }
 declare ptr @malloc(i64)
+declare ptr @aligned_alloc(i64, i64)
 declare void @free(ptr)
 declare i32 @sched_yield()
 
@@ -29,16 +30,19 @@ entry:
   %blocks = load i64, ptr %blocks.at
   %ended = getelementptr %Job, ptr %job, i32 0, i32 1
   %mode = call i64 @begin()
+  ; Memory to work with, which stays in the cache of this thread's core from block to block.
+  %scratch = call ptr @aligned_alloc(i64 64, i64 $scratch)
   br label %take
 take:
   %index = atomicrmw add ptr %job, i64 1 monotonic
   %is.left = icmp ult i64 %index, %blocks
   br i1 %is.left, label %do, label %done
 do:
-  call void @block(ptr %job, i64 %index)
+  call void @block(ptr %job, i64 %index, ptr %scratch)
   %old = atomicrmw add ptr %ended, i64 1 release
   br label %take
 done:
+  call void @free(ptr %scratch)
   call void @end(i64 %mode)
   ret void
 }
@@ -172,7 +176,8 @@ prepare:
   %sizes = load ptr, ptr %sizes.at
   %robots = load i64, ptr %sizes
   %rounded = add i64 %robots, $fill
-  %blocks = udiv i64 %rounded, $robots_per_block
+  %groups = udiv i64 %rounded, $robots_per_block
+  %blocks = mul i64 %groups, $blocks_per_robot
   %end = getelementptr %Job, ptr null, i32 1
   %bytes = ptrtoint ptr %end to i64
   %job = call ptr @malloc(i64 %bytes)

@@ -1,6 +1,6 @@
 ; A block of the CPU's kernels that step. A template of `jetbot_mjx.compiler.ffi_wrapper`.
 ; Takes a block of robots through all steps: rows of a tile are numbers, columns are robots.
-define internal void @block(ptr %job, i64 %index) {
+define internal void @block(ptr %job, i64 %index, ptr %scratch) {
 entry:
   %tile = alloca [$rows x <$lanes x float>], align $alignment
   %robots.at = getelementptr %Job, ptr %job, i32 0, i32 4

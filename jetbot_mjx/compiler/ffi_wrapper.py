@@ -20,7 +20,7 @@ from jetbot_mjx.compiler.llvm_codegen import STEP, map_text, step_text
 VERSION = (0, 3)
 """Version of XLA's foreign function interface."""
 
-SYMBOLS = ("malloc", "free", "sched_yield")
+SYMBOLS = ("malloc", "aligned_alloc", "free", "sched_yield")
 """Functions of the C library that a kernel calls."""
 
 _BLOCKS_PER_THREAD = 4
@@ -59,22 +59,63 @@ def kernel_text(kernel: Kernel, *, lanes: int, name: str, machine: str) -> str:
     """
     sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     if kernel.table is None:
-        block, robots = _step_block(kernel, sizes, lanes), lanes
-        arguments, arrays = len(sizes), len(sizes) + kernel.carried
+        block = _step_block(kernel, sizes, lanes)
+        arguments, results, robots = len(sizes), kernel.carried, lanes
     else:
-        block, robots = _map_block(kernel, sizes, kernel.table.shape[1], lanes), 1
-        arguments, arrays = len(sizes) + 1, len(sizes) + 2
+        block = _map_block(kernel, sizes, kernel.table.shape[1], lanes)
+        arguments, results, robots = len(sizes) + 1, 1, 1
+    return call_text(
+        block,
+        arguments=arguments,
+        results=results,
+        robots_per_block=robots,
+        blocks_per_thread=_BLOCKS_PER_THREAD,
+        name=name,
+        machine=machine,
+    )
+
+
+def call_text(
+    block: str,
+    *,
+    arguments: int,
+    results: int,
+    robots_per_block: int = 1,
+    blocks_per_robot: int = 1,
+    blocks_per_thread: int,
+    scratch: int = 0,
+    name: str,
+    machine: str,
+) -> str:
+    """Write the LLVM module of a function that XLA calls, around one that computes a block.
+
+    Args:
+      block: the text of the function `block`, which takes the address of a job, the index of a
+        block, and the address of its thread's scratch memory, and of what it needs; `address`
+        reads the arrays from a job.
+      arguments: the number of arrays that it reads; the first axis of the first one has the robots.
+      results: the number of arrays that it writes.
+      robots_per_block: the number of robots of a block.
+      blocks_per_robot: the number of blocks of as many robots.
+      blocks_per_thread: the smallest number of blocks for which a thread is worth its start.
+      scratch: bytes of scratch memory, a multiple of 64.
+      name: the name of the function, a C identifier.
+      machine: the processor, one of `MACHINES`.
+    """
+    arrays = arguments + results
     values = {
         "arrays": arrays,
         "block": block,
-        "blocks_per_thread": _BLOCKS_PER_THREAD,
-        "fill": robots - 1,
+        "blocks_per_robot": blocks_per_robot,
+        "blocks_per_thread": blocks_per_thread,
+        "fill": robots_per_block - 1,
         "major": VERSION[0],
         "minor": VERSION[1],
         "name": name,
         "patience": _PATIENCE,
         "pointers": "\n  ".join(_pointer(i, arguments) for i in range(arrays)),
-        "robots_per_block": robots,
+        "robots_per_block": robots_per_block,
+        "scratch": scratch,
     }
     processor = _ASSETS.joinpath(f"xla_call.{machine}.ll").read_text("utf-8")
     return processor + Template(TEXT).substitute(values)
@@ -84,7 +125,7 @@ def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
     """Write the function that takes a block of robots through all steps."""
     carried = kernel.carried
     values = {
-        "addresses": "\n  ".join(_address(i) for i in range(len(sizes) + carried)),
+        "addresses": "\n  ".join(address(i) for i in range(len(sizes) + carried)),
         "alignment": 4 * lanes,
         "lanes": lanes,
         "reads": _copies("%r{i} = mul i64 %robot, {size}", _READ, sizes, lanes),
@@ -105,7 +146,7 @@ def _map_block(kernel: Kernel, sizes: Sequence[int], items: int, lanes: int) -> 
     rows = [*(4 * size for size in sizes), 0, items * len(kernel.program.outputs)]
     values = {
         "addresses": "\n  ".join(
-            f"{_address(i)}\n"
+            f"{address(i)}\n"
             f"  %row{i} = mul i64 %index, {size}\n"
             f"  %p{i} = getelementptr i8, ptr %a{i}, i64 %row{i}"
             for i, size in enumerate(rows)
@@ -121,8 +162,8 @@ def _template(file: str) -> Template:
     return Template(_ASSETS.joinpath(file).read_text("utf-8"))
 
 
-def _address(i: int) -> str:
-    """Return the lines that load the address of array `i` of a job."""
+def address(i: int) -> str:
+    """Return the lines that load the address of array `i` of a job as `%a{i}`."""
     return (
         f"%a{i}.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 {i}\n"
         f"  %a{i} = load ptr, ptr %a{i}.at"

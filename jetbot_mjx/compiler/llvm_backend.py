@@ -25,7 +25,9 @@ IMPL: str = "llvm"
 PLATFORM: str = "cpu"
 NEEDS: str = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
 
-_NAME = "physics"
+NAME = "kernel"
+"""Name of a kernel's function."""
+
 _LEVEL = 2
 """Optimisation level of code generation; the program is already simplified, so no passes run."""
 
@@ -38,14 +40,16 @@ _loaded: dict[str, tuple[Any, bytes]] = {}
 call them until the process ends."""
 
 
-class _Host(NamedTuple):
-    """A `_Host` describes the processor in LLVM's terms."""
+class Host(NamedTuple):
+    """A `Host` describes the processor in LLVM's terms."""
 
     machine: str
     name: str
     features: str
     lanes: int
     """Number of float32 values in a vector register."""
+    registers: int
+    """Number of vector registers."""
     version: str
     """Version of llvmlite and LLVM."""
 
@@ -55,7 +59,7 @@ def is_available() -> bool:
     """Return whether llvmlite is installed and XLA can call a kernel compiled by it on CPUs."""
     try:
         device = jax.local_devices(backend=PLATFORM)[0]
-        host = _host()
+        host = host_processor()
     except (ImportError, OSError, RuntimeError, AttributeError, TypeError):
         # llvmlite is missing or does not know this processor, the C library lacks a function, or
         # JAX_PLATFORMS leaves out the CPU.
@@ -76,28 +80,43 @@ def kernel_text(kernel: Kernel) -> str:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
-    host = _host()
-    return ffi_wrapper.kernel_text(kernel, lanes=host.lanes, name=_NAME, machine=host.machine)
+    host = host_processor()
+    return ffi_wrapper.kernel_text(kernel, lanes=host.lanes, name=NAME, machine=host.machine)
 
 
 def prepare(kernel: Kernel) -> None:
     """Begin to compile a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
-    in_background(lambda: _compiled(kernel))
+    in_background(lambda: registered(kernel.text(IMPL, lambda: kernel_text(kernel))))
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
-    results = kernel.results(leaves[0].shape[0])
-    return list(jax.ffi.ffi_call(_compiled(kernel), results)(*leaves))
+    text = kernel.text(IMPL, lambda: kernel_text(kernel))
+    return launch_text(text, leaves, kernel.results(leaves[0].shape[0]))
 
 
-def _compiled(kernel: Kernel) -> str:
-    """Return the name under which XLA calls a kernel, which is compiled on first use."""
-    return _registered(kernel.text(IMPL, lambda: kernel_text(kernel)))
+def launch_text(
+    text: str, arguments: Sequence[Array], results: Sequence[jax.ShapeDtypeStruct]
+) -> list[Array]:
+    """Call a function, while JAX lowers a program for CPUs.
+
+    Args:
+      text: an LLVM module with the function `NAME`, from `ffi_wrapper`.
+      arguments: the arrays that it reads.
+      results: shapes and dtypes of the arrays that it writes.
+
+    Returns:
+      The results.
+    """
+    return list(jax.ffi.ffi_call(registered(text), list(results))(*arguments))
 
 
-def _registered(text: str) -> str:
-    """Return the name under which XLA calls a kernel; compile and register it on first use."""
+def registered(text: str) -> str:
+    """Return the name under which XLA calls a function; compile and register it on first use.
+
+    Args:
+      text: an LLVM module with the function `NAME`, from `ffi_wrapper`.
+    """
     name = f"jetbot_mjx_{hashlib.sha256(_key(text)).hexdigest()}"
     # Programs are traced in several threads.
     with _lock:
@@ -108,7 +127,7 @@ def _registered(text: str) -> str:
 
 def _register(name: str, code: bytes) -> None:
     engine = _load(code)
-    address = ctypes.c_void_p(engine.get_function_address(_NAME))
+    address = ctypes.c_void_p(engine.get_function_address(NAME))
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
     _loaded[name] = engine, code
 
@@ -139,7 +158,7 @@ def register(kernels: Mapping[str, bytes]) -> None:
 
 def _key(text: str) -> bytes:
     """Return the cache key: everything that a kernel's machine code depends on."""
-    host = _host()
+    host = host_processor()
     return "\n".join([host.version, host.name, host.features, str(_LEVEL), text]).encode()
 
 
@@ -165,7 +184,7 @@ def _load(code: bytes) -> Any:
 
 
 def _target_machine() -> Any:
-    binding, host = _binding(), _host()
+    binding, host = _binding(), host_processor()
     target = binding.Target.from_triple(binding.get_process_triple())
     return target.create_target_machine(
         cpu=host.name, features=host.features, opt=_LEVEL, codemodel="jitdefault", jit=True
@@ -186,16 +205,18 @@ def _binding() -> Any:
 
 
 @functools.cache
-def _host() -> _Host:
+def host_processor() -> Host:
     binding = _binding()
     features = binding.get_host_cpu_features()
     lanes = 16 if features.get("avx512f") else 8 if features.get("avx2") else 4
     machine = binding.get_process_triple().partition("-")[0]
     version = f"{importlib.import_module('llvmlite').__version__} {binding.llvm_version_info}"
-    return _Host(
-        machine="aarch64" if machine == "arm64" else machine,
+    machine = "aarch64" if machine == "arm64" else machine
+    return Host(
+        machine=machine,
         name=binding.get_host_cpu_name(),
         features=features.flatten(),
         lanes=lanes,
+        registers=32 if lanes == 16 or machine == "aarch64" else 16,
         version=version,
     )

@@ -516,6 +516,10 @@ class LlvmEmitter:
         how = "zext" if to == "i" else "uitofp" if source == "b" else "sitofp"
         return f"{how} {self.type(source)} {operands[0]} to {self.type(to)}"
 
+    def _bitcast(self, value: Expr, operands: list[str]) -> str:
+        source, to = value.operands[0].dtype.kind, value.dtype.kind
+        return f"bitcast {self.type(source)} {operands[0]} to {self.type(to)}"
+
     def _comparison(self, value: Expr, operands: list[str]) -> str:
         kind = value.operands[0].dtype.kind
         pair = f"{self.type(kind)} {', '.join(operands)}"
@@ -547,7 +551,7 @@ _FUSED = "contract"
 _EMIT: dict[tuple[str, str], _Emit] = {
     **{(op, "f"): _instruction(f"f{op} {_FUSED}", "f") for op in ("add", "mul", "sub")},
     **{(op, "i"): _instruction(op, "i") for op in ("add", "mul", "sub")},
-    **{(op, "b"): _instruction(op, "b") for op in ("and", "or", "xor")},
+    **{(op, kind): _instruction(op, kind) for op in ("and", "or", "xor") for kind in "ib"},
     **{(op, kind): LlvmEmitter._comparison for op in COMPARISONS for kind in "fi"},
     **{(op, "b"): LlvmEmitter._comparison for op in ("eq", "ne")},
     **{(op, "f"): LlvmEmitter._call for op in _INTRINSICS},
@@ -555,11 +559,14 @@ _EMIT: dict[tuple[str, str], _Emit] = {
     **{(op, "i"): LlvmEmitter._larger for op in ("max", "min")},
     **{("select", kind): LlvmEmitter._select for kind in "fi"},
     **{("convert", kind): LlvmEmitter._convert for kind in "fib"},
+    **{("bitcast", kind): LlvmEmitter._bitcast for kind in "fi"},
     ("abs", "i"): LlvmEmitter._magnitude,
     ("div", "f"): LlvmEmitter._quotient,
     ("is_finite", "f"): LlvmEmitter._finite,
     ("neg", "f"): _instruction("fneg", "f"),
     ("neg", "i"): LlvmEmitter._negative,
     ("not", "b"): LlvmEmitter._negation,
+    ("shift_left", "i"): _instruction("shl", "i"),
+    ("shift_right_logical", "i"): _instruction("lshr", "i"),
 }
 """Functions that return an operation's last instruction, by operation and kind of the operands."""

@@ -441,6 +441,11 @@ class _JaxprLowering:
             result = self._elementwise("mul", result, x)
         return result if equation.params["y"] >= 0 else self._elementwise("div", one, result)
 
+    def _logistic(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        one = constant_array(np.float32(1))
+        exp = self._elementwise("exp", self._elementwise("neg", x))
+        return self._elementwise("div", one, self._elementwise("add", one, exp))
+
     def _rsqrt(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 

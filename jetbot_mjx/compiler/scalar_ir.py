@@ -97,21 +97,28 @@ def convert_constant(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return x.astype(dtype)
 
 
+def _bitcast(x: Any) -> Any:
+    return x.view(_INT if x.dtype == _FLOAT else _FLOAT)
+
+
 EVALUATE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
     "atan2": np.arctan2,
+    "bitcast": _bitcast,
     "cos": np.cos,
     "div": _divide,
     "eq": np.equal,
     "exp": np.exp,
+    "expm1": np.expm1,
     "floor": np.floor,
     "ge": np.greater_equal,
     "gt": np.greater,
     "is_finite": np.isfinite,
     "le": np.less_equal,
     "log": np.log,
+    "log1p": np.log1p,
     "lt": np.less,
     "max": np.maximum,
     "min": np.minimum,
@@ -122,6 +129,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "or": np.bitwise_or,
     "pow": np.power,
     "rem": np.fmod,
+    "shift_left": np.left_shift,
+    "shift_right_logical": lambda x, by: (x.view(np.uint32) >> by.view(np.uint32)).view(x.dtype),
     "sign": np.sign,
     "sin": np.sin,
     "sqrt": np.sqrt,
@@ -129,7 +138,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "tanh": np.tanh,
     "xor": np.bitwise_xor,
 }
-"""The NumPy function of every operation except `select` and `convert`."""
+"""The NumPy function of every operation except `select` and `convert`; `bitcast` takes the bits of a
+float32 as an int32 or the other way round."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""
@@ -177,6 +187,8 @@ class ExprGraph:
             if simplified is not None:
                 return simplified
         dtype = _BOOL if op in COMPARISONS or op == "is_finite" else operand_dtype
+        if op == "bitcast":
+            dtype = _INT if dtype == _FLOAT else _FLOAT
         return self._record(op, operands, dtype)
 
     def select(self, condition: Scalar, on_false: Scalar, on_true: Scalar) -> Scalar:
@@ -346,18 +358,26 @@ _FINE = np.float64((np.float32(np.pi / 2 - _COARSE).view(np.uint32) & 0xFFFFE000
 _QUARTER_TURN = [np.float32(part) for part in (_COARSE, _FINE, np.pi / 2 - _COARSE - _FINE)]
 
 
-def _polynomial(function: Callable[[np.ndarray], np.ndarray], degree: int) -> list[np.float32]:
-    """Return polynomial coefficients of a function in s = r², lowest first, for |r| up to π/4."""
-    end = (np.pi / 4) ** 2
-    fit = np.polynomial.Chebyshev.interpolate(
-        lambda s: function(np.sqrt(s)), degree, domain=[0.0, end]
-    )
+def _polynomial(
+    function: Callable[[np.ndarray], np.ndarray], degree: int, low: float, high: float
+) -> list[np.float32]:
+    """Return polynomial coefficients of a function, lowest first, for numbers in an interval."""
+    fit = np.polynomial.Chebyshev.interpolate(function, degree, domain=[low, high])
     power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1], window=[-1, 1])
     return [np.float32(c) for c in power.coef]
 
 
-_SINE = _polynomial(lambda r: np.sinc(r / np.pi), 4)  # sin(r)/r
-_COSINE = _polynomial(np.cos, 5)
+def _horner(graph: ExprGraph, coefficients: Sequence[np.float32], x: Scalar) -> Scalar:
+    """Return the value of a polynomial."""
+    total: Scalar = coefficients[-1]
+    for coefficient in reversed(coefficients[:-1]):
+        total = graph.apply("add", graph.apply("mul", total, x), coefficient)
+    return total
+
+
+# The polynomials of sine and cosine are in s = r², for |r| up to π/4.
+_SINE = _polynomial(lambda s: np.sinc(np.sqrt(s) / np.pi), 4, 0.0, (np.pi / 4) ** 2)  # sin(r)/r
+_COSINE = _polynomial(lambda s: np.cos(np.sqrt(s)), 5, 0.0, (np.pi / 4) ** 2)
 
 
 def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
@@ -370,33 +390,121 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
         r = do("sub", r, do("mul", turns, part))
     s = do("mul", r, r)
 
-    def horner(coefficients: list[np.float32]) -> Scalar:
-        total: Scalar = coefficients[-1]
-        for coefficient in reversed(coefficients[:-1]):
-            total = do("add", do("mul", total, s), coefficient)
-        return total
-
     def modulo(count: Scalar, of: float) -> Scalar:
         whole = do("floor", do("mul", count, np.float32(1 / of)))
         return do("sub", count, do("mul", whole, np.float32(of)))
 
     # Evaluate both polynomials, and select value and sign by the quadrant.
-    sine, cosine = do("mul", r, horner(_SINE)), horner(_COSINE)
+    sine, cosine = do("mul", r, _horner(graph, _SINE, s)), _horner(graph, _COSINE, s)
     quarter = modulo(do("add", turns, np.float32(ahead)), 4.0)
     odd = do("ge", modulo(quarter, 2.0), np.float32(1))
     value = graph.select(odd, sine, cosine)
     return graph.select(do("ge", quarter, np.float32(2)), value, do("neg", value))
 
 
+_LN2 = float(np.log(2.0))
+# ln 2 as a sum of two parts, of which the products of the first with an exponent are exact.
+_LN2_COARSE = np.float32(round(_LN2 * 2**14) / 2**14)
+_LN2_FINE = np.float32(_LN2 - float(_LN2_COARSE))
+_EXP = _polynomial(np.exp, 6, -_LN2 / 2, _LN2 / 2)
+_ROOT = float(np.sqrt(2.0))
+_LOG_END = ((_ROOT - 1.0) / (_ROOT + 1.0)) ** 2
+# atanh(t)/t in s = t², and tanh(x)/x in s = x².
+_ARTANH = _polynomial(
+    lambda s: np.arctanh(np.sqrt(s)) / np.sqrt(s), 3, 1e-12 * _LOG_END, _LOG_END
+)
+# expm1(x)/x
+_EXPM1_END = 0.5
+_EXPM1 = _polynomial(lambda x: np.expm1(x) / x, 7, -_EXPM1_END, _EXPM1_END + 1e-9)
+_TANH_END = 0.6
+_TANH = _polynomial(lambda s: np.tanh(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _TANH_END**2)
+
+
+def _simplify_exp(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    """Expand exp(x) to basic arithmetic; where the result is subnormal, it is 0."""
+    # exp(x) = 2^n exp(r) with |r| at most ln(2)/2. In the sum with 1.5 * 2^23, the last bits are n.
+    do = graph.apply
+    rounding = np.float32(1.5 * 2**23)
+    rounded = do("add", do("mul", x, np.float32(1 / _LN2)), rounding)
+    n = do("sub", rounded, rounding)
+    r = do("sub", do("sub", x, do("mul", n, _LN2_COARSE)), do("mul", n, _LN2_FINE))
+    # Add n to the exponent.
+    shifted = do("shift_left", do("bitcast", rounded), np.int32(23))
+    result = do("bitcast", do("add", do("bitcast", _horner(graph, _EXP, r)), shifted))
+    result = graph.select(do("lt", x, np.float32(-87.336)), result, np.float32(0))
+    # Infinity where the result is too large, and NaN of NaN.
+    beyond = do("mul", x, np.float32(np.inf))
+    return graph.select(do("lt", x, np.float32(88.7228)), beyond, result)
+
+
+def _simplify_expm1(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    """Expand exp(x) - 1 to basic arithmetic."""
+    do = graph.apply
+    near = do("mul", x, _horner(graph, _EXPM1, x))
+    far = do("sub", do("exp", x), np.float32(1))
+    return graph.select(do("lt", do("abs", x), np.float32(_EXPM1_END)), far, near)
+
+
+def _simplify_log(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    """Expand log(x) to basic arithmetic; subnormal numbers are taken for 0."""
+    # x = 2^n m with m from √½ to √2, and log(m) = 2 artanh((m - 1) / (m + 1)).
+    do = graph.apply
+    bits = do("bitcast", x)
+    n = graph.convert(do("shift_right_logical", bits, np.int32(23)), _FLOAT)
+    n = do("sub", n, np.float32(127))
+    m = do("bitcast", do("or", do("and", bits, np.int32((1 << 23) - 1)), np.int32(127 << 23)))
+    is_high = do("gt", m, np.float32(_ROOT))
+    m = graph.select(is_high, m, do("mul", m, np.float32(0.5)))
+    n = graph.select(is_high, n, do("add", n, np.float32(1)))
+    series = _log_near_one(graph, do("sub", m, np.float32(1)))
+    result = do("add", do("mul", n, _LN2_COARSE), do("add", do("mul", n, _LN2_FINE), series))
+    smallest = np.finfo(np.float32).tiny
+    result = graph.select(do("lt", x, smallest), result, np.float32(-np.inf))
+    result = graph.select(do("lt", x, np.float32(0)), result, np.float32(np.nan))
+    # Infinity and NaN are their own logarithms.
+    return graph.select(do("lt", x, np.float32(np.inf)), x, result)
+
+
+def _log_near_one(graph: ExprGraph, x: Scalar) -> Scalar:
+    """Expand log(1 + x) to basic arithmetic, for 1 + x from √½ to √2."""
+    do = graph.apply
+    t = do("div", x, do("add", x, np.float32(2)))
+    return do("mul", do("add", t, t), _horner(graph, _ARTANH, do("mul", t, t)))
+
+
+def _simplify_log1p(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    """Expand log(1 + x) to basic arithmetic."""
+    do = graph.apply
+    far = do("log", do("add", x, np.float32(1)))
+    is_near = do("lt", do("abs", do("sub", x, np.float32(0.06))), np.float32(0.35))
+    return graph.select(is_near, far, _log_near_one(graph, x))
+
+
+def _simplify_tanh(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    """Expand tanh(x) to basic arithmetic."""
+    do = graph.apply
+    near = do("mul", x, _horner(graph, _TANH, do("mul", x, x)))
+    size = do("abs", x)
+    grown = do("add", do("exp", do("add", size, size)), np.float32(1))
+    far = do("sub", np.float32(1), do("div", np.float32(2), grown))
+    far = graph.select(do("lt", x, np.float32(0)), far, do("neg", far))
+    return graph.select(do("lt", size, np.float32(_TANH_END)), far, near)
+
+
 _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
     **{op: functools.partial(_simplify_commutative, op=op) for op in _COMMUTATIVE},
     "cos": functools.partial(_simplify_sine, ahead=1),
     "div": _simplify_div,
+    "exp": _simplify_exp,
+    "expm1": _simplify_expm1,
+    "log": _simplify_log,
+    "log1p": _simplify_log1p,
     "neg": _simplify_inverse("neg"),
     "not": _simplify_inverse("not"),
     "pow": _simplify_pow,
     "sign": _simplify_sign,
     "sin": _simplify_sine,
     "sub": _simplify_sub,
+    "tanh": _simplify_tanh,
 }
 """Functions that return an equal but simpler scalar; None: there is none."""

@@ -1,0 +1,184 @@
+"""Launch the kernels of PPO's update on NVIDIA GPUs.
+
+All policies of a batch are updated by the same launches: the policies are the third axis of the
+grid, and each gets its share of the GPU's multiprocessors. The blocks of a policy write a vector
+each, which XLA adds up in a fixed order.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.compiler.background import in_background
+from jetbot_mjx.compiler.kernel import Backend
+from jetbot_mjx.compiler.update import advantages, shapes
+from jetbot_mjx.compiler.update import gradient as gradient_kernel
+from jetbot_mjx.compiler.update.shapes import (
+    MOST_OBSERVATIONS,
+    MOST_OUTPUTS,
+    MOST_SUMS,
+    MOST_WIDTH,
+    LossTerms,
+    Minibatch,
+    Tiling,
+    UpdateShape,
+)
+
+BACKEND: Backend = ptx_backend
+"""The back end that compiles the kernels."""
+
+_LEAST_CAPABILITY = 80
+"""Ten times the compute capability of the first GPUs with products of float16."""
+
+PTX_VERSION = 81
+"""Ten times the first version of PTX whose conversions to float16 saturate."""
+
+_SHARED_MEMORY = {
+    80: 166_912,
+    86: 101_376,
+    87: 166_912,
+    89: 101_376,
+    90: 232_448,
+    110: 232_448,
+    120: 101_376,
+}
+"""Bytes of shared memory that a block may have, by the least compute capability."""
+
+
+def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
+    """Return why the GPUs of this process cannot run the kernels, or None.
+
+    Args:
+      shape: the networks.
+      batch: the minibatch.
+    """
+    outputs = max(shape.outputs)
+    if shape.observations > MOST_OBSERVATIONS:
+        return f"it takes at most {MOST_OBSERVATIONS} numbers, not {shape.observations}"
+    if outputs > MOST_OUTPUTS:
+        return f"it takes at most {MOST_OUTPUTS} outputs, not {outputs}"
+    if shape.width % 16 or shape.width > MOST_WIDTH:
+        return f"it takes layers of 16, 32, ... {MOST_WIDTH} units, not {shape.width}"
+    if shape.sums > MOST_SUMS:
+        return "the gradient of these networks does not fit in the registers of a block"
+    try:
+        capability = ptx_backend.compute_capability()
+    except RuntimeError:
+        return "there is no NVIDIA GPU"
+    if capability < _LEAST_CAPABILITY:
+        return f"it needs compute capability 8.0, and this GPU has {capability / 10:.1f}"
+    memory = _shared_memory()
+    if shapes.gradient_tiling(shape, memory) is None:
+        return f"the networks do not fit in the {memory // 1024} KiB of shared memory of this GPU"
+    if shapes.advantage_tiling(shape, batch, 1, memory) is None:
+        return f"unrolls of {batch.time} steps do not fit in the {memory // 1024} KiB of this GPU"
+    return None
+
+
+class _Kernel(NamedTuple):
+    """A `_Kernel` is one of the two kernels, ready to launch."""
+
+    name: str
+    text: Future[str]
+    """Its PTX."""
+    grid: tuple[int, int, int]
+    threads: int
+    shared_memory: int
+    """Dynamic shared memory of a block [bytes]."""
+
+    def launch(
+        self, arguments: Sequence[Array], *results: tuple[int, ...]
+    ) -> list[Float[Array, "..."]]:
+        """Run the kernel, and return float32 arrays of the given shapes."""
+        like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in results]
+        return ptx_backend.launch_ptx(
+            self.name,
+            self.text.result(),
+            arguments,
+            like,
+            self.grid,
+            self.threads,
+            self.shared_memory,
+        )
+
+
+@functools.cache
+def prepare(
+    shape: UpdateShape, terms: LossTerms, size: Minibatch, policies: int
+) -> tuple[_Kernel, _Kernel]:
+    """Divide the work among the blocks, and begin to compile both kernels to PTX.
+
+    Args:
+      shape: the networks.
+      terms: the constants of the loss.
+      size: the minibatch.
+      policies: the number of policies that share the GPU.
+
+    Returns:
+      The kernels of the advantages and of the gradient.
+    """
+
+    def kernel(name: str, write: Callable[[], str], tiling: Tiling, x: int, y: int) -> _Kernel:
+        architecture = ptx_backend.target_architecture()
+
+        def compiled() -> str:
+            text = ptx_backend.assembled(write(), architecture, PTX_VERSION)
+            ptx_backend.assemble_ahead(text)
+            return text
+
+        return _Kernel(
+            name, in_background(compiled), (x, y, policies), tiling.threads, tiling.layout["size"]
+        )
+
+    # Share the multiprocessors among all policies.
+    most = max(1, ptx_backend.processor_count() // policies)
+    tiling = shapes.advantage_tiling(shape, size, most, _shared_memory())
+    assert tiling is not None
+    parts = min(most, advantages.tile_count(tiling, size))
+    write = functools.partial(advantages.advantages_text, tiling, size, terms)
+    first = kernel(advantages.NAME, write, tiling, parts, 1)
+    # Half of the blocks compute the policy's gradient, and half the values'.
+    tiling = shapes.gradient_tiling(shape, _shared_memory())
+    assert tiling is not None
+    blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
+    write = functools.partial(gradient_kernel.gradient_text, tiling, size, terms, parts)
+    return first, kernel(gradient_kernel.NAME, write, tiling, blocks, 2)
+
+
+def launch(
+    shape: UpdateShape, terms: LossTerms, arguments: Sequence[Array]
+) -> Float[Array, "policies size"]:
+    """Run both kernels, while JAX lowers a program for an NVIDIA GPU.
+
+    Args:
+      shape: the networks.
+      terms: the constants of the loss.
+      arguments: those of `launch.gradient`, with the policies as their first axis.
+
+    Returns:
+      The gradients, with the sums of the metrics at their places.
+    """
+    params, mean, scale, rows, last, unrolls, noise = arguments
+    policies = params.shape[0]
+    size = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
+    first, second = prepare(shape, terms, size, policies)
+    parts, blocks = first.grid[0], second.grid[0]
+    samples = policies, size.samples
+    estimates = first.launch(
+        [params, mean, scale, rows, last, unrolls], samples, samples, (policies, parts, 2)
+    )
+    (vectors,) = second.launch(
+        [params, mean, scale, rows, unrolls, noise, *estimates], (policies, blocks, shape.size)
+    )
+    return vectors.sum(1)
+
+
+def _shared_memory() -> int:
+    capability = ptx_backend.compute_capability()
+    return _SHARED_MEMORY[max(x for x in _SHARED_MEMORY if x <= capability)]
