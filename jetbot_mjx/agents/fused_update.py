@@ -141,37 +141,38 @@ class FusedUpdate:
         launch.prepare(self._shape, self._terms, self.batch, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
-        """Return a tree with a vector in place of every `PPONetworkParams`."""
+        """Return a tree with a vector in place of every `PPONetworkParams`, on host or device."""
 
         def vector(node: Any) -> Any:
             if not isinstance(node, NetworkParams):
                 return node
+            library: Any = np if isinstance(jax.tree.leaves(node)[0], np.ndarray) else jnp
             parts, end = [], 0
             for place in self._places:
                 leaf = getattr(node, place.network)
                 for key in place.path:
                     leaf = leaf[key]
-                parts += [jnp.zeros(place.start - end), leaf.reshape(-1)]
+                parts += [np.zeros(place.start - end, np.float32), leaf.reshape(-1)]
                 end = place.stop
-            return jnp.concatenate([*parts, jnp.zeros(self._shape.size - end)])
+            return library.concatenate([*parts, np.zeros(self._shape.size - end, np.float32)])
 
         return jax.tree.map(vector, tree, is_leaf=lambda x: isinstance(x, NetworkParams))
 
-    def unpack(self, tree: PyTree, like: PyTree) -> PyTree:
-        """Return a tree with `PPONetworkParams` in place of vectors, as in another tree."""
+    def unpack(self, tree: PyTree) -> PyTree:
+        """Return a tree with `PPONetworkParams` in place of every vector of that length."""
+        return jax.tree.map(
+            lambda x: self.network_params(x) if x.shape == (self._shape.size,) else x, tree
+        )
 
-        def params(node: Any, vector: Any) -> Any:
-            if not isinstance(node, NetworkParams):
-                return vector
-            networks: dict[str, Any] = {"policy": {}, "value": {}}
-            for place in self._places:
-                inner = networks[place.network]
-                for key in place.path[:-1]:
-                    inner = inner.setdefault(key, {})
-                inner[place.path[-1]] = vector[place.start : place.stop].reshape(place.shape)
-            return NetworkParams(**networks)
-
-        return jax.tree.map(params, like, tree, is_leaf=lambda x: isinstance(x, NetworkParams))
+    def network_params(self, vector: Float[Array, " size"]) -> Any:
+        """Return the `PPONetworkParams` that a vector holds."""
+        networks: dict[str, Any] = {"policy": {}, "value": {}}
+        for place in self._places:
+            inner = networks[place.network]
+            for key in place.path[:-1]:
+                inner = inner.setdefault(key, {})
+            inner[place.path[-1]] = vector[place.start : place.stop].reshape(place.shape)
+        return NetworkParams(**networks)
 
     def collected(self, data: Transition, normalizer: Any) -> Collected:
         """Return the collected data as the kernels read it.

@@ -24,7 +24,7 @@ Protocol of a training step:
 3. `update` makes `num_updates_per_batch` passes over the unrolls. Each pass shuffles them, splits
    them into `num_minibatches` and applies one step of Adam to each minibatch.
 
-Networks, action distribution, loss, running statistics, unrolls, gradients and the ADAPTIVE_KL rule
+Networks, action distribution, loss, running statistics, steps, gradients and the ADAPTIVE_KL rule
 are Brax's, and so is the order of the random keys. On one device and with `normalizer: brax` and
 `update: xla`, every step equals a step of `brax.training.agents.ppo.train`. The deviations from
 Brax are:
@@ -45,13 +45,15 @@ Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.
 google/brax v0.14.2, brax/training/agents/ppo.
 """
 
+import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
+import numpy as np
 import optax
 from brax.envs import Env
 from brax.training import acting
@@ -72,6 +74,9 @@ from jetbot_mjx.errors import UserError
 # Pyright does not follow flax's dataclasses.
 _NetworkParams: Any = losses.PPONetworkParams
 _UInt64: Any = UInt64
+
+_EXTRA_FIELDS = ("truncation", "episode_metrics", "episode_done")
+"""Fields of the state's `info` that are collected."""
 
 LOSSES = {
     "total_loss": "loss/total",
@@ -112,8 +117,14 @@ class TrainState(struct.PyTreeNode):
     """Random key of the next training step."""
     env_steps: UInt64
     """Number of environment steps so far, over all devices."""
-    tally: dict[str, Any]
-    """Sums of the metrics over the last `tally["training_steps"]` training steps."""
+    tally: Any
+    """Sums of the metrics of `TALLIED` over the last `training_steps`, in one vector: XLA computes
+    each array that a loop carries by a kernel of its own."""
+
+    @property
+    def sums(self) -> dict[str, Any]:
+        """Return the sums of the metrics by name."""
+        return dict(zip(TALLIED, self.tally, strict=True))
 
     @property
     def policy_params(self) -> PolicyParams:
@@ -127,7 +138,7 @@ class NanDump(struct.PyTreeNode):
     found: Any
     """Whether there is a non-finite state; otherwise the other fields have no meaning."""
     env_state: Any
-    """The state of one environment at the start of the unroll."""
+    """The state of one environment at the start of the unroll, as from `pack_rows` on devices."""
     actions: Any
     """The actions of the unroll, shape (time, action)."""
     step: Any
@@ -187,11 +198,14 @@ class PPO:
         self.notice: str | None = None
         """One line that says why the kernels of the update do not run, or None."""
         self._fused: fused_update.FusedUpdate | None = None
+        # The layout of states between calls stays, even if XLA takes over the update.
+        self._layout: fused_update.FusedUpdate | None = None
         if config.update != "xla":
             sizes = self._env.observation_size, self._env.action_size
             found = fused_update.choose(config, *sizes, device_count, axis_name)
             if isinstance(found, fused_update.FusedUpdate):
                 self._fused = found
+                self._layout = found
             else:
                 self._refuse_fused(found)
 
@@ -269,7 +283,7 @@ class PPO:
             env_state=self._env.reset(jax.random.split(env_key, self.config.num_envs)),
             key=jax.random.split(epoch_key, 1)[0],
             env_steps=_UInt64(hi=0, lo=0),
-            tally=dict.fromkeys(TALLIED, jnp.zeros(())),
+            tally=jnp.zeros(len(TALLIED)),
         )
         # Remove weak types, which Python numbers have and for which the step would compile again.
         return jax.tree.map(lambda x: jnp.asarray(x).astype(jnp.asarray(x).dtype), state)
@@ -280,43 +294,68 @@ class PPO:
         """Run several training steps; one program serves any number of them.
 
         Args:
-          state: the training state of this shard.
+          state: the training state of this shard, from `packed`.
           num_steps: the number of training steps.
           restart: whether to reset the tally before the first step.
 
         Returns:
-          The state after the last step, and the first `NanDump` of these steps on this shard.
+          The packed state after the last step, and the first `NanDump` of these steps on this shard.
         """
-        tally = jax.tree.map(lambda x: jnp.where(restart, 0.0, x), state.tally)
+        tally = jnp.where(restart, 0.0, state.tally)
+        if not self._fused:
+            state = self.unpacked(state)
 
         def body(_: Array, carry: tuple[TrainState, NanDump]) -> tuple[TrainState, NanDump]:
             before, nan_dump = carry
             state, metrics, found = self.train_step(before)
-            metrics["training_steps"] = jnp.ones(())
-            tally = {name: total + metrics[name] for name, total in before.tally.items()}
             nan_dump = jax.tree.map(
                 lambda one, other: jnp.where(nan_dump.found, one, other), nan_dump, found
             )
-            return state.replace(tally=tally), nan_dump
+            return state.replace(tally=before.tally + metrics), nan_dump
 
         none = NanDump(
             found=jnp.zeros((), bool),
-            env_state=jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.env_state),
+            env_state=jax.tree.map(
+                lambda x: jnp.zeros(x.shape[1:], x.dtype),
+                jax.eval_shape(pack_rows, state.env_state),
+            ),
             actions=jnp.zeros((self.config.unroll_length, self._env.action_size)),
             step=jnp.zeros((), jnp.int32),
         )
-        return jax.lax.fori_loop(0, num_steps, body, (state.replace(tally=tally), none))
+        state, nan_dump = jax.lax.fori_loop(
+            0, num_steps, body, (state.replace(tally=tally), none)
+        )
+        return (state if self._fused else self.packed(state)), nan_dump
+
+    def packed(self, state: TrainState) -> TrainState:
+        """Return a state with vectors for parameters and moments if the update may be fused.
+
+        Args:
+          state: the state, from `init` or on the host.
+        """
+        if self._layout is None:
+            return state
+        params, optimizer_state = self._layout.pack((state.params, state.optimizer_state))
+        return state.replace(params=params, optimizer_state=optimizer_state)
+
+    def unpacked(self, state: TrainState) -> TrainState:
+        """Return a state without vectors, the inverse of `packed`."""
+        if self._layout is None:
+            return state
+        params, optimizer_state = self._layout.unpack((state.params, state.optimizer_state))
+        return state.replace(params=params, optimizer_state=optimizer_state)
 
     def train_step(
         self, state: TrainState
-    ) -> tuple[TrainState, dict[str, Float[Array, ""]], NanDump]:
+    ) -> tuple[TrainState, Float[Array, " metrics"], NanDump]:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
-          state: the training state of this shard.
+          state: the training state of this shard, whose parameters and moments are vectors if the
+            update is fused.
 
         Returns:
-          The next state; the metrics of the step, which are means over the minibatches and sums
+          The next state; the metrics of `TALLIED`, which are means over the minibatches and sums
           over the episodes that ended during collection; and the first non-finite state.
         """
         # Each device draws its own keys, and all devices continue from the same one.
@@ -345,7 +384,7 @@ class PPO:
             key=next_key,
             env_steps=state.env_steps + self.config.steps_per_training_step,
         )
-        return state, {**metrics, **self._episode_sums(data)}, nan_dump
+        return state, jnp.concatenate([jnp.ones(1), metrics, self._episode_sums(data)]), nan_dump
 
     def _with_floor(
         self, normalizer: running_statistics.RunningStatisticsState
@@ -374,22 +413,33 @@ class PPO:
           The environment states after the last unroll; the unrolls, of shape (unrolls, time, ...),
           with `next_observation` of their last step only; and the first non-finite state.
         """
+        if self._fused:
+            state = state.replace(params=self._fused.network_params(state.params))
         policy = self._make_policy(tuple(state.policy_params))
+
+        shapes: Any = None
+
+        def step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], PyTree]:
+            nonlocal shapes
+            env_state, key = carry
+            key, next_key = jax.random.split(key)
+            after, transition = acting.actor_step(self._env, env_state, policy, key, _EXTRA_FIELDS)
+            # The loss needs the next observation only at the end of an unroll, where it is in the
+            # state: the others, possibly images, are not even stored.
+            transition = transition._replace(next_observation=None)
+            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), transition)
+            return (after, next_key), pack_rows(transition)
 
         def unroll(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], PyTree]:
             env_state, key = carry
             key, next_key = jax.random.split(key)
-            after, data = acting.generate_unroll(
-                self._env,
-                env_state,
-                policy,
-                key,
-                self.config.unroll_length,
-                extra_fields=("truncation", "episode_metrics", "episode_done"),
+            # Copied into one array, because the steps overwrite the state.
+            start = pack_rows(env_state)
+            (after, _), rows = jax.lax.scan(
+                step, (env_state, key), length=self.config.unroll_length
             )
-            nan_dump = _find_nan_dump(env_state, data)
-            # The loss needs the next observation only at the end of an unroll, where it is in the
-            # state: the others, possibly images, are not even stored.
+            data: Transition = unpack_rows(rows, shapes)
+            nan_dump = _find_nan_dump(start, data)
             data = data._replace(next_observation=jax.tree.map(lambda x: x[None], after.obs))
             return (after, next_key), (data, nan_dump)
 
@@ -411,22 +461,22 @@ class PPO:
         normalizer: running_statistics.RunningStatisticsState,
         data: Transition,
         key: UInt32[Array, "2"],
-    ) -> tuple[PyTree, PyTree, dict[str, Float[Array, ""]]]:
+    ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
         """Update the networks in several passes over the collected data, in minibatches.
 
         Each minibatch applies one step of Adam along the gradient of the loss L that the module
         states, clipped to the global norm `max_grad_norm`.
 
         Args:
-          params: the parameters of the networks.
-          optimizer_state: the state of the optimizer from `make_optimizer`.
+          params: the parameters of the networks; a vector if the update is fused.
+          optimizer_state: the state of the optimizer from `make_optimizer`, with vectors likewise.
           normalizer: the statistics that normalise the observations.
           data: the unrolls, shape (unrolls, time, ...); `next_observation` may hold only the last.
           key: the random key of the shuffles and of the samples that estimate the entropy.
 
         Returns:
-          The new parameters, the new optimizer state, and the mean metrics of the minibatches whose
-          gradient was finite.
+          The new parameters, the new optimizer state, and the mean metrics of `LOSSES` over the
+          minibatches whose gradient was finite, followed by the number of the others.
         """
         # Drop the episode statistics, which need not be shuffled.
         extras = {
@@ -434,13 +484,11 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
-        unpacked, fused = (params, optimizer_state), self._fused
-        if fused:
-            params, optimizer_state = fused.pack(unpacked)
-            collected = fused.collected(data, normalizer)
+        fused = self._fused
+        collected = fused.collected(data, normalizer) if fused else None
 
         def loss_and_gradient(params: PyTree, batch: Any, key: Array) -> Any:
-            if fused:
+            if fused and collected:
                 return fused.loss_and_gradient(params, collected, batch, key)
             return self._loss_and_gradient(params, normalizer, batch, key)
 
@@ -462,8 +510,6 @@ class PPO:
         (params, optimizer_state), metrics = jax.lax.scan(
             one_pass, (params, optimizer_state), self._draw_passes(key, data.reward.shape[0])
         )
-        if fused:
-            params, optimizer_state = fused.unpack((params, optimizer_state), unpacked)
         return params, optimizer_state, self._mean_metrics(metrics)
 
     def _draw_passes(self, key: Array, unrolls: int) -> tuple[Array, Array]:
@@ -482,17 +528,15 @@ class PPO:
 
     def _mean_metrics(
         self, metrics: Float[Array, "passes minibatches metrics"]
-    ) -> dict[str, Float[Array, ""]]:
-        """Average the metrics over the applied updates of all devices."""
+    ) -> Float[Array, " metrics"]:
+        """Average the metrics over the applied updates of all devices, and count the others."""
         if self._axis is not None:
             metrics = jax.lax.pmean(metrics, self._axis)
-        *columns, applied = jnp.moveaxis(metrics, -1, 0)
-        count = jnp.maximum(applied.sum(), 1.0)
-        means = {
-            name: jnp.where(applied > 0, values, 0.0).sum() / count
-            for name, values in zip(LOSSES.values(), columns, strict=True)
-        }
-        return {**means, "nonfinite_updates": (1.0 - applied).sum()}
+        applied = metrics[..., -1:]
+        # A metric of an update that was not applied may be NaN.
+        totals = jnp.where(applied > 0, metrics, 0.0).sum(axis=(0, 1))
+        means = totals[:-1] / jnp.maximum(totals[-1], 1.0)
+        return jnp.append(means, metrics.shape[0] * metrics.shape[1] - totals[-1])
 
     def _minibatch_step(
         self,
@@ -561,24 +605,22 @@ class PPO:
                 vf_coefficient=self.config.vf_loss_coefficient,
             )
 
-    def _episode_sums(self, data: Transition) -> dict[str, Float[Array, ""]]:
+    def _episode_sums(self, data: Transition) -> Float[Array, " sums"]:
         """Sum the metrics of the episodes that ended during collection over all devices."""
         ended = data.extras["state_extras"]["episode_done"]
         statistics: Any = data.extras["state_extras"]["episode_metrics"]
-        sums = {
-            name: (ended * statistics.get(brax_name, jnp.zeros(()))).sum()
-            for brax_name, name in _EPISODE_SUMS.items()
-        }
-        sums["rollout/episodes"] = ended.sum()
+        terms = [ended]
+        terms += [ended * statistics.get(name, jnp.zeros(())) for name in _EPISODE_SUMS]
+        sums = jnp.stack(terms).sum(axis=(1, 2))
         return sums if self._axis is None else jax.lax.psum(sums, self._axis)
 
 
 TALLIED = (
     "training_steps",
+    *LOSSES.values(),
     "nonfinite_updates",
     "rollout/episodes",
     *_EPISODE_SUMS.values(),
-    *LOSSES.values(),
 )
 """Names of the metrics in `TrainState.tally`."""
 
@@ -618,6 +660,40 @@ def _encoded(
         observation=jax.tree.map(lambda x: x[:, :-1], encoded),
         next_observation=jax.tree.map(lambda x: x[:, -1:], encoded),
     )
+
+
+def pack_rows(tree: PyTree) -> tuple[Float[Array, "n columns"], list[Array]]:
+    """Return the bits of a batch of arrays in one; arrays without 32 bits by themselves.
+
+    A loop stores and carries one array with one kernel, and each further one with another.
+    """
+
+    def floats(x: Array) -> Array:
+        return x.view(jnp.float32).reshape(x.shape[0], -1)
+
+    leaves = jax.tree.leaves(tree)
+    others = [x for x in leaves if x.dtype.itemsize != 4]
+    return jnp.concatenate([floats(x) for x in leaves if x.dtype.itemsize == 4], axis=1), others
+
+
+def unpack_rows(rows: tuple[Any, Sequence[Any]], shapes: PyTree) -> PyTree:
+    """Return the arrays of `pack_rows`, of rows with any axes in front, on host or device.
+
+    Args:
+      rows: one array with the bits, and a list of the arrays without 32 bits.
+      shapes: shapes and dtypes of a row of each array.
+    """
+    bits, others = rows[0], iter(rows[1])
+    leaves, start = [], 0
+    for leaf in jax.tree.leaves(shapes):
+        if leaf.dtype.itemsize != 4:
+            leaves.append(next(others))
+            continue
+        end = start + math.prod(leaf.shape)
+        columns = bits[..., start:end].reshape(*bits.shape[:-1], *leaf.shape)
+        leaves.append(columns.view(leaf.dtype))
+        start = end
+    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
 
 
 def _find_nan_dump(start: PyTree, data: Transition) -> NanDump:

@@ -415,6 +415,12 @@ class _JaxprLowering:
         dtype = np.dtype(equation.params["new_dtype"])
         return scalar_array((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
+    def _bitcast_convert_type(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        dtypes = {np.dtype(equation.params["new_dtype"]), np.dtype(equation.invars[0].aval.dtype)}
+        if dtypes != {np.dtype(np.float32), np.dtype(np.int32)}:
+            raise UnsupportedError("a bitcast other than between float32 and int32")
+        return self._elementwise("bitcast", x)
+
     def _select_n(self, equation: Any, which: ScalarArray, *cases: ScalarArray) -> ScalarArray:
         result = cases[-1]
         for i in reversed(range(len(cases) - 1)):

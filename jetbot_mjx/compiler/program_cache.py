@@ -21,7 +21,7 @@ from typing import Any, Self
 import jax
 from jax.experimental import serialize_executable
 
-from jetbot_mjx.compiler import llvm_backend
+from jetbot_mjx.compiler import llvm_backend, random_bits
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once, write_private
 from jetbot_mjx.compiler.xla_options import Options, untuned_options
@@ -128,7 +128,7 @@ class ProgramCache:
 
     def _lower(self, trace: Callable[[], jax.stages.Traced]) -> tuple[jax.stages.Lowered, float]:
         """Return a lowered program, and the seconds that this took."""
-        with self._tracing:
+        with self._tracing, random_bits.by_one_kernel():
             began = time.perf_counter()
             return trace().lower(), time.perf_counter() - began
 

@@ -9,8 +9,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import jax
+import numpy as np
+
 from jetbot_mjx.agents.networks import PolicyParams
-from jetbot_mjx.agents.ppo import TrainState
+from jetbot_mjx.agents.ppo import TALLIED, TrainState
 from jetbot_mjx.config import Config, ConfigError, parse_config
 from jetbot_mjx.runs.checkpoint import POLICY, explanation
 from jetbot_mjx.runs.checkpoint_store import (
@@ -25,7 +28,7 @@ from jetbot_mjx.runs.checkpoint_store import (
 TRAINING = "training"
 """Name of the tree that holds the part of the state that acting does not need."""
 
-_REST = ("optimizer_state", "env_state", "key", "env_steps", "tally")
+_REST = ("optimizer_state", "env_state", "key", "env_steps")
 
 
 class Resumption(NamedTuple):
@@ -40,8 +43,10 @@ class Resumption(NamedTuple):
 
 
 def to_trees(state: TrainState) -> dict[str, Any]:
-    """Return a training state as the trees of a checkpoint."""
-    return {POLICY: state.policy_params, TRAINING: {name: getattr(state, name) for name in _REST}}
+    """Return a training state as the trees of a checkpoint, with its sums by name."""
+    rest = {name: getattr(state, name) for name in _REST}
+    sums = {name: np.asarray(total) for name, total in state.sums.items()}
+    return {POLICY: state.policy_params, TRAINING: {**rest, "tally": sums}}
 
 
 def resume(
@@ -99,7 +104,10 @@ def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState,
     except ConfigError as error:
         raise CheckpointError(f"checkpoint {path} belongs to another run: {error}") from None
     policy: PolicyParams = read_tree(path, POLICY, template.policy_params)
-    rest = read_tree(path, TRAINING, {name: getattr(template, name) for name in _REST})
+    wanted = {name: getattr(template, name) for name in _REST}
+    sum_shape = jax.ShapeDtypeStruct((), np.float32)
+    rest = read_tree(path, TRAINING, {**wanted, "tally": dict.fromkeys(TALLIED, sum_shape)})
+    rest["tally"] = np.stack([rest["tally"][name] for name in TALLIED])
     state = TrainState(
         params=template.params.replace(policy=policy.policy, value=policy.value),
         normalizer=policy.normalizer,

@@ -29,7 +29,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
+from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState, unpack_rows
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
@@ -112,10 +112,18 @@ class CompiledTrainer:
 
     def template(self) -> TrainState:
         """Return the shapes and dtypes of one seed's state."""
-        return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._shapes)
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._shapes)
+        return jax.eval_shape(self.ppo.unpacked, one)
+
+    def unpack_env(self, row: Any) -> Any:
+        """Return the state of one environment, on the host, from a row of `ppo.pack_rows`."""
+        return unpack_rows(
+            row,
+            jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), self._shapes.env_state),
+        )
 
     def init(self) -> TrainState:
-        """Return the state before the first step, on the devices."""
+        """Return the packed state before the first step, on the devices."""
         return self.init_later()()
 
     def init_later(self) -> Callable[[], TrainState]:
@@ -129,7 +137,7 @@ class CompiledTrainer:
         return lambda: program()(self._seeds)
 
     def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
-        return jax.vmap(lambda seed: self.ppo.init(jax.random.PRNGKey(seed)))(seeds)
+        return jax.vmap(lambda seed: self.ppo.packed(self.ppo.init(jax.random.PRNGKey(seed))))(seeds)
 
     def put(self, states: Sequence[TrainState]) -> TrainState:
         """Copy the states of all seeds from the host to the devices.
@@ -140,7 +148,7 @@ class CompiledTrainer:
         Returns:
           One state with the seeds as the first axis.
         """
-        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *states)
+        stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *map(self.ppo.packed, states))
         return jax.tree.map(
             lambda x, sharding: jax.make_array_from_callback(x.shape, sharding, x.__getitem__),
             stacked,
@@ -153,7 +161,8 @@ class CompiledTrainer:
             # A process cannot read the devices of another: replicate everything first.
             state = jax.jit(lambda state: state, out_shardings=self._replicated)(state)
         host = jax.device_get(state)
-        return [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
+        each = [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
+        return [self.ppo.unpacked(state) for state in each]
 
     def compile(self) -> Advance:
         """Compile the training step once; another shape is an error and never compiles again.
@@ -305,12 +314,13 @@ def _train_loop(
         chunk = next_chunk(count, elapsed, call_seconds)
         done, seconds, restart = done + count, seconds + elapsed, False
         for device, seed in np.argwhere(found):
-            nan_dump = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
+            packed = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
+            nan_dump = packed.replace(env_state=trainer.unpack_env(packed.env_state))
             recorder.on_nan_dump(int(seed), done * size, nan_dump)
         # Show the progress within an interval, and report at its end.
         if done < goal:
-            sums = jax.tree.map(np.mean, jax.device_get(state.tally))
-            recorder.on_progress(done * size, _metrics(sums, config.entropy_cost), seconds)
+            mean = state.replace(tally=np.mean(jax.device_get(state.tally), axis=0))
+            recorder.on_progress(done * size, _metrics(mean.sums, config.entropy_cost), seconds)
             continue
         if not _report(trainer, recorder, state, seconds):
             return
@@ -347,8 +357,8 @@ def _progress(
     entropy_cost = trainer.ppo.config.entropy_cost
     progress = []
     for one in trainer.get(state):
-        metrics = _metrics(one.tally, entropy_cost)
-        saved = one.replace(tally=jax.tree.map(np.zeros_like, one.tally)) if restart else one
+        metrics = _metrics(one.sums, entropy_cost)
+        saved = one.replace(tally=np.zeros_like(one.tally)) if restart else one
         progress.append(Progress(env_steps(one), one.policy_params, metrics, seconds, saved))
     return progress
 

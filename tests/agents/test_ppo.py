@@ -198,13 +198,13 @@ def test_one_training_step_is_brax_s(side_by_side, smoke):
     # Sums over 4096 observations of up to 1.2 m and 6 rad/s.
     assert_close(state.normalizer, brax.params.normalizer, rtol=2e-6)
     assert int(brax.env_steps) == ppo_trainer.env_steps(state) == SIZE
-    metrics = {name: float(state.tally[name]) for name in LOSSES.values()}
+    metrics = {name: float(state.sums[name]) for name in LOSSES.values()}
     expected = {name: brax.metrics[name] for name in LOSSES.values()}
     # Means of 16 minibatches of 1024 samples; they agree to 1e-7 here.
     assert metrics == pytest.approx(expected, rel=1e-5, abs=1e-6)
     adaptive = metrics["policy/learning_rate"] < 0.9 * smoke.ppo.learning_rate
     assert adaptive == (schedule == "ADAPTIVE_KL")
-    assert state.tally["nonfinite_updates"] == state.tally["nonfinite_envs"] == 0
+    assert state.sums["nonfinite_updates"] == state.sums["nonfinite_envs"] == 0
 
 
 def assert_close(one, other, rtol):
@@ -220,7 +220,7 @@ def test_several_training_steps_are_brax_s(side_by_side):
         travelled = furthest(state.params, begun.params)
         assert travelled > 5e-3
         assert furthest(state.policy_params[1:], brax.params[1:]) < 0.1 * travelled
-        assert float(state.tally["loss/total"]) == pytest.approx(
+        assert float(state.sums["loss/total"]) == pytest.approx(
             brax.metrics["loss/total"], rel=0.02, abs=1e-3
         )
 
@@ -481,11 +481,11 @@ def test_worlds_that_blow_up_are_counted_and_do_not_spoil_the_state(brittle, beg
     state, _ = brittle.advance(begun)
     ppo = brittle.ppo.config
     steps = ppo.steps_per_training_step // ppo.num_envs
-    assert float(state.tally["nonfinite_envs"]) == ppo.num_envs * (steps // FUSE)
-    assert float(state.tally["rollout/episodes"]) == ppo.num_envs * (steps // FUSE)
+    assert float(state.sums["nonfinite_envs"]) == ppo.num_envs * (steps // FUSE)
+    assert float(state.sums["rollout/episodes"]) == ppo.num_envs * (steps // FUSE)
     state, _ = at_once
-    assert float(state.tally["nonfinite_envs"]) == ppo.num_envs * (LINEAR_STEPS * steps // FUSE)
-    assert float(state.tally["nonfinite_updates"]) == 0
+    assert float(state.sums["nonfinite_envs"]) == ppo.num_envs * (LINEAR_STEPS * steps // FUSE)
+    assert float(state.sums["nonfinite_updates"]) == 0
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(state))
 
 
@@ -525,7 +525,7 @@ def test_the_linear_step_size_falls_to_nothing(brittle, begun, smoke):
     for _ in range(LINEAR_STEPS + 1):
         before = state
         state, _ = brittle.advance(state, restart=True)
-        rates.append(float(state.tally["policy/learning_rate"]))
+        rates.append(float(state.sums["policy/learning_rate"]))
     middle = np.arange(LINEAR_STEPS) * per_step + (per_step - 1) / 2
     fallen = smoke.ppo.learning_rate * (1 - middle / (LINEAR_STEPS * per_step))
     np.testing.assert_allclose(rates[:-1], fallen, rtol=1e-5)
@@ -539,21 +539,21 @@ def test_how_steps_are_cut_into_calls_does_not_matter(brittle, begun, at_once):
     for steps in (1, 3, 4):
         state, _ = brittle.advance(state, steps)
     assert_same_bits(state, at_once[0])
-    assert float(state.tally["training_steps"]) == LINEAR_STEPS
+    assert float(state.sums["training_steps"]) == LINEAR_STEPS
 
 
 def test_a_restart_empties_the_tally_and_nothing_else(brittle, begun):
     earlier, _ = brittle.advance(begun, 2)
     added, _ = brittle.advance(earlier, 1)
     anew, _ = brittle.advance(earlier, 1, restart=True)
-    assert_same_bits(anew.replace(tally={}), added.replace(tally={}))
-    assert float(anew.tally["training_steps"]) == 1
-    for name, value in anew.tally.items():
-        total = float(earlier.tally[name]) + float(value)
-        assert float(added.tally[name]) == pytest.approx(total, rel=1e-6), name
+    assert_same_bits(anew.replace(tally=0), added.replace(tally=0))
+    assert float(anew.sums["training_steps"]) == 1
+    for name, value in anew.sums.items():
+        total = float(earlier.sums[name]) + float(value)
+        assert float(added.sums[name]) == pytest.approx(total, rel=1e-6), name
     no_steps, nan_dump = brittle.advance(earlier, 0, restart=True)
     assert not bool(nan_dump.found)
-    assert set(map(float, no_steps.tally.values())) == {0.0}
+    assert set(map(float, no_steps.sums.values())) == {0.0}
 
 
 # Whole trainings.

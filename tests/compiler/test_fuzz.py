@@ -41,11 +41,11 @@ def by_llvm(program, lanes, arguments):
     text = ffi_wrapper.kernel_text(
         Kernel(program, carried=1, steps=1, fallback=list),
         lanes=lanes,
-        name=llvm_backend._NAME,
-        machine=llvm_backend._host().machine,
+        name=llvm_backend.NAME,
+        machine=llvm_backend.host_processor().machine,
     )
     _engines.append(llvm_backend._load(llvm_backend._compile(text)))
-    handler = call_frame.Handler(_engines[-1].get_function_address(llvm_backend._NAME))
+    handler = call_frame.Handler(_engines[-1].get_function_address(llvm_backend.NAME))
     result = np.full_like(arguments[0], np.nan)
     assert call_frame.call(handler, arguments, [result]) is None
     return result
@@ -53,7 +53,7 @@ def by_llvm(program, lanes, arguments):
 
 def check(seed, monkeypatch):
     function = random_functions.RandomFunction(seed)
-    lanes = llvm_backend._host().lanes
+    lanes = llvm_backend.host_processor().lanes
     x = random_functions.inputs(seed, 2 * lanes + 3)
     theirs = np.asarray(jax.jit(jax.vmap(function), compiler_options=_quick())(x))
     if seed % 2:

@@ -118,7 +118,7 @@ def test_a_robots_bits_do_not_depend_on_those_beside_it(driven):
     _, drive_it = driven
     targets = drawn(1000, holds=2)
     together = drive_it(targets)
-    for robots in (1, llvm_backend._host().lanes - 1, llvm_backend._host().lanes + 1):
+    for robots in (1, llvm_backend.host_processor().lanes - 1, llvm_backend.host_processor().lanes + 1):
         few = drive_it(targets[:, :robots])
         np.testing.assert_array_equal(few.qpos, together.qpos[:robots])
     spoilt = drive_it(targets.at[0, 3].set(jnp.nan))
@@ -229,9 +229,9 @@ def test_machine_code_is_kept_for_its_text_and_its_processor(cache, monkeypatch)
     kept.write_bytes(kept.read_bytes()[:-1])
     assert (compiles(), compiles()) == (1, 0)
     assert (compiles("other"), compiles("other")) == (1, 0)
-    host = llvm_backend._host()
+    host = llvm_backend.host_processor()
     for other in ({"name": "x86-64"}, {"features": ""}, {"version": "0"}):
-        monkeypatch.setattr(llvm_backend, "_host", lambda other=other: host._replace(**other))
+        monkeypatch.setattr(llvm_backend, "host_processor", lambda other=other: host._replace(**other))
         assert (compiles(), compiles()) == (1, 0)
 
 

@@ -20,7 +20,7 @@ pytest.importorskip("llvmlite")
 if not llvm_backend.is_available():
     pytest.skip("there is no CPU that it is written for", allow_module_level=True)
 
-LANES = llvm_backend._host().lanes
+LANES = llvm_backend.host_processor().lanes
 _engines = []
 
 
@@ -31,7 +31,7 @@ def text_of(program, carried=1, steps=1):
 def compiled(program, carried=1, steps=1):
     """A kernel as a function of a call frame."""
     _engines.append(llvm_backend._load(llvm_backend._compile(text_of(program, carried, steps))))
-    return call_frame.Handler(_engines[-1].get_function_address(llvm_backend._NAME))
+    return call_frame.Handler(_engines[-1].get_function_address(llvm_backend.NAME))
 
 
 def run(program, arguments, carried=1, steps=1):
@@ -44,9 +44,9 @@ def run(program, arguments, carried=1, steps=1):
 def lanes(request, monkeypatch):
     """One lane is what a GPU's thread does."""
     if request.param == "one lane":
-        host = llvm_backend._host()._replace(lanes=1)
-        monkeypatch.setattr(llvm_backend, "_host", lambda: host)
-    return llvm_backend._host().lanes
+        host = llvm_backend.host_processor()._replace(lanes=1)
+        monkeypatch.setattr(llvm_backend, "host_processor", lambda: host)
+    return llvm_backend.host_processor().lanes
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -223,8 +223,8 @@ def test_the_text_is_good_for_every_machine(triple, monkeypatch):
     binding.initialize_all_targets()
     binding.initialize_all_asmprinters()
     machine = "x86_64" if triple.startswith("x86") else "aarch64"
-    host = llvm_backend._host()._replace(machine=machine, lanes=4)
-    monkeypatch.setattr(llvm_backend, "_host", lambda: host)
+    host = llvm_backend.host_processor()._replace(machine=machine, lanes=4)
+    monkeypatch.setattr(llvm_backend, "host_processor", lambda: host)
     text = text_of(scalarize(FUNCTIONS["a loop of conditions"], VECTOR))
     module = binding.parse_assembly(text)
     module.triple = triple

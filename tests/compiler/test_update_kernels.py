@@ -14,7 +14,7 @@ from jetbot_mjx.agents.gae import compute_gae
 from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.update import advantages, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
-from jetbot_mjx.compiler.update.launch import PTX_VERSION
+from jetbot_mjx.compiler.update.launch_gpu import PTX_VERSION
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling, UpdateShape
 
 pytest.importorskip("llvmlite")

@@ -153,7 +153,7 @@ def test_a_state_is_read_back_whole(states, template):
     for env_steps, state in states.items():
         assert jax.tree.structure(state) == jax.tree.structure(template)
         assert ppo_trainer.env_steps(state) == env_steps
-        assert state.tally["training_steps"] == 0
+        assert state.sums["training_steps"] == 0
     keys = {state.key.tobytes() for state in states.values()}
     assert len(keys) == len(STEPS)
     assert len({digest(state.env_state) for state in states.values()}) == len(STEPS)
@@ -237,7 +237,7 @@ def test_a_state_between_two_reports_is_saved_with_what_was_summed_up(
     session.run(config, tmp_path)
     found = resume([tmp_path], [config], template)
     assert found.env_steps == 24_576
-    assert found.states[0].tally["training_steps"] == 2
+    assert found.states[0].sums["training_steps"] == 2
     assert found.progress[0]["env_steps"] == 16_384
     assert read_about(checkpoint_path(tmp_path, 24_576))["metrics"] == {}
 
