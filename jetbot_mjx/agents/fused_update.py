@@ -80,6 +80,7 @@ def shape_of(
         action_size,
         network.distribution_type,
         network.activation,
+        config.normalize_advantage,
     )
     if not isinstance(observation_size, int):
         return "it takes observations without images"
@@ -130,7 +131,6 @@ class FusedUpdate:
         self.batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
         """A minibatch on one device."""
         self._places = _places(shape)
-        self._terms = LossTerms(**{name: getattr(config, name) for name in LossTerms._fields})
         mask = np.zeros(shape.size, bool)
         for place in self._places:
             mask[place.start : place.stop] = True
@@ -138,7 +138,7 @@ class FusedUpdate:
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        launch.prepare(self._shape, self._terms, self.batch, policies)
+        launch.prepare(self._shape, self.batch, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`, on host or device."""
@@ -223,9 +223,9 @@ class FusedUpdate:
         # Brax draws the noise with time as the first axis.
         noise = jax.random.normal(key, (time, unrolls.shape[0], shape.actions))
         rows, last, mean, scale = collected
-        result = launch.gradient(
-            shape, self._terms, params, mean, scale, rows, last, unrolls, noise
-        )
+        terms = [getattr(self._config, name) for name in LossTerms._fields]
+        terms = jnp.stack([jnp.asarray(term, jnp.float32) for term in terms])
+        result = launch.gradient(shape, params, mean, scale, rows, last, unrolls, noise, terms)
         gradient = jnp.where(self._is_parameter, result, 0.0)
         if self._axis is not None:
             gradient = jax.lax.pmean(gradient, self._axis)

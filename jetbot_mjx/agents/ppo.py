@@ -53,7 +53,6 @@ from typing import Any
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
-import numpy as np
 import optax
 from brax.envs import Env
 from brax.training import acting
@@ -223,6 +222,11 @@ class PPO:
             raise UserError(f"ppo.update = fused: {reason}: choose auto or xla")
         self.notice = f"ppo.update = xla: {reason}"
 
+    @property
+    def is_fused(self) -> bool:
+        """Whether kernels of this package compute the update."""
+        return self._fused is not None
+
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels of the update, before `advance` is traced.
 
@@ -250,9 +254,11 @@ class PPO:
         Raises:
           UserError: `ppo.update` requests the kernels.
         """
-        if self._fused is None or update_probe.runs_correctly():
+        # A CPU's kernels are compiled by what compiled the probe of its back end.
+        on_gpu = jax.default_backend() == "gpu"
+        if self._fused is None or not on_gpu or update_probe.runs_correctly():
             return True
-        self._refuse_fused("the fused update failed its check on this GPU")
+        self._refuse_fused("the fused update failed its check on this machine")
         print(self.notice, file=sys.stderr)
         return False
 
@@ -299,7 +305,7 @@ class PPO:
           restart: whether to reset the tally before the first step.
 
         Returns:
-          The packed state after the last step, and the first `NanDump` of these steps on this shard.
+          The packed state after the last step, and the shard's first `NanDump` of these steps.
         """
         tally = jnp.where(restart, 0.0, state.tally)
         if not self._fused:
@@ -322,9 +328,7 @@ class PPO:
             actions=jnp.zeros((self.config.unroll_length, self._env.action_size)),
             step=jnp.zeros((), jnp.int32),
         )
-        state, nan_dump = jax.lax.fori_loop(
-            0, num_steps, body, (state.replace(tally=tally), none)
-        )
+        state, nan_dump = jax.lax.fori_loop(0, num_steps, body, (state.replace(tally=tally), none))
         return (state if self._fused else self.packed(state)), nan_dump
 
     def packed(self, state: TrainState) -> TrainState:
@@ -345,9 +349,7 @@ class PPO:
         params, optimizer_state = self._layout.unpack((state.params, state.optimizer_state))
         return state.replace(params=params, optimizer_state=optimizer_state)
 
-    def train_step(
-        self, state: TrainState
-    ) -> tuple[TrainState, Float[Array, " metrics"], NanDump]:
+    def train_step(self, state: TrainState) -> tuple[TrainState, Float[Array, " metrics"], NanDump]:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
@@ -417,7 +419,7 @@ class PPO:
             state = state.replace(params=self._fused.network_params(state.params))
         policy = self._make_policy(tuple(state.policy_params))
 
-        shapes: Any = None
+        shapes: Any = ()
 
         def step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], PyTree]:
             nonlocal shapes
@@ -438,7 +440,7 @@ class PPO:
             (after, _), rows = jax.lax.scan(
                 step, (env_state, key), length=self.config.unroll_length
             )
-            data: Transition = unpack_rows(rows, shapes)
+            data: Any = unpack_rows(rows, shapes)
             nan_dump = _find_nan_dump(start, data)
             data = data._replace(next_observation=jax.tree.map(lambda x: x[None], after.obs))
             return (after, next_key), (data, nan_dump)
@@ -690,7 +692,7 @@ def unpack_rows(rows: tuple[Any, Sequence[Any]], shapes: PyTree) -> PyTree:
             leaves.append(next(others))
             continue
         end = start + math.prod(leaf.shape)
-        columns = bits[..., start:end].reshape(*bits.shape[:-1], *leaf.shape)
+        columns = bits[..., start:end].reshape((*bits.shape[:-1], *leaf.shape))
         leaves.append(columns.view(leaf.dtype))
         start = end
     return jax.tree.unflatten(jax.tree.structure(shapes), leaves)

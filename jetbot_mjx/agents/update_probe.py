@@ -12,8 +12,8 @@ import numpy as np
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.compiler.update.shapes import LossTerms, UpdateShape
 
-_SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh")
-_TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0, normalize_advantage=False)
+_SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh", normalizes=False)
+_TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0)
 _UNROLLS, _TIME = 8, 4
 _MOST_ERROR = 0.01
 """Largest difference of the gradients, relative to their norm; GPUs have products of float16."""
@@ -44,9 +44,10 @@ def runs_correctly() -> bool:
     arrays = [np.asarray(x, np.float32) for x in (params, *statistics, rows, last)]
     order = np.arange(_UNROLLS, dtype=np.int32)
     with jax.default_device(jax.local_devices(backend=backend.PLATFORM)[0]):
-        arguments = jax.device_put((*arrays, order, np.asarray(noise, np.float32)))
+        last_arrays = (np.asarray(x, np.float32) for x in (noise, _TERMS))
+        arguments = jax.device_put((*arrays, order, *last_arrays))
         try:
-            result = jax.jit(functools.partial(launch.gradient, _SHAPE, _TERMS))(*arguments)
+            result = jax.jit(functools.partial(launch.gradient, _SHAPE))(*arguments)
         except jax.errors.JaxRuntimeError:
             return False
         # Beside the gradient, the vector has the sums of the metrics, on which nothing depends.

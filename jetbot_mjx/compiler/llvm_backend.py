@@ -206,6 +206,7 @@ def _binding() -> Any:
 
 @functools.cache
 def host_processor() -> Host:
+    """Return a description of this machine's processor."""
     binding = _binding()
     features = binding.get_host_cpu_features()
     lanes = 16 if features.get("avx512f") else 8 if features.get("avx2") else 4

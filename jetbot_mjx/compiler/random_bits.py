@@ -60,8 +60,9 @@ def _kernel() -> Kernel:
     """Return the kernel of one pair of counts (bits of floats, as are the keys)."""
 
     def step(first: Array, second: Array, key: Array, other: Array) -> tuple[Array, Array]:
-        bits = [jax.lax.bitcast_convert_type(x, jnp.int32) for x in (first, second, key, other)]
-        return tuple(jax.lax.bitcast_convert_type(x, jnp.float32) for x in _threefry(*bits))
+        bits = [x.view(jnp.int32) for x in (first, second, key, other)]
+        hashes = _threefry(*bits)
+        return hashes[0].view(jnp.float32), hashes[1].view(jnp.float32)
 
     number = jax.ShapeDtypeStruct((), np.float32)
     program = scalarize(step, *[number] * 4)

@@ -138,8 +138,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "tanh": np.tanh,
     "xor": np.bitwise_xor,
 }
-"""The NumPy function of every operation except `select` and `convert`; `bitcast` takes the bits of a
-float32 as an int32 or the other way round."""
+"""The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
+a float32 for an int32, or the other way round."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""
@@ -410,9 +410,7 @@ _EXP = _polynomial(np.exp, 6, -_LN2 / 2, _LN2 / 2)
 _ROOT = float(np.sqrt(2.0))
 _LOG_END = ((_ROOT - 1.0) / (_ROOT + 1.0)) ** 2
 # atanh(t)/t in s = t², and tanh(x)/x in s = x².
-_ARTANH = _polynomial(
-    lambda s: np.arctanh(np.sqrt(s)) / np.sqrt(s), 3, 1e-12 * _LOG_END, _LOG_END
-)
+_ARTANH = _polynomial(lambda s: np.arctanh(np.sqrt(s)) / np.sqrt(s), 3, 1e-12 * _LOG_END, _LOG_END)
 # expm1(x)/x
 _EXPM1_END = 0.5
 _EXPM1 = _polynomial(lambda x: np.expm1(x) / x, 7, -_EXPM1_END, _EXPM1_END + 1e-9)

@@ -55,6 +55,8 @@ class Sizes(NamedTuple):
     """The last observation of one unroll."""
     layers: int
     """The activations of both networks and of their convolutions for one sample."""
+    gradient: int
+    """What a gradient stores of one sample; nothing if the update is fused."""
     parameters: int
     """One copy of the networks, Adam's moments, the normaliser and the sums of metrics."""
 
@@ -101,7 +103,7 @@ def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
     """
     # Trace the state, and what one training step collects.
     state = jax.eval_shape(ppo.init, _KEY)
-    _, data, _ = jax.eval_shape(ppo.collect, state, state.key)
+    _, data, _ = jax.eval_shape(ppo.collect, jax.eval_shape(ppo.packed, state), state.key)
     config = ppo.config
     unrolls = config.batch_size * config.num_minibatches
     samples = unrolls * config.unroll_length
@@ -122,6 +124,7 @@ def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
         learned=learned // samples,
         unroll=ends // unrolls,
         layers=_FLOAT * units + encoded,
+        gradient=0 if ppo.is_fused else int(_LAYERS * (_FLOAT * units + encoded)),
         parameters=_bytes(state) - environments,
     )
 
@@ -163,14 +166,15 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
         batch_size=ppo.batch_size,
         parameters=config.seeds * each.parameters,
         environments=config.seeds * stepped,
-        collecting=config.seeds * (collected + environments * working),
+        collecting=config.seeds * (collected + stepped + environments * working),
         learning=config.seeds
         * (
             collected
             + shuffled
-            + stepped
+            # The states before the unroll, as rows, and their copy.
+            + 2 * stepped
             + each.parameters
-            + int(_LAYERS * minibatch * each.layers)
+            + minibatch * each.gradient
         ),
         evaluation=config.evaluation.episodes * (2 * each.environment + working),
     )

@@ -117,10 +117,9 @@ class CompiledTrainer:
 
     def unpack_env(self, row: Any) -> Any:
         """Return the state of one environment, on the host, from a row of `ppo.pack_rows`."""
-        return unpack_rows(
-            row,
-            jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), self._shapes.env_state),
-        )
+        batched = self._shapes.env_state
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), batched)
+        return unpack_rows(row, shapes)
 
     def init(self) -> TrainState:
         """Return the packed state before the first step, on the devices."""
@@ -137,7 +136,10 @@ class CompiledTrainer:
         return lambda: program()(self._seeds)
 
     def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
-        return jax.vmap(lambda seed: self.ppo.packed(self.ppo.init(jax.random.PRNGKey(seed))))(seeds)
+        def init(seed: UInt32[Array, ""]) -> TrainState:
+            return self.ppo.packed(self.ppo.init(jax.random.PRNGKey(seed)))
+
+        return jax.vmap(init)(seeds)
 
     def put(self, states: Sequence[TrainState]) -> TrainState:
         """Copy the states of all seeds from the host to the devices.

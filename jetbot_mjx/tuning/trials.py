@@ -71,7 +71,8 @@ class Trials:
         init = jax.vmap(lambda traced, seed: self._ppo(traced).init(jax.random.PRNGKey(seed)))
 
         def advance(traced: Any, state: TrainState, steps: Any) -> TrainState:
-            return self._ppo(traced).advance(state, steps, jnp.ones((), bool))[0]
+            ppo = self._ppo(traced)
+            return ppo.unpacked(ppo.advance(ppo.packed(state), steps, jnp.ones((), bool))[0])
 
         # `jax.jit` compiles anew for each number of trials.
         jit = functools.partial(jax.jit, compiler_options=compiler_options(config))

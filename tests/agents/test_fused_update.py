@@ -16,7 +16,7 @@ from jetbot_mjx.agents import fused_update, update_probe
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.compiler import ptx_backend
-from jetbot_mjx.compiler.update import advantages, gradient, launch
+from jetbot_mjx.compiler.update import advantages, gradient, launch, launch_gpu
 from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.errors import UserError
@@ -50,13 +50,8 @@ def make_ppo(settings):
     ("changes", "sizes", "reason"),
     [
         ({}, ({"pixels/camera": (8, 8, 3)}, 2), "without images"),
-        ({}, (65, 2), "at most 64 numbers, not 65"),
-        ({}, (16, 5), "at most 8 outputs, not 10"),
         ({"hidden": [64, 32]}, (16, 2), "hidden layers of one width"),
         ({"network": {"value_hidden_layer_sizes": [32]}}, (16, 2), "the same hidden layers"),
-        ({"hidden": [40, 40]}, (16, 2), "16, 32, ... 128 units, not 40"),
-        ({"hidden": [144]}, (16, 2), "16, 32, ... 128 units, not 144"),
-        ({"hidden": [128] * 4}, (16, 2), "does not fit in the registers"),
     ],
 )
 def test_it_says_which_networks_it_cannot_compute(changes, sizes, reason):
@@ -65,18 +60,39 @@ def test_it_says_which_networks_it_cannot_compute(changes, sizes, reason):
     assert reason in found
 
 
+@pytest.mark.parametrize(
+    ("changes", "sizes", "reason"),
+    [
+        ({}, (65, 2), "at most 64 numbers, not 65"),
+        ({}, (16, 5), "at most 8 outputs, not 10"),
+        ({"hidden": [40, 40]}, (16, 2), "16, 32, ... 128 units, not 40"),
+        ({"hidden": [144]}, (16, 2), "16, 32, ... 128 units, not 144"),
+        ({"hidden": [128] * 4}, (16, 2), "does not fit in the registers"),
+    ],
+)
+def test_it_says_which_networks_a_gpu_cannot_compute(changes, sizes, reason):
+    shape = fused_update.shape_of(config(**changes).ppo, *sizes)
+    assert reason in launch_gpu.refusal(shape, Minibatch(64, 16, 4))
+
+
 @pytest.mark.cpu
-def test_a_cpu_takes_xla_and_does_not_mention_it():
+def test_a_cpu_takes_the_kernels_where_it_can():
+    assert make_ppo(config())._fused is not None
     assert make_ppo(config()).notice is None
+    other = make_ppo(config(hidden=[40]))
+    assert other._fused is None
+    assert other.notice == "ppo.update = xla: it takes layers of 16, 32, 48, ... units, not 40"
 
 
 @pytest.mark.cpu
-def test_requested_on_a_cpu_it_is_an_error_of_one_line(root, tmp_path):
-    config = load_config(root / "configs" / "smoke.yaml", ["ppo.update=fused"])
+def test_requested_where_it_cannot_run_it_is_an_error_of_one_line(root, tmp_path):
+    sizes = "ppo.network.policy_hidden_layer_sizes=[40]"
+    config = load_config(root / "configs" / "smoke.yaml", ["ppo.update=fused", sizes])
     with pytest.raises(UserError) as caught:
         session.run(config, tmp_path / "run")
     assert str(caught.value) == (
-        "ppo.update = fused: it needs an NVIDIA GPU, and this is cpu: choose auto or xla"
+        "ppo.update = fused: it takes two networks of the same hidden layers of one width:"
+        " choose auto or xla"
     )
     assert not (tmp_path / "run").exists()
 
@@ -114,7 +130,7 @@ def test_vectors_become_the_same_parameters(distribution):
     # All numbers are there once, and nothing else.
     total = sum(float(jnp.abs(x).sum()) for x in jax.tree.leaves(params))
     np.testing.assert_allclose(jnp.abs(packed[0]).sum(), total, rtol=1e-5)
-    again = fused.unpack(packed, tree)
+    again = fused.unpack(packed)
     assert jax.tree.structure(again) == jax.tree.structure(tree)
     jax.tree.map(np.testing.assert_array_equal, again, tree)
 
@@ -182,22 +198,22 @@ def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
     assert re.findall(r"grid_z = (\d+)", text) == [str(policies)] * 2
 
 
-def modelled(shape, terms, *arrays):
+def modelled(shape, *arrays):
     """`launch.gradient` on the model of a GPU, for one policy."""
 
     def run(*arrays):
-        params, mean, scale, rows, last, unrolls, noise = (np.array(x) for x in arrays)
+        params, mean, scale, rows, last, unrolls, noise, terms = (np.array(x) for x in arrays)
         batch = Minibatch(len(rows), len(unrolls), rows.shape[1])
         tiling = Tiling(shape, 64, 1, 16)
         blocks = min(2, advantages.tile_count(tiling, batch))
         sizes = batch.samples, batch.samples, (blocks, 2)
         estimates = [np.full(size, np.nan, np.float32) for size in sizes]
-        text = advantages.advantages_text(tiling, batch, terms)
-        Gpu(text, [params, mean, scale, rows, last, unrolls, *estimates]).run(blocks)
+        text = advantages.advantages_text(tiling, batch)
+        Gpu(text, [params, mean, scale, rows, last, unrolls, terms, *estimates]).run(blocks)
         tiling = Tiling(shape, 32, 1)
         vector = np.full((1, shape.size), np.nan, np.float32)
-        text = gradient.gradient_text(tiling, batch, terms, blocks)
-        Gpu(text, [params, mean, scale, rows, unrolls, noise, *estimates, vector]).run(1, 2)
+        text = gradient.gradient_text(tiling, batch, blocks)
+        Gpu(text, [params, mean, scale, rows, unrolls, noise, *estimates, terms, vector]).run(1, 2)
         return vector[0]
 
     result = jax.ShapeDtypeStruct((shape.size,), np.float32)
@@ -207,8 +223,6 @@ def modelled(shape, terms, *arrays):
 @pytest.mark.cpu
 def test_the_probe_agrees_with_the_model(monkeypatch):
     monkeypatch.setattr(launch, "gradient", modelled)
-    monkeypatch.setattr(ptx_backend, "is_available", lambda: True)
-    monkeypatch.setattr(ptx_backend, "PLATFORM", "cpu")
     assert update_probe.runs_correctly.__wrapped__()
     monkeypatch.setattr(launch, "gradient", lambda *arrays: 1.1 * modelled(*arrays))
     assert not update_probe.runs_correctly.__wrapped__()
@@ -224,7 +238,7 @@ def test_kernels_that_fail_their_check_are_left_to_xla(monkeypatch, capsys):
     assert not ppo.check()
     assert ppo._fused is None
     assert capsys.readouterr().err == (
-        "ppo.update = xla: the fused update failed its check on this GPU\n"
+        "ppo.update = xla: the fused update failed its check on this machine\n"
     )
     ppo.config, ppo._fused = config(update="fused").ppo, object()
     with pytest.raises(UserError, match=r"ppo\.update = fused: .* choose auto or xla"):
@@ -243,7 +257,6 @@ def test_without_a_back_end_xla_computes_the_update(monkeypatch, capsys):
     assert capsys.readouterr().err.startswith("ppo.update = xla: it needs an NVIDIA GPU, llvmlite")
 
 
-@on_a_gpu
 def test_the_probe_agrees():
     assert update_probe.runs_correctly()
 

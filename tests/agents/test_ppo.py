@@ -20,7 +20,7 @@ from brax.training.types import Transition
 from gliding import Gliding
 
 from jetbot_mjx import evaluate
-from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer
+from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer, unpack_rows
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import EGOCENTRIC, LAYOUTS, Field, GoalTask
@@ -84,10 +84,17 @@ class Jitted:
     def __init__(self, config, env):
         self.ppo = on_one_device(config, env)
         self.init = jax.jit(self.ppo.init)
-        self._jitted = jax.jit(self.ppo.advance)
+        self._jitted = jax.jit(self._advance)
+
+    def _advance(self, state, steps, restart):
+        state, nan_dump = self.ppo.advance(self.ppo.packed(state), steps, restart)
+        return self.ppo.unpacked(state), nan_dump
 
     def advance(self, state, steps=1, restart=False):
-        return self._compiled(state, jnp.int32(steps), jnp.bool_(restart))
+        after, nan_dump = self._compiled(state, jnp.int32(steps), jnp.bool_(restart))
+        world = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state.env_state)
+        row = jax.device_get(nan_dump.env_state)
+        return after, nan_dump.replace(env_state=unpack_rows(row, world))
 
     @functools.cached_property
     def _compiled(self):
@@ -327,7 +334,14 @@ def tiny(schedule="NONE", passes=1):
     values = TINY | {"learning_rate_schedule": schedule, "num_updates_per_batch": passes}
     config = parse_config({"task": {"observation": "egocentric"}, "ppo": values})
     jitted = Jitted(config, make_env(config))
-    return jitted.ppo, jax.jit(jitted.ppo.update)
+    compiled = jax.jit(jitted.ppo.update)
+
+    def update(*arguments):
+        params, optimizer_state, metrics = compiled(*arguments)
+        names = [*LOSSES.values(), "nonfinite_updates"]
+        return params, optimizer_state, dict(zip(names, metrics, strict=True))
+
+    return jitted.ppo, update
 
 
 def beginning(ppo):

@@ -118,7 +118,11 @@ def test_a_robots_bits_do_not_depend_on_those_beside_it(driven):
     _, drive_it = driven
     targets = drawn(1000, holds=2)
     together = drive_it(targets)
-    for robots in (1, llvm_backend.host_processor().lanes - 1, llvm_backend.host_processor().lanes + 1):
+    for robots in (
+        1,
+        llvm_backend.host_processor().lanes - 1,
+        llvm_backend.host_processor().lanes + 1,
+    ):
         few = drive_it(targets[:, :robots])
         np.testing.assert_array_equal(few.qpos, together.qpos[:robots])
     spoilt = drive_it(targets.at[0, 3].set(jnp.nan))
@@ -231,7 +235,9 @@ def test_machine_code_is_kept_for_its_text_and_its_processor(cache, monkeypatch)
     assert (compiles("other"), compiles("other")) == (1, 0)
     host = llvm_backend.host_processor()
     for other in ({"name": "x86-64"}, {"features": ""}, {"version": "0"}):
-        monkeypatch.setattr(llvm_backend, "host_processor", lambda other=other: host._replace(**other))
+        monkeypatch.setattr(
+            llvm_backend, "host_processor", lambda other=other: host._replace(**other)
+        )
         assert (compiles(), compiles()) == (1, 0)
 
 
@@ -242,7 +248,7 @@ def test_another_kernel_has_another_name():
         llvm_backend.kernel_text(kernel_of(lambda x, n=n: x + n, shape, steps=steps))
         for n, steps in ((1.0, 1), (2.0, 1), (1.0, 2))
     ]
-    assert len({llvm_backend._registered(text) for text in texts}) == 3
+    assert len({llvm_backend.registered(text) for text in texts}) == 3
 
 
 @pytest.fixture
@@ -279,11 +285,11 @@ def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, m
 @pytest.fixture
 def asked_anew():
     llvm_backend.is_available.cache_clear()
-    llvm_backend._host.cache_clear()
+    llvm_backend.host_processor.cache_clear()
     llvm_backend._binding.cache_clear()
     yield
     llvm_backend.is_available.cache_clear()
-    llvm_backend._host.cache_clear()
+    llvm_backend.host_processor.cache_clear()
     llvm_backend._binding.cache_clear()
 
 

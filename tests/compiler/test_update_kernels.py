@@ -11,8 +11,8 @@ from brax.training.distribution import NormalDistribution, NormalTanhDistributio
 from gpu_model import Gpu
 
 from jetbot_mjx.agents.gae import compute_gae
-from jetbot_mjx.compiler import ptx_backend
-from jetbot_mjx.compiler.update import advantages, shapes
+from jetbot_mjx.compiler import llvm_backend, ptx_backend
+from jetbot_mjx.compiler.update import advantages, launch_cpu, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
 from jetbot_mjx.compiler.update.launch_gpu import PTX_VERSION
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling, UpdateShape
@@ -26,7 +26,6 @@ TERMS = LossTerms(
     discounting=0.9,
     gae_lambda=0.8,
     reward_scaling=2.0,
-    normalize_advantage=True,
 )
 ACTIVATIONS = {
     "tanh": jnp.tanh,
@@ -47,7 +46,6 @@ class Case(NamedTuple):
     """Rows of a tile of the advantages."""
     blocks: int = 1
     seeds: int = 1
-    terms: LossTerms = TERMS
 
 
 # With tiles that are not full, layers that eight warps cannot divide evenly, unrolls that do not
@@ -72,11 +70,10 @@ CASES = {
         UpdateShape(64, 16, 1, 4, "tanh_normal", "swish"), Minibatch(99, 70, 1), (32, 1), 64, 2, 2
     ),
     "swish, advantages as they are": Case(
-        UpdateShape(16, 112, 2, 2, "normal", "swish"),
+        UpdateShape(16, 112, 2, 2, "normal", "swish", normalizes=False),
         Minibatch(12, 7, 10),
         (32, 1),
         64,
-        terms=TERMS._replace(normalize_advantage=False),
     ),
 }
 
@@ -142,7 +139,7 @@ def loss(leaves, data, case):
     shape = case.shape
     brax, parameters = policy(leaves, data, shape)
     current, old, advantage = brax.create_dist(parameters), data["distribution"], data["advantage"]
-    if case.terms.normalize_advantage:
+    if case.shape.normalizes:
         advantage = (advantage - advantage.mean()) / (advantage.std() + 1e-8)
     ratio = jnp.exp(brax.log_prob(parameters, data["raw_action"]) - data["log_prob"])
     clipped = jnp.clip(ratio, 1 - TERMS.clipping_epsilon, 1 + TERMS.clipping_epsilon)
@@ -234,6 +231,10 @@ def stacked(made, *names):
 NETWORK = ("params", "mean", "scale", "rows")
 
 
+def terms_of(case):
+    return np.array([TERMS] * case.seeds, np.float32)
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_the_advantages_are_those_of_float64(name):
     case = CASES[name]
@@ -244,8 +245,9 @@ def test_the_advantages_are_those_of_float64(name):
         np.full((case.seeds, *rest), np.nan, np.float32)
         for rest in (case.batch[1:], case.batch[1:], (blocks, 2))
     ]
-    text = advantages.advantages_text(tiling, case.batch, case.terms)
-    Gpu(text, [*stacked(made, *NETWORK, "last", "unrolls"), *results]).run(blocks, 1, case.seeds)
+    text = advantages.advantages_text(tiling, case.batch)
+    arrays = [*stacked(made, *NETWORK, "last", "unrolls"), terms_of(case), *results]
+    Gpu(text, arrays).run(blocks, 1, case.seeds)
     for data, advantage, target, parts in zip(made, *results, strict=True):
         np.testing.assert_allclose(advantage, data.advantages, atol=0.01)
         np.testing.assert_allclose(target, data.targets, atol=0.01)
@@ -267,17 +269,81 @@ def test_the_gradient_is_that_of_float64(name):
     thirds = [np.array_split(data.advantages.ravel(), 3) for data in made]
     parts = np.array([[[x.sum(), (x**2).sum()] for x in third] for third in thirds], np.float32)
     result = np.full((case.seeds, blocks, case.shape.size), np.nan, np.float32)
-    text = gradient_kernel.gradient_text(tiling, case.batch, case.terms, 3)
-    arrays = [*stacked(made, *NETWORK, "unrolls", "noise"), *estimated, parts, result]
+    text = gradient_kernel.gradient_text(tiling, case.batch, 3)
+    arrays = [*stacked(made, *NETWORK, "unrolls", "noise"), *estimated, parts]
+    arrays += [terms_of(case), result]
     Gpu(text, arrays).run(blocks, 2, case.seeds)
     for data, vectors in zip(made, result, strict=True):
-        total, start = vectors.astype(np.float64).sum(0), 0
-        for expected in data.gradient:
-            ours = total[start : start + expected.size]
-            start += expected.size
-            error = np.linalg.norm(ours - expected) / np.linalg.norm(expected)
-            assert error < 0.01, (start, expected.size)
-        assert start == case.shape.size
+        assert_is_gradient(vectors.astype(np.float64).sum(0), data, 0.01)
+
+
+def assert_is_gradient(vector, data, bound):
+    start = 0
+    for expected in data.gradient:
+        ours = vector[start : start + expected.size]
+        start += expected.size
+        error = np.linalg.norm(ours - expected) / np.linalg.norm(expected)
+        assert error < bound, (start, expected.size)
+    assert start == vector.size
+
+
+# Sizes that only CPUs take; parts of several unrolls, and the last one with fewer.
+CPU_CASES = {
+    **CASES,
+    "a layer of 256": Case(
+        UpdateShape(70, 256, 1, 5, "tanh_normal", "elu"), Minibatch(90, 90, 3), (0, 0), 0
+    ),
+    "several parts": Case(
+        UpdateShape(3, 16, 2, 1, "normal", "tanh"), Minibatch(90, 70, 11), (0, 0), 0, seeds=2
+    ),
+}
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize(("lanes", "registers"), [(None, None), (8, 16), (4, 32)])
+@pytest.mark.parametrize("name", CPU_CASES)
+def test_the_gradient_on_a_cpu_is_that_of_float64(name, lanes, registers, monkeypatch):
+    if lanes is not None:
+        host = llvm_backend.host_processor()._replace(lanes=lanes, registers=registers)
+        monkeypatch.setattr(llvm_backend, "host_processor", lambda: host)
+    case = CPU_CASES[name]
+    made = [make_data(case, seed) for seed in range(case.seeds)]
+    arrays = [*stacked(made, *NETWORK, "last", "unrolls", "noise"), terms_of(case)]
+    result = jax.jit(lambda *arrays: launch_cpu.launch(case.shape, arrays))(*arrays)
+    for data, vector in zip(made, np.asarray(result), strict=True):
+        assert_is_gradient(vector, data, 2e-4)
+
+
+@pytest.mark.cpu
+def test_the_gradient_on_a_cpu_does_not_depend_on_the_policies_beside_it():
+    case = CPU_CASES["several parts"]
+    made = [make_data(case, seed) for seed in range(2)]
+    arrays = [*stacked(made, *NETWORK, "last", "unrolls", "noise"), terms_of(case)]
+    run = jax.jit(lambda *arrays: launch_cpu.launch(case.shape, arrays))
+    both = run(*arrays)
+    for i in range(2):
+        np.testing.assert_array_equal(run(*(x[i : i + 1] for x in arrays))[0], both[i])
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize(
+    ("shape", "batch", "reason"),
+    [
+        (
+            UpdateShape(16, 128, 3, 9, "tanh_normal", "tanh"),
+            Minibatch(9, 9, 9),
+            "16 outputs, not 18",
+        ),
+        (UpdateShape(16, 40, 3, 2, "normal", "tanh"), Minibatch(9, 9, 9), "48, ... units, not 40"),
+        (
+            UpdateShape(16, 128, 3, 2, "normal", "tanh"),
+            Minibatch(9, 9, 2000),
+            "2000 steps do not fit",
+        ),
+    ],
+)
+def test_it_says_what_a_cpu_cannot_compute(shape, batch, reason):
+    assert reason in launch_cpu.refusal(shape, batch)
 
 
 @pytest.mark.parametrize("architecture", [80, 90])
@@ -286,8 +352,8 @@ def test_llvm_compiles_them(name, architecture):
     case = CASES[name]
     tilings = Tiling(case.shape, *case.gradient), Tiling(case.shape, 64, 1, 16)
     texts = (
-        gradient_kernel.gradient_text(tilings[0], Minibatch(4096, 512, 16), TERMS, 74),
-        advantages.advantages_text(tilings[1], Minibatch(4096, 512, 16), TERMS),
+        gradient_kernel.gradient_text(tilings[0], Minibatch(4096, 512, 16), 74),
+        advantages.advantages_text(tilings[1], Minibatch(4096, 512, 16)),
     )
     for tiling, text in zip(tilings, texts, strict=True):
         ptx = ptx_backend.assembled(text, architecture, PTX_VERSION)

@@ -69,7 +69,7 @@ def test_a_trial_is_the_training_that_its_values_give(trials, outcomes):
     @jax.jit
     def train(key):
         steps = jnp.asarray(config.ppo.training_steps, jnp.int32)
-        return ppo.advance(ppo.init(key), steps, jnp.ones((), bool))[0]
+        return ppo.unpacked(ppo.advance(ppo.packed(ppo.init(key)), steps, jnp.ones((), bool))[0])
 
     alone = train(jax.random.PRNGKey(3)).policy_params
     for ours, theirs in zip(leaves(outcomes[1].params), leaves(alone), strict=True):

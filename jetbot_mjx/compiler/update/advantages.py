@@ -19,28 +19,26 @@ def tile_count(tiling: Tiling, batch: Minibatch) -> int:
     return -(-batch.unrolls // (tiling.rows // (batch.time + 1)))
 
 
-def advantages_text(tiling: Tiling, batch: Minibatch, terms: LossTerms) -> str:
+def advantages_text(tiling: Tiling, batch: Minibatch) -> str:
     """Write the kernel.
 
     Its arguments are the parameters, mean and 1 / std of the observations, the collected rows,
-    the last observations, and the unrolls of the minibatch; its results the advantages, the
-    targets, and for each block the sums of the advantages and of their squares.
+    the last observations, the unrolls of the minibatch, and the `LossTerms`; its results the
+    advantages, the targets, and for each block the sums of the advantages and of their squares.
 
     Args:
       tiling: the division of the work.
       batch: the minibatch.
-      terms: the constants of the loss.
 
     Returns:
       The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
     """
-    return _AdvantageKernel(tiling, batch, terms).write()
+    return _AdvantageKernel(tiling, batch).write()
 
 
 class _AdvantageKernel(NetworkKernel):
-    def __init__(self, tiling: Tiling, batch: Minibatch, terms: LossTerms) -> None:
+    def __init__(self, tiling: Tiling, batch: Minibatch) -> None:
         super().__init__(tiling, batch, tile_count(tiling, batch))
-        self.terms = terms
         self.per_tile = tiling.rows // (batch.time + 1)
 
     def write(self) -> str:
@@ -49,10 +47,12 @@ class _AdvantageKernel(NetworkKernel):
         seed = ir.register("ctaid.z")
         sizes = [shape.size, shape.observations, shape.observations]
         sizes += [batch.collected * batch.time * shape.columns["size"]]
-        sizes += [batch.collected * shape.observations, batch.unrolls, batch.samples, batch.samples]
+        sizes += [batch.collected * shape.observations, batch.unrolls, len(LossTerms._fields)]
+        sizes += [batch.samples, batch.samples]
         self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
         part = seed * self.blocks + self.block
-        self.statistics = ir.row(Value(ir, "%a8", "ptr addrspace(1)"), part, 2)
+        self.statistics = ir.row(Value(ir, "%a9", "ptr addrspace(1)"), part, 2)
+        self.terms = self.load_terms(self.arrays[6])
         params = ir.element(self.arrays[0], ir.constant(shape.policy_size, "i32"))
         self.load_network(params, ir.constant(1, "i32"), self.arrays[1], self.arrays[2])
         ir.synchronize()
@@ -63,7 +63,7 @@ class _AdvantageKernel(NetworkKernel):
         ends = total + advantage, squares + advantage * advantage
         self.end_tiles(tile, [(total, ends[0]), (squares, ends[1])])
         self._store_statistics(*ends)
-        return self.text(NAME, 9)
+        return self.text(NAME, 10)
 
     def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
         """Return the unroll of a row of a tile, which may not exist, and the step in it."""
@@ -120,8 +120,8 @@ class _AdvantageKernel(NetworkKernel):
         there = ir.select(self.thread < rows, unroll, beyond) < beyond
         with ir.when(there):
             place = unroll * time + step
-            ir.put(advantage, self.arrays[6], place)
-            ir.put(self._read("targets", own), self.arrays[7], place)
+            ir.put(advantage, self.arrays[7], place)
+            ir.put(self._read("targets", own), self.arrays[8], place)
         return ir.select(there, advantage, 0.0)
 
     def _store_values(self) -> None:

@@ -12,10 +12,6 @@ a layer with its biases, and another one the gradient of both.
 import dataclasses
 import functools
 import itertools
-import math
-
-import jax
-import jax.numpy as jnp
 
 from jetbot_mjx.compiler import ffi_wrapper
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
@@ -50,6 +46,8 @@ _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `_MOST_PARTS` times as many."""
 
 _MOST_PARTS = 32
+
+_TERMS = LossTerms(*[vector_of()] * len(LossTerms._fields))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +117,7 @@ class Division:
     @property
     def reads(self) -> int:
         """Return how many numbers the loss of a sample reads."""
-        return 6 * self.shape.actions + self.outputs + 3
+        return 6 * self.shape.actions + self.outputs + 3 + len(LossTerms._fields)
 
     @functools.cached_property
     def layout(self) -> dict[str, int]:
@@ -134,7 +132,7 @@ class Division:
         sizes |= dict.fromkeys(("deltas0", "deltas1"), self.rows * stride)
         sizes |= dict.fromkeys(("outputs", "errors"), self.rows * HEAD)
         sizes["head_sums"] = (shape.width + 1) * HEAD
-        sizes |= {"sums": self.slots * self.lanes, "statistics": 2 * self.lanes}
+        sizes |= {"sums": self.slots * self.lanes, "statistics": self.lanes}
         sizes |= {"loss": self.reads * self.lanes}
         sizes |= {"results": (HEAD + self.slots) * self.lanes}
         padded = [_rounded(size, _PAD) for size in sizes.values()]
@@ -142,25 +140,22 @@ class Division:
         return {**dict(zip(sizes, starts, strict=False)), "size": starts[-1]}
 
 
-def kernel_text(
-    division: Division, terms: LossTerms, *, registers: int, name: str, machine: str
-) -> str:
+def kernel_text(division: Division, *, registers: int, name: str, machine: str) -> str:
     """Write the LLVM module of a kernel, whose function XLA calls.
 
     The values' kernel takes the parameters of both networks, mean and 1 / std of the observations,
-    the collected rows, the unrolls of the minibatch and the last observations, each with the
-    policies as the first axis. It returns the gradient of each part and the advantages. The
-    policy's kernel takes noise, of shape (time, unrolls, action), and advantages
+    the collected rows, the unrolls of the minibatch, the `LossTerms` and the last observations,
+    each with the policies as the first axis. It returns the gradient of each part and the
+    advantages. The policy's kernel takes noise, of shape (time, unrolls, action), and advantages
     instead of the last observations, and returns no advantages.
 
     Args:
       division: the division of the minibatch.
-      terms: the constants of the loss.
       registers: the number of vector registers.
       name: the name of the function.
       machine: the processor, one of `ffi_wrapper.MACHINES`.
     """
-    kernel = (_PolicyKernel if division.is_policy else _ValueKernel)(division, terms)
+    kernel = (_PolicyKernel if division.is_policy else _ValueKernel)(division)
     lanes = division.lanes
     functions = [*kernel.functions(), product_text(lanes, registers), kernel.block()]
     lines = [product_declarations(lanes), "declare float @llvm.sqrt.f32(float)"]
@@ -183,9 +178,8 @@ class _Kernel:
     arguments: tuple[str, ...]
     results: tuple[str, ...]
 
-    def __init__(self, division: Division, terms: LossTerms) -> None:
+    def __init__(self, division: Division) -> None:
         self.division, self.shape, self.batch = division, division.shape, division.batch
-        self.terms = terms
         self.programs: list[LlvmEmitter] = []
         self.code = VectorCode(division.lanes)
 
@@ -194,7 +188,9 @@ class _Kernel:
         scalar = vector_of()
         activation = functools.partial(sample_loss.activation, self.shape.activation)
         return [
-            self._on_layers("activate", scalarize(activation, scalar), ["%one"], ["%one", "%other"]),
+            self._on_layers(
+                "activate", scalarize(activation, scalar), ["%one"], ["%one", "%other"]
+            ),
             self._on_layers(
                 "multiply",
                 scalarize(lambda one, other: one * other, scalar, scalar),
@@ -210,6 +206,11 @@ class _Kernel:
     def add_losses(self, first: str, count: str) -> None:
         raise NotImplementedError
 
+    def load_terms(self) -> list[str]:
+        """Return the coefficients of the loss."""
+        code, array = self.code, self.arrays["terms"]
+        return [code.load(code.at(array, i)) for i in range(len(LossTerms._fields))]
+
     def row_of(self, unroll: str, step: str) -> str:
         """Return the address of the collected row of a step."""
         code = self.code
@@ -219,7 +220,9 @@ class _Kernel:
     def collected(self, unroll: str) -> str:
         """Return the index of an unroll of the minibatch among the collected ones."""
         code = self.code
-        return code.let(f"sext i32 {code.load(code.at(self.arrays['unrolls'], unroll), 'i32')} to i64")
+        return code.let(
+            f"sext i32 {code.load(code.at(self.arrays['unrolls'], unroll), 'i32')} to i64"
+        )
 
     def _on_layers(
         self, name: str, program: ScalarProgram, reads: list[str], writes: list[str]
@@ -287,6 +290,7 @@ class _Kernel:
             "scale": shape.observations,
             "rows": batch.collected * batch.time * shape.columns["size"],
             "unrolls": batch.unrolls,
+            "terms": len(LossTerms._fields),
             "last": batch.collected * shape.observations,
             "noise": batch.samples * shape.actions,
             "advantages": batch.samples,
@@ -447,13 +451,14 @@ class _Kernel:
 class _ValueKernel(_Kernel):
     """Values, advantages, and the gradient of the value network."""
 
-    arguments = ("params", "mean", "scale", "rows", "unrolls", "last")
+    arguments = ("params", "mean", "scale", "rows", "unrolls", "terms", "last")
     results = ("vectors", "advantages")
 
     def loss_function(self) -> str:
         program = scalarize(
-            functools.partial(sample_loss.value_step, terms=self.terms, samples=self.batch.samples),
+            functools.partial(sample_loss.value_step, samples=self.batch.samples),
             ValueStep(*[vector_of()] * len(ValueStep._fields)),
+            _TERMS,
         )
         return self._on_sample("loss", program, 1)
 
@@ -461,10 +466,14 @@ class _ValueKernel(_Kernel):
         """Run backwards through each unroll of the tile."""
         code, shape, time, places = self.code, self.shape, self.batch.time, self.places
         reads, writes = places["loss"], places["results"]
+        for place, term in enumerate(self.load_terms(), start=len(ValueStep._fields)):
+            code.store(term, code.at(reads, place))
         with code.loop(count) as i:
             start = code.mul(i, time + 1)
             last = code.load(code.at(places["outputs"], code.mul(code.add(start, time), HEAD)))
-            code.store(number(0.0), code.at(places["errors"], code.mul(code.add(start, time), HEAD)))
+            code.store(
+                number(0.0), code.at(places["errors"], code.mul(code.add(start, time), HEAD))
+            )
             for place, value in enumerate((last, last, number(0.0)), start=4):
                 code.store(value, code.at(reads, place))
             unroll = code.add(first, i)
@@ -486,7 +495,7 @@ class _ValueKernel(_Kernel):
 class _PolicyKernel(_Kernel):
     """The gradient of the policy network."""
 
-    arguments = ("params", "mean", "scale", "rows", "unrolls", "noise", "advantages")
+    arguments = ("params", "mean", "scale", "rows", "unrolls", "terms", "noise", "advantages")
     results = ("vectors",)
 
     def loss_function(self) -> str:
@@ -503,47 +512,47 @@ class _PolicyKernel(_Kernel):
         )
         loss = functools.partial(
             sample_loss.policy_sample,
-            terms=self.terms,
             samples=self.batch.samples,
             tanh=self.shape.distribution == "tanh_normal",
         )
-        return self._on_sample("loss", scalarize(loss, sample), self.division.lanes)
+        return self._on_sample("loss", scalarize(loss, sample, _TERMS), self.division.lanes)
 
     def _begin(self) -> None:
         super()._begin()
-        if self.terms.normalize_advantage:
+        if self.shape.normalizes:
             self._load_statistics()
 
     def _load_statistics(self) -> None:
         """Compute the mean of all advantages and 1 / (std + 1e-8)."""
+        code = self.code
+        self.mean = self._mean_advantage(None)
+        variance = self._mean_advantage(self.mean)
+        deviation = code.let(f"call float @llvm.sqrt.f32(float {variance})")
+        deviation = code.arithmetic("fadd", deviation, number(1e-8))
+        self.scale = code.arithmetic("fdiv", number(1.0), deviation)
+
+    def _mean_advantage(self, centre: str | None) -> str:
+        """Return the mean of the advantages, or of their squared distances from a centre."""
         code, samples, lanes = self.code, self.batch.samples, self.code.lanes
-        sums, squares = (code.at(self.places["statistics"], i * lanes) for i in range(2))
-        code.fill(sums, 2 * lanes)
+        total = self.places["statistics"]
+        code.fill(total, lanes)
+
+        def add(place: str, kind: str) -> None:
+            value = code.load(code.at(self.arrays["advantages"], place), kind)
+            if centre is not None:
+                centres = centre if kind == "float" else self._splat(centre)
+                value = code.arithmetic("fsub", value, centres, kind)
+                value = code.arithmetic("fmul", value, value, kind)
+            self.accumulate(total, value, kind)
+
         whole = samples // lanes
-        mean = number(0.0)
-        for target, is_square in ((sums, False), (squares, True)):
-
-            def add(place: str, kind: str) -> None:
-                value = code.load(code.at(self.arrays["advantages"], place), kind)
-                if is_square:
-                    shift = mean if kind == "float" else self._splat(mean)
-                    value = code.arithmetic("fsub", value, shift, kind)
-                    value = code.arithmetic("fmul", value, value, kind)
-                self.accumulate(target, value, kind)
-
-            with code.loop(whole) as i:
-                add(code.mul(i, lanes), code.vector)
-            with code.loop(samples % lanes) as i:
-                add(code.add(i, whole * lanes), "float")
-            with code.loop(lanes - 1) as i:
-                self.accumulate(target, code.load(code.at(target, code.add(i, 1))))
-            total = code.arithmetic("fmul", code.load(target), number(1 / samples))
-            if not is_square:
-                mean = total
-                continue
-            deviation = code.let(f"call float @llvm.sqrt.f32(float {total})")
-            deviation = code.arithmetic("fadd", deviation, number(1e-8))
-            self.mean, self.scale = mean, code.arithmetic("fdiv", number(1.0), deviation)
+        with code.loop(whole) as i:
+            add(code.mul(i, lanes), code.vector)
+        with code.loop(samples % lanes) as i:
+            add(code.add(i, whole * lanes), "float")
+        with code.loop(lanes - 1) as i:
+            self.accumulate(total, code.load(code.at(total, code.add(i, 1))))
+        return code.arithmetic("fmul", code.load(total), number(1 / samples))
 
     def _splat(self, value: str) -> str:
         code = self.code
@@ -553,7 +562,7 @@ class _PolicyKernel(_Kernel):
 
     def add_losses(self, first: str, count: str) -> None:
         """Compute the losses of as many samples at once as a vector has lanes."""
-        code, shape, time, places = self.code, self.shape, self.batch.time, self.places
+        code, time, places = self.code, self.batch.time, self.places
         division, lanes = self.division, code.lanes
         rows = code.mul(count, time)
         groups = code.let(f"udiv i64 {code.add(rows, lanes - 1)}, {lanes}")
@@ -591,7 +600,7 @@ class _PolicyKernel(_Kernel):
         noise = code.at(self.arrays["noise"], code.mul(noise, actions))
         sample = code.add(code.mul(unroll, batch.time), step)
         advantage = code.load(code.at(self.arrays["advantages"], sample))
-        if self.terms.normalize_advantage:
+        if self.shape.normalizes:
             advantage = code.arithmetic("fsub", advantage, self.mean)
             advantage = code.arithmetic("fmul", advantage, self.scale)
         sources = [(outputs, self.division.outputs)]
@@ -602,10 +611,9 @@ class _PolicyKernel(_Kernel):
         first = columns["raw_action"]
         sources.append((code.at(collected, first), columns["reward"] - first))
         sources.append((noise, actions))
-        values = [
-            code.load(code.at(source, i)) for source, count in sources for i in range(count)
-        ]
+        values = [code.load(code.at(source, i)) for source, count in sources for i in range(count)]
         values += [advantage, code.select(is_there, "float", number(1.0), number(0.0))]
+        values += self.load_terms()
         target = code.at(self.places["loss"], lane)
         for i, value in enumerate(values):
             code.store(value, code.at(target, i * code.lanes))

@@ -38,29 +38,29 @@ def tile_count(tiling: Tiling, batch: Minibatch) -> int:
     return -(-batch.samples // tiling.rows)
 
 
-def gradient_text(tiling: Tiling, batch: Minibatch, terms: LossTerms, parts: int) -> str:
+def gradient_text(tiling: Tiling, batch: Minibatch, parts: int) -> str:
     """Write the kernel.
 
     Its arguments are the parameters, mean and 1 / std of the observations, the collected rows, the
-    unrolls of the minibatch, the noise, of shape (time, unrolls, action), and the results of the
-    kernel of the advantages; its result is a vector for each block, whose sum is the gradient.
+    unrolls of the minibatch, the noise, of shape (time, unrolls, action), the results of the kernel
+    of the advantages, and the `LossTerms`; its result is a vector for each block, whose sum is the
+    gradient.
 
     Args:
       tiling: the division of the work.
       batch: the minibatch.
-      terms: the constants of the loss.
       parts: the number of blocks of the kernel of the advantages.
 
     Returns:
       The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
     """
-    return _GradientKernel(tiling, batch, terms, parts).write()
+    return _GradientKernel(tiling, batch, parts).write()
 
 
 class _GradientKernel(NetworkKernel):
-    def __init__(self, tiling: Tiling, batch: Minibatch, terms: LossTerms, parts: int) -> None:
+    def __init__(self, tiling: Tiling, batch: Minibatch, parts: int) -> None:
         super().__init__(tiling, batch, tile_count(tiling, batch))
-        self.terms, self.parts = terms, parts
+        self.parts = parts
         self.width, self.shares = self.shape.width, self.shape.shares
         self.error_scale = batch.samples * _MEAN_SCALE
 
@@ -72,18 +72,20 @@ class _GradientKernel(NetworkKernel):
         sizes = [shape.size, shape.observations, shape.observations]
         sizes += [batch.collected * batch.time * shape.columns["size"], batch.unrolls]
         sizes += [batch.samples * shape.actions, batch.samples, batch.samples, 2 * self.parts]
+        sizes += [len(LossTerms._fields)]
         self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
         part = seed * self.blocks + self.block
         start = self.network * shape.policy_size
-        parts = ir.row(Value(ir, "%a9", "ptr addrspace(1)"), part, shape.size)
+        parts = ir.row(Value(ir, "%a10", "ptr addrspace(1)"), part, shape.size)
         self.part = ir.element(parts, start)
         self.params = ir.element(self.arrays[0], start)
+        self.terms = self.load_terms(self.arrays[9])
         self.outputs = ir.select(
             self.is_policy, ir.constant(shape.outputs[0], "i32"), ir.constant(1, "i32")
         )
         self.load_network(self.params, self.outputs, self.arrays[1], self.arrays[2])
         self._clear()
-        if self.terms.normalize_advantage:
+        if self.shape.normalizes:
             self._load_statistics()
         ir.synchronize()
         tile = self.begin_tiles()
@@ -99,7 +101,7 @@ class _GradientKernel(NetworkKernel):
         ir.synchronize()
         self.end_tiles(tile, list(zip(self.begun, self._all_sums(), strict=True)))
         self._store_gradient()
-        return self.text(NAME, 10)
+        return self.text(NAME, 11)
 
     def _clear(self) -> None:
         ir = self.ir
@@ -204,7 +206,7 @@ class _GradientKernel(NetworkKernel):
             self._policy_loss()
         with ir.when(self.network.equals(1)):
             error = ir.read(self.own) - self._extra(self.tiling.extras - 1)
-            slope = error * (self.terms.vf_loss_coefficient / self.batch.samples)
+            slope = error * self.terms.vf_loss_coefficient * (1 / self.batch.samples)
             self._store_errors([slope], [error * error])
 
     def _policy_loss(self) -> None:
@@ -230,12 +232,12 @@ class _GradientKernel(NetworkKernel):
             if tanh:
                 log_ratio -= _log_slope(ir, action[i])
         ratio, advantage = ir.exp(log_ratio), self._advantage()
-        low, high = ir.constant(1 - terms.clipping_epsilon), 1 + terms.clipping_epsilon
+        low, high = 1.0 - terms.clipping_epsilon, 1.0 + terms.clipping_epsilon
         clipped = ir.select(ratio < low, low, ir.minimum(ratio, high)) * advantage
         surrogate = ratio * advantage
         by_log = ir.select(surrogate <= clipped, surrogate * (-1 / samples), 0.0)
         # The entropy, of a sample of the current policy.
-        weight = -terms.entropy_cost / samples
+        weight = terms.entropy_cost * (-1 / samples)
         entropy = ir.constant(0.0)
         by_mean, by_scale = [], []
         for i in actions:
@@ -260,7 +262,7 @@ class _GradientKernel(NetworkKernel):
     def _advantage(self) -> Value:
         """Return the advantage of the thread's sample, normalised if configured."""
         advantage = self._extra(self.tiling.extras - 2)
-        if not self.terms.normalize_advantage:
+        if not self.shape.normalizes:
             return advantage
         place = self.bytes_of("statistics") + 4 * 2 * LANES
         mean, scale = (self.ir.read(self.ir.shared(place + 4 * i)) for i in (0, 1))

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float, Int
 
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import launch_cpu, launch_gpu
-from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
 
 _LAUNCHERS: dict[str, Any] = {"gpu": launch_gpu, "cpu": launch_cpu}
 """The modules that launch the kernels, by the kind of JAX's default device."""
@@ -37,21 +37,19 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return launcher.refusal(shape, batch)
 
 
-def prepare(shape: UpdateShape, terms: LossTerms, batch: Minibatch, policies: int) -> None:
+def prepare(shape: UpdateShape, batch: Minibatch, policies: int) -> None:
     """Begin to compile the kernels, before a program is traced that launches them.
 
     Args:
       shape: the networks.
-      terms: the constants of the loss.
       batch: the minibatch.
       policies: the number of policies that are trained at once.
     """
-    _LAUNCHERS[jax.default_backend()].prepare(shape, terms, batch, policies)
+    _LAUNCHERS[jax.default_backend()].prepare(shape, batch, policies)
 
 
 def gradient(
     shape: UpdateShape,
-    terms: LossTerms,
     params: Float[Array, " size"],
     mean: Float[Array, " obs"],
     scale: Float[Array, " obs"],
@@ -59,12 +57,12 @@ def gradient(
     last: Float[Array, "collected obs"],
     unrolls: Int[Array, " unrolls"],
     noise: Float[Array, "time unrolls action"],
+    terms: Float[Array, " terms"],
 ) -> Float[Array, " size"]:
     """Compute the gradient of PPO's loss by the parameters of both networks.
 
     Args:
       shape: the networks.
-      terms: the constants of the loss.
       params: the parameters of both networks, in the order of `UpdateShape`.
       mean: what is subtracted from the observations.
       scale: what they are then multiplied by.
@@ -72,30 +70,31 @@ def gradient(
       last: the observations after the last steps.
       unrolls: the unrolls of the minibatch, as indices of the collected ones.
       noise: standard normal noise, which estimates the entropy.
+      terms: the coefficients of the loss, in the order of `LossTerms`.
 
     Returns:
       The gradient, with the sums of the metrics at their places.
     """
-    arguments = (params, mean, scale, rows, last, unrolls, noise)
-    return _gradient_p.bind(*arguments, shape=shape, terms=terms)
+    arguments = (params, mean, scale, rows, last, unrolls, noise, terms)
+    return _gradient_p.bind(*arguments, shape=shape)
 
 
 _gradient_p = Primitive("ppo_gradient")
 
 
 @_gradient_p.def_abstract_eval
-def _abstract(params: Any, *_: Any, shape: UpdateShape, terms: LossTerms) -> ShapedArray:
+def _abstract(params: Any, *_: Any, shape: UpdateShape) -> ShapedArray:
     return ShapedArray(params.shape, params.dtype)
 
 
 @_gradient_p.def_impl
-def _run(*arguments: Array, shape: UpdateShape, terms: LossTerms) -> Array:
+def _run(*arguments: Array, shape: UpdateShape) -> Array:
     # Enable jit here: within `jax.disable_jit` this function would call itself.
     with jax.disable_jit(False):
-        return _compiled(*arguments, shape=shape, terms=terms)
+        return _compiled(*arguments, shape=shape)
 
 
-_compiled = jax.jit(_gradient_p.bind, static_argnames=("shape", "terms"))
+_compiled = jax.jit(_gradient_p.bind, static_argnames="shape")
 
 
 def _batch(
@@ -103,14 +102,13 @@ def _batch(
     axes: Sequence[int | None],
     *,
     shape: UpdateShape,
-    terms: LossTerms,
 ) -> tuple[Array, int]:
     (size,) = {x.shape[i] for x, i in zip(arguments, axes, strict=True) if i is not None}
     moved = [
         jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
         for x, axis in zip(arguments, axes, strict=True)
     ]
-    return _gradient_p.bind(*moved, shape=shape, terms=terms), 0
+    return _gradient_p.bind(*moved, shape=shape), 0
 
 
 batching.primitive_batchers[_gradient_p] = _batch
@@ -119,11 +117,11 @@ batching.primitive_batchers[_gradient_p] = _batch
 def _lowered(launcher: Any) -> Callable[..., Array]:
     """Return the function that JAX lowers for a platform."""
 
-    def lowered(*arguments: Array, shape: UpdateShape, terms: LossTerms) -> Array:
+    def lowered(*arguments: Array, shape: UpdateShape) -> Array:
         batch = arguments[0].shape[:-1]
         policies, depth = math.prod(batch), len(batch)
         flat = [x.reshape(policies, *x.shape[depth:]) for x in arguments]
-        return launcher.launch(shape, terms, flat).reshape(*batch, shape.size)
+        return launcher.launch(shape, flat).reshape(*batch, shape.size)
 
     return lowered
 
@@ -134,5 +132,3 @@ for _launcher in _LAUNCHERS.values():
         mlir.lower_fun(_lowered(_launcher), multiple_results=False),
         platform=_launcher.BACKEND.PLATFORM,
     )
-
-

@@ -17,7 +17,7 @@ from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import cpu_kernels
 from jetbot_mjx.compiler.update.cpu_kernels import Division
-from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
 
 BACKEND: Backend = llvm_backend
 """The back end that compiles the kernels."""
@@ -51,34 +51,31 @@ def _divisions(shape: UpdateShape, batch: Minibatch) -> tuple[Division, Division
 
 
 @functools.cache
-def _text(division: Division, terms: LossTerms) -> str:
+def _text(division: Division) -> str:
     """Return the LLVM module of a kernel."""
     host = llvm_backend.host_processor()
     return cpu_kernels.kernel_text(
-        division, terms, registers=host.registers, name=llvm_backend.NAME, machine=host.machine
+        division, registers=host.registers, name=llvm_backend.NAME, machine=host.machine
     )
 
 
-def prepare(shape: UpdateShape, terms: LossTerms, batch: Minibatch, policies: int) -> None:
+def prepare(shape: UpdateShape, batch: Minibatch, policies: int) -> None:
     """Begin to compile both kernels, which serve any number of policies, as `launch.prepare`."""
     for division in _divisions(shape, batch):
-        in_background(lambda division=division: llvm_backend.registered(_text(division, terms)))
+        in_background(lambda division=division: llvm_backend.registered(_text(division)))
 
 
-def launch(
-    shape: UpdateShape, terms: LossTerms, arguments: Sequence[Array]
-) -> Float[Array, "policies size"]:
+def launch(shape: UpdateShape, arguments: Sequence[Array]) -> Float[Array, "policies size"]:
     """Run both kernels, while JAX lowers a program for CPUs.
 
     Args:
       shape: the networks.
-      terms: the constants of the loss.
       arguments: those of `launch.gradient`, with the policies as their first axis.
 
     Returns:
       The gradients, with the sums of the metrics at their places.
     """
-    params, mean, scale, rows, last, unrolls, noise = arguments
+    params, mean, scale, rows, last, unrolls, noise, terms = arguments
     policies = params.shape[0]
     batch = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
     values, policy = _divisions(shape, batch)
@@ -88,8 +85,8 @@ def launch(
 
     def run(division: Division, others: Sequence[Array], *results: int) -> list[Array]:
         like = [floats(division.parts, division.size), *map(floats, results)]
-        given = [params, mean, scale, rows, unrolls, *others]
-        vectors, *rest = llvm_backend.launch_text(_text(division, terms), given, like)
+        given = [params, mean, scale, rows, unrolls, terms, *others]
+        vectors, *rest = llvm_backend.launch_text(_text(division), given, like)
         # XLA's own reduction takes longer than a part does.
         total = functools.reduce(jnp.add, [vectors[:, i] for i in range(division.parts)])
         return [total, *rest]

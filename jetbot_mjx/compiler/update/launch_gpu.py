@@ -24,7 +24,6 @@ from jetbot_mjx.compiler.update.shapes import (
     MOST_OUTPUTS,
     MOST_SUMS,
     MOST_WIDTH,
-    LossTerms,
     Minibatch,
     Tiling,
     UpdateShape,
@@ -109,14 +108,11 @@ class _Kernel(NamedTuple):
 
 
 @functools.cache
-def prepare(
-    shape: UpdateShape, terms: LossTerms, size: Minibatch, policies: int
-) -> tuple[_Kernel, _Kernel]:
+def prepare(shape: UpdateShape, size: Minibatch, policies: int) -> tuple[_Kernel, _Kernel]:
     """Divide the work among the blocks, and begin to compile both kernels to PTX.
 
     Args:
       shape: the networks.
-      terms: the constants of the loss.
       size: the minibatch.
       policies: the number of policies that share the GPU.
 
@@ -141,40 +137,38 @@ def prepare(
     tiling = shapes.advantage_tiling(shape, size, most, _shared_memory())
     assert tiling is not None
     parts = min(most, advantages.tile_count(tiling, size))
-    write = functools.partial(advantages.advantages_text, tiling, size, terms)
+    write = functools.partial(advantages.advantages_text, tiling, size)
     first = kernel(advantages.NAME, write, tiling, parts, 1)
     # Half of the blocks compute the policy's gradient, and half the values'.
     tiling = shapes.gradient_tiling(shape, _shared_memory())
     assert tiling is not None
     blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
-    write = functools.partial(gradient_kernel.gradient_text, tiling, size, terms, parts)
+    write = functools.partial(gradient_kernel.gradient_text, tiling, size, parts)
     return first, kernel(gradient_kernel.NAME, write, tiling, blocks, 2)
 
 
-def launch(
-    shape: UpdateShape, terms: LossTerms, arguments: Sequence[Array]
-) -> Float[Array, "policies size"]:
+def launch(shape: UpdateShape, arguments: Sequence[Array]) -> Float[Array, "policies size"]:
     """Run both kernels, while JAX lowers a program for an NVIDIA GPU.
 
     Args:
       shape: the networks.
-      terms: the constants of the loss.
       arguments: those of `launch.gradient`, with the policies as their first axis.
 
     Returns:
       The gradients, with the sums of the metrics at their places.
     """
-    params, mean, scale, rows, last, unrolls, noise = arguments
+    params, mean, scale, rows, last, unrolls, noise, terms = arguments
     policies = params.shape[0]
     size = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
-    first, second = prepare(shape, terms, size, policies)
+    first, second = prepare(shape, size, policies)
     parts, blocks = first.grid[0], second.grid[0]
     samples = policies, size.samples
     estimates = first.launch(
-        [params, mean, scale, rows, last, unrolls], samples, samples, (policies, parts, 2)
+        [params, mean, scale, rows, last, unrolls, terms], samples, samples, (policies, parts, 2)
     )
     (vectors,) = second.launch(
-        [params, mean, scale, rows, unrolls, noise, *estimates], (policies, blocks, shape.size)
+        [params, mean, scale, rows, unrolls, noise, *estimates, terms],
+        (policies, blocks, shape.size),
     )
     return vectors.sum(1)
 

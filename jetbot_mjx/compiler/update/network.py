@@ -2,7 +2,14 @@
 
 from collections.abc import Callable, Sequence
 
-from jetbot_mjx.compiler.update.shapes import MOST_OUTPUTS, PAD, Minibatch, Tiling, padded
+from jetbot_mjx.compiler.update.shapes import (
+    MOST_OUTPUTS,
+    PAD,
+    LossTerms,
+    Minibatch,
+    Tiling,
+    padded,
+)
 from jetbot_mjx.compiler.update.tensor_core import (
     DECLARATIONS,
     LANES,
@@ -46,6 +53,11 @@ class NetworkKernel:
     def argument(self, index: int, seed: Value, size: int) -> Value:
         """Return the array of a seed."""
         return self.ir.row(Value(self.ir, f"%a{index}", "ptr addrspace(1)"), seed, size)
+
+    def load_terms(self, array: Value) -> LossTerms:
+        """Return the coefficients of the loss."""
+        count = len(LossTerms._fields)
+        return LossTerms(*(self.ir.fetch(array, self.ir.constant(i, "i32")) for i in range(count)))
 
     def share(self, total: int, groups: int, group: Value) -> Value:
         """Return the first of a group's tiles; the last group's may overlap the one before."""

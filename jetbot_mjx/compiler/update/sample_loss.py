@@ -5,7 +5,7 @@ of `brax.training.agents.ppo.losses`, the distributions those of `brax.training.
 """
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -65,7 +65,7 @@ def policy_sample(
 
     Args:
       sample: the sample.
-      terms: the constants of the loss.
+      terms: the coefficients of the loss.
       samples: the number of samples of the minibatch.
       tanh: whether the distribution is `tanh_normal`.
 
@@ -74,7 +74,7 @@ def policy_sample(
       `POLICY_METRICS`.
     """
     outputs, deviations, action, log_prob, old, noise, advantage, weight = sample
-    mean, raw = (jnp.split(outputs, 2) if tanh else (outputs, outputs))
+    mean, raw = jnp.split(outputs, 2) if tanh else (outputs, outputs)
     scale = _softplus(raw) + _MIN_STD if tanh else deviations
     old_mean, old_scale = jnp.split(old, 2)
     old_scale = _softplus(old_scale) + _MIN_STD if tanh else old_scale
@@ -91,7 +91,7 @@ def policy_sample(
     by_mean = by_log * distance * inverse
     by_scale = by_log * (distance * distance - 1.0) * inverse
     # The entropy, of a sample of the current policy.
-    cost = weight * (-terms.entropy_cost / samples)
+    cost = weight * terms.entropy_cost * (-1.0 / samples)
     entropy = log_scale + (0.5 + _HALF_LOG_TWO_PI)
     by_scale += inverse * cost
     if tanh:
@@ -131,7 +131,7 @@ def value_step(step: ValueStep, terms: LossTerms, samples: int) -> tuple[Array, 
 
     Args:
       step: the step.
-      terms: the constants of the loss.
+      terms: the coefficients of the loss.
       samples: the number of samples of the minibatch.
 
     Returns:
@@ -147,7 +147,7 @@ def value_step(step: ValueStep, terms: LossTerms, samples: int) -> tuple[Array, 
     target = estimate + step.value
     advantage = (reward + future * step.next_target - step.value) * kept
     error = step.value - target
-    slope = error * (terms.vf_loss_coefficient / samples)
+    slope = error * terms.vf_loss_coefficient * (1.0 / samples)
     return advantage, slope, error * error, step.value, target, estimate
 
 
@@ -164,6 +164,6 @@ def _log_slope(x: Array) -> Array:
     return 2.0 * (math.log(2.0) - x - _softplus(-2.0 * x))
 
 
-def vector_of(*sizes: int) -> jax.ShapeDtypeStruct:
+def vector_of(*sizes: int) -> Any:
     """Return the shape of an argument of a function of one sample."""
     return jax.ShapeDtypeStruct(sizes, jnp.float32)

@@ -2,7 +2,7 @@
 
 import dataclasses
 import functools
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from jetbot_mjx.compiler.update.tensor_core import LANES, TILE
 
@@ -25,7 +25,7 @@ _ADVANTAGE_WARPS = 16
 
 
 class UpdateShape(NamedTuple):
-    """An `UpdateShape` describes both networks, which have the same hidden layers.
+    """An `UpdateShape` describes both networks, which have the same hidden layers, and the loss.
 
     Their parameters are one vector: for each network and layer the weights, of shape (inputs,
     outputs), and the biases; then the policy's standard deviations, if the distribution is
@@ -39,6 +39,8 @@ class UpdateShape(NamedTuple):
     actions: int
     distribution: str
     activation: str
+    normalizes: bool = True
+    """Whether advantages are normalised over the minibatch."""
 
     @property
     def outputs(self) -> tuple[int, int]:
@@ -118,15 +120,17 @@ class Minibatch(NamedTuple):
 
 
 class LossTerms(NamedTuple):
-    """A `LossTerms` holds the constants of the loss, under the names of the configuration."""
+    """A `LossTerms` holds the coefficients of the loss, under the names of the configuration.
 
-    clipping_epsilon: float
-    entropy_cost: float
-    vf_loss_coefficient: float
-    discounting: float
-    gae_lambda: float
-    reward_scaling: float
-    normalize_advantage: bool
+    The kernels read them from an array, because they may differ between policies.
+    """
+
+    clipping_epsilon: Any
+    entropy_cost: Any
+    vf_loss_coefficient: Any
+    discounting: Any
+    gae_lambda: Any
+    reward_scaling: Any
 
 
 class Shares(NamedTuple):

@@ -73,9 +73,7 @@ class VectorCode:
         self._begin(body)
         yield self.let(f"sub i64 {self.sub(count, 1)}, {index}") if down else index
         self.do(f"{index}.next = add i64 {index}, 1")
-        self.lines[phi] = (
-            f"{index} = phi i64 [0, %{before}], [{index}.next, %{self._label}]"
-        )
+        self.lines[phi] = f"{index} = phi i64 [0, %{before}], [{index}.next, %{self._label}]"
         self.do(f"br label %{head}")
         self._begin(end)
 
@@ -209,8 +207,8 @@ def product_text(lanes: int, registers: int) -> str:
       The text of the functions.
     """
     columns = 4 if registers >= 32 else 2
-    shapes = [(ROWS, columns), (ROWS, 1), (1, columns), (1, 1)]
-    return "\n".join([*(_tile_text(*shape, lanes) for shape in shapes), _blocks_text(columns, lanes)])
+    tiles = (_tile_text(r, c, lanes) for r in (ROWS, 1) for c in (columns, 1))
+    return "\n".join([*tiles, _blocks_text(columns, lanes)])
 
 
 _PARAMETERS = (
