@@ -428,7 +428,8 @@ class PPO:
             after, transition = acting.actor_step(self._env, env_state, policy, key, _EXTRA_FIELDS)
             # The loss needs the next observation only at the end of an unroll, where it is in the
             # state: the others, possibly images, are not even stored.
-            transition = transition._replace(next_observation=None)
+            nothing: Any = None
+            transition = transition._replace(next_observation=nothing)
             shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), transition)
             return (after, next_key), pack_rows(transition)
 
@@ -440,10 +441,10 @@ class PPO:
             (after, _), rows = jax.lax.scan(
                 step, (env_state, key), length=self.config.unroll_length
             )
-            data: Any = unpack_rows(rows, shapes)
+            data: Transition = unpack_rows(rows, shapes)
+            last: Any = jax.tree.map(lambda x: x[None], after.obs)
             nan_dump = _find_nan_dump(start, data)
-            data = data._replace(next_observation=jax.tree.map(lambda x: x[None], after.obs))
-            return (after, next_key), (data, nan_dump)
+            return (after, next_key), (data._replace(next_observation=last), nan_dump)
 
         # Run the unrolls one after the other, and return the first non-finite state of all.
         count = self.config.batch_size * self.config.num_minibatches // self.config.num_envs

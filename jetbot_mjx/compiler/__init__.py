@@ -2,8 +2,9 @@
 
 `lower_jaxpr` lowers the function to operations on scalars (`scalar_ir`, `indexing`), `schedule`
 orders them, and `llvm_codegen` writes them as LLVM IR. `llvm_backend` compiles that IR for CPUs and
-`ptx_backend` for NVIDIA GPUs; `kernel` wraps both as one JAX primitive. `program_cache` caches
-whole compiled programs from one process to the next. This package knows nothing of robots.
+`ptx_backend` for NVIDIA GPUs; `kernel` wraps both as one JAX primitive. `random_bits` has JAX's
+random bits as such a kernel, and `update` the gradient of PPO's loss. `program_cache` caches whole
+compiled programs from one process to the next. This package knows nothing of robots.
 """
 
 from typing import TYPE_CHECKING
