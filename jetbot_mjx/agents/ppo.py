@@ -236,14 +236,19 @@ class PPO:
         Raises:
           UserError: `ppo.update` requests the kernels, and XLA cannot launch them.
         """
-        if self._fused is None:
-            return
         # Try the back end first: LLVM does one thing at a time, and physics waits for this.
-        backend = launch.backend()
-        if backend.is_available():
+        self.try_backend()
+        if self._fused is not None:
             self._fused.prepare(policies)
-        else:
-            self._refuse_fused(f"it needs {backend.NEEDS}")
+
+    def try_backend(self) -> None:
+        """Let XLA compile the update if the back end of its kernels is not available.
+
+        Raises:
+          UserError: `ppo.update` requests the kernels.
+        """
+        if self._fused is not None and not launch.backend().is_available():
+            self._refuse_fused(f"it needs {launch.backend().NEEDS}")
             print(self.notice, file=sys.stderr)
 
     def check(self) -> bool:
@@ -421,7 +426,7 @@ class PPO:
 
         shapes: Any = ()
 
-        def step(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], PyTree]:
+        def step(carry: Any, _: None) -> Any:
             nonlocal shapes
             env_state, key = carry
             key, next_key = jax.random.split(key)
@@ -433,7 +438,7 @@ class PPO:
             shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), transition)
             return (after, next_key), pack_rows(transition)
 
-        def unroll(carry: tuple[Any, Array], _: None) -> tuple[tuple[Any, Array], PyTree]:
+        def unroll(carry: Any, _: None) -> Any:
             env_state, key = carry
             key, next_key = jax.random.split(key)
             # Copied into one array, because the steps overwrite the state.
@@ -441,10 +446,10 @@ class PPO:
             (after, _), rows = jax.lax.scan(
                 step, (env_state, key), length=self.config.unroll_length
             )
-            data: Transition = unpack_rows(rows, shapes)
-            last: Any = jax.tree.map(lambda x: x[None], after.obs)
+            data: Any = unpack_rows(rows, shapes)
             nan_dump = _find_nan_dump(start, data)
-            return (after, next_key), (data._replace(next_observation=last), nan_dump)
+            data = data._replace(next_observation=jax.tree.map(lambda x: x[None], after.obs))
+            return (after, next_key), (data, nan_dump)
 
         # Run the unrolls one after the other, and return the first non-finite state of all.
         count = self.config.batch_size * self.config.num_minibatches // self.config.num_envs

@@ -27,6 +27,9 @@ from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once,
 from jetbot_mjx.compiler.xla_options import Options, untuned_options
 
 _UNUSED_DAYS = 30
+# Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
+_tracing = threading.Lock()
+
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
 
 
@@ -45,8 +48,6 @@ class ProgramCache:
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
         self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
-        # Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
-        self._tracing = threading.Lock()
 
     def prefetch(self, *names: str) -> None:
         """Start to load programs in threads, and return at once."""
@@ -128,7 +129,7 @@ class ProgramCache:
 
     def _lower(self, trace: Callable[[], jax.stages.Traced]) -> tuple[jax.stages.Lowered, float]:
         """Return a lowered program, and the seconds that this took."""
-        with self._tracing, random_bits.by_one_kernel():
+        with _tracing, random_bits.by_one_kernel():
             began = time.perf_counter()
             return trace().lower(), time.perf_counter() - began
 

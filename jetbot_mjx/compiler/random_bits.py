@@ -34,7 +34,7 @@ def by_one_kernel() -> Iterator[None]:
     """Lower draws of random bits for CPUs to one kernel each inside the context.
 
     Where the kernel cannot be had, or JAX keeps its lowering rules elsewhere, they stay as they
-    are. Other threads that lower programs meanwhile get the kernel too.
+    are. Other threads that lower programs meanwhile get the kernel too. One thread at a time.
     """
     rules = _rules()
     if threefry2x32_p not in rules or not llvm_backend.is_available():

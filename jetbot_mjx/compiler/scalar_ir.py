@@ -432,7 +432,7 @@ def _simplify_exp(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     result = graph.select(do("lt", x, np.float32(-87.336)), result, np.float32(0))
     # Infinity where the result is too large, and NaN of NaN.
     beyond = do("mul", x, np.float32(np.inf))
-    return graph.select(do("lt", x, np.float32(88.7228)), beyond, result)
+    return graph.select(do("lt", x, np.float32(88.722839)), beyond, result)
 
 
 def _simplify_expm1(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
@@ -466,8 +466,10 @@ def _simplify_log(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
 def _log_near_one(graph: ExprGraph, x: Scalar) -> Scalar:
     """Expand log(1 + x) to basic arithmetic, for 1 + x from √½ to √2."""
     do = graph.apply
-    t = do("div", x, do("add", x, np.float32(2)))
-    return do("mul", do("add", t, t), _horner(graph, _ARTANH, do("mul", t, t)))
+    # log(1 + x) = 2 artanh(t), t = x / (x + 2); 2 t is not smaller than the smallest x.
+    double = do("div", do("add", x, x), do("add", x, np.float32(2)))
+    t = do("mul", double, np.float32(0.5))
+    return do("mul", double, _horner(graph, _ARTANH, do("mul", t, t)))
 
 
 def _simplify_log1p(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:

@@ -63,6 +63,11 @@ class Trials:
         env = make_env(config)
         self._env = wrap_for_training(env, config.task.episode_length)
         self._networks = make_networks(config.ppo, env.observation_size, env.action_size)
+        ppo = PPO(config.ppo, self._env, self._networks)
+        ppo.try_backend()
+        if not ppo.is_fused:
+            unfused = config.ppo.model_copy(update={"update": "xla"})
+            self._config = config.model_copy(update={"ppo": unfused})
         episodes = rollout_fn(
             maybe_randomize(env), [policy_controller(self._networks)], config.task.episode_length
         )

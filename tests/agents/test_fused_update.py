@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +16,7 @@ from gpu_model import Gpu
 from jetbot_mjx.agents import fused_update, update_probe
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import PPO
-from jetbot_mjx.compiler import ptx_backend
+from jetbot_mjx.compiler import llvm_backend, ptx_backend
 from jetbot_mjx.compiler.update import advantages, gradient, launch, launch_gpu
 from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
@@ -82,6 +83,22 @@ def test_a_cpu_takes_the_kernels_where_it_can():
     other = make_ppo(config(hidden=[40]))
     assert other._fused is None
     assert other.notice == "ppo.update = xla: it takes layers of 16, 32, 48, ... units, not 40"
+
+
+@pytest.mark.cpu
+def test_without_llvmlite_a_cpu_takes_xla_and_says_so(monkeypatch):
+    llvm_backend.is_available.cache_clear()
+    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+    monkeypatch.setattr(llvm_backend, "_binding", llvm_backend._binding.__wrapped__)
+    monkeypatch.setattr(llvm_backend, "host_processor", llvm_backend.host_processor.__wrapped__)
+    try:
+        ppo = make_ppo(config())
+        assert ppo._fused is None
+        assert ppo.notice.startswith("ppo.update = xla: it needs a CPU, llvmlite")
+        with pytest.raises(UserError, match=r"ppo\.update = fused: it needs a CPU, llvmlite"):
+            make_ppo(config(update="fused"))
+    finally:
+        llvm_backend.is_available.cache_clear()
 
 
 @pytest.mark.cpu

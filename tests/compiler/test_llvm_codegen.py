@@ -229,3 +229,33 @@ def test_the_text_is_good_for_every_machine(triple, monkeypatch):
     module = binding.parse_assembly(text)
     module.triple = triple
     assert binding.Target.from_triple(triple).create_target_machine().emit_object(module)
+
+
+EXACT = {
+    "exp": (jnp.exp, np.exp),
+    "expm1": (jnp.expm1, np.expm1),
+    "log": (jnp.log, np.log),
+    "log1p": (jnp.log1p, np.log1p),
+    "logistic": (jax.nn.sigmoid, lambda x: 1 / (1 + np.exp(-x))),
+    "tanh": (jnp.tanh, np.tanh),
+}
+
+
+@pytest.mark.parametrize("name", EXACT)
+def test_functions_are_those_of_float64(name):
+    function, exact = EXACT[name]
+    rng = np.random.default_rng(0)
+    small = np.geomspace(1.2e-38, 1e3, 20_000)
+    special = [0, -0.0, np.inf, -np.inf, np.nan, 88.7228, 88.73, -87.3, 3e38, 1.2e-38]
+    x = np.concatenate([rng.uniform(-100, 100, 20_000), small, -small, special]).astype(np.float32)
+    program = scalarize(function, jax.ShapeDtypeStruct((), np.float32))
+    (ours,) = run(program, [x])
+    with np.errstate(all="ignore"):
+        expected = exact(x.astype(np.float64))
+        rounded = expected.astype(np.float32)
+    # Subnormal numbers are flushed to zero.
+    normal = np.isfinite(rounded) & (np.abs(expected) > np.finfo(np.float32).tiny)
+    units = np.abs(ours[normal] - expected[normal]) / np.spacing(np.abs(rounded[normal]))
+    assert units.max() < 3.0
+    flushed = np.where(np.isfinite(rounded) & ~normal, 0.0, rounded)[~normal]
+    np.testing.assert_array_equal(np.where(np.isfinite(ours[~normal]), 0.0, ours[~normal]), flushed)

@@ -166,8 +166,9 @@ def averaging():
     )
 
     def moment(update, data):
+        """The moment, and the total loss, the first of `LOSSES`."""
         _, state, metrics = jax.jit(update)(params, optimizer_state, normalizer, data, key)
-        return jax.device_get((state[-1].inner_state[0].mu, metrics["loss/total"]))
+        return jax.device_get((state[-1].inner_state[0].mu, metrics[0]))
 
     (all_of_it, loss), (together, same_loss) = moment(alone.update, data), moment(sharded, data)
     half, _ = moment(alone.update, jax.tree.map(lambda x: x[:16], data))

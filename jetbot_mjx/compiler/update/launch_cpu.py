@@ -34,6 +34,8 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
       shape: the networks.
       batch: the minibatch.
     """
+    if not llvm_backend.is_available():
+        return f"it needs {llvm_backend.NEEDS}"
     outputs = max(shape.outputs)
     if outputs > cpu_kernels.HEAD:
         return f"it takes at most {cpu_kernels.HEAD} outputs, not {outputs}"
