@@ -49,6 +49,17 @@ def to_trees(state: TrainState) -> dict[str, Any]:
     return {POLICY: state.policy_params, TRAINING: {**rest, "tally": sums}}
 
 
+def tree_shapes(template: TrainState) -> dict[str, Any]:
+    """Return the shapes and dtypes of the trees of `to_trees`.
+
+    Args:
+      template: the shapes and dtypes of a training state.
+    """
+    rest = {name: getattr(template, name) for name in _REST}
+    sums = dict.fromkeys(TALLIED, jax.ShapeDtypeStruct((), np.float32))
+    return {POLICY: template.policy_params, TRAINING: {**rest, "tally": sums}}
+
+
 def resume(
     run_dirs: Sequence[Path], configs: Sequence[Config], template: TrainState
 ) -> Resumption | None:
@@ -103,10 +114,9 @@ def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState,
         parse_config(about["config"], source="stored config").check_resume(config)
     except ConfigError as error:
         raise CheckpointError(f"checkpoint {path} belongs to another run: {error}") from None
-    policy: PolicyParams = read_tree(path, POLICY, template.policy_params)
-    wanted = {name: getattr(template, name) for name in _REST}
-    sum_shape = jax.ShapeDtypeStruct((), np.float32)
-    rest = read_tree(path, TRAINING, {**wanted, "tally": dict.fromkeys(TALLIED, sum_shape)})
+    shapes = tree_shapes(template)
+    policy: PolicyParams = read_tree(path, POLICY, shapes[POLICY])
+    rest = read_tree(path, TRAINING, shapes[TRAINING])
     rest["tally"] = np.stack([rest["tally"][name] for name in TALLIED])
     state = TrainState(
         params=template.params.replace(policy=policy.policy, value=policy.value),
