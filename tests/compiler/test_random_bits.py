@@ -56,26 +56,28 @@ def test_outside_nothing_has_changed():
 
 
 def test_two_caches_that_lower_at_once_leave_jax_as_it_was():
-    key, begun, done = jax.random.PRNGKey(0), threading.Event(), threading.Event()
+    key = jax.random.PRNGKey(0)
+    begun, inside, over = threading.Event(), threading.Event(), threading.Event()
 
-    def slow():
+    def first():
         begun.set()
-        done.wait(0.3)
+        inside.wait(0.3)
         return jax.jit(jax.random.uniform).trace(key)
 
-    def quick():
-        begun.wait()
-        ProgramCache({}).compile("quick", lambda: jax.jit(jax.random.normal).trace(key))
-        done.set()
+    def second():
+        inside.set()
+        over.wait(2.0)
+        return jax.jit(jax.random.normal).trace(key)
 
-    threads = [
-        threading.Thread(target=lambda: ProgramCache({}).compile("slow", slow)),
-        threading.Thread(target=quick),
-    ]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
+    def compile_second():
+        begun.wait()
+        ProgramCache({}).compile("second", second)
+
+    thread = threading.Thread(target=compile_second)
+    thread.start()
+    ProgramCache({}).compile("first", first)
+    over.set()
+    thread.join()
     assert kernels(lowered(key)) == 0
 
 
