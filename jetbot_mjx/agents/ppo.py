@@ -224,7 +224,7 @@ class PPO:
 
     @property
     def is_fused(self) -> bool:
-        """Whether kernels of this package compute the update."""
+        """Return whether kernels of this package compute the update."""
         return self._fused is not None
 
     def prepare(self, policies: int) -> None:
