@@ -45,9 +45,8 @@ Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.
 google/brax v0.14.2, brax/training/agents/ppo.
 """
 
-import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import jax
@@ -55,7 +54,6 @@ import jax.flatten_util
 import jax.numpy as jnp
 import optax
 from brax.envs import Env
-from brax.training import acting
 from brax.training.acme import running_statistics
 from brax.training.agents.ppo import losses, optimizer
 from brax.training.agents.ppo import networks as ppo_networks
@@ -66,6 +64,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 from jetbot_mjx.agents import fused_update, gae, update_probe
 from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
+from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.errors import UserError
@@ -111,7 +110,7 @@ class TrainState(struct.PyTreeNode):
     normalizer: running_statistics.RunningStatisticsState
     """Running mean and standard deviation of the observation."""
     env_state: Any
-    """Batched state of all environments."""
+    """Batched state of all environments; in a packed state a `Packed`."""
     key: Any
     """Random key of the next training step."""
     env_steps: UInt64
@@ -137,7 +136,7 @@ class NanDump(struct.PyTreeNode):
     found: Any
     """Whether there is a non-finite state; otherwise the other fields have no meaning."""
     env_state: Any
-    """The state of one environment at the start of the unroll, as from `pack_rows` on devices."""
+    """The state of one environment at the start of the unroll; a `Packed` on devices."""
     actions: Any
     """The actions of the unroll, shape (time, action)."""
     step: Any
@@ -314,7 +313,7 @@ class PPO:
         """
         tally = jnp.where(restart, 0.0, state.tally)
         if not self._fused:
-            state = self.unpacked(state)
+            state = self._with_trees(state)
 
         def body(_: Array, carry: tuple[TrainState, NanDump]) -> tuple[TrainState, NanDump]:
             before, nan_dump = carry
@@ -326,29 +325,34 @@ class PPO:
 
         none = NanDump(
             found=jnp.zeros((), bool),
-            env_state=jax.tree.map(
-                lambda x: jnp.zeros(x.shape[1:], x.dtype),
-                jax.eval_shape(pack_rows, state.env_state),
-            ),
+            env_state=jax.tree.map(lambda x: jnp.zeros(x.shape[1:], x.dtype), state.env_state),
             actions=jnp.zeros((self.config.unroll_length, self._env.action_size)),
             step=jnp.zeros((), jnp.int32),
         )
         state, nan_dump = jax.lax.fori_loop(0, num_steps, body, (state.replace(tally=tally), none))
-        return (state if self._fused else self.packed(state)), nan_dump
+        return (state if self._fused else self._with_vectors(state)), nan_dump
 
     def packed(self, state: TrainState) -> TrainState:
-        """Return a state with vectors for parameters and moments if the update may be fused.
+        """Return a state with few arrays, as `advance` takes it.
 
         Args:
           state: the state, from `init` or on the host.
         """
+        return self._with_vectors(state.replace(env_state=pack(state.env_state, batch_axes=1)))
+
+    def unpacked(self, state: TrainState) -> TrainState:
+        """Return a state with all arrays, the inverse of `packed`."""
+        return self._with_trees(state.replace(env_state=state.env_state.unpack()))
+
+    def _with_vectors(self, state: TrainState) -> TrainState:
+        """Replace parameters and moments by vectors if the update may be fused."""
         if self._layout is None:
             return state
         params, optimizer_state = self._layout.pack((state.params, state.optimizer_state))
         return state.replace(params=params, optimizer_state=optimizer_state)
 
-    def unpacked(self, state: TrainState) -> TrainState:
-        """Return a state without vectors, the inverse of `packed`."""
+    def _with_trees(self, state: TrainState) -> TrainState:
+        """Replace the vectors of `_with_vectors` by trees."""
         if self._layout is None:
             return state
         params, optimizer_state = self._layout.unpack((state.params, state.optimizer_state))
@@ -358,8 +362,8 @@ class PPO:
         """Collect experience with the current policy, and update the policy with it.
 
         Args:
-          state: the training state of this shard, whose parameters and moments are vectors if the
-            update is fused.
+          state: the packed state of this shard; parameters and moments are trees unless the update
+            is fused.
 
         Returns:
           The next state; the metrics of `TALLIED`, which are means over the minibatches and sums
@@ -409,11 +413,11 @@ class PPO:
 
     def collect(
         self, state: TrainState, key: UInt32[Array, "2"]
-    ) -> tuple[PyTree, Transition, NanDump]:
+    ) -> tuple[Packed, Transition, NanDump]:
         """Collect unrolls until there are enough for all minibatches.
 
         Args:
-          state: the training state of this shard.
+          state: the state of this shard, as for `train_step`.
           key: the random key of the actions' noise.
 
         Returns:
@@ -424,32 +428,36 @@ class PPO:
             state = state.replace(params=self._fused.network_params(state.params))
         policy = self._make_policy(tuple(state.policy_params))
 
-        shapes: Any = ()
-
         def step(carry: Any, _: None) -> Any:
-            nonlocal shapes
-            env_state, key = carry
+            start, key = carry
             key, next_key = jax.random.split(key)
-            after, transition = acting.actor_step(self._env, env_state, policy, key, _EXTRA_FIELDS)
+            before = start.unpack()
+            action, extras = policy(before.obs, key)
+            packed = self._env.step_packed(start, action)
+            after = packed.unpack()
             # The loss needs the next observation only at the end of an unroll, where it is in the
             # state: the others, possibly images, are not even stored.
             nothing: Any = None
-            transition = transition._replace(next_observation=nothing)
-            shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), transition)
-            return (after, next_key), pack_rows(transition)
+            state_extras = {name: after.info[name] for name in _EXTRA_FIELDS}
+            all_extras: Any = {"policy_extras": extras, "state_extras": state_extras}
+            transition = Transition(
+                observation=before.obs,
+                action=action,
+                reward=after.reward,
+                discount=1 - after.done,
+                next_observation=nothing,
+                extras=all_extras,
+            )
+            return (packed, next_key), pack(transition, batch_axes=1)
 
         def unroll(carry: Any, _: None) -> Any:
-            env_state, key = carry
+            start, key = carry
             key, next_key = jax.random.split(key)
-            # Copied into one array, because the steps overwrite the state.
-            start = pack_rows(env_state)
-            (after, _), rows = jax.lax.scan(
-                step, (env_state, key), length=self.config.unroll_length
-            )
-            data: Any = unpack_rows(rows, shapes)
+            (after, _), steps = jax.lax.scan(step, (start, key), length=self.config.unroll_length)
+            data: Any = steps.unpack()
             nan_dump = _find_nan_dump(start, data)
-            data = data._replace(next_observation=jax.tree.map(lambda x: x[None], after.obs))
-            return (after, next_key), (data, nan_dump)
+            ends = jax.tree.map(lambda x: x[None], after.unpack().obs)
+            return (after, next_key), (data._replace(next_observation=ends), nan_dump)
 
         # Run the unrolls one after the other, and return the first non-finite state of all.
         count = self.config.batch_size * self.config.num_minibatches // self.config.num_envs
@@ -670,41 +678,7 @@ def _encoded(
     )
 
 
-def pack_rows(tree: PyTree) -> tuple[Float[Array, "n columns"], list[Array]]:
-    """Return the bits of a batch of arrays in one; arrays without 32 bits by themselves.
-
-    A loop stores and carries one array with one kernel, and each further one with another.
-    """
-
-    def floats(x: Array) -> Array:
-        return x.view(jnp.float32).reshape(x.shape[0], -1)
-
-    leaves = jax.tree.leaves(tree)
-    others = [x for x in leaves if x.dtype.itemsize != 4]
-    return jnp.concatenate([floats(x) for x in leaves if x.dtype.itemsize == 4], axis=1), others
-
-
-def unpack_rows(rows: tuple[Any, Sequence[Any]], shapes: PyTree) -> PyTree:
-    """Return the arrays of `pack_rows`, of rows with any axes in front, on host or device.
-
-    Args:
-      rows: one array with the bits, and a list of the arrays without 32 bits.
-      shapes: shapes and dtypes of a row of each array.
-    """
-    bits, others = rows[0], iter(rows[1])
-    leaves, start = [], 0
-    for leaf in jax.tree.leaves(shapes):
-        if leaf.dtype.itemsize != 4:
-            leaves.append(next(others))
-            continue
-        end = start + math.prod(leaf.shape)
-        columns = bits[..., start:end].reshape((*bits.shape[:-1], *leaf.shape))
-        leaves.append(columns.view(leaf.dtype))
-        start = end
-    return jax.tree.unflatten(jax.tree.structure(shapes), leaves)
-
-
-def _find_nan_dump(start: PyTree, data: Transition) -> NanDump:
+def _find_nan_dump(start: Packed, data: Transition) -> NanDump:
     """Return the first non-finite state of an unroll, from data of shape (time, environment)."""
     statistics: Any = data.extras["state_extras"]["episode_metrics"]
     ended = data.extras["state_extras"]["episode_done"]

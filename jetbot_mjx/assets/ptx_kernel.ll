@@ -5,6 +5,8 @@ declare i32 @llvm.nvvm.read.ptx.sreg.tid.x()
 declare i32 @llvm.nvvm.read.ptx.sreg.ctaid.x()
 declare i32 @llvm.nvvm.read.ptx.sreg.ntid.x()
 declare void @llvm.nvvm.barrier0()
+declare i32 @llvm.umin.i32(i32, i32)
+@shared = external addrspace(3) global [0 x float], align 16
 define ptx_kernel void @$name($parameters) {
   ; Threads beyond the last robot step the last robot too, without storing it: so no thread of a warp
   ; leaves early.
@@ -21,10 +23,12 @@ entry:
   br label %load
 load:
   %wide = zext i32 %robot to i64
+  $fetch
   $loads
+  $before
   br label %steps
 steps:
-  %count = phi i32 [0, %load], [%count.next, %$end]
+  %count = phi i32 [0, %$entered], [%count.next, %$end]
   $carries
   ; Without this barrier, threads whose loops make different numbers of iterations drift apart until
   ; their instructions no longer fit into the cache: 540 instead of 760 M steps/s.
@@ -34,11 +38,14 @@ steps:
   %again = icmp ult i32 %count.next, $steps
   br i1 %again, label %steps, label %end
 end:
-  br i1 %is.there, label %store, label %done
+  $after
+  $release
+  br i1 %is.there, label %store, label %stored
 store:
   $stores
-  br label %done
-done:
+  br label %stored
+stored:
+  $deliver
   ret void
 }
 !nvvm.annotations = !{!0}

@@ -18,15 +18,21 @@ read:
   $reads
   %lane.next = add i64 %lane, 1
   %more = icmp ult i64 %lane.next, $lanes
-  br i1 %more, label %read, label %steps
+  br i1 %more, label %read, label %before
+before:
+  $before
+  br label %steps
 steps:
-  %count = phi i64 [0, %read], [%count.next, %steps]
+  %count = phi i64 [0, %before], [%count.next, %steps]
   call void @$step(ptr %tile)
   %count.next = add i64 %count, 1
   %again = icmp ult i64 %count.next, $steps
-  br i1 %again, label %steps, label %write
+  br i1 %again, label %steps, label %after
+after:
+  $after
+  br label %write
 write:
-  %out = phi i64 [0, %steps], [%out.next, %write]
+  %out = phi i64 [0, %after], [%out.next, %write]
   %to = add i64 %first, %out
   $writes
   %out.next = add i64 %out, 1

@@ -1,5 +1,7 @@
 """Register the back ends that compile kernels, and check that a requested one is available."""
 
+from typing import Any
+
 import jax
 
 from jetbot_mjx.compiler import kernel, llvm_backend, ptx_backend
@@ -9,6 +11,35 @@ BACKENDS: tuple[kernel.Backend, ...] = (ptx_backend, llvm_backend)
 """Back ends that can compile a kernel."""
 
 kernel.register(*BACKENDS)
+
+
+_PLATFORMS = {"gpu": "cuda"}
+"""Names of lowering platforms, where they differ from those of JAX's devices."""
+
+
+def default_backend(impl: str) -> kernel.Backend | None:
+    """Return the back end that runs kernels on JAX's default device, if there is one.
+
+    Args:
+      impl: the name of the back end that must run them, or `auto`.
+    """
+    settings: Any = jax.config
+    device = settings.jax_default_device or jax.local_devices()[0]
+    platform = device if isinstance(device, str) else device.platform
+    platform = _PLATFORMS.get(platform, platform)
+    for backend in available_backends(impl):
+        if platform == backend.PLATFORM:
+            return backend
+    return None
+
+
+def available_backends(impl: str) -> list[kernel.Backend]:
+    """Return the back ends that a setting allows and this process has.
+
+    Args:
+      impl: the setting's value: the name of a back end, `auto` or `xla`.
+    """
+    return [x for x in BACKENDS if impl in ("auto", x.IMPL) and x.is_available()]
 
 
 def require_backend(impl: str, setting: str) -> None:

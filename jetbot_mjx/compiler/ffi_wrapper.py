@@ -13,9 +13,10 @@ import math
 from collections.abc import Sequence
 from importlib import resources
 from string import Template
+from typing import Any
 
 from jetbot_mjx.compiler.kernel import Kernel
-from jetbot_mjx.compiler.llvm_codegen import STEP, map_text, step_text
+from jetbot_mjx.compiler.llvm_codegen import STEP, declarations, map_text, tile_text
 
 VERSION = (0, 3)
 """Version of XLA's foreign function interface."""
@@ -41,7 +42,7 @@ TEXT = _ASSETS.joinpath("xla_call.ll").read_text("utf-8")
 def kernel_text(kernel: Kernel, *, lanes: int, name: str, machine: str) -> str:
     """Write the LLVM module whose function XLA calls.
 
-    The function takes float32 arrays of shape (robots, ...) and returns the carried ones. With a
+    The function takes and returns float32 arrays of shape (robots, ...). With a
     table, it takes these arrays and the table, and returns the bytes of all robots, of shape
     (robots, items x results).
 
@@ -60,7 +61,7 @@ def kernel_text(kernel: Kernel, *, lanes: int, name: str, machine: str) -> str:
     sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     if kernel.table is None:
         block = _step_block(kernel, sizes, lanes)
-        arguments, results, robots = len(sizes), kernel.carried, lanes
+        arguments, results, robots = len(sizes), len(kernel.results()), lanes
     else:
         block = _map_block(kernel, sizes, kernel.table.shape[1], lanes)
         arguments, results, robots = len(sizes) + 1, 1, 1
@@ -123,21 +124,36 @@ def call_text(
 
 def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
     """Write the function that takes a block of robots through all steps."""
-    carried = kernel.carried
+    results = [math.prod(result.shape) for result in kernel.results()]
+    # The tile begins with the rows of the step, or its results; the arguments follow, if what comes
+    # before or after the step reads them too.
+    step_rows = range(sum(array.size for array in kernel.program.inputs))
+    stepped = range(sum(array.size for array in kernel.program.outputs))
+    start = 0 if kernel.before is None else max(len(step_rows), len(stepped))
+    rows = range(start, start + sum(sizes))
+    functions: dict[str, tuple[Any, Sequence[int]]] = {STEP: (kernel.program, step_rows)}
+    if kernel.before is not None:
+        functions["before"] = kernel.before, rows
+    if kernel.after is not None:
+        functions["after"] = kernel.after, [*rows, *stepped]
     values = {
-        "addresses": "\n  ".join(address(i) for i in range(len(sizes) + carried)),
+        "addresses": "\n  ".join(address(i) for i in range(len(sizes) + len(results))),
+        "after": "" if kernel.after is None else "call void @after(ptr %tile)",
         "alignment": 4 * lanes,
+        "before": "" if kernel.before is None else "call void @before(ptr %tile)",
         "lanes": lanes,
-        "reads": _copies("%r{i} = mul i64 %robot, {size}", _READ, sizes, lanes),
-        "rows": max(1, sum(sizes)),
+        "reads": _copies("%r{i} = mul i64 %robot, {size}", _READ, sizes, lanes, row=start),
+        "rows": max(1, rows.stop, sum(results), len(stepped)),
         "step": STEP,
         "steps": kernel.steps,
-        "writes": _copies(
-            "%w{i} = mul i64 %to, {size}", _WRITE, sizes[:carried], lanes, first=len(sizes)
-        ),
+        "writes": _copies("%w{i} = mul i64 %to, {size}", _WRITE, results, lanes, first=len(sizes)),
     }
-    step = step_text(kernel.program, carried=carried, lanes=lanes)
-    return step + _template("xla_step.ll").substitute(values)
+    texts = [
+        tile_text(program, lanes=lanes, name=name, rows=rows)
+        for name, (program, rows) in functions.items()
+    ]
+    declared = "\n".join(declarations(lanes)) + "\n"
+    return declared + "".join(texts) + _template("xla_step.ll").substitute(values)
 
 
 def _map_block(kernel: Kernel, sizes: Sequence[int], items: int, lanes: int) -> str:
@@ -200,7 +216,9 @@ _WRITE = """\
 """Lines that copy one scalar of a robot's results from its lane of the tile."""
 
 
-def _copies(start: str, copy: str, sizes: Sequence[int], lanes: int, first: int = 0) -> str:
+def _copies(
+    start: str, copy: str, sizes: Sequence[int], lanes: int, first: int = 0, row: int = 0
+) -> str:
     """Return the lines that copy arrays, the first of which has the number `first`.
 
     Args:
@@ -209,8 +227,9 @@ def _copies(start: str, copy: str, sizes: Sequence[int], lanes: int, first: int 
       sizes: the number of scalars per robot in each array.
       lanes: the number of robots in a block.
       first: the number of the first array.
+      row: the row of the tile of its first scalar.
     """
-    lines, row = [], 0
+    lines = []
     for i, size in enumerate(sizes, start=first):
         lines.append(start.format(i=i, size=size))
         for j in range(size):

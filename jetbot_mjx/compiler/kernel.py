@@ -51,14 +51,14 @@ Step = Callable[[PyTree, PyTree], PyTree]
 class Kernel:
     """A `Kernel` holds a function of one robot that a back end can run for many robots.
 
-    Without a table it is a step, whose results replace its first arguments. Kernels are compared by
-    identity.
+    Without a table it is a step, whose results replace its first arguments, between what is
+    computed once before the first step and once after the last. Kernels are compared by identity.
     """
 
     program: ScalarProgram
-    """The function. A step's results have the shapes of its first `carried` arguments; with a
-    table, its last argument is a column of it, and its results are scalars from 0 to 255, which
-    are rounded down to bytes."""
+    """The step. Its results have the shapes of its first `carried` arguments, unless it runs only
+    once; with a table, its last argument is a column of it, and its results are scalars from 0 to
+    255, which are rounded down to bytes."""
     carried: int
     """Number of argument leaves that are carried from step to step."""
     steps: int
@@ -71,6 +71,11 @@ class Kernel:
     the fallback if there is none."""
     setting: str = "physics.impl"
     """Key of the setting that chose `impl`, for error messages."""
+    before: ScalarProgram | None = None
+    """A function from the arguments to those of the first step; None: they are the same."""
+    after: ScalarProgram | None = None
+    """A function from the arguments and the results of the last step to the results; None: they
+    are those of the last step."""
     table: Float[np.ndarray, "rows items"] | None = None
     """What differs between the items of a robot; None: the kernel is a step."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
@@ -87,7 +92,7 @@ class Kernel:
     @property
     def argument_shapes(self) -> list[tuple[int, ...]]:
         """Return the shapes of the arguments of one robot."""
-        shapes = [array.shape for array in self.program.inputs]
+        shapes = [array.shape for array in (self.before or self.program).inputs]
         return shapes if self.table is None else shapes[:-1]
 
     def results(self, *batch: int) -> list[jax.ShapeDtypeStruct]:
@@ -95,7 +100,7 @@ class Kernel:
         if self.table is not None:
             size = self.table.shape[1] * len(self.program.outputs)
             return [jax.ShapeDtypeStruct((*batch, size), np.uint8)]
-        shapes = self.argument_shapes[: self.carried]
+        shapes = [array.shape for array in (self.after or self.program).outputs]
         return [jax.ShapeDtypeStruct((*batch, *shape), np.float32) for shape in shapes]
 
 
@@ -146,6 +151,24 @@ def as_step(kernel: Kernel) -> Step:
         return jax.tree.unflatten(jax.tree.structure(carry), results)
 
     return step
+
+
+def as_function(kernel: Kernel) -> Callable[[Sequence[Array]], list[Array]]:
+    """Return a kernel without a table as a JAX function of one robot, which `jax.vmap` can batch.
+
+    Args:
+      kernel: the kernel.
+
+    Returns:
+      A function from the kernel's arguments, which must be float32, to its results. It cannot be
+      differentiated.
+    """
+    return lambda leaves: _kernel_p.bind(*leaves, kernel=kernel)
+
+
+def called_by(equation: Any) -> Kernel | None:
+    """Return the kernel that an equation of a jaxpr calls; None: it does something else."""
+    return equation.params["kernel"] if equation.primitive is _kernel_p else None
 
 
 def as_map(kernel: Kernel) -> Callable[[PyTree], UInt8[Array, " bytes"]]:

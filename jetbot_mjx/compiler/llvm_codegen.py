@@ -19,25 +19,26 @@ from jetbot_mjx.compiler.scalar_ir import COMPARISONS, Expr, Scalar, Unsupported
 from jetbot_mjx.compiler.schedule import Block, Item, PlacedBranch, PlacedLoop
 
 STEP = "step"
-"""Name of the function that runs one step."""
+"""Name of the function that runs one step, or all items."""
 
-_ELEMENTS = {"f": "float", "i": "i32", "b": "i1"}
+_ELEMENTS = {"f": "float", "i": "i32", "u": "i32", "b": "i1"}
 """LLVM's type by the kind of a dtype."""
 
 _EXTREMES = {"max": "maximum", "min": "minimum"}
-_INTRINSICS = {"abs": "fabs", "floor": "floor", "sqrt": "sqrt"}
+_INTRINSICS = {"abs": "fabs", "floor": "floor", "round": "roundeven", "sqrt": "sqrt"}
 
 
-def step_text(program: ScalarProgram, *, carried: int, lanes: int) -> str:
-    """Write an LLVM function that replaces its first arguments by the results of a program.
+def tile_text(program: ScalarProgram, *, lanes: int, name: str, rows: Sequence[int]) -> str:
+    """Write an LLVM function that runs a program on a tile.
 
-    The function's parameter is the address of a tile. The tile has a row of `lanes` float32 values
-    for each scalar of the arguments and is aligned to the size of a row.
+    The function's parameter is the address of a tile, whose rows are `lanes` float32 values, one of
+    each robot, and are aligned to their size. The results are written to the first rows.
 
     Args:
-      program: the step; its results have the shapes of its first `carried` arguments.
-      carried: the number of argument leaves that the results replace.
+      program: the program.
       lanes: the number of robots that the function steps side by side.
+      name: the name of the function.
+      rows: the row of each scalar of the arguments.
 
     Returns:
       The text of the function and of the declarations that it needs.
@@ -52,15 +53,12 @@ def step_text(program: ScalarProgram, *, carried: int, lanes: int) -> str:
         address = emitter.do(f"getelementptr {vector}, ptr %tile, i64 {place}")
         return f"ptr {address}, align {4 * lanes}"
 
-    count = sum(array.size for array in program.inputs)
-    results = emitter.step([emitter.do(f"load {vector}, {row(i)}") for i in range(count)])
-    carried_scalars = sum(array.size for array in program.outputs[:carried])
-    for i, result in enumerate(results[:carried_scalars]):
+    results = emitter.step([emitter.do(f"load {vector}, {row(i)}") for i in rows])
+    for i, result in enumerate(results):
         emitter.add(f"store {vector} {result}, {row(i)}")
     return "\n".join(
         [
-            *emitter.declarations(),
-            f"define internal void @{STEP}(ptr noalias %tile) noinline {{",
+            f"define internal void @{name}(ptr noalias %tile) noinline {{",
             "entry:",
             *emitter.lines,
             "ret void",
@@ -131,6 +129,11 @@ def map_text(program: ScalarProgram, *, lanes: int, items: int) -> str:
     )
 
 
+def declarations(lanes: int) -> list[str]:
+    """Return the declarations of the LLVM intrinsics that programs call, once for a module."""
+    return LlvmEmitter(ScalarProgram([], [], Block()), lanes).declarations()
+
+
 def require(program: ScalarProgram) -> None:
     """Check that a program can be written as LLVM IR.
 
@@ -144,7 +147,14 @@ class LlvmEmitter:
     """An `LlvmEmitter` collects the lines of an LLVM function and the names of its values."""
 
     def __init__(
-        self, program: ScalarProgram, lanes: int, label: str = "entry", *, approximate: bool = False
+        self,
+        program: ScalarProgram,
+        lanes: int,
+        label: str = "entry",
+        *,
+        approximate: bool = False,
+        prefix: str = "v",
+        for_gpu: bool = False,
     ) -> None:
         """Begin with no lines.
 
@@ -154,6 +164,9 @@ class LlvmEmitter:
           label: the label of the basic block that the first lines belong to.
           approximate: whether division and square root may be off by some units in the last place,
             as a GPU's own instructions for them are.
+          prefix: what the names of values begin with, which differs between the programs of one
+            function.
+          for_gpu: whether the function is for an NVIDIA GPU.
 
         Raises:
           UnsupportedError: an argument is not float32.
@@ -163,6 +176,8 @@ class LlvmEmitter:
         self.lines: list[str] = []
         self.label = label
         self._program = program
+        self._prefix = prefix
+        self._for_gpu = for_gpu
         self._lanes = lanes
         self._fast = "afn " if approximate else ""
         self._count = 0
@@ -257,10 +272,13 @@ class LlvmEmitter:
         return f"<{count * lanes} x i8>", joined
 
     def declarations(self) -> list[str]:
-        """Return the declarations of the LLVM intrinsics that programs call."""
+        """Return the declarations of the LLVM intrinsics that programs call, once for a module."""
         number, whole, truth = self.type("f"), self.type("i"), self.type("b")
         lines = [f"declare {number} {self._function(x)}({number})" for x in _INTRINSICS.values()]
-        lines.append(f"declare {whole} {self._function('fptosi.sat')}({number})")
+        lines += [
+            f"declare {whole} {self._function(x)}({number})" for x in ("fptosi.sat", "fptoui.sat")
+        ]
+        lines.append(f"declare {whole} @llvm.fshl.{self._suffix}i32({whole}, {whole}, {whole})")
         if self._lanes == 1:
             lines += [
                 f"declare float {self._function(x)}(float, float)" for x in _EXTREMES.values()
@@ -291,14 +309,18 @@ class LlvmEmitter:
 
     def _new(self) -> str:
         self._count += 1
-        return f"%v{self._count}"
+        return f"%{self._prefix}{self._count}"
 
     def _labels(self, *names: str) -> list[str]:
         self._count += 1
-        return [f"{name}.{self._count}" for name in names]
+        return [f"{name}.{self._prefix}{self._count}" for name in names]
+
+    @property
+    def _suffix(self) -> str:
+        return "" if self._lanes == 1 else f"v{self._lanes}"
 
     def _function(self, name: str) -> str:
-        size = "" if self._lanes == 1 else f"v{self._lanes}"
+        size = self._suffix
         return f"@llvm.{name}.{size}i32.{size}f32" if "sat" in name else f"@llvm.{name}.{size}f32"
 
     def _operand(self, x: Scalar) -> str:
@@ -309,6 +331,9 @@ class LlvmEmitter:
 
     def _constant(self, x: Scalar) -> str:
         kind = x.dtype.kind
+        if kind == "u":
+            # LLVM's integers have no sign, but its text has.
+            x = x.view(np.int32)
         return self._splat(kind, _float(x) if kind == "f" else str(int(x)))
 
     def _any(self, condition: str) -> str:
@@ -489,6 +514,19 @@ class LlvmEmitter:
         below = self.do(f"icmp slt {whole} {x}, {zero}")
         return self._select_text(below, "i", self.do(f"sub {whole} {zero}, {x}"), x)
 
+    def _word_sum(self, value: Expr, operands: list[str]) -> str:
+        a, b = operands
+        if self._for_gpu:
+            # LLVM's instruction selection for GPUs takes time quadratic in the number of sums with
+            # one of the operands, and 13 s for a hundred random numbers from one key.
+            return f'call i32 asm "add.u32 $0, $1, $2;", "=r,r,r"(i32 {a}, i32 {b})'
+        return f"add {self.type('u')} {a}, {b}"
+
+    def _rotation(self, value: Expr, operands: list[str]) -> str:
+        whole, (x, by) = self.type("u"), operands
+        function = f"@llvm.fshl.{self._suffix}i32"
+        return f"call {whole} {function}({whole} {x}, {whole} {x}, {whole} {by})"
+
     def _negative(self, value: Expr, operands: list[str]) -> str:
         return f"sub {self.type('i')} {self._splat('i', '0')}, {operands[0]}"
 
@@ -497,7 +535,8 @@ class LlvmEmitter:
 
     def _larger(self, value: Expr, operands: list[str]) -> str:
         a, b = operands
-        better = "sgt" if value.op == "max" else "slt"
+        sign = "u" if value.dtype.kind == "u" else "s"
+        better = f"{sign}gt" if value.op == "max" else f"{sign}lt"
         return self._select_text(self.do(f"icmp {better} {self.type('i')} {a}, {b}"), "i", a, b)
 
     def _select_text(self, condition: str, kind: str, if_true: str, if_false: str) -> str:
@@ -511,9 +550,12 @@ class LlvmEmitter:
     def _convert(self, value: Expr, operands: list[str]) -> str:
         source, to = value.operands[0].dtype.kind, value.dtype.kind
         if source == "f":
-            function = self._function("fptosi.sat")
+            function = self._function("fptoui.sat" if to == "u" else "fptosi.sat")
             return f"call {self.type('i')} {function}({self.type('f')} {operands[0]})"
-        how = "zext" if to == "i" else "uitofp" if source == "b" else "sitofp"
+        if to == "f":
+            how = "sitofp" if source == "i" else "uitofp"
+        else:
+            how = "zext" if source == "b" else "bitcast"
         return f"{how} {self.type(source)} {operands[0]} to {self.type(to)}"
 
     def _bitcast(self, value: Expr, operands: list[str]) -> str:
@@ -526,7 +568,7 @@ class LlvmEmitter:
         if kind == "f":
             # NaN differs from every number, so `ne` is the only unordered comparison.
             return f"fcmp {'une' if value.op == 'ne' else f'o{value.op}'} {pair}"
-        sign = "" if value.op in ("eq", "ne") else "s"
+        sign = "" if value.op in ("eq", "ne") else "u" if kind == "u" else "s"
         return f"icmp {sign}{value.op} {pair}"
 
 
@@ -551,22 +593,29 @@ _FUSED = "contract"
 _EMIT: dict[tuple[str, str], _Emit] = {
     **{(op, "f"): _instruction(f"f{op} {_FUSED}", "f") for op in ("add", "mul", "sub")},
     **{(op, "i"): _instruction(op, "i") for op in ("add", "mul", "sub")},
-    **{(op, kind): _instruction(op, kind) for op in ("and", "or", "xor") for kind in "ib"},
-    **{(op, kind): LlvmEmitter._comparison for op in COMPARISONS for kind in "fi"},
+    **{(op, "u"): _instruction(op, "u") for op in ("mul", "sub")},
+    ("add", "u"): LlvmEmitter._word_sum,
+    **{(op, kind): _instruction(op, kind) for op in ("and", "or", "xor") for kind in "iub"},
+    **{(op, kind): LlvmEmitter._comparison for op in COMPARISONS for kind in "fiu"},
     **{(op, "b"): LlvmEmitter._comparison for op in ("eq", "ne")},
     **{(op, "f"): LlvmEmitter._call for op in _INTRINSICS},
     **{(op, "f"): LlvmEmitter._extreme for op in ("max", "min")},
-    **{(op, "i"): LlvmEmitter._larger for op in ("max", "min")},
-    **{("select", kind): LlvmEmitter._select for kind in "fi"},
-    **{("convert", kind): LlvmEmitter._convert for kind in "fib"},
+    **{(op, kind): LlvmEmitter._larger for op in ("max", "min") for kind in "iu"},
+    **{("select", kind): LlvmEmitter._select for kind in "fiu"},
+    **{("convert", kind): LlvmEmitter._convert for kind in "fiub"},
     **{("bitcast", kind): LlvmEmitter._bitcast for kind in "fi"},
     ("abs", "i"): LlvmEmitter._magnitude,
     ("div", "f"): LlvmEmitter._quotient,
     ("is_finite", "f"): LlvmEmitter._finite,
     ("neg", "f"): _instruction("fneg", "f"),
-    ("neg", "i"): LlvmEmitter._negative,
+    **{("neg", kind): LlvmEmitter._negative for kind in "iu"},
+    ("div", "i"): _instruction("sdiv", "i"),
+    ("div", "u"): _instruction("udiv", "u"),
+    ("rem", "i"): _instruction("srem", "i"),
+    ("rem", "u"): _instruction("urem", "u"),
     ("not", "b"): LlvmEmitter._negation,
-    ("shift_left", "i"): _instruction("shl", "i"),
-    ("shift_right_logical", "i"): _instruction("lshr", "i"),
+    ("rotate_left", "u"): LlvmEmitter._rotation,
+    **{("shift_left", kind): _instruction("shl", kind) for kind in "iu"},
+    **{("shift_right_logical", kind): _instruction("lshr", kind) for kind in "iu"},
 }
 """Functions that return an operation's last instruction, by operation and kind of the operands."""

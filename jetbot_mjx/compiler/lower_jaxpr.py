@@ -34,7 +34,9 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jax.extend.core import ClosedJaxpr, Literal
 
 from jetbot_mjx.compiler.indexing import (
@@ -46,6 +48,7 @@ from jetbot_mjx.compiler.indexing import (
     shape_of,
     windows,
 )
+from jetbot_mjx.compiler.random_rules import RANDOM_RULES
 from jetbot_mjx.compiler.scalar_ir import (
     EVALUATE,
     ExprGraph,
@@ -68,6 +71,10 @@ MAX_PROGRAM_OPERATIONS = 100_000
 
 MIN_BRANCH_OPERATIONS = 24
 """Smallest number of operations for which a branch is faster than computing both sides."""
+
+
+_FLOAT = np.dtype(np.float32)
+_WORDS = {_FLOAT, np.dtype(np.int32), np.dtype(np.uint32), np.dtype(bool)}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -101,12 +108,42 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> ScalarProgram:
       UnsupportedError: the function has an operation that cannot be lowered, or too many of them.
     """
     closed = jax.make_jaxpr(function)(*arguments)
+    return scalarize_part(closed, closed.jaxpr.invars, closed.jaxpr.outvars)
+
+
+def scalarize_part(
+    closed: ClosedJaxpr, arguments: Sequence[Any], results: Sequence[Any], *, words: bool = False
+) -> ScalarProgram:
+    """Lower the part of a traced function between some of its variables, as `scalarize` does.
+
+    Args:
+      closed: the function.
+      arguments: its variables that are arguments of the program.
+      results: its variables or literals that the program returns.
+      words: whether arguments and results are float32 whatever their dtypes: those of 32 bits by
+        their bits, and a bool as 0 or 1.
+
+    Returns:
+      The program.
+
+    Raises:
+      UnsupportedError: as `scalarize`, or the results need more than the arguments.
+    """
     graph = ExprGraph()
-    inputs = [
-        full_array(leaf.shape, lambda dtype=leaf.dtype: graph.input(dtype))
-        for leaf in jax.tree.leaves(arguments)
-    ]
-    outputs = _JaxprLowering(graph).lower(closed, inputs)
+    lowering = _JaxprLowering(graph)
+    env: dict[Any, ScalarArray] = {}
+    inputs = []
+    for variable in arguments:
+        dtype = np.dtype(variable.aval.dtype)
+        given = _FLOAT if words else dtype
+        inputs.append(full_array(shape_of(variable), lambda dtype=given: graph.input(dtype)))
+        env[variable] = lowering.bitcast(inputs[-1], given, dtype)
+    outputs = lowering.lower_part(closed, env, results)
+    if words:
+        outputs = [
+            lowering.bitcast(x, np.dtype(atom.aval.dtype), _FLOAT)
+            for x, atom in zip(outputs, results, strict=True)
+        ]
     block = schedule(x for array in outputs for x in array.ravel())
     program = ScalarProgram(inputs, outputs, block)
     if program.size > MAX_PROGRAM_OPERATIONS:
@@ -118,16 +155,27 @@ class _JaxprLowering:
     """A `_JaxprLowering` records the operations of a jaxpr on scalars.
 
     The lowering rule of the JAX primitive `name` is `RULES[name]` or the method `_name`: a function
-    of the equation and its operands that returns the results.
+    of the equation and its operands that returns the results. Those of random numbers are in
+    `RANDOM_RULES` and take the graph too.
     """
 
     def __init__(self, graph: ExprGraph) -> None:
         self._graph = graph
 
     def lower(self, closed: ClosedJaxpr, arguments: Sequence[ScalarArray]) -> list[ScalarArray]:
-        jaxpr, constants = closed.jaxpr, map(constant_array, closed.consts)
-        env: dict[Any, ScalarArray] = dict(zip(jaxpr.constvars, constants, strict=True))
-        env |= dict(zip(jaxpr.invars, arguments, strict=True))
+        env = dict(zip(closed.jaxpr.invars, arguments, strict=True))
+        return self.lower_part(closed, env, closed.jaxpr.outvars)
+
+    def lower_part(
+        self, closed: ClosedJaxpr, env: dict[Any, ScalarArray], results: Sequence[Any]
+    ) -> list[ScalarArray]:
+        """Lower the equations that some results need.
+
+        Args:
+          closed: the jaxpr.
+          env: the scalars of the variables that are known, to which others are added.
+          results: variables or literals of the jaxpr.
+        """
 
         def read(atom: Any) -> ScalarArray:
             if isinstance(atom, Literal):
@@ -135,16 +183,28 @@ class _JaxprLowering:
                 return constant_array(np.asarray(atom.val, aval.dtype))
             return env[atom]
 
-        for equation in jaxpr.eqns:
-            results = self._lower_eqn(equation, [read(atom) for atom in equation.invars])
-            env |= dict(zip(equation.outvars, results, strict=True))
-        return [read(atom) for atom in jaxpr.outvars]
+        needed = {atom for atom in results if not isinstance(atom, Literal)} - env.keys()
+        equations = []
+        for equation in reversed(closed.jaxpr.eqns):
+            if any(variable in needed for variable in equation.outvars):
+                equations.append(equation)
+                atoms = (atom for atom in equation.invars if not isinstance(atom, Literal))
+                needed |= {atom for atom in atoms if atom not in env}
+        for variable, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True):
+            if variable in needed:
+                env[variable] = _constants(constant)
+        for equation in reversed(equations):
+            values = self._lower_eqn(equation, [read(atom) for atom in equation.invars])
+            env |= dict(zip(equation.outvars, values, strict=True))
+        return [read(atom) for atom in results]
 
     def _lower_eqn(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
         name = equation.primitive.name
-        if name in EVALUATE:
+        if name in EVALUATE and not hasattr(self, f"_{name}"):
             return [self._elementwise(name, *operands)]
         rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
+        if rule is None and name in RANDOM_RULES:
+            rule = functools.partial(RANDOM_RULES[name], self._graph)
         if rule is None:
             raise UnsupportedError(f"the operation {name}")
         result = rule(equation, *operands)
@@ -416,10 +476,32 @@ class _JaxprLowering:
         return scalar_array((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
     def _bitcast_convert_type(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        dtypes = {np.dtype(equation.params["new_dtype"]), np.dtype(equation.invars[0].aval.dtype)}
-        if dtypes != {np.dtype(np.float32), np.dtype(np.int32)}:
-            raise UnsupportedError("a bitcast other than between float32 and int32")
-        return self._elementwise("bitcast", x)
+        source, to = equation.invars[0].aval.dtype, equation.params["new_dtype"]
+        if bool in (source, to):
+            raise UnsupportedError("a bitcast of truth values")
+        return self.bitcast(x, np.dtype(source), np.dtype(to))
+
+    def bitcast(self, x: ScalarArray, source: np.dtype, to: np.dtype) -> ScalarArray:
+        """Return the same bits as another dtype; a bool is 0 or 1.
+
+        Args:
+          x: the scalars.
+          source: their dtype.
+          to: the dtype of the result.
+        """
+        if source == to:
+            return x
+        if not {source, to} <= _WORDS:
+            raise UnsupportedError(f"the bits of {source} as {to}")
+
+        def cast(one: Scalar) -> Scalar:
+            if {source.kind, to.kind} in ({"f", "i"}, {"f", "u"}):
+                # The graph knows the bits of a float32 as int32.
+                whole = one if source.kind == "f" else self._graph.convert(one, np.dtype(np.int32))
+                one = self._graph.apply("bitcast", whole)
+            return self._graph.convert(one, to)
+
+        return scalar_array(map(cast, x.ravel()), x.shape)
 
     def _select_n(self, equation: Any, which: ScalarArray, *cases: ScalarArray) -> ScalarArray:
         result = cases[-1]
@@ -436,6 +518,11 @@ class _JaxprLowering:
         self, equation: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
     ) -> ScalarArray:
         return self._elementwise("min", self._elementwise("max", x, low), high)
+
+    def _round(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        if equation.params["rounding_method"] != jax.lax.RoundingMethod.TO_NEAREST_EVEN:
+            raise UnsupportedError("rounding other than to the nearest even number")
+        return self._elementwise("round", x)
 
     def _square(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._elementwise("mul", x, x)
@@ -603,6 +690,18 @@ def _unflatten(arrays: Sequence[ScalarArray], flat: Sequence[Scalar]) -> list[Sc
     """Split scalars into arrays of the shapes of the given arrays."""
     scalars = iter(flat)
     return [full_array(array.shape, lambda: next(scalars)) for array in arrays]
+
+
+def _constants(array: Any) -> ScalarArray:
+    """Convert a constant of a jaxpr to scalars.
+
+    Raises:
+      UnsupportedError: it is not known yet, or an array of random keys.
+    """
+    dtype: Any = getattr(array, "dtype", None)
+    if isinstance(array, Tracer) or jnp.issubdtype(dtype, jax.dtypes.extended):
+        raise UnsupportedError(f"a constant {array}")
+    return constant_array(array)
 
 
 def _at(array: ScalarArray, i: int) -> ScalarArray:

@@ -36,6 +36,14 @@ _MIN_THREADS = 32
 _ITEM_THREADS = 128
 """Number of threads that compute the items of a robot."""
 
+_DIRECT_WORDS = 32
+"""Number of words of a robot that its thread reads where they are. Of longer rows, the threads of a
+block copy their part of an array to shared memory and back, each the word beside that of the next
+thread: threads that each read a row of their own wait 70 µs for 65,536 rows of 77 words."""
+
+_SHARED_MEMORY = {70: 49_152, 80: 98_304, 90: 98_304}
+"""Bytes of shared memory for that, by target architecture; all GPUs that run its code have it."""
+
 _BLOCKS = 128
 """Number of blocks above which blocks grow: a GPU has about as many multiprocessors."""
 
@@ -79,14 +87,26 @@ def prepare(kernel: Kernel) -> None:
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `jetbot_mjx.compiler.kernel.Backend`."""
     robots = leaves[0].shape[0]
-    threads = threads_in_block(robots)
+    words = _shared_words(kernel, target_architecture())
+    threads = threads_in_block(robots, words)
     blocks, rest = divmod(robots, threads)
     if kernel.table is not None:
         # A block computes all items of a robot.
         threads, blocks, rest = _ITEM_THREADS, robots, 0
     text = _text(kernel, robots if rest else _FULL_BLOCKS)
     blocks += rest > 0
-    return launch_ptx(_NAME, text, leaves, kernel.results(robots), (blocks, 1, 1), threads)
+    grid, shared = (blocks, 1, 1), 4 * threads * words
+    return launch_ptx(_NAME, text, leaves, kernel.results(robots), grid, threads, shared)
+
+
+def _shared_words(kernel: Kernel, architecture: int) -> int:
+    """Return how many words of a robot are in shared memory; 0: a thread reads them directly."""
+    if kernel.table is not None:
+        return 0
+    shapes = kernel.argument_shapes, [x.shape for x in kernel.results()]
+    words = max(sum(map(math.prod, one)) for one in shapes)
+    fits = 4 * _MIN_THREADS * words <= _SHARED_MEMORY[architecture]
+    return words if words > _DIRECT_WORDS and fits else 0
 
 
 def _text(kernel: Kernel, robots: int) -> str:
@@ -161,10 +181,19 @@ def assemble_ahead(text: str) -> None:
     in_background(load)
 
 
-def threads_in_block(robots: int) -> int:
-    """Return the number of robots per block, a power of two that occupies every multiprocessor."""
+def threads_in_block(robots: int, words: int = 0) -> int:
+    """Return the number of robots per block, a power of two that occupies every multiprocessor.
+
+    Args:
+      robots: the number of all robots.
+      words: how many words of a robot are in shared memory.
+    """
     wanted = 2 ** math.ceil(math.log2(max(1, robots / _BLOCKS)))
-    return min(max(wanted, _MIN_THREADS), _MAX_THREADS)
+    most = _MAX_THREADS
+    if words:
+        fitting = _SHARED_MEMORY[target_architecture()] // (4 * words)
+        most = min(most, 2 ** int(math.log2(fitting)))
+    return min(max(wanted, _MIN_THREADS), most)
 
 
 def compiled(kernel: Kernel, architecture: int) -> str:
@@ -180,9 +209,10 @@ def compiled(kernel: Kernel, architecture: int) -> str:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction.
     """
-    return assembled(
-        (kernel_text if kernel.table is None else map_kernel_text)(kernel), architecture
-    )
+    if kernel.table is not None:
+        return assembled(map_kernel_text(kernel), architecture)
+    shares = _shared_words(kernel, architecture) > 0
+    return assembled(kernel_text(kernel, shares=shares), architecture)
 
 
 def assembled(text: str, architecture: int, version: int | None = None) -> str:
@@ -204,7 +234,7 @@ def assembled(text: str, architecture: int, version: int | None = None) -> str:
     return machine.emit_assembly(module)
 
 
-def kernel_text(kernel: Kernel) -> str:
+def kernel_text(kernel: Kernel, *, shares: bool = False) -> str:
     """Write a kernel that steps as LLVM IR.
 
     Its parameters are the addresses of all argument leaves, followed by the addresses of all result
@@ -212,36 +242,64 @@ def kernel_text(kernel: Kernel) -> str:
 
     Args:
       kernel: the kernel.
+      shares: whether the threads of a block copy arrays by way of shared memory.
 
     Returns:
       The text of an LLVM module.
     """
-    # Write one step, which reads the carried values as %now and the others as %in.
-    program, carried = kernel.program, kernel.carried
-    emitter = LlvmEmitter(program, lanes=1, label="steps")
-    sizes = [array.size for array in program.inputs]
+    transfers = _shared_transfers if shares else _transfers
+    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     arguments = [f"%in{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
-    carried_scalars = sum(sizes[:carried])
-    now = [f"%now{i}" for i in range(carried_scalars)]
-    results = emitter.step([*now, *arguments[carried_scalars:]])[:carried_scalars]
-    # Insert it into the loop over the steps, whose carries begin with the arguments.
+    # Write what comes before the first step, which computes its arguments.
+    program, before, entered = kernel.program, [], "load"
+    if kernel.before is not None:
+        first = LlvmEmitter(kernel.before, lanes=1, label=entered, prefix="before", for_gpu=True)
+        arguments = first.step(arguments)
+        before, entered = first.lines, first.label
+    # Write one step, which reads the carried values as %now, and put it into the loop over the
+    # steps, whose carries begin with the arguments.
+    emitter = LlvmEmitter(program, lanes=1, label="steps", for_gpu=True)
+    carried = sum(array.size for array in program.inputs[: kernel.carried])
+    now = [f"%now{i}" for i in range(carried)]
+    results = emitter.step([*now, *arguments[carried:]])
     end = emitter.label
     carries = [
-        f"{name} = phi float [{before}, %load], [{after}, %{end}]"
-        for name, before, after in zip(now, arguments, results, strict=False)
+        f"{name} = phi float [{initial}, %{entered}], [{updated}, %{end}]"
+        for name, initial, updated in zip(now, arguments, results, strict=False)
     ]
+    # Write what comes after the last step. It loads the arguments again, because registers that
+    # held them meanwhile would be missing in the steps.
+    after: list[str] = []
+    if kernel.after is not None:
+        last = LlvmEmitter(kernel.after, lanes=1, label="end", prefix="after", for_gpu=True)
+        again = [f"%again{i}.{j}" for i, size in enumerate(sizes) for j in range(size)]
+        results = last.step([*again, *results])
+        after = [*transfers(sizes, "again"), *last.lines]
+    stored = [math.prod(result.shape) for result in kernel.results()]
+    barrier = "call void @llvm.nvvm.barrier0()"
+    fetch, deliver = [], ["ret void"]
+    if shares:
+        fetch = [*_block_copies(sizes, "fetch"), barrier]
+        deliver = [barrier, *_block_copies(stored, "deliver", len(sizes)), "ret void"]
     values = {
+        "after": "\n  ".join(after),
+        "before": "\n  ".join(before),
         "carries": "\n  ".join(carries),
         "declarations": "\n".join(emitter.declarations()),
+        "deliver": "\n  ".join(deliver),
         "end": end,
-        "loads": "\n  ".join(_transfers(sizes, "load")),
+        "entered": entered,
+        "fetch": "\n  ".join(fetch),
+        "loads": "\n  ".join(transfers(sizes, "in")),
         "max_threads": _MAX_THREADS,
         "name": _NAME,
-        "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(len(sizes) + carried)),
+        "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(len(sizes) + len(stored))),
+        # The results take the place of the arguments, which all threads have read by then.
+        "release": barrier if shares else "",
         "robots": _ROBOTS,
         "step": "\n  ".join(emitter.lines),
         "steps": kernel.steps,
-        "stores": "\n  ".join(_transfers(sizes[:carried], "store", len(sizes), results)),
+        "stores": "\n  ".join(transfers(stored, "out", len(sizes), results)),
     }
     return Template(_TEXT).substitute(values)
 
@@ -261,7 +319,7 @@ def map_kernel_text(kernel: Kernel) -> str:
     Returns:
       The text of an LLVM module.
     """
-    emitter = LlvmEmitter(kernel.program, lanes=1, label="items", approximate=True)
+    emitter = LlvmEmitter(kernel.program, lanes=1, label="items", approximate=True, for_gpu=True)
     *sizes, row = [array.size for array in kernel.program.inputs]
     assert kernel.table is not None
     items = kernel.table.shape[1]
@@ -291,7 +349,7 @@ def map_kernel_text(kernel: Kernel) -> str:
         "hoisted": "\n  ".join(before),
         "item": "\n  ".join(emitter.lines),
         "items": items,
-        "loads": "\n  ".join(_transfers(sizes, "load")),
+        "loads": "\n  ".join(_transfers(sizes, "in")),
         "max_threads": _ITEM_THREADS,
         "name": _NAME,
         "parameters": ", ".join(f"ptr addrspace(1) %a{i}" for i in range(table + 2)),
@@ -303,22 +361,104 @@ def map_kernel_text(kernel: Kernel) -> str:
 
 
 def _transfers(
-    sizes: Sequence[int], do: str, first: int = 0, results: Sequence[str] = ()
+    sizes: Sequence[int], name: str, first: int = 0, results: Sequence[str] = ()
 ) -> list[str]:
-    """Return the lines that load a robot's row of each array, or store results in them."""
+    """Return the lines that load a robot's row of each array, or store results in them.
+
+    Args:
+      sizes: the number of scalars of a robot in each array.
+      name: what the names of the loaded values begin with.
+      first: the number of the first array.
+      results: the names of the values to store; without, values are loaded.
+    """
     lines, names = [], iter(results)
     for i, size in enumerate(sizes):
         array = f"%a{i + first}"
-        lines.append(f"%{do}{i} = mul i64 %wide, {4 * size}")
-        lines.append(f"%{do}p{i} = getelementptr i8, ptr addrspace(1) {array}, i64 %{do}{i}")
+        lines.append(f"%{name}{i} = mul i64 %wide, {4 * size}")
+        lines.append(f"%{name}p{i} = getelementptr i8, ptr addrspace(1) {array}, i64 %{name}{i}")
         for j in range(size):
-            place = f"%{do}p{i}.{j}"
-            lines.append(f"{place} = getelementptr float, ptr addrspace(1) %{do}p{i}, i64 {j}")
+            place = f"%{name}p{i}.{j}"
+            lines.append(f"{place} = getelementptr float, ptr addrspace(1) %{name}p{i}, i64 {j}")
             lines.append(
-                f"%in{i}.{j} = load float, ptr addrspace(1) {place}"
-                if do == "load"
-                else f"store float {next(names)}, ptr addrspace(1) {place}"
+                f"store float {next(names)}, ptr addrspace(1) {place}"
+                if results
+                else f"%{name}{i}.{j} = load float, ptr addrspace(1) {place}"
             )
+    return lines
+
+
+def _shared_transfers(
+    sizes: Sequence[int], name: str, first: int = 0, results: Sequence[str] = ()
+) -> list[str]:
+    """Return the lines of `_transfers` for rows in shared memory."""
+    lines, names, start = [], iter(results), 0
+    for i, size in enumerate(sizes):
+        # The rows of an array follow those of the arrays before it, for all threads of the block.
+        lines.append(f"%{name}{i}.all = mul i32 %threads, {start}")
+        lines.append(f"%{name}{i}.row = mul i32 %local, {size}")
+        lines.append(f"%{name}{i} = add i32 %{name}{i}.all, %{name}{i}.row")
+        for j in range(size):
+            place = f"%{name}p{i}.{j}"
+            lines.append(f"%{name}w{i}.{j} = add i32 %{name}{i}, {j}")
+            lines.append(
+                f"{place} = getelementptr float, ptr addrspace(3) @shared, i32 %{name}w{i}.{j}"
+            )
+            lines.append(
+                f"store float {next(names)}, ptr addrspace(3) {place}"
+                if results
+                else f"%{name}{i}.{j} = load float, ptr addrspace(3) {place}"
+            )
+        start += size
+    return lines
+
+
+def _block_copies(sizes: Sequence[int], name: str, first: int = 0) -> list[str]:
+    """Return the lines in which a block copies its rows of all arrays to shared memory or back.
+
+    Args:
+      sizes: the number of words of a robot in each array.
+      name: `fetch` or `deliver`, with which names begin.
+      first: the number of the first array.
+    """
+    lines, start = [], 0
+    if name == "fetch":
+        lines += [
+            "%local = sub i32 %robot, %before",
+            "%after.before = sub i32 %robots, %before",
+            "%is.full = icmp ult i32 %threads, %after.before",
+            "%rows = select i1 %is.full, i32 %threads, i32 %after.before",
+        ]
+    for i, size in enumerate(sizes):
+        at = f"%{name}{i}"
+        lines += [
+            f"{at}.first = mul i32 %before, {size}",
+            f"{at}.long = zext i32 {at}.first to i64",
+            f"{at}.there = getelementptr float, ptr addrspace(1) %a{i + first}, i64 {at}.long",
+            f"{at}.begin = mul i32 %threads, {start}",
+            f"{at}.here = getelementptr float, ptr addrspace(3) @shared, i32 {at}.begin",
+            f"{at}.count = mul i32 %rows, {size}",
+            f"{at}.last = sub i32 {at}.count, 1",
+        ]
+        # Load all words before the first store: a thread waits for memory once.
+        stores = []
+        wanted = "%thread"
+        for j in range(size):
+            word = f"{at}.{j}"
+            source, target = f"ptr addrspace(1) {word}.wide", f"ptr addrspace(3) {word}.shared"
+            if name == "deliver":
+                source, target = target, source
+            lines += [
+                # In the last block, some threads copy the last word too.
+                f"{word}.k = call i32 @llvm.umin.i32(i32 {wanted}, i32 {at}.last)",
+                f"{word}.shared = getelementptr float, ptr addrspace(3) {at}.here, i32 {word}.k",
+                f"{word}.wide = getelementptr float, ptr addrspace(1) {at}.there, i32 {word}.k",
+                f"{word}.value = load float, {source}",
+                f"{word}.next = add i32 {wanted}, %threads",
+            ]
+            wanted = f"{word}.next"
+            stores.append(f"store float {word}.value, {target}")
+        lines += stores
+        start += size
     return lines
 
 

@@ -3,9 +3,6 @@
 Motivation: XLA compiles a draw of random bits for a CPU to a loop of fourteen kernels, however few
 bits it draws, and a training draws in a dozen places. Together they took a third of the time in
 which XLA compiled a training step.
-
-Source: J. K. Salmon et al., Parallel Random Numbers: As Easy as 1, 2, 3, SC 2011,
-doi:10.1145/2063384.2063405 (Threefry-2x32 with 20 rounds, which JAX uses).
 """
 
 import contextlib
@@ -24,9 +21,6 @@ from jaxtyping import Array, UInt32
 from jetbot_mjx.compiler import llvm_backend
 from jetbot_mjx.compiler.kernel import Kernel
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
-
-_ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
-_PARITY = 0x1BD11BDA
 
 
 @contextlib.contextmanager
@@ -59,30 +53,13 @@ def _rules() -> dict[Any, Any]:
 def _kernel() -> Kernel:
     """Return the kernel of one pair of counts (bits of floats, as are the keys)."""
 
-    def step(first: Array, second: Array, key: Array, other: Array) -> tuple[Array, Array]:
-        bits = [x.view(jnp.int32) for x in (first, second, key, other)]
-        hashes = _threefry(*bits)
-        return hashes[0].view(jnp.float32), hashes[1].view(jnp.float32)
+    def step(*words: Array) -> list[Array]:
+        first, second, key, other = (x.view(jnp.uint32) for x in words)
+        return [x.view(jnp.float32) for x in threefry2x32_p.bind(key, other, first, second)]
 
     number = jax.ShapeDtypeStruct((), np.float32)
     program = scalarize(step, *[number] * 4)
     return Kernel(program, carried=2, steps=1, fallback=lambda *_: [])
-
-
-def _threefry(first: Array, second: Array, key: Array, other: Array) -> tuple[Array, Array]:
-    """Return the hash of two counts under two keys, all as int32, whose sums wrap around."""
-    keys = key, other, key ^ other ^ np.int32(_PARITY)
-    first, second = first + keys[0], second + keys[1]
-    for group in range(5):
-        for rotation in _ROTATIONS[group % 2]:
-            first = first + second
-            turned = jax.lax.shift_left(second, np.int32(rotation)) | jax.lax.shift_right_logical(
-                second, np.int32(32 - rotation)
-            )
-            second = first ^ turned
-        first = first + keys[(group + 1) % 3]
-        second = second + keys[(group + 2) % 3] + np.int32(group + 1)
-    return first, second
 
 
 def _lowered(

@@ -33,7 +33,7 @@ class Expr:
     that a loop carries between iterations, `result` a result of a loop or branch."""
     operands: tuple[Scalar, ...]
     dtype: np.dtype
-    """dtype of the result: float32, int32 or bool."""
+    """dtype of the result: float32, int32, uint32 or bool."""
     index: int
     """Position in the order of recording; operands have smaller indices."""
     owner: "Loop | Branch | None" = None
@@ -80,6 +80,8 @@ def is_constant(x: Scalar) -> bool:
 COMPARISONS = ("lt", "le", "gt", "ge", "eq", "ne")
 
 _FLOAT, _INT, _BOOL = np.dtype(np.float32), np.dtype(np.int32), np.dtype(bool)
+_UINT = np.dtype(np.uint32)
+_DTYPES = (_FLOAT, _INT, _UINT, _BOOL)
 
 
 def _divide(a: Any, b: Any) -> Any:
@@ -101,6 +103,12 @@ def _bitcast(x: Any) -> Any:
     return x.view(_INT if x.dtype == _FLOAT else _FLOAT)
 
 
+def _erf_inv(x: Any) -> Any:
+    from scipy import special
+
+    return special.erfinv(x)
+
+
 EVALUATE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
     "add": np.add,
@@ -110,6 +118,7 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "cos": np.cos,
     "div": _divide,
     "eq": np.equal,
+    "erf_inv": _erf_inv,
     "exp": np.exp,
     "expm1": np.expm1,
     "floor": np.floor,
@@ -129,6 +138,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "or": np.bitwise_or,
     "pow": np.power,
     "rem": np.fmod,
+    "rotate_left": lambda x, by: (x << by) | (x >> (x.dtype.type(32) - by)),
+    "round": np.round,
     "shift_left": np.left_shift,
     "shift_right_logical": lambda x, by: (x.view(np.uint32) >> by.view(np.uint32)).view(x.dtype),
     "sign": np.sign,
@@ -139,7 +150,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "xor": np.bitwise_xor,
 }
 """The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
-a float32 for an int32, or the other way round."""
+a float32 for an int32, or the other way round; `round` rounds to the nearest whole number, and half
+of one to the nearest even."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""
@@ -180,7 +192,7 @@ class ExprGraph:
             with np.errstate(all="ignore"):
                 return np.asarray(EVALUATE[op](*operands))[()]
         operand_dtype = recorded[0].dtype
-        if operand_dtype not in (_FLOAT, _INT, _BOOL):
+        if operand_dtype not in _DTYPES:
             raise UnsupportedError(f"{op} of {operand_dtype}")
         if simplify := _SIMPLIFY.get(op):
             simplified = simplify(self, operand_dtype, *operands)
@@ -213,10 +225,15 @@ class ExprGraph:
         if is_constant(x):
             return convert_constant(np.asarray(x), dtype)[()]
         # JAX has no 64-bit types by default, so no other dtypes occur.
-        if dtype not in (_FLOAT, _INT, _BOOL):
+        if dtype not in _DTYPES:
             raise UnsupportedError(f"a conversion to {dtype}")
         if x.dtype == dtype:
             return x
+        if x.op == "convert" and {x.dtype, dtype} == {_INT, _UINT}:
+            # Converted back, the bits are those of before.
+            before = x.operands[0]
+            if before.dtype == dtype:
+                return before
         if dtype == _BOOL:
             return self.apply("ne", x, x.dtype.type(0))
         return self._record("convert", (x,), dtype)
@@ -329,7 +346,19 @@ def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
         return x
     if is_constant(y) and dtype == _FLOAT and y != 0:
         return graph.apply("mul", x, np.float32(1 / np.float64(y)))
-    return None
+    return _simplify_rem(graph, dtype, x, y)
+
+
+def _simplify_rem(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> None:
+    """Accept divisors only with which no processor fails."""
+    if dtype != _FLOAT and not (is_constant(y) and y > 0):
+        raise UnsupportedError("a division of integers by what may not be positive")
+
+
+def _simplify_shift(graph: ExprGraph, dtype: np.dtype, x: Scalar, by: Scalar) -> None:
+    """Accept shifts only that all processors do alike."""
+    if not (is_constant(by) and 0 <= by < 32):
+        raise UnsupportedError("a shift that may not be from 0 to 31 bits")
 
 
 def _simplify_inverse(op: str) -> Callable[..., Scalar | None]:
@@ -416,6 +445,14 @@ _EXPM1_END = 0.5
 _EXPM1 = _polynomial(lambda x: np.expm1(x) / x, 7, -_EXPM1_END, _EXPM1_END + 1e-9)
 _TANH_END = 0.6
 _TANH = _polynomial(lambda s: np.tanh(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _TANH_END**2)
+# atan(t)/t in s = t², for t up to tan(π/8).
+_ATAN_END = float(np.tan(np.pi / 8))
+_ATAN = _polynomial(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _ATAN_END**2)
+# For w = -log(1 - x²), erf⁻¹(x)/x is a polynomial in w up to the first end, then in √w; float32 has
+# no x between 1 and that of the last end.
+_ERF_INV_NEAR = 5.0
+_ERF_INV_FAR = 16.7
+_ERF_INV_CENTRE = float((np.sqrt(_ERF_INV_NEAR) + np.sqrt(_ERF_INV_FAR)) / 2)
 
 
 def _simplify_exp(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
@@ -491,10 +528,72 @@ def _simplify_tanh(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     return graph.select(do("lt", size, np.float32(_TANH_END)), far, near)
 
 
+def _simplify_atan2(graph: ExprGraph, dtype: np.dtype, y: Scalar, x: Scalar) -> Scalar:
+    """Expand atan2(y, x) to basic arithmetic, with the sign of y even if it is zero."""
+    do = graph.apply
+    # The angle from the nearest axis is atan(t) with t up to 1, or π/4 + atan((t - 1) / (t + 1)).
+    across, along = do("abs", y), do("abs", x)
+    small, large = do("min", across, along), do("max", across, along)
+    t = do("div", small, large)
+    t = graph.select(do("eq", large, np.float32(0)), t, np.float32(0))
+    # Infinity in both directions is halfway between them.
+    t = graph.select(do("eq", small, np.float32(np.inf)), t, np.float32(1))
+    beyond = do("gt", t, np.float32(_ATAN_END))
+    turned = do("div", do("sub", t, np.float32(1)), do("add", t, np.float32(1)))
+    u = graph.select(beyond, t, turned)
+    angle = do("mul", u, _horner(graph, _ATAN, do("mul", u, u)))
+    angle = graph.select(beyond, angle, do("add", angle, np.float32(np.pi / 4)))
+    # Reflect it at the diagonal and at the axis of y.
+    steep = do("gt", across, along)
+    angle = graph.select(steep, angle, do("sub", np.float32(np.pi / 2), angle))
+    backwards = do("lt", do("bitcast", x), np.int32(0))
+    angle = graph.select(backwards, angle, do("sub", np.float32(np.pi), angle))
+    return graph.select(do("lt", do("bitcast", y), np.int32(0)), angle, do("neg", angle))
+
+
+def _simplify_erf_inv(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
+    """Expand the inverse of the error function to basic arithmetic.
+
+    Source: M. Giles, Approximating the erfinv function, GPU Computing Gems 2 (2010), for the form
+    x p(w) with w = -log(1 - x²); the polynomials are interpolated here.
+    """
+    do = graph.apply
+    # Near ±1, one of the factors is exact.
+    w = do("neg", do("log", do("mul", do("sub", np.float32(1), x), do("add", x, np.float32(1)))))
+    near, far = _inverse_error_polynomials()
+    inside = _horner(graph, near, do("sub", w, np.float32(_ERF_INV_NEAR / 2)))
+    root = do("sub", do("sqrt", w), np.float32(_ERF_INV_CENTRE))
+    factor = graph.select(do("lt", w, np.float32(_ERF_INV_NEAR)), _horner(graph, far, root), inside)
+    result = do("mul", x, factor)
+    is_end = do("eq", do("abs", x), np.float32(1))
+    return graph.select(is_end, result, do("mul", x, np.float32(np.inf)))
+
+
+@functools.cache
+def _inverse_error_polynomials() -> tuple[list[np.float32], list[np.float32]]:
+    """Return polynomials of erf⁻¹(x)/x in w and in √w, around the centres of their intervals."""
+    # Imported late, because few programs draw normal numbers.
+    from scipy import special
+
+    def factor(w: np.ndarray) -> np.ndarray:
+        # 1 - x = 1 - √(1 - e^-w), without cancellation.
+        x = np.sqrt(-np.expm1(-w))
+        return special.erfcinv(np.exp(-w) / (1 + x)) / x
+
+    near = _polynomial(
+        lambda d: factor(d + _ERF_INV_NEAR / 2), 8, 1e-9 - _ERF_INV_NEAR / 2, _ERF_INV_NEAR / 2
+    )
+    half = (np.sqrt(_ERF_INV_FAR) - np.sqrt(_ERF_INV_NEAR)) / 2
+    far = _polynomial(lambda d: factor((d + _ERF_INV_CENTRE) ** 2), 8, -half, half)
+    return near, far
+
+
 _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
     **{op: functools.partial(_simplify_commutative, op=op) for op in _COMMUTATIVE},
+    "atan2": _simplify_atan2,
     "cos": functools.partial(_simplify_sine, ahead=1),
     "div": _simplify_div,
+    "erf_inv": _simplify_erf_inv,
     "exp": _simplify_exp,
     "expm1": _simplify_expm1,
     "log": _simplify_log,
@@ -502,6 +601,10 @@ _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
     "neg": _simplify_inverse("neg"),
     "not": _simplify_inverse("not"),
     "pow": _simplify_pow,
+    "rem": _simplify_rem,
+    "rotate_left": _simplify_shift,
+    "shift_left": _simplify_shift,
+    "shift_right_logical": _simplify_shift,
     "sign": _simplify_sign,
     "sin": _simplify_sine,
     "sub": _simplify_sub,

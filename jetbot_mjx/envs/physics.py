@@ -7,7 +7,6 @@ import contextlib
 import copy
 import functools
 import threading
-from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -17,24 +16,13 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jetbot_mjx.compiler import kernel, llvm_codegen
-from jetbot_mjx.compiler.backends import BACKENDS, require_backend
+from jetbot_mjx.compiler.backends import available_backends, default_backend, require_backend
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.envs import cholesky, mjx
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
-
-_PLATFORMS = {"gpu": "cuda"}
-"""Names of lowering platforms, where they differ from those of JAX's devices."""
-
-
-def _platform() -> str:
-    """Return the lowering platform of JAX's default device."""
-    settings: Any = jax.config
-    device = settings.jax_default_device or jax.local_devices()[0]
-    platform = device if isinstance(device, str) else device.platform
-    return _PLATFORMS.get(platform, platform)
 
 
 class Physics:
@@ -88,9 +76,13 @@ class Physics:
     @property
     def impl(self) -> str:
         """Implementation that JAX's default device runs: `physics.impl`, with `auto` resolved."""
-        platform = _platform()
-        impls = [x.IMPL for x in self._backends() if platform == x.PLATFORM]
-        return "xla" if not impls or self._kernel_step() is None else impls[0]
+        backend = default_backend(self._config.impl)
+        return "xla" if backend is None or self._kernel_step() is None else backend.IMPL
+
+    @property
+    def may_be_kernel(self) -> bool:
+        """Whether a step can be one kernel, unless it has what no kernel can do."""
+        return bool(available_backends(self._config.impl))
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
@@ -172,24 +164,15 @@ class Physics:
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
-    def _backends(self) -> Iterator[kernel.Backend]:
-        """Find the back ends that the configuration allows and this process has."""
-        allowed = (x for x in BACKENDS if self._config.impl in ("auto", x.IMPL))
-        return (x for x in allowed if x.is_available())
-
     def _kernel_step(self) -> kernel.Step | None:
         """Return an environment step as one kernel; None: XLA compiles it on all platforms."""
-        if not any(self._backends()):
+        if not self.may_be_kernel:
             return None
         # Programs are traced in several threads; only one of them lowers the kernel.
         with self._lock:
             if self._kernel is None:
                 try:
-                    lowered = self._lower()
-                    self._kernel = kernel.as_step(lowered)
-                    for backend in self._backends():
-                        if _platform() == backend.PLATFORM:
-                            backend.prepare(lowered)
+                    self._kernel = kernel.as_step(self._lower())
                 except UnsupportedError as error:
                     self._kernel = error
         if not isinstance(self._kernel, UnsupportedError):

@@ -2,21 +2,23 @@
 
 `wrap_for_training` is the entry point. The order, from the inside out:
 
-    JetBotEnv > DomainRandomizationWrapper > EpisodeWrapper > NewEpisodeWrapper > CameraWrapper
-      > jax.vmap
+    JetBotEnv > DomainRandomizationWrapper > EpisodeWrapper > NewEpisodeWrapper > KernelWrapper
+      > CameraWrapper > BatchWrapper
 
 All wrappers but the last one see a single robot without a batch axis.
 """
 
+import functools
 from collections.abc import Callable
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
 from brax.envs import Env, Wrapper
-from brax.envs.wrappers.training import VmapWrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
+from jetbot_mjx.compiler.one_kernel import as_one_kernel
+from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
@@ -68,12 +70,14 @@ def wrap_for_training(
         one: Any = env.blind() if varied is env else varied
         if final_images:
             one = with_camera(one, env.camera)
-        one = NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))
-        return one if final_images else with_camera(one, env.camera)
+        return NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))
 
+    camera = None if final_images else env.camera
     if randomization_fn is None:
-        return VmapWrapper(wrap_one(env))
-    return RandomizedVmapWrapper(env, wrap_one, randomization_fn)
+        return BatchWrapper(with_camera(KernelWrapper(wrap_one(env)), camera))
+    return RandomizedBatchWrapper(
+        env, lambda env: with_camera(wrap_one(env), camera), randomization_fn
+    )
 
 
 class EpisodeWrapper(Wrapper):
@@ -251,7 +255,69 @@ class NewEpisodeWrapper(Wrapper):
         )
 
 
-class RandomizedVmapWrapper(Wrapper):
+class KernelWrapper(Wrapper):
+    """A wrapper that compiles a step as one kernel, and a reset as another, if physics is one."""
+
+    def __init__(self, env: Any) -> None:
+        """Wrap one environment, which observes numbers only.
+
+        Args:
+          env: the environment, in all wrappers of a single robot but that of the camera.
+        """
+        super().__init__(env)
+        if not env.unwrapped.physics.may_be_kernel:
+            return
+        self.reset = as_one_kernel(env.reset)
+        self.step = as_one_kernel(env.step)
+        self.step_packed = as_one_kernel(functools.partial(_step_packed, env))
+
+    def step_packed(self, packed: Packed, action: Float[Array, "2"]) -> Packed:
+        """Make one step of a packed state, with one array in and one array out.
+
+        Args:
+          packed: the state before the step.
+          action: the action, in [-1, 1]².
+        """
+        return _step_packed(self.env, packed, action)
+
+
+def _step_packed(env: Any, packed: Packed, action: Float[Array, "2"]) -> Packed:
+    return pack(env.step(packed.unpack(), action))
+
+
+class BatchWrapper(Wrapper):
+    """A batch of environments, with the methods of one."""
+
+    env: Any
+
+    def reset(self, rng: UInt32[Array, "n 2"]) -> State:
+        """Begin an episode in every environment.
+
+        Args:
+          rng: one random key per environment.
+        """
+        return jax.vmap(self.env.reset)(rng)
+
+    def step(self, state: State, action: Float[Array, "n 2"]) -> State:
+        """Step every environment.
+
+        Args:
+          state: the batch of states.
+          action: one action per environment, in [-1, 1]².
+        """
+        return jax.vmap(self.env.step)(state, action)
+
+    def step_packed(self, packed: Packed, action: Float[Array, "n 2"]) -> Packed:
+        """Step every environment, with few arrays for XLA to pass on.
+
+        Args:
+          packed: the batch of states.
+          action: one action per environment, in [-1, 1]².
+        """
+        return jax.vmap(self.env.step_packed)(packed, action)
+
+
+class RandomizedBatchWrapper(BatchWrapper):
     """A batch of environments, each with its own fixed physics model.
 
     It has the place of Brax's `DomainRandomizationVmapWrapper`.
@@ -300,6 +366,15 @@ class RandomizedVmapWrapper(Wrapper):
             return self._wrap_one(self.env.with_model(model)).step(state, action)
 
         return jax.vmap(step, in_axes=(self._axes, 0, 0))(self._models, state, action)
+
+    def step_packed(self, packed: Packed, action: Float[Array, "n 2"]) -> Packed:
+        """Step every environment.
+
+        Args:
+          packed: the batch of states.
+          action: one action per environment, in [-1, 1]².
+        """
+        return pack(self.step(packed.unpack(), action), batch_axes=1)
 
 
 def _episode_fields(state: State) -> tuple[PyTree, ...]:

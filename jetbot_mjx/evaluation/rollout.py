@@ -5,7 +5,6 @@ that a scripted controller can be evaluated like a policy. This module adds the 
 `jax.vmap`.
 """
 
-import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -14,17 +13,21 @@ import jax.numpy as jnp
 from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, Int, UInt32
 
+from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.task import Goal
-from jetbot_mjx.envs.wrappers import EpisodeWrapper
+from jetbot_mjx.envs.wrappers import BatchWrapper, EpisodeWrapper, KernelWrapper
 
 # Separates the actions' random numbers from those that the first reset, the robot and later
 # episodes draw from the same key.
 _ACTION_DRAWS = 0x61637473
+
+_TALLY = "tally"
+"""Key of the episode's statistics in the state's `info`."""
 
 Controller = Callable[[Any, State, UInt32[Array, "2"]], Float[Array, "2"]]
 
@@ -79,9 +82,42 @@ class _Carry(NamedTuple):
     """A `_Carry` holds what the loop over the environment steps carries."""
 
     time: Int[Array, ""]
-    state: State
-    tally: _Tally
+    states: Packed
     qpos: Float[Array, "n time nq"] | None
+
+
+class _OneEpisodeWrapper(Wrapper):
+    """A wrapper that sums up the first episode in `info`, and then keeps its final state."""
+
+    env: Any
+
+    def reset(self, rng: UInt32[Array, "2"]) -> State:
+        """Begin the episode with empty statistics."""
+        state = self.env.reset(rng)
+        zero = jnp.zeros(())
+        return state.replace(info={**state.info, _TALLY: _Tally(jnp.ones(()), *[zero] * 6)})
+
+    def step(self, state: State, action: Float[Array, "2"]) -> State:
+        """Make one step and add to the statistics, unless the episode has ended."""
+        nstate: Any = self.env.step(state, action)
+        tally: _Tally = state.info[_TALLY]
+        moved = jnp.linalg.norm(
+            nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
+        )
+        now = _Tally(
+            alive=-nstate.done,
+            success=nstate.metrics["success"],
+            steps=jnp.ones(()),
+            episode_return=nstate.reward,
+            terminated=nstate.info["terminated"],
+            nonfinite=nstate.metrics["nonfinite_envs"],
+            path_length=moved,
+        )
+        added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
+        # Keep the final state of an episode that has ended.
+        nstate = nstate.replace(info={**nstate.info, _TALLY: tally})
+        kept = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
+        return kept.replace(info={**kept.info, _TALLY: added})
 
 
 def rollout_fn(
@@ -105,16 +141,13 @@ def rollout_fn(
       randomness.
     """
     blind = env.blind() if isinstance(env, JetBotEnv) else env
-    episode_env = with_camera(EpisodeWrapper(blind, episode_length), env.camera)
-    step = jax.vmap(functools.partial(_step_and_tally, episode_env))
+    one = KernelWrapper(_OneEpisodeWrapper(EpisodeWrapper(blind, episode_length)))
+    batch = BatchWrapper(with_camera(one, env.camera))
     # Fold in twice: `fold_in(key, 1)` alone equals `split(key)[1]`, from which the goal is drawn.
     fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
 
     def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
-        # Reset the environments, and start with empty episode statistics.
-        first = jax.vmap(episode_env.reset)(keys)
-        zero = jnp.zeros(keys.shape[0])
-        tally = _Tally(jnp.ones_like(zero), *[zero] * 6)
+        first = batch.reset(keys)
 
         def act(state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
             branches = [lambda s, k, c=c: c(params, s, k) for c in controllers]
@@ -122,60 +155,37 @@ def rollout_fn(
 
         def goes_on(carry: _Carry) -> Bool[Array, ""]:
             # Stop early, because most policies reach all goals long before the time limit.
-            return (carry.time < episode_length) & (carry.tally.alive > 0).any()
+            alive = carry.states.unpack().info[_TALLY].alive
+            return (carry.time < episode_length) & (alive > 0).any()
 
         def body(carry: _Carry) -> _Carry:
             step_keys = fold_in(fold_in(keys, _ACTION_DRAWS), carry.time)
-            actions = jax.vmap(act)(carry.state, step_keys)
-            state, tally = step(carry.state, carry.tally, actions)
-            qpos = carry.qpos
+            actions = jax.vmap(act)(carry.states.unpack(), step_keys)
+            states, qpos = batch.step_packed(carry.states, actions), carry.qpos
             if qpos is not None:
-                qpos = qpos.at[:, carry.time + 1].set(state.pipeline_state.qpos)
-            return _Carry(carry.time + 1, state, tally, qpos)
+                last = states.unpack().pipeline_state.qpos
+                qpos = qpos.at[:, carry.time + 1].set(last)
+            return _Carry(carry.time + 1, states, qpos)
 
         # Step all environments until the episode of each has ended.
         start = first.pipeline_state.qpos
         trail = jnp.repeat(start[:, None], episode_length + 1, axis=1) if record else None
-        end = jax.lax.while_loop(
-            goes_on, body, _Carry(jnp.zeros((), jnp.int32), first, tally, trail)
-        )
+        begun = _Carry(jnp.zeros((), jnp.int32), pack(first, batch_axes=1), trail)
+        end = jax.lax.while_loop(goes_on, body, begun)
         return _to_episodes(env, first, end)
 
     return run
 
 
-def _step_and_tally(
-    env: Any, state: State, tally: _Tally, action: Float[Array, "2"]
-) -> tuple[State, _Tally]:
-    """Step one environment and add to its episode statistics, unless its episode has ended."""
-    nstate = env.step(state, action)
-    moved = jnp.linalg.norm(
-        nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
-    )
-    now = _Tally(
-        alive=-nstate.done,
-        success=nstate.metrics["success"],
-        steps=jnp.ones(()),
-        episode_return=nstate.reward,
-        terminated=nstate.info["terminated"],
-        nonfinite=nstate.metrics["nonfinite_envs"],
-        path_length=moved,
-    )
-    added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
-    # Keep the final state of an episode that has ended.
-    nstate = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
-    return nstate, added
-
-
 def _to_episodes(env: JetBotEnv | Wrapper, first: State, end: _Carry) -> Episodes:
     """Return the episodes between the reset states and the carry after the last step."""
-    start, last, tally, qpos = first.pipeline_state.qpos, end.state, end.tally, end.qpos
+    start, last, qpos = first.pipeline_state.qpos, end.states.unpack(), end.qpos
     if qpos is not None:
         # Repeat the final state in the rows that were not reached.
         ended = jnp.arange(qpos.shape[1]) > end.time
         qpos = jnp.where(ended[:, None], last.pipeline_state.qpos[:, None], qpos)
     # All episodes have ended: the other statistics are those of whole episodes.
-    statistics = {name: x for name, x in tally._asdict().items() if name != "alive"}
+    statistics = {name: x for name, x in last.info[_TALLY]._asdict().items() if name != "alive"}
     return Episodes(
         **statistics,
         start_w=start[:, QPOS_XYZ][:, :2],

@@ -29,7 +29,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState, unpack_rows
+from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
@@ -114,12 +114,6 @@ class CompiledTrainer:
         """Return the shapes and dtypes of one seed's state."""
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), self._shapes)
         return jax.eval_shape(self.ppo.unpacked, one)
-
-    def unpack_env(self, row: Any) -> Any:
-        """Return the state of one environment, on the host, from a row of `ppo.pack_rows`."""
-        batched = self._shapes.env_state
-        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[2:], x.dtype), batched)
-        return unpack_rows(row, shapes)
 
     def init(self) -> TrainState:
         """Return the packed state before the first step, on the devices."""
@@ -317,7 +311,7 @@ def _train_loop(
         done, seconds, restart = done + count, seconds + elapsed, False
         for device, seed in np.argwhere(found):
             packed = jax.tree.map(lambda x, at=(device, seed): np.asarray(x)[at], nan_dumps)
-            nan_dump = packed.replace(env_state=trainer.unpack_env(packed.env_state))
+            nan_dump = packed.replace(env_state=packed.env_state.unpack())
             recorder.on_nan_dump(int(seed), done * size, nan_dump)
         # Show the progress within an interval, and report at its end.
         if done < goal:

@@ -20,7 +20,7 @@ from brax.training.types import Transition
 from gliding import Gliding
 
 from jetbot_mjx import evaluate
-from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer, unpack_rows
+from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import EGOCENTRIC, LAYOUTS, Field, GoalTask
@@ -92,9 +92,7 @@ class Jitted:
 
     def advance(self, state, steps=1, restart=False):
         after, nan_dump = self._compiled(state, jnp.int32(steps), jnp.bool_(restart))
-        world = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), state.env_state)
-        row = jax.device_get(nan_dump.env_state)
-        return after, nan_dump.replace(env_state=unpack_rows(row, world))
+        return after, nan_dump.replace(env_state=jax.device_get(nan_dump.env_state).unpack())
 
     @functools.cached_property
     def _compiled(self):

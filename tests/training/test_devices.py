@@ -99,13 +99,13 @@ def trained_program(config):
     advance = program.compile()
     state, faults = advance(begun, STEPS, False)
     (last,) = program.get(state)
-    shards = state.env_state.obs.addressable_shards
+    shards = state.env_state.words.addressable_shards
 
     everyone_the_same = first.replace(
         env_state=jax.tree.map(lambda x: np.repeat(x[:1], x.shape[0], axis=0), first.env_state)
     )
     driven, _ = advance(program.put([everyone_the_same]), 1, False)
-    each_device_s_first = np.asarray(driven.env_state.pipeline_state.qpos)[
+    each_device_s_first = np.asarray(driven.env_state.unpack().pipeline_state.qpos)[
         0, :: config.ppo.num_envs // DEVICES
     ]
     shared = state.replace(env_state=None)
@@ -132,11 +132,10 @@ def robots(config):
     """What was drawn for the environments, and each one's key of noise."""
     drawn = {"friction": (0.4, 1.2), "motor_gain": (0.9, 1.1), "yaw_noise": (0.0, 0.1)}
     config = config.model_copy(update={"randomization": RandomizationConfig(**drawn)})
-    episode_params = (
-        CompiledTrainer.from_config(config, make_env(config)).init().env_state.episode_params
-    )
+    env_state = CompiledTrainer.from_config(config, make_env(config)).init().env_state
+    episode_params = env_state.unpack().episode_params
     return {
-        "shards": [shard.data.shape for shard in episode_params.drawn.addressable_shards],
+        "shards": [shard.data.shape[:2] for shard in env_state.words.addressable_shards],
         "drawn": np.asarray(episode_params.drawn)[0].tolist(),
         "keys": np.asarray(episode_params.sensors.key)[0].tolist(),
     }
@@ -192,7 +191,7 @@ def restored(run_dir):
 def test_every_device_draws_robots_and_noise_of_its_own(told):
     robots = told["robots"]
     envs = load_config(SMOKE).ppo.num_envs
-    assert robots["shards"] == [[1, envs // DEVICES, 3]] * DEVICES
+    assert robots["shards"] == [[1, envs // DEVICES]] * DEVICES
     for column in np.transpose(robots["drawn"]):
         assert len(set(column.tolist())) == envs
     assert len({tuple(key) for key in robots["keys"]}) == envs
@@ -200,7 +199,9 @@ def test_every_device_draws_robots_and_noise_of_its_own(told):
 
 def test_the_environments_are_dealt_over_the_devices(told):
     assert told["device_count"] == DEVICES
-    assert told["shards"] == [[device, 1, 128 // DEVICES, OBS] for device in range(DEVICES)]
+    assert [shard[:3] for shard in told["shards"]] == [
+        [device, 1, 128 // DEVICES] for device in range(DEVICES)
+    ]
     assert told["faults"] == [DEVICES, 1]
 
 

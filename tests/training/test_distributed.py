@@ -58,10 +58,11 @@ def tell(interrupted, *arguments):
 
     def reported(trainer, recorder, state, seconds):
         own = jax.tree.map(lambda x: np.asarray(x.addressable_data(0)), state)
+        worlds = own.env_state.unpack()
         told = {
             "parameters": digest(own.params),
-            "keys": own.env_state.key.reshape(-1, 2).tolist(),
-            "goals": own.env_state.goal.reshape(-1, 3).tolist(),
+            "keys": worlds.key.reshape(-1, 2).tolist(),
+            "goals": worlds.goal.reshape(-1, 3).tolist(),
             "devices": [jax.local_device_count(), jax.device_count()],
         }
         print("told:", json.dumps(told), flush=True)

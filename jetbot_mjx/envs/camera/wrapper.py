@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, UInt8, UInt32
 
+from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.envs.camera.looks import Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.timing import SeenPose, noise_seed
@@ -141,6 +142,15 @@ class CameraWrapper(Wrapper):
         """
         nstate = self.env.step(state.replace(obs=numbers_of(state.obs)), action)
         return see(self.camera, self.env.task, nstate, state.obs[PIXELS], nstate.done > 0)
+
+    def step_packed(self, packed: Packed, action: Float[Array, "2"]) -> Packed:
+        """Make one step of a packed state.
+
+        Args:
+          packed: the state before the step.
+          action: the action, in [-1, 1]².
+        """
+        return pack(self.step(packed.unpack(), action))
 
     @property
     def observation_size(self) -> dict[str, tuple[int, ...]]:

@@ -1,0 +1,154 @@
+"""Compile a function of one robot as one kernel, with the kernel of its physics inside.
+
+Motivation: around physics, a step of a training computes observation, reward, the end of the
+episode, and the first state of the next one. XLA compiles that to forty small kernels, in which a
+GPU mostly waits for the next launch, and of which a CPU compiles each for 16 ms.
+
+Protocol: `as_one_kernel` traces the function. Where it calls one kernel that steps
+(`kernel.as_step`), the equations divide into those that the arguments of that kernel need and those
+that the results need. Both are lowered to scalars, and run in the kernel before its first step and
+after its last. What both need is computed twice, so that no register holds it during the steps. A
+function that calls no kernel becomes a kernel as it is. A function that cannot be lowered, or calls
+several kernels, stays as it is.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
+from jaxtyping import Array
+
+from jetbot_mjx.compiler import kernel, llvm_codegen
+from jetbot_mjx.compiler.backends import default_backend
+from jetbot_mjx.compiler.lower_jaxpr import scalarize_part
+from jetbot_mjx.compiler.scalar_ir import UnsupportedError
+
+
+def as_one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Return a function of one robot that is one kernel if it can be, and as it is otherwise.
+
+    Args:
+      function: a function of pytrees of arrays. It is traced once for all arguments of the same
+        shapes.
+
+    Returns:
+      The same function. It cannot be differentiated where it is a kernel; `jax.vmap` batches it.
+    """
+    known: dict[Any, tuple[Callable[..., list[Array]], Any]] = {}
+
+    @functools.wraps(function)
+    def run(*arguments: Any) -> Any:
+        leaves, structure = jax.tree.flatten(arguments)
+        key = structure, tuple((x.shape, x.dtype) for x in map(jnp.asarray, leaves))
+        if key not in known:
+            traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+            compiled = _compiled(traced), jax.tree.structure(shapes)
+            if any(isinstance(x, Tracer) for x in traced.consts):
+                # It depends on what another function traces, and holds only inside of it.
+                return jax.tree.unflatten(compiled[1], compiled[0](*leaves))
+            known[key] = compiled
+        flat, tree = known[key]
+        return jax.tree.unflatten(tree, flat(*leaves))
+
+    return run
+
+
+def _compiled(traced: ClosedJaxpr) -> Callable[..., list[Array]]:
+    """Return a traced function of flat arguments as one kernel, if it can be."""
+    # What another function traces is an argument of the kernel too.
+    places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
+    try:
+        one = _lowered(traced, places)
+    except UnsupportedError:
+        return jaxpr_as_fun(traced)
+    backend = default_backend(one.impl)
+    if backend is not None:
+        backend.prepare(one)
+    launch = kernel.as_function(one)
+    constants = [traced.consts[i] for i in places]
+    arguments = _dtypes(_arguments(traced, places))
+    results = _dtypes(traced.jaxpr.outvars)
+
+    def run(*leaves: Array) -> list[Array]:
+        pairs = zip((*constants, *leaves), arguments, strict=True)
+        words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
+        return _from_words(launch(words), results)
+
+    return run
+
+
+def _lowered(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
+    """Lower a traced function to a kernel.
+
+    Args:
+      traced: the function.
+      places: the places of those of its constants that are arguments of the kernel, before others.
+
+    Raises:
+      UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
+    """
+    arguments, results = _arguments(traced, places), traced.jaxpr.outvars
+    lower = functools.partial(scalarize_part, traced, words=True)
+    fallback = _fallback(traced, places)
+    calls = [x for x in traced.jaxpr.eqns if kernel.called_by(x) is not None]
+    if not calls:
+        program = lower(arguments, results)
+        llvm_codegen.require(program)
+        return kernel.Kernel(program, carried=0, steps=1, fallback=fallback)
+    step = kernel.called_by(calls[0])
+    if len(calls) > 1 or step is None or step.table is not None or step.before or step.after:
+        raise UnsupportedError("more than one kernel")
+    before = lower(arguments, calls[0].invars)
+    after = lower([*arguments, *calls[0].outvars], results)
+    for program in (before, after):
+        llvm_codegen.require(program)
+    return kernel.Kernel(
+        step.program,
+        carried=step.carried,
+        steps=step.steps,
+        fallback=fallback,
+        impl=step.impl,
+        setting=step.setting,
+        before=before,
+        after=after,
+    )
+
+
+def _arguments(traced: ClosedJaxpr, places: Sequence[int]) -> list[Any]:
+    """Return the variables of a jaxpr that are arguments of its kernel."""
+    return [*(traced.jaxpr.constvars[i] for i in places), *traced.jaxpr.invars]
+
+
+def _dtypes(atoms: Sequence[Any]) -> list[np.dtype]:
+    return [np.dtype(atom.aval.dtype) for atom in atoms]
+
+
+def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
+    """Return the same computation in JAX, from and to words."""
+    dtypes = _dtypes(_arguments(traced, places))
+
+    def run(*words: Array) -> list[Array]:
+        arguments = _from_words(words, dtypes)
+        constants = list(traced.consts)
+        for place, argument in zip(places, arguments, strict=False):
+            constants[place] = argument
+        closed = ClosedJaxpr(traced.jaxpr, constants)
+        return [_to_word(x) for x in jaxpr_as_fun(closed)(*arguments[len(places) :])]
+
+    return run
+
+
+def _to_word(x: Array) -> Array:
+    """Return an array's bits as float32; a bool is 0 or 1."""
+    return x.astype(jnp.float32) if x.dtype.kind == "b" else x.view(jnp.float32)
+
+
+def _from_words(words: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
+    """Return the arrays of some dtypes from their bits."""
+    pairs = zip(words, dtypes, strict=True)
+    return [x != 0 if dtype.kind == "b" else x.view(dtype) for x, dtype in pairs]

@@ -1,0 +1,65 @@
+"""Keep a tree of arrays in one array.
+
+Motivation: XLA compiles and launches a kernel for every array that a loop stores or carries,
+however small it is. The state of an environment is twenty arrays.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jaxtyping import Array, Float, PyTree
+
+_Shape = tuple[tuple[int, ...], np.dtype]
+
+
+class Packed(struct.PyTreeNode):
+    """A `Packed` holds a tree of arrays, with any batch axes in front, on host or device."""
+
+    words: Float[Array, "*batch columns"]
+    """The bits of all arrays with 32 bits, one after the other."""
+    others: list[Array]
+    """The other arrays."""
+    structure: Any = struct.field(pytree_node=False)
+    """Structure of the tree."""
+    shapes: tuple[_Shape, ...] = struct.field(pytree_node=False)
+    """Shape, without the batch axes, and dtype of each array."""
+
+    def unpack(self) -> PyTree:
+        """Return the tree."""
+        others, start = iter(self.others), 0
+        leaves = []
+        for shape, dtype in self.shapes:
+            if dtype.itemsize != 4:
+                leaves.append(next(others))
+                continue
+            end = start + math.prod(shape)
+            columns = self.words[..., start:end].reshape((*self.words.shape[:-1], *shape))
+            # On the host, a copy does not keep the other arrays alive.
+            columns = columns.copy() if isinstance(columns, np.ndarray) else columns
+            leaves.append(columns.view(dtype))
+            start = end
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
+    """Pack a tree of arrays.
+
+    Args:
+      tree: the arrays, which all begin with the batch axes.
+      batch_axes: the number of these axes.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    shapes = tuple((x.shape[batch_axes:], np.dtype(x.dtype)) for x in leaves)
+    library: Any = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
+    batch = leaves[0].shape[:batch_axes]
+    words = [
+        library.asarray(x).view(np.float32).reshape(*batch, -1)
+        for x in leaves
+        if x.dtype.itemsize == 4
+    ]
+    others = [x for x in leaves if x.dtype.itemsize != 4]
+    return Packed(library.concatenate(words, axis=-1), others, structure, shapes)
