@@ -201,12 +201,26 @@ class FusedUpdate:
         last = data.next_observation[:, -1]
         return Collected(jnp.concatenate(rows, axis=-1), last, mean, scale)
 
+    def noise(
+        self, keys: UInt32[Array, "minibatches 2"], unrolls: int, time: int
+    ) -> Float[Array, "minibatches time unrolls actions"]:
+        """Draw the noise that estimates the entropy in all minibatches of a pass.
+
+        Args:
+          keys: the key of each minibatch.
+          unrolls: the number of unrolls of the pass.
+          time: their length.
+        """
+        # Brax draws the noise with time as the first axis.
+        shape = time, unrolls // len(keys), self._shape.actions
+        return jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
+
     def loss_and_gradient(
         self,
         params: Float[Array, " size"],
         collected: Collected,
         unrolls: Int[Array, " unrolls"],
-        key: UInt32[Array, "2"],
+        noise: Float[Array, "time unrolls actions"],
     ) -> tuple[tuple[Array, dict[str, Array]], Float[Array, " size"]]:
         """Compute Brax's PPO loss and its gradient.
 
@@ -214,14 +228,12 @@ class FusedUpdate:
           params: the parameters, from `pack`.
           collected: all data, from `collected`.
           unrolls: the unrolls of the minibatch.
-          key: the key of the noise that estimates the entropy.
+          noise: the noise of the minibatch, from `noise`.
 
         Returns:
           The loss with its metrics under Brax's names, and the gradient as a vector.
         """
         shape, time = self._shape, collected.rows.shape[1]
-        # Brax draws the noise with time as the first axis.
-        noise = jax.random.normal(key, (time, unrolls.shape[0], shape.actions))
         rows, last, mean, scale = collected
         terms = [getattr(self._config, name) for name in LossTerms._fields]
         terms = jnp.stack([jnp.asarray(term, jnp.float32) for term in terms])

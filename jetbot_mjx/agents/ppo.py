@@ -503,25 +503,25 @@ class PPO:
         fused = self._fused
         collected = fused.collected(data, normalizer) if fused else None
 
-        def loss_and_gradient(params: PyTree, batch: Any, key: Array) -> Any:
+        def loss_and_gradient(params: PyTree, batch: Any, drawn: Array) -> Any:
             if fused and collected:
-                return fused.loss_and_gradient(params, collected, batch, key)
-            return self._loss_and_gradient(params, normalizer, batch, key)
+                return fused.loss_and_gradient(params, collected, batch, drawn)
+            return self._loss_and_gradient(params, normalizer, batch, drawn)
 
         def one_pass(carry: PyTree, drawn: tuple[Array, Array]) -> tuple[PyTree, PyTree]:
-            order, minibatch_key = drawn
+            order, loss_keys = drawn
 
             def minibatches(x: Array) -> Array:
                 return x.reshape((self.config.num_minibatches, -1, *x.shape[1:]))
 
-            # The kernels read the unrolls where they are.
+            # The kernels read the unrolls where they are, and their noise from one array.
             shuffled = order if fused else jax.tree.map(lambda x: x[order], data)
-            (params, optimizer_state, _), metrics = jax.lax.scan(
-                lambda carry, batch: self._minibatch_step(carry, batch, loss_and_gradient),
-                (*carry, minibatch_key),
-                jax.tree.map(minibatches, shuffled),
+            noise = fused.noise(loss_keys, *data.reward.shape) if fused else loss_keys
+            return jax.lax.scan(
+                lambda carry, batch: self._minibatch_step(carry, *batch, loss_and_gradient),
+                carry,
+                (jax.tree.map(minibatches, shuffled), noise),
             )
-            return (params, optimizer_state), metrics
 
         (params, optimizer_state), metrics = jax.lax.scan(
             one_pass, (params, optimizer_state), self._draw_passes(key, data.reward.shape[0])
@@ -529,7 +529,14 @@ class PPO:
         return params, optimizer_state, self._mean_metrics(metrics)
 
     def _draw_passes(self, key: Array, unrolls: int) -> tuple[Array, Array]:
-        """Draw the order of the unrolls in each pass, and the key of its minibatches."""
+        """Draw the order of the unrolls in each pass, and the keys of its minibatches."""
+        count = self.config.num_minibatches
+
+        def draw_loss_keys(key: Array) -> Array:
+            if self._fused:
+                return jax.random.split(key, count)
+            # As in Brax, each key follows from the one before.
+            return jax.lax.scan(lambda key, _: tuple(jax.random.split(key)), key, length=count)[1]
 
         def draw(key: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
             key, shuffle_key, minibatch_key = jax.random.split(key, 3)
@@ -540,7 +547,7 @@ class PPO:
             draw, key, length=self.config.num_updates_per_batch
         )
         orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
-        return orders, minibatch_keys
+        return orders, jax.vmap(draw_loss_keys)(minibatch_keys)
 
     def _mean_metrics(
         self, metrics: Float[Array, "passes minibatches metrics"]
@@ -556,8 +563,9 @@ class PPO:
 
     def _minibatch_step(
         self,
-        carry: tuple[PyTree, PyTree, UInt32[Array, "2"]],
+        carry: tuple[PyTree, PyTree],
         batch: Any,
+        drawn: Array,
         loss_and_gradient: Callable[..., Any],
     ) -> tuple[PyTree, Float[Array, " metrics"]]:
         """Apply one gradient step, or skip it if the gradient is not finite.
@@ -565,9 +573,8 @@ class PPO:
         Returns:
           The new carry; the metrics of `LOSSES`, and whether the step was applied.
         """
-        params, optimizer_state, key = carry
-        key, loss_key = jax.random.split(key)
-        (_, metrics), gradient = loss_and_gradient(params, batch, loss_key)
+        params, optimizer_state = carry
+        (_, metrics), gradient = loss_and_gradient(params, batch, drawn)
         finite = jnp.isfinite(optax.tree.norm(gradient))
         # Adapt the step size to the KL divergence, and compute the update.
         before = params, optimizer_state
@@ -591,7 +598,7 @@ class PPO:
         metrics = {**metrics, "learning_rate": rate}
         # One vector: XLA stores each array of a scan by a kernel of its own.
         row = jnp.stack([*(metrics[name] for name in LOSSES), finite.astype(jnp.float32)])
-        return (params, optimizer_state, key), row
+        return (params, optimizer_state), row
 
     def _loss(
         self,

@@ -28,7 +28,6 @@ import contextlib
 import hashlib
 import itertools
 import json
-import logging
 import os
 import re
 import shutil
@@ -38,9 +37,7 @@ from typing import Any, Self
 
 import jax
 import numpy as np
-import orbax.checkpoint as ocp
 import tensorstore as ts
-from orbax.checkpoint import checkpoint_managers
 
 from jetbot_mjx.errors import NotFoundError, UserError
 
@@ -56,10 +53,6 @@ _DELETED = ".deleted"
 
 _SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
-
-# Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
-# tracebacks from each of its threads for errors that it raises as well.
-logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 class CheckpointError(UserError):
@@ -79,7 +72,9 @@ class CheckpointStore:
     """
 
     def __init__(self, run_dir: Path, keep: int) -> None:
-        """Open a run's checkpoint folder and remove unfinished files of an earlier process.
+        """Open a run's checkpoint folder.
+
+        Unfinished files of an earlier process are removed before the first checkpoint.
 
         Args:
           run_dir: the run folder, which must exist.
@@ -88,22 +83,32 @@ class CheckpointStore:
         self._success = {
             step: stored_success_rate(run_dir, step) for step in checkpoint_steps(run_dir)
         }
-        options = ocp.CheckpointManagerOptions(
-            create=False,
-            multiprocessing_options=_single_process_options(),
-            step_name_format=ocp.path.step.standard_name_format(
-                step_format_fixed_length=_STEP_DIGITS
-            ),
-            preservation_policy=_PreserveBestAndLatest(keep, self._success),
-            cleanup_tmp_directories=True,
-            # Orbax moves a checkpoint here before it deletes it.
-            todelete_subdir=_DELETED,
-        )
+        self._keep = keep
+        self._opened: Any = None
         self._folder = (run_dir / FOLDER).absolute()
         self._clear_deleted()
         with self._writing():
             self._folder.mkdir(exist_ok=True)
-            self._manager = ocp.CheckpointManager(self._folder, options=options)
+
+    @property
+    def _orbax(self) -> Any:
+        """The module that writes: imported with the first checkpoint, while a program compiles."""
+        from jetbot_mjx.runs import checkpoint_manager
+
+        return checkpoint_manager
+
+    @property
+    def _manager(self) -> Any:
+        """Orbax's manager, opened with the first checkpoint."""
+        if self._opened is None:
+            self._opened = self._orbax.open_manager(
+                self._folder,
+                self._keep,
+                self._success,
+                step_digits=_STEP_DIGITS,
+                deleted=_DELETED,
+            )
+        return self._opened
 
     def save(
         self,
@@ -136,13 +141,9 @@ class CheckpointStore:
         about = {**about, "env_steps": env_steps, _SUCCESS: success_rate, _DIGESTS: digests}
         about[_DIGESTS] = {**digests, _ABOUT: _digest_json(about)}
         # Hand over to Orbax, which writes in the background.
-        items = {name: ocp.args.StandardSave(tree) for name, tree in flat.items()}
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
-            started = self._manager.save(
-                env_steps, args=ocp.args.Composite(**items, **{_ABOUT: ocp.args.JsonSave(about)})
-            )
-            if not started:
+            if not self._orbax.start_save(self._manager, env_steps, flat, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
 
     def wait(self) -> None:
@@ -151,8 +152,9 @@ class CheckpointStore:
         Raises:
           CheckpointError: a checkpoint could not be written.
         """
-        with self._writing():
-            self._manager.wait_until_finished()
+        if self._opened is not None:
+            with self._writing():
+                self._manager.wait_until_finished()
 
     def __enter__(self) -> Self:
         """Return the store itself."""
@@ -160,8 +162,9 @@ class CheckpointStore:
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all checkpoints are on disk, and close the store."""
-        with self._writing():
-            self._manager.close()
+        if self._opened is not None:
+            with self._writing():
+                self._manager.close()
         shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
 
     def _clear_deleted(self) -> None:
@@ -191,25 +194,6 @@ class CheckpointStore:
                 f"{self._folder}: a checkpoint could not be written: {_reason(error)}; the earlier"
                 " ones are unchanged"
             ) from error
-
-
-class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
-    """A preservation policy of Orbax that keeps the latest, the first and the best checkpoints.
-
-    Of equally good checkpoints the later one counts as the best.
-    """
-
-    def __init__(self, latest: int, success: Mapping[int, float]) -> None:
-        self._latest = latest
-        self._success = success
-
-    def should_preserve(
-        self, checkpoints: Sequence[Any], *, context: checkpoint_managers.PreservationContext
-    ) -> Sequence[bool]:
-        success = [self._success.get(one.step, -1.0) for one in checkpoints]
-        best = max(range(len(success)), key=lambda index: (success[index], index), default=0)
-        first_of_latest = len(checkpoints) - self._latest
-        return [index in (0, best) or index >= first_of_latest for index in range(len(checkpoints))]
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
@@ -399,11 +383,3 @@ def _describe(array: Any) -> str:
         return "missing"
     dtype = getattr(array.dtype, "numpy_dtype", array.dtype)
     return f"{np.dtype(dtype)}{list(array.shape)}"
-
-
-def _single_process_options() -> Any:
-    """Return options with which Orbax does not wait for other processes, which do not write."""
-    me = jax.process_index()
-    return ocp.options.MultiprocessingOptions(
-        primary_host=me, active_processes={me}, barrier_sync_key_prefix=f"process-{me}"
-    )

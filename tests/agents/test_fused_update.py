@@ -205,8 +205,8 @@ def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
 
     def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
-        key = jax.random.PRNGKey(0)
-        return fused.loss_and_gradient(fused.pack(params), collected, order, key)[1]
+        drawn = noise(fused, jax.random.PRNGKey(0), settings)
+        return fused.loss_and_gradient(fused.pack(params), collected, order, drawn)[1]
 
     made = jax.tree.map(lambda x: jnp.stack([x] * policies), one)
     traced = jax.jit(jax.vmap(one_gradient)).trace(*made)
@@ -347,6 +347,11 @@ def rounding(settings, networks):
     return dataclasses.replace(networks, policy_network=policy, value_network=value)
 
 
+def noise(fused, key, settings):
+    """The noise of one minibatch."""
+    return fused.noise(key[None], settings.ppo.batch_size, settings.ppo.unroll_length)[0]
+
+
 def assert_gradient_is_xlas(settings):
     """A minibatch's gradient and metrics, from unrolls in another order among all.
 
@@ -367,7 +372,8 @@ def assert_gradient_is_xlas(settings):
     def ours(params):
         shuffled = fused.collected(jax.tree.map(lambda x: x[order], batch), statistics)
         places = jnp.argsort(order).astype(jnp.int32)
-        return fused.loss_and_gradient(fused.pack(params), shuffled, places, key)
+        drawn = noise(fused, key, settings)
+        return fused.loss_and_gradient(fused.pack(params), shuffled, places, drawn)
 
     (_, found), vector = ours(params)
     error = jnp.linalg.norm(vector - fused.pack(expected)) / jnp.linalg.norm(vector)
@@ -386,7 +392,8 @@ def test_several_policies_take_the_same_launches():
 
     def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
-        return fused.loss_and_gradient(fused.pack(params), collected, order, key)[1]
+        drawn = noise(fused, key, settings)
+        return fused.loss_and_gradient(fused.pack(params), collected, order, drawn)[1]
 
     together = jax.jit(jax.vmap(one_gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
     for one, ours in zip(made, together, strict=True):
