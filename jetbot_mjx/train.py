@@ -80,9 +80,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.training import ppo_trainer  # noqa: F401
     cli.prepare_device()
     programs = open_program_cache(config)
-    programs.prefetch("advance", "init")
+    loads = programs.prefetch("advance", "init")
     with cli.exit_on_interrupt():
         from jetbot_mjx.training import session
+
+        if loads:
+            # Import what writes checkpoints meanwhile; if not, there is time while XLA compiles.
+            from jetbot_mjx.runs import checkpoint_manager  # noqa: F401
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
         print(

@@ -25,16 +25,16 @@ Protocol of a training step:
    them into `num_minibatches` and applies one step of Adam to each minibatch.
 
 Networks, action distribution, loss, running statistics, steps, gradients and the ADAPTIVE_KL rule
-are Brax's, and so is the order of the random keys. On one device and with `normalizer: brax` and
-`update: xla`, every step equals a step of `brax.training.agents.ppo.train`. The deviations from
-Brax are:
+are Brax's. On one device and with `normalizer: brax` and `update: xla`, the order of the random
+keys is Brax's too, and every step equals a step of `brax.training.agents.ppo.train`. The deviations
+from Brax are:
 
 - An update with a non-finite gradient is skipped and counted.
 - The first non-finite environment state is returned as a `NanDump`.
 - `normalizer: physical` bounds the standard deviation from below by the observation's scale.
 - `learning_rate_schedule: LINEAR` lowers the step size to zero over the training.
 - `update: fused` computes the same loss with kernels of this package, on GPUs with products of
-  float16.
+  float16, and draws shuffles and noise with other keys, many at once.
 - GAE is unrolled, and of the next observations only those that the loss needs are stored.
 
 The step is written for one shard of the environments. Under `jax.shard_map` over `axis_name`
@@ -64,7 +64,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 from jetbot_mjx.agents import fused_update, gae, update_probe
 from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
 from jetbot_mjx.agents.vision import VisionNetworks
-from jetbot_mjx.compiler.packed import Packed, pack
+from jetbot_mjx.compiler.packed import Condensed, Packed, condense, pack
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.errors import UserError
@@ -508,7 +508,17 @@ class PPO:
                 return fused.loss_and_gradient(params, collected, batch, drawn)
             return self._loss_and_gradient(params, normalizer, batch, drawn)
 
-        def one_pass(carry: PyTree, drawn: tuple[Array, Array]) -> tuple[PyTree, PyTree]:
+        def step(carry: Condensed, batch: Any) -> tuple[Condensed, None]:
+            params, optimizer_state, totals = carry.restore()
+            minibatch, drawn = batch
+            params, optimizer_state, metrics = self._minibatch_step(
+                params, optimizer_state, minibatch, drawn, loss_and_gradient
+            )
+            # A metric of an update that was not applied may be NaN.
+            totals += jnp.where(metrics[-1] > 0, metrics, 0.0)
+            return condense((params, optimizer_state, totals)), None
+
+        def one_pass(carry: Condensed, drawn: tuple[Array, Array]) -> tuple[Condensed, None]:
             order, loss_keys = drawn
 
             def minibatches(x: Array) -> Array:
@@ -517,63 +527,63 @@ class PPO:
             # The kernels read the unrolls where they are, and their noise from one array.
             shuffled = order if fused else jax.tree.map(lambda x: x[order], data)
             noise = fused.noise(loss_keys, *data.reward.shape) if fused else loss_keys
-            return jax.lax.scan(
-                lambda carry, batch: self._minibatch_step(carry, *batch, loss_and_gradient),
-                carry,
-                (jax.tree.map(minibatches, shuffled), noise),
-            )
+            return jax.lax.scan(step, carry, (jax.tree.map(minibatches, shuffled), noise))
 
-        (params, optimizer_state), metrics = jax.lax.scan(
-            one_pass, (params, optimizer_state), self._draw_passes(key, data.reward.shape[0])
-        )
-        return params, optimizer_state, self._mean_metrics(metrics)
+        # XLA computes each array that a loop carries by a kernel of its own.
+        start = condense((params, optimizer_state, jnp.zeros(len(LOSSES) + 1)))
+        end, _ = jax.lax.scan(one_pass, start, self._draw_passes(key, data.reward.shape[0]))
+        params, optimizer_state, totals = end.restore()
+        return params, optimizer_state, self._mean_metrics(totals)
 
     def _draw_passes(self, key: Array, unrolls: int) -> tuple[Array, Array]:
         """Draw the order of the unrolls in each pass, and the keys of its minibatches."""
-        count = self.config.num_minibatches
+        passes, count = self.config.num_updates_per_batch, self.config.num_minibatches
 
         def draw_loss_keys(key: Array) -> Array:
-            if self._fused:
-                return jax.random.split(key, count)
-            # As in Brax, each key follows from the one before.
             return jax.lax.scan(lambda key, _: tuple(jax.random.split(key)), key, length=count)[1]
 
         def draw(key: Array, _: None) -> tuple[Array, tuple[Array, Array]]:
             key, shuffle_key, minibatch_key = jax.random.split(key, 3)
             return key, (shuffle_key, minibatch_key)
 
+        if self._fused:
+            first, second = jax.random.split(key)
+            shuffle_keys = jax.random.split(first, passes)
+            loss_keys = jax.random.split(second, (passes, count))
+        else:
+            # As in Brax, each key follows from the one before.
+            _, (shuffle_keys, minibatch_keys) = jax.lax.scan(draw, key, length=passes)
+            loss_keys = jax.vmap(draw_loss_keys)(minibatch_keys)
         # Shuffle for all passes at once: a GPU takes about as long for one.
-        _, (shuffle_keys, minibatch_keys) = jax.lax.scan(
-            draw, key, length=self.config.num_updates_per_batch
-        )
         orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
-        return orders, jax.vmap(draw_loss_keys)(minibatch_keys)
+        return orders, loss_keys
 
-    def _mean_metrics(
-        self, metrics: Float[Array, "passes minibatches metrics"]
-    ) -> Float[Array, " metrics"]:
-        """Average the metrics over the applied updates of all devices, and count the others."""
+    def _mean_metrics(self, totals: Float[Array, " metrics"]) -> Float[Array, " metrics"]:
+        """Average the metrics over the applied updates of all devices, and count the others.
+
+        Args:
+          totals: the sums of the metrics of the applied updates, followed by their number.
+        """
         if self._axis is not None:
-            metrics = jax.lax.pmean(metrics, self._axis)
-        applied = metrics[..., -1:]
-        # A metric of an update that was not applied may be NaN.
-        totals = jnp.where(applied > 0, metrics, 0.0).sum(axis=(0, 1))
+            totals = jax.lax.pmean(totals, self._axis)
         means = totals[:-1] / jnp.maximum(totals[-1], 1.0)
-        return jnp.append(means, metrics.shape[0] * metrics.shape[1] - totals[-1])
+        updates = self.config.num_updates_per_batch * self.config.num_minibatches
+        return jnp.append(means, updates - totals[-1])
 
     def _minibatch_step(
         self,
-        carry: tuple[PyTree, PyTree],
+        params: PyTree,
+        optimizer_state: PyTree,
         batch: Any,
         drawn: Array,
         loss_and_gradient: Callable[..., Any],
-    ) -> tuple[PyTree, Float[Array, " metrics"]]:
+    ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
         """Apply one gradient step, or skip it if the gradient is not finite.
 
         Returns:
-          The new carry; the metrics of `LOSSES`, and whether the step was applied.
+          The new parameters and state of the optimizer; the metrics of `LOSSES`, and whether the
+          step was applied.
         """
-        params, optimizer_state = carry
         (_, metrics), gradient = loss_and_gradient(params, batch, drawn)
         finite = jnp.isfinite(optax.tree.norm(gradient))
         # Adapt the step size to the KL divergence, and compute the update.
@@ -596,9 +606,8 @@ class PPO:
         )
         rate = optimizer_state[-1].hyperparams["learning_rate"]
         metrics = {**metrics, "learning_rate": rate}
-        # One vector: XLA stores each array of a scan by a kernel of its own.
         row = jnp.stack([*(metrics[name] for name in LOSSES), finite.astype(jnp.float32)])
-        return (params, optimizer_state), row
+        return params, optimizer_state, row
 
     def _loss(
         self,

@@ -127,8 +127,11 @@ def scalarize_part(
       The program.
 
     Raises:
-      UnsupportedError: as `scalarize`, or the results need more than the arguments.
+      UnsupportedError: as `scalarize`, or the function does more than return results.
     """
+    if closed.effects:
+        # For example `jax.debug.print`, on which no result depends.
+        raise UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
     graph = ExprGraph()
     lowering = _JaxprLowering(graph)
     env: dict[Any, ScalarArray] = {}

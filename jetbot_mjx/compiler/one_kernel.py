@@ -43,6 +43,9 @@ def as_one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
 
     @functools.wraps(function)
     def run(*arguments: Any) -> Any:
+        if jax.config.values["jax_disable_jit"]:
+            # The user wants to see every operation.
+            return function(*arguments)
         leaves, structure = jax.tree.flatten(arguments)
         key = structure, tuple((x.shape, x.dtype) for x in map(jnp.asarray, leaves))
         if key not in known:

@@ -63,3 +63,34 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     ]
     others = [x for x in leaves if x.dtype.itemsize != 4]
     return Packed(library.concatenate(words, axis=-1), others, structure, shapes)
+
+
+class Condensed(struct.PyTreeNode):
+    """A `Condensed` holds a tree of arrays, of which the small ones are in one array."""
+
+    large: list[Array]
+    small: Packed
+    structure: Any = struct.field(pytree_node=False)
+    """Structure of the tree."""
+    is_large: tuple[bool, ...] = struct.field(pytree_node=False)
+    """Which of its leaves are large."""
+
+    def restore(self) -> PyTree:
+        """Return the tree."""
+        large, small = iter(self.large), iter(self.small.unpack())
+        leaves = [next(large) if one else next(small) for one in self.is_large]
+        return jax.tree.unflatten(self.structure, leaves)
+
+
+def condense(tree: PyTree, most: int = 16) -> Condensed:
+    """Pack the small arrays of a tree, at least one.
+
+    Args:
+      tree: the arrays.
+      most: the largest size of a small array.
+    """
+    leaves, structure = jax.tree.flatten(tree)
+    is_large = tuple(x.size > most for x in leaves)
+    large = [x for x, one in zip(leaves, is_large, strict=True) if one]
+    small = [x for x, one in zip(leaves, is_large, strict=True) if not one]
+    return Condensed(large, pack(small), structure, is_large)

@@ -49,14 +49,15 @@ class ProgramCache:
         self._key = f"{key} {sorted(options.items())}"
         self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
 
-    def prefetch(self, *names: str) -> None:
-        """Start to load programs in threads, and return at once."""
+    def prefetch(self, *names: str) -> bool:
+        """Start to load programs in threads, and return at once whether there are files of all."""
         if self._folder is None:
-            return
+            return False
         for name in names:
             pool = ThreadPoolExecutor(1)
             self._prefetched[name] = pool.submit(_load, self._path(name))
             pool.shutdown(wait=False)
+        return all(self._path(name).exists() for name in names)
 
     def find(self, name: str) -> jax.stages.Compiled | None:
         """Return a program if it was compiled before.

@@ -131,7 +131,8 @@ def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
     assert pictures.episodes == 2
     every = jax.vmap(env.reset)(report_keys(4)).goal
     for number, goal_w in goals_w.items():
-        np.testing.assert_array_equal(goal_w, every[number])
+        # Another program draws it, and may round the last bit otherwise.
+        np.testing.assert_allclose(goal_w, every[number], rtol=1e-6)
     assert names(pictures.files["video"].parent) == [
         "goals-3,1.gif",
         "goals-3,1.mp4",
