@@ -9,6 +9,7 @@ other side of an enclosing branch, do not count for either.
 Source: LLVM Language Reference Manual.
 """
 
+import math
 import struct
 from collections.abc import Callable, Sequence
 
@@ -278,6 +279,11 @@ class LlvmEmitter:
         lines += [
             f"declare {whole} {self._function(x)}({number})" for x in ("fptosi.sat", "fptoui.sat")
         ]
+        wide = self._wide
+        lines += [
+            f"declare {wide} @llvm.{name}.{self._suffix}f64({', '.join([wide] * count)})"
+            for name, count in (("roundeven", 1), ("floor", 1), ("fma", 3))
+        ]
         lines.append(f"declare {whole} @llvm.fshl.{self._suffix}i32({whole}, {whole}, {whole})")
         if self._lanes == 1:
             lines += [
@@ -527,6 +533,34 @@ class LlvmEmitter:
         function = f"@llvm.fshl.{self._suffix}i32"
         return f"call {whole} {function}({whole} {x}, {whole} {x}, {whole} {by})"
 
+    @property
+    def _wide(self) -> str:
+        return "double" if self._lanes == 1 else f"<{self._lanes} x double>"
+
+    def _call_wide(self, name: str, *operands: str) -> str:
+        arguments = ", ".join(f"{self._wide} {x}" for x in operands)
+        return self.do(f"call {self._wide} @llvm.{name}.{self._suffix}f64({arguments})")
+
+    def _wide_constant(self, x: float) -> str:
+        number = _float(x)
+        return number if self._lanes == 1 else f"splat (double {number})"
+
+    def _angle(self, value: Expr, operands: list[str]) -> str:
+        wide, (x,) = self._wide, operands
+        angle = self.do(f"fpext {self.type('f')} {x} to {wide}")
+        turns = self.do(f"fmul {wide} {angle}, {self._wide_constant(2 / math.pi)}")
+        turns = self._call_wide("roundeven", turns)
+        if value.op == "quarter_turns":
+            quarter = self.do(f"fmul {wide} {turns}, {self._wide_constant(0.25)}")
+            whole = self._call_wide("floor", quarter)
+            result = self._call_wide("fma", whole, self._wide_constant(-4.0), turns)
+        else:
+            # π/2 in two parts; each product is exact in a fused multiply-add.
+            result = angle
+            for part in _HALF_PI:
+                result = self._call_wide("fma", turns, self._wide_constant(-part), result)
+        return f"fptrunc {wide} {result} to {self.type('f')}"
+
     def _negative(self, value: Expr, operands: list[str]) -> str:
         return f"sub {self.type('i')} {self._splat('i', '0')}, {operands[0]}"
 
@@ -587,6 +621,9 @@ def _float(x: float) -> str:
     return f"0x{struct.pack('>d', float(x)).hex().upper()}"
 
 
+_HALF_PI = (math.pi / 2, 6.123233995736766e-17)
+"""π/2 as a sum of two numbers of 64 bits."""
+
 # Allow fused multiply-add, which rounds once instead of twice.
 _FUSED = "contract"
 
@@ -605,6 +642,7 @@ _EMIT: dict[tuple[str, str], _Emit] = {
     **{("convert", kind): LlvmEmitter._convert for kind in "fiub"},
     **{("bitcast", kind): LlvmEmitter._bitcast for kind in "fi"},
     ("abs", "i"): LlvmEmitter._magnitude,
+    **{(op, "f"): LlvmEmitter._angle for op in ("angle_rest", "quarter_turns")},
     ("div", "f"): LlvmEmitter._quotient,
     ("is_finite", "f"): LlvmEmitter._finite,
     ("neg", "f"): _instruction("fneg", "f"),

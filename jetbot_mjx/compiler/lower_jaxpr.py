@@ -23,8 +23,8 @@ Protocol, in the order in which a function passes through the package:
 4. `schedule` places the operations in blocks, and `llvm_codegen` writes the blocks as LLVM IR.
 
 Arguments for this protocol: the operations and their order are those of the function, so results
-differ from JAX's by round-off only, as long as all numbers are finite. The lowering knows nothing
-of robots.
+differ from JAX's by round-off only, as long as all numbers are finite. (`scalarize_part` can also
+lower functions whose numbers may not be.) The lowering knows nothing of robots.
 """
 
 import contextlib
@@ -55,6 +55,7 @@ from jetbot_mjx.compiler.scalar_ir import (
     Loop,
     Scalar,
     UnsupportedError,
+    check_scalars,
     is_constant,
     is_same,
 )
@@ -112,7 +113,12 @@ def scalarize(function: Callable[..., Any], *arguments: Any) -> ScalarProgram:
 
 
 def scalarize_part(
-    closed: ClosedJaxpr, arguments: Sequence[Any], results: Sequence[Any], *, words: bool = False
+    closed: ClosedJaxpr,
+    arguments: Sequence[Any],
+    results: Sequence[Any],
+    *,
+    words: bool = False,
+    finite: bool = True,
 ) -> ScalarProgram:
     """Lower the part of a traced function between some of its variables, as `scalarize` does.
 
@@ -122,6 +128,7 @@ def scalarize_part(
       results: its variables or literals that the program returns.
       words: whether arguments and results are float32 whatever their dtypes: those of 32 bits by
         their bits, and a bool as 0 or 1.
+      finite: whether all numbers are finite, as for `ExprGraph`.
 
     Returns:
       The program.
@@ -132,10 +139,13 @@ def scalarize_part(
     if closed.effects:
         # For example `jax.debug.print`, on which no result depends.
         raise UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
-    graph = ExprGraph()
+    graph = ExprGraph(finite=finite)
     lowering = _JaxprLowering(graph)
     env: dict[Any, ScalarArray] = {}
     inputs = []
+    for variable in [*arguments, *results]:
+        if jnp.issubdtype(variable.aval.dtype, jax.dtypes.extended):
+            raise UnsupportedError(f"an argument or result of {variable.aval.dtype}")
     for variable in arguments:
         dtype = np.dtype(variable.aval.dtype)
         given = _FLOAT if words else dtype
@@ -557,8 +567,12 @@ class _JaxprLowering:
     def _reduce_sum(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, x)
 
-    _reduce_and = functools.partialmethod(_reduce, "and", np.bool_(True))
-    _reduce_or = functools.partialmethod(_reduce, "or", np.bool_(False))
+    def _reduce_and(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        zero = equation.outvars[0].aval.dtype.type(0)
+        return self._reduce("and", np.bitwise_not(zero), equation, x)
+
+    def _reduce_or(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        return self._reduce("or", equation.outvars[0].aval.dtype.type(0), equation, x)
 
     def _reduce_max(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("max", _lowest(equation), equation, x)
@@ -584,6 +598,11 @@ class _JaxprLowering:
             best = x[row][0]
             for i, scalar in enumerate(x[row][1:], start=1):
                 wins = self._graph.apply(better, scalar, best)
+                if not self._graph.finite and scalar.dtype.kind == "f":
+                    # The first NaN wins.
+                    is_nan = self._graph.apply("ne", scalar, scalar)
+                    is_first = self._graph.apply("eq", best, best)
+                    wins = self._graph.apply("or", wins, self._graph.apply("and", is_nan, is_first))
                 best = self._graph.select(wins, best, scalar)
                 places[row] = self._graph.select(wins, places[row], kind(i))
         return places
@@ -686,7 +705,9 @@ def _index(x: Scalar) -> int:
 
 
 def _flatten(arrays: Sequence[ScalarArray]) -> list[Scalar]:
-    return [x for array in arrays for x in array.ravel()]
+    scalars = [x for array in arrays for x in array.ravel()]
+    check_scalars(scalars)
+    return scalars
 
 
 def _unflatten(arrays: Sequence[ScalarArray], flat: Sequence[Scalar]) -> list[ScalarArray]:

@@ -96,12 +96,13 @@ def _lowered(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
       UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
     """
     arguments, results = _arguments(traced, places), traced.jaxpr.outvars
-    lower = functools.partial(scalarize_part, traced, words=True)
-    fallback = _fallback(traced, places)
+    # Whether a state is finite is decided here: NaN must stay NaN.
+    lower = functools.partial(scalarize_part, traced, words=True, finite=False)
     calls = [x for x in traced.jaxpr.eqns if kernel.called_by(x) is not None]
     if not calls:
         program = lower(arguments, results)
         llvm_codegen.require(program)
+        fallback = _fallback(traced, places)
         return kernel.Kernel(program, carried=0, steps=1, fallback=fallback)
     step = kernel.called_by(calls[0])
     if len(calls) > 1 or step is None or step.table is not None or step.before or step.after:
@@ -114,7 +115,7 @@ def _lowered(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
         step.program,
         carried=step.carried,
         steps=step.steps,
-        fallback=fallback,
+        fallback=_fallback(traced, places),
         impl=step.impl,
         setting=step.setting,
         before=before,

@@ -13,7 +13,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PyTree
 
-_Shape = tuple[tuple[int, ...], np.dtype]
+_Shape = tuple[tuple[int, ...], Any]
+
+
+def _is_word(dtype: Any) -> bool:
+    """Return whether numbers of a dtype have 32 bits; random keys are no numbers."""
+    return isinstance(dtype, np.dtype) and dtype.itemsize == 4
 
 
 class Packed(struct.PyTreeNode):
@@ -33,7 +38,7 @@ class Packed(struct.PyTreeNode):
         others, start = iter(self.others), 0
         leaves = []
         for shape, dtype in self.shapes:
-            if dtype.itemsize != 4:
+            if not _is_word(dtype):
                 leaves.append(next(others))
                 continue
             end = start + math.prod(shape)
@@ -53,15 +58,13 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
       batch_axes: the number of these axes.
     """
     leaves, structure = jax.tree.flatten(tree)
-    shapes = tuple((x.shape[batch_axes:], np.dtype(x.dtype)) for x in leaves)
+    shapes = tuple((x.shape[batch_axes:], x.dtype) for x in leaves)
     library: Any = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
     batch = leaves[0].shape[:batch_axes]
     words = [
-        library.asarray(x).view(np.float32).reshape(*batch, -1)
-        for x in leaves
-        if x.dtype.itemsize == 4
+        library.asarray(x).view(np.float32).reshape(*batch, -1) for x in leaves if _is_word(x.dtype)
     ]
-    others = [x for x in leaves if x.dtype.itemsize != 4]
+    others = [x for x in leaves if not _is_word(x.dtype)]
     return Packed(library.concatenate(words, axis=-1), others, structure, shapes)
 
 

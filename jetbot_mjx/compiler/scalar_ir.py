@@ -5,12 +5,13 @@ with zero. Most entries of the matrices of a robot's physics are zeros, so most 
 disappears. A `Loop` and a `Branch` are recorded as units; `schedule` decides in which block of the
 program each operation is computed.
 
-Two simplifications hold for finite numbers only: 0·x is 0, and x - x is 0.
+Three simplifications hold for finite numbers only: 0·x, 0/x and x - x are 0. A graph for numbers
+that may be infinite or NaN goes without them, and reduces angles of any size.
 """
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -103,6 +104,14 @@ def _bitcast(x: Any) -> Any:
     return x.view(_INT if x.dtype == _FLOAT else _FLOAT)
 
 
+def _reduced(x: Any) -> tuple[Any, Any]:
+    """Return how many quarter turns, modulo 4, are nearest to an angle, and what is left."""
+    wide = x.astype(np.float64)
+    angle = np.arctan2(np.sin(wide), np.cos(wide))
+    turns = np.round(angle * (2 / np.pi))
+    return np.mod(turns, 4).astype(x.dtype), (angle - turns * (np.pi / 2)).astype(x.dtype)
+
+
 def _erf_inv(x: Any) -> Any:
     from scipy import special
 
@@ -113,6 +122,7 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "abs": np.abs,
     "add": np.add,
     "and": np.bitwise_and,
+    "angle_rest": lambda x: _reduced(x)[1],
     "atan2": np.arctan2,
     "bitcast": _bitcast,
     "cos": np.cos,
@@ -137,6 +147,7 @@ EVALUATE: dict[str, Callable[..., Any]] = {
     "not": np.bitwise_not,
     "or": np.bitwise_or,
     "pow": np.power,
+    "quarter_turns": lambda x: _reduced(x)[0],
     "rem": np.fmod,
     "rotate_left": lambda x, by: (x << by) | (x >> (x.dtype.type(32) - by)),
     "round": np.round,
@@ -151,7 +162,8 @@ EVALUATE: dict[str, Callable[..., Any]] = {
 }
 """The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
 a float32 for an int32, or the other way round; `round` rounds to the nearest whole number, and half
-of one to the nearest even."""
+of one to the nearest even. `quarter_turns` and `angle_rest` divide an angle up to 2⁵⁰ into quarter
+turns, modulo 4, and an angle up to π/4."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""
@@ -162,11 +174,20 @@ _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 class ExprGraph:
     """An `ExprGraph` records operations on scalars, each of them once."""
 
-    def __init__(self) -> None:
-        """Start with an empty graph."""
+    def __init__(self, *, finite: bool = True) -> None:
+        """Start with an empty graph.
+
+        Args:
+          finite: whether all numbers are finite, and angles at most 10⁴.
+        """
+        self.finite = finite
         self._values: dict[tuple[Any, ...], Expr] = {}
         self.count = 0
         """Number of recorded operations."""
+
+    def is_exact(self, dtype: np.dtype) -> bool:
+        """Return whether what follows for finite numbers holds for all numbers of a dtype."""
+        return self.finite or dtype != _FLOAT
 
     def input(self, dtype: np.dtype) -> Expr:
         """Add an input of the program."""
@@ -192,8 +213,8 @@ class ExprGraph:
             with np.errstate(all="ignore"):
                 return np.asarray(EVALUATE[op](*operands))[()]
         operand_dtype = recorded[0].dtype
-        if operand_dtype not in _DTYPES:
-            raise UnsupportedError(f"{op} of {operand_dtype}")
+        if operand_dtype not in _DTYPES or any(x.dtype != operand_dtype for x in operands):
+            raise UnsupportedError(f"{op} of {', '.join(str(x.dtype) for x in operands)}")
         if simplify := _SIMPLIFY.get(op):
             simplified = simplify(self, operand_dtype, *operands)
             if simplified is not None:
@@ -207,6 +228,7 @@ class ExprGraph:
         """Select one of two scalars of one dtype by a bool scalar."""
         if is_constant(condition):
             return on_true if condition else on_false
+        check_scalars([on_false, on_true])
         if on_false is on_true or (_are_constant(on_true, on_false) and on_false == on_true):
             return on_false
         if condition.op == "not":
@@ -286,6 +308,13 @@ class ExprGraph:
         return self.count - 1
 
 
+def check_scalars(values: Iterable[Any]) -> None:
+    """Raise an `UnsupportedError` if something is not a scalar, such as a random key."""
+    for value in values:
+        if not isinstance(value, Expr | np.generic):
+            raise UnsupportedError(f"a choice between values such as {type(value).__name__}")
+
+
 def is_same(x: Scalar, y: Scalar) -> bool:
     """Return whether two scalars are the same operation, or constants with equal bits."""
     return x is y or (_are_constant(x, y) and _identity(x) == _identity(y))
@@ -319,10 +348,14 @@ def _simplify_commutative(
 ) -> Scalar | None:
     if x is y and op in ("and", "or", "max", "min"):
         return x
+    if op in ("max", "min") and dtype == _FLOAT:
+        for one in (x, y):
+            if is_constant(one) and np.isnan(one):
+                return one
     if op in ("and", "or", "xor") and dtype != _BOOL:
         return None
     for one, other in ((x, y), (y, x)):
-        if op in _ABSORBING and _equals(one, _ABSORBING[op]):
+        if op in _ABSORBING and _equals(one, _ABSORBING[op]) and graph.is_exact(dtype):
             return dtype.type(_ABSORBING[op])
         if op in _NEUTRAL and _equals(one, _NEUTRAL[op]):
             return other
@@ -332,7 +365,7 @@ def _simplify_commutative(
 
 
 def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if x is y:
+    if x is y and graph.is_exact(dtype):
         return dtype.type(0)
     if _equals(x, 0):
         return graph.apply("neg", y)
@@ -340,7 +373,7 @@ def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 
 
 def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
-    if _equals(x, 0):
+    if _equals(x, 0) and graph.is_exact(dtype):
         return dtype.type(0)
     if _equals(y, 1):
         return x
@@ -376,6 +409,8 @@ def _simplify_pow(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 
 def _simplify_sign(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     zero, one = dtype.type(0), dtype.type(1)
+    if dtype.kind == "u":
+        return graph.select(graph.apply("gt", x, zero), zero, one)
     below = graph.select(graph.apply("lt", x, zero), x, -one)
     return graph.select(graph.apply("gt", x, zero), below, one)
 
@@ -410,13 +445,22 @@ _COSINE = _polynomial(lambda s: np.cos(np.sqrt(s)), 5, 0.0, (np.pi / 4) ** 2)
 
 
 def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
-    """Expand sin(x + ahead π/2) to basic arithmetic, equal on every machine, for |x| up to 10⁴."""
+    """Expand sin(x + ahead π/2) to basic arithmetic, equal on every machine.
+
+    If the graph's numbers are finite, |x| is at most 10⁴; otherwise any number.
+    """
     # Reduce the angle to r = x - turns π/2, with |r| at most π/4.
     do = graph.apply
-    turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
-    r = x
-    for part in _QUARTER_TURN:
-        r = do("sub", r, do("mul", turns, part))
+    if graph.finite:
+        turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
+        r = x
+        for part in _QUARTER_TURN:
+            r = do("sub", r, do("mul", turns, part))
+    else:
+        # Beyond, neighbouring numbers are thousands of turns apart; infinity becomes NaN.
+        is_angle = do("lt", do("abs", x), np.float32(2**50))
+        x = graph.select(is_angle, do("mul", x, np.float32(0)), x)
+        turns, r = do("quarter_turns", x), do("angle_rest", x)
     s = do("mul", r, r)
 
     def modulo(count: Scalar, of: float) -> Scalar:

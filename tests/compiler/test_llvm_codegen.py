@@ -10,6 +10,7 @@ import pytest
 from call_frame import Pool
 from kernel_cases import FUNCTIONS, LOOPS, VECTOR, robots
 from run_program import evaluate
+from scipy import special
 
 from jetbot_mjx.compiler import ffi_wrapper, llvm_backend
 from jetbot_mjx.compiler.kernel import Kernel
@@ -259,3 +260,142 @@ def test_functions_are_those_of_float64(name):
     assert units.max() < 3.0
     flushed = np.where(np.isfinite(rounded) & ~normal, 0.0, rounded)[~normal]
     np.testing.assert_array_equal(np.where(np.isfinite(ours[~normal]), 0.0, ours[~normal]), flushed)
+
+
+def in_units(ours, exact):
+    """How far numbers are off, in units of the last place, where they are not too small."""
+    with np.errstate(all="ignore"):
+        rounded = exact.astype(np.float32)
+    normal = np.isfinite(rounded) & (np.abs(exact) > np.finfo(np.float32).tiny)
+    return np.abs(ours[normal] - exact[normal]) / np.spacing(np.abs(rounded[normal]))
+
+
+def directions():
+    """Vectors of all sizes and directions, and next to the axes and the diagonals."""
+    rng = np.random.default_rng(0)
+    angles = np.linspace(-np.pi, np.pi, 20_001)
+    sizes = 10 ** rng.uniform(-37, 38, (2, 20_000))
+    ratios = 10 ** rng.uniform(-6, 6, 20_000)
+    near = 1 + np.arange(-500, 500) * 2.0**-23
+    one = np.concatenate([np.sin(angles), sizes[0], ratios, np.ones(1000)])
+    other = np.concatenate([np.cos(angles), sizes[1], 1 / ratios, near])
+    signs = rng.choice([-1, 1], (2, len(one)))
+    return np.float32(signs * [one, other])
+
+
+def test_the_angle_of_a_vector_is_that_of_float64(lanes):
+    program = scalarize(jnp.arctan2, *[jax.ShapeDtypeStruct((), np.float32)] * 2)
+    y, x = directions()
+    (ours,) = run(program, [y, x])
+    exact = np.arctan2(np.float64(y), np.float64(x))
+    assert in_units(ours, exact).max() <= 4
+    too_small = np.abs(exact) < np.finfo(np.float32).tiny
+    assert too_small.any()
+    np.testing.assert_array_less(np.abs(ours[too_small]), 2 * np.finfo(np.float32).tiny)
+    np.testing.assert_array_equal(np.signbit(ours), np.signbit(exact))
+
+
+def test_the_angles_between_zeros_and_infinities_are_those_of_numpy(lanes):
+    program = scalarize(jnp.arctan2, *[jax.ShapeDtypeStruct((), np.float32)] * 2)
+    ends = np.float32([0.0, -0.0, 1, -1, 1.2e-38, 3e38, -3e38, np.inf, -np.inf, np.nan])
+    y, x = (part.ravel() for part in np.meshgrid(ends, ends))
+    (ours,) = run(program, [y, x])
+    exact = np.arctan2(np.float64(y), np.float64(x))
+    number = ~np.isnan(exact)
+    np.testing.assert_array_equal(np.isnan(ours), ~number)
+    np.testing.assert_array_equal(np.signbit(ours[number]), np.signbit(exact[number]))
+    np.testing.assert_allclose(ours[number], exact[number], rtol=2e-7, atol=2e-38)
+
+
+def test_the_inverse_of_the_error_function_is_that_of_float64(lanes):
+    rng = np.random.default_rng(0)
+    near_one = 1 - np.arange(1, 20_000) * 2.0**-24
+    small = np.geomspace(1.2e-38, 0.5, 20_000)
+    inside = np.concatenate([rng.uniform(-1, 1, 20_000), near_one, -near_one, small, -small])
+    x = np.float32([*inside, 1, -1, 0.0, -0.0, 1.5, np.inf, -np.inf, np.nan])
+    (ours,) = run(scalarize(jax.lax.erf_inv, jax.ShapeDtypeStruct((), np.float32)), [x])
+    assert in_units(ours[:-8], special.erfinv(np.float64(x[:-8]))).max() <= 8
+    np.testing.assert_array_equal(ours[-8:-4], np.float32([np.inf, -np.inf, 0, 0]))
+    np.testing.assert_array_equal(np.signbit(ours[-6:-4]), [False, True])
+    assert np.isnan(ours[-4:]).all()
+
+
+def test_half_a_number_is_rounded_to_the_even_one(lanes):
+    halves = np.arange(-1000, 1000) / 4
+    large = [4194304.5, 4194305.5, 8388607.5, 2**23 + 1, 2**24 + 2, -8388607.5, 3e38]
+    x = np.float32([*halves, *large, -0.0, -0.3, np.inf, -np.inf, np.nan])
+    (ours,) = run(scalarize(jnp.round, jax.ShapeDtypeStruct((), np.float32)), [x])
+    np.testing.assert_array_equal(ours, np.round(x))
+    np.testing.assert_array_equal(np.signbit(ours), np.signbit(np.round(x)))
+
+
+def of_words(function, *arrays):
+    """What a kernel makes of numbers of 32 bits, one of each array for a robot."""
+
+    def as_floats(*words):
+        result = function(*(x.view(y.dtype) for x, y in zip(words, arrays, strict=True)))
+        return [(result.astype(jnp.uint32) if result.dtype == bool else result).view(jnp.float32)]
+
+    program = scalarize(as_floats, *[jax.ShapeDtypeStruct((), np.float32)] * len(arrays))
+    (ours,) = run(program, [x.view(np.float32) for x in arrays])
+    return ours.view(np.uint32)
+
+
+def check_words(function, *arrays):
+    theirs = np.asarray(jax.vmap(function)(*arrays))
+    theirs = theirs.astype(np.uint32) if theirs.dtype == bool else theirs.view(np.uint32)
+    np.testing.assert_array_equal(of_words(function, *arrays), theirs)
+
+
+WORDS = np.uint32([0, 1, 7, 2**24 + 1, 2**31 - 1, 2**31, 2**31 + 129, 2**32 - 129, 2**32 - 1])
+PAIRS = [x.ravel() for x in np.meshgrid(WORDS, WORDS)]
+LARGE = {np.uint32: np.uint32(2**31 + 7), np.int32: np.int32(-7)}
+WORD_FUNCTIONS = {
+    "sums": lambda a, b, large: a + b - large,
+    "differences": lambda a, b, large: large - (a - b),
+    "products": lambda a, b, large: (a + 3) * b * large,
+    "negatives": lambda a, b, large: -a,
+    "extremes": lambda a, b, large: jnp.maximum(a, b) ^ jnp.minimum(a, b),
+    "extremes of a constant": lambda a, b, large: jnp.maximum(a, large) ^ jnp.minimum(b, large),
+    "bits": lambda a, b, large: (a & b) + (a | large) * (a ^ b),
+    "less": lambda a, b, large: (a < b) * 1 + (a <= b) * 2 + (a < large) * 4 + (large <= b) * 8,
+    "more": lambda a, b, large: (a > b) * 1 + (a >= b) * 2 + (a > large) * 4 + (large >= b) * 8,
+    "equal": lambda a, b, large: (a == b) * 1 + (a != b) * 2 + (a == large) * 4,
+    "choices": lambda a, b, large: jnp.where(a > b, a, b - large),
+    "quotients": lambda a, b, large: (a // 7) ^ (b % 1000) ^ jax.lax.div(a, a.dtype.type(3)),
+    "remainders": lambda a, b, large: jax.lax.rem(a, a.dtype.type(2**31 - 1)),
+    "shifts": lambda a, b, large: (
+        (a << 0) ^ (a << 31) ^ jax.lax.shift_right_logical(b, a.dtype.type(13))
+    ),
+    "truths": lambda a, b, large: a.astype(bool) ^ (b > large),
+    "a loop": lambda a, b, large: jax.lax.while_loop(
+        lambda state: (state[0] > 5) & (state[1] < 40),
+        lambda state: (state[0] - state[0] // 4, state[1] + 1),
+        (a, 0),
+    )[0],
+}
+
+
+@pytest.mark.parametrize("dtype", LARGE)
+@pytest.mark.parametrize("name", WORD_FUNCTIONS)
+def test_whole_numbers_with_and_without_a_sign_are_those_of_jax(name, dtype, lanes):
+    def function(a, b):
+        return WORD_FUNCTIONS[name](a, b, LARGE[dtype])
+
+    check_words(function, *(x.view(dtype) for x in PAIRS))
+
+
+@pytest.mark.parametrize("by", [2**31, 2**32 - 1])
+def test_words_are_divided_by_what_has_the_highest_bit(by, lanes):
+    check_words(lambda x: x // jnp.uint32(by), WORDS)
+    check_words(lambda x: x % jnp.uint32(by), WORDS)
+
+
+@pytest.mark.parametrize("to", [np.float32, np.int32, np.uint32, bool])
+@pytest.mark.parametrize("source", [np.float32, np.int32, np.uint32])
+def test_conversions_are_those_of_jax(source, to, lanes):
+    numbers = WORDS.view(source)
+    if source == np.float32:
+        ends = [0.7, -0.7, -0.0, 2**31, -(2**31), 2**32 - 256, 2**32, 1e20, -1e20]
+        numbers = np.float32([*range(-3, 4), *ends, np.inf, -np.inf, np.nan])
+    check_words(lambda x: x.astype(to), numbers)

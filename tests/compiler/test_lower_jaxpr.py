@@ -198,11 +198,54 @@ def filled_up(x):
         (lambda x: x.astype(jnp.float16) * 2, "float16"),
         (lambda x: jax.random.uniform(jax.random.PRNGKey(0), (4,)) * x, "random"),
         (jax.lax.erf, "erf"),
+        (lambda x: jnp.int32(7) // x.astype(int), "what may not be positive"),
+        (lambda x: jax.lax.rem(x.astype(int), x.astype(int)), "what may not be positive"),
+        (lambda x: jax.lax.div(x.astype(int), jnp.int32(0)), "what may not be positive"),
+        (lambda x: x.astype(int) // -3, "what may not be positive"),
+        (lambda x: x.astype(int) << x.astype(int), "from 0 to 31 bits"),
+        (lambda x: x.astype(jnp.uint32) >> jnp.uint32(32), "from 0 to 31 bits"),
+        (lambda x: x.astype(int) >> 3, "shift_right_arithmetic"),
+        (lambda x: jax.lax.round(x), "rounding other than to the nearest even"),
+        (lambda x: x.view(jnp.float16), "the bits of float32 as float16"),
     ],
 )
 def test_what_cannot_be_written_so_is_named(function, reason):
     with pytest.raises(UnsupportedError, match=reason):
         lower_jaxpr.scalarize(function, MATRIX)
+
+
+def test_of_a_function_only_a_part_is_computed():
+    closed = jax.make_jaxpr(lambda x, y: (jnp.sqrt(x * y) + y, jnp.sin(y)))(1.0, 2.0)
+    x, y = closed.jaxpr.invars
+    (root,) = (one.outvars[0] for one in closed.jaxpr.eqns if one.primitive.name == "sqrt")
+    before = lower_jaxpr.scalarize_part(closed, [x, y], [root, y])
+    assert sorted(value.op for value in before.block.values()) == ["mul", "sqrt"]
+    after = lower_jaxpr.scalarize_part(closed, [root, y], closed.jaxpr.outvars[:1])
+    assert [value.op for value in after.block.values()] == ["add"]
+    half = evaluate(before, [np.float32([8, 2]), np.float32([2, 0.5])])
+    np.testing.assert_array_equal(evaluate(after, half)[0], [6, 1.5])
+
+
+def test_what_is_no_float_is_passed_by_its_bits():
+    def function(x, count, word, flag):
+        return jnp.where(flag, x, -x), count - 1, word + 1, ~flag, jnp.int32(-3), True
+
+    given = [np.float32([2, np.inf]), np.int32([-7, 2**31 - 1]), np.uint32([2**32 - 1, 2**31])]
+    flags = np.array([True, False])
+    closed = jax.make_jaxpr(function)(*(x[0] for x in (*given, flags)))
+    program = lower_jaxpr.scalarize_part(
+        closed, closed.jaxpr.invars, closed.jaxpr.outvars, words=True
+    )
+    assert all(x.dtype == np.float32 for array in program.inputs for x in array.ravel())
+    words = [*(x.view(np.float32) for x in given), np.float32(flags)]
+    results = evaluate(program, words)
+    assert all(x.dtype == np.float32 for x in results)
+    np.testing.assert_array_equal(results[0], [2, -np.inf])
+    np.testing.assert_array_equal(results[1].view(np.int32), [-8, 2**31 - 2])
+    np.testing.assert_array_equal(results[2].view(np.uint32), [0, 2**31 + 1])
+    np.testing.assert_array_equal(results[3], [0, 1])
+    np.testing.assert_array_equal(results[4].view(np.int32), [-3, -3])
+    np.testing.assert_array_equal(results[5], [1, 1])
 
 
 def items(block, kind):

@@ -1,8 +1,12 @@
 """Arithmetic that is written down: what is known is done, what is shared is shared."""
 
+import math
+
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import run_program
+from scipy import special
 
 from jetbot_mjx.compiler import scalar_ir
 from jetbot_mjx.compiler.indexing import scalar_array
@@ -117,8 +121,185 @@ def test_the_sign_of_a_number_is_that_of_the_library(graph, x):
     np.testing.assert_array_equal(evaluate(graph.apply("sign", x), (x, numbers)), np.sign(numbers))
 
 
+ENDS = np.float32([0.0, -0.0, 1, -1, 2.5, -2.5, 3e38, -3e38, np.inf, -np.inf, np.nan])
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_angle_of_a_vector_is_that_of_the_library(graph, x, known):
+    y = graph.input(np.float32)
+    angles = np.float32(np.linspace(-np.pi, np.pi, 4001))
+    ups = np.concatenate([np.repeat(ENDS, len(ENDS)), np.sin(angles)])
+    alongs = np.concatenate([np.tile(ENDS, len(ENDS)), np.cos(angles)])
+    if known:
+        ours = np.float32([graph.apply("atan2", *pair) for pair in zip(ups, alongs, strict=True)])
+    else:
+        ours = evaluate(graph.apply("atan2", y, x), (y, ups), (x, alongs))
+    exact = np.arctan2(np.float64(ups), np.float64(alongs))
+    number = ~np.isnan(exact)
+    np.testing.assert_array_equal(np.isnan(ours), ~number)
+    np.testing.assert_array_equal(np.signbit(ours[number]), np.signbit(exact[number]))
+    np.testing.assert_array_max_ulp(ours[number], np.float32(exact[number]), 4)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_the_inverse_of_the_error_function_is_that_of_the_library(graph, x, known):
+    near_one = 1 - np.arange(1, 500) * 2.0**-24
+    numbers = np.float32([*np.linspace(-0.999, 0.999, 4001), *near_one, *-near_one])
+    numbers = np.concatenate([numbers, np.float32([1, -1, 0.0, -0.0, 1.5, np.inf, np.nan])])
+    if known:
+        ours = np.float32([graph.apply("erf_inv", number) for number in numbers])
+    else:
+        ours = evaluate(graph.apply("erf_inv", x), (x, numbers))
+    exact = special.erfinv(np.float64(numbers))
+    np.testing.assert_array_equal(ours[-7:], np.float32([np.inf, -np.inf, 0, 0, *[np.nan] * 3]))
+    np.testing.assert_array_max_ulp(ours[:-7], np.float32(exact[:-7]), 8)
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_half_a_number_is_rounded_to_the_even_one(graph, x, known):
+    numbers = np.float32([0.5, 1.5, 2.5, -0.5, -1.5, -0.3, 0.7, 4194304.5, 8388607.5, 2**24 + 2])
+    wanted = np.float32([0, 2, 2, -0.0, -2, -0.0, 1, 4194304, 8388608, 2**24 + 2])
+    if known:
+        ours = np.float32([graph.apply("round", number) for number in numbers])
+    else:
+        ours = evaluate(graph.apply("round", x), (x, numbers))
+    np.testing.assert_array_equal(ours, wanted)
+    np.testing.assert_array_equal(np.signbit(ours), np.signbit(wanted))
+
+
 def test_whole_numbers_divide_towards_zero(graph):
     assert graph.apply("div", np.int32(-7), np.int32(2)) == -3
+
+
+WORDS = np.uint32([0, 1, 7, 2**24 + 1, 2**31 - 1, 2**31, 2**31 + 129, 2**32 - 129, 2**32 - 1])
+PAIRS = [x.ravel() for x in np.meshgrid(WORDS, WORDS)]
+WORD_OPERATIONS = {
+    "add": np.add,
+    "sub": np.subtract,
+    "mul": np.multiply,
+    "max": np.maximum,
+    "min": np.minimum,
+    "and": np.bitwise_and,
+    "or": np.bitwise_or,
+    "xor": np.bitwise_xor,
+    "lt": np.less,
+    "le": np.less_equal,
+    "gt": np.greater,
+    "ge": np.greater_equal,
+    "eq": np.equal,
+    "ne": np.not_equal,
+}
+
+
+@pytest.mark.parametrize("known", [0, 1, 2])
+@pytest.mark.parametrize("op", WORD_OPERATIONS)
+def test_words_without_a_sign_are_those_of_the_library(graph, op, known):
+    one, other = graph.input(np.uint32), graph.input(np.uint32)
+    if known == 0:
+        ours = evaluate(graph.apply(op, one, other), (one, PAIRS[0]), (other, PAIRS[1]))
+    elif known == 1:
+        results = [graph.apply(op, one, word) for word in WORDS]
+        columns = [evaluate(result, (one, WORDS)) for result in results]
+        ours = np.concatenate(columns)
+    else:
+        ours = np.array([graph.apply(op, *pair) for pair in zip(*PAIRS, strict=True)])
+    theirs = WORD_OPERATIONS[op](*PAIRS)
+    assert ours.dtype == theirs.dtype
+    np.testing.assert_array_equal(ours, theirs)
+
+
+DIVISORS = [1, 2, 3, 1000, 2**31 - 1]
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32])
+@pytest.mark.parametrize("op", ["div", "rem"])
+def test_whole_numbers_are_divided_by_what_is_known(graph, op, dtype, known):
+    numbers = WORDS.view(dtype)
+    reference = {"div": lambda x, by: int(x / by), "rem": math.fmod}[op]
+    divisors = [*DIVISORS, *([2**31, 2**32 - 1] if dtype == np.uint32 else [])]
+    for by in map(dtype, divisors):
+        if known:
+            ours = [graph.apply(op, number, by) for number in numbers]
+        else:
+            x = graph.input(dtype)
+            ours = evaluate(graph.apply(op, x, by), (x, numbers))
+        np.testing.assert_array_equal(ours, [reference(int(x), int(by)) for x in numbers])
+
+
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32])
+@pytest.mark.parametrize("op", ["div", "rem"])
+def test_whole_numbers_are_divided_by_nothing_that_may_not_be_positive(graph, op, dtype):
+    x, y = graph.input(dtype), graph.input(dtype)
+    numbers = [(x, y), (x, x), (dtype(7), y), (x, dtype(0))]
+    for pair in [*numbers, *([(x, dtype(-3))] if dtype == np.int32 else [])]:
+        with pytest.raises(UnsupportedError, match="a division of integers by what may not"):
+            graph.apply(op, *pair)
+
+
+SHIFTS = {
+    "shift_left": lambda x, by: (x << by) % 2**32,
+    "shift_right_logical": lambda x, by: x >> by,
+    "rotate_left": lambda x, by: (x << by | x >> (32 - by)) % 2**32,
+}
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("op", SHIFTS)
+def test_words_are_shifted_by_what_is_known(graph, op, known):
+    for dtype in (np.uint32, np.int32) if op != "rotate_left" else (np.uint32,):
+        numbers = WORDS.view(dtype)
+        for by in (0, 1, 13, 31):
+            if known:
+                ours = np.array([graph.apply(op, number, dtype(by)) for number in numbers])
+            else:
+                x = graph.input(dtype)
+                ours = evaluate(graph.apply(op, x, dtype(by)), (x, numbers))
+            assert ours.dtype == dtype
+            wanted = [SHIFTS[op](int(word), by) for word in WORDS]
+            np.testing.assert_array_equal(ours.view(np.uint32), wanted)
+
+
+@pytest.mark.parametrize("op", SHIFTS)
+def test_words_are_shifted_by_no_more_than_they_have_and_nothing_that_depends(graph, op):
+    x = graph.input(np.int32)
+    word = graph.input(np.uint32)
+    cases = [(x, np.int32(32)), (x, np.int32(-1)), (x, x), (np.int32(1), x), (word, word)]
+    for pair in [*cases, (word, np.uint32(32))]:
+        with pytest.raises(UnsupportedError, match="a shift that may not be from 0 to 31 bits"):
+            graph.apply(op, *pair)
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("to", [np.float32, np.int32, np.uint32, bool])
+@pytest.mark.parametrize("source", [np.float32, np.int32, np.uint32, bool])
+def test_conversions_are_those_of_jax(graph, source, to, known):
+    numbers = {
+        np.float32: np.float32(
+            [*range(-3, 4), 0.7, -0.7, -0.0, 2**31, 2**32 - 256, 2**32, -(2**31)]
+        ),
+        np.int32: WORDS.view(np.int32),
+        np.uint32: WORDS,
+        bool: np.array([True, False]),
+    }[source]
+    if source == np.float32:
+        numbers = np.append(numbers, np.float32([1e20, -1e20, np.inf, -np.inf, np.nan]))
+    to = np.dtype(to)
+    theirs = np.asarray(jnp.asarray(numbers).astype(to))
+    if known:
+        ours = np.array([graph.convert(number, to) for number in numbers])
+    else:
+        x = graph.input(source)
+        ours = evaluate(graph.convert(x, to), (x, numbers))
+    assert ours.dtype == theirs.dtype
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_what_is_converted_there_and_back_is_what_it_was(graph):
+    word = graph.input(np.uint32)
+    whole = graph.convert(word, np.dtype(np.int32))
+    assert graph.convert(whole, np.dtype(np.uint32)) is word
+    assert graph.convert(word, np.dtype(np.uint32)) is word
 
 
 @pytest.mark.parametrize("known", [True, False])

@@ -1,0 +1,103 @@
+"""What one kernel may not assume: that numbers are finite, that values are numbers."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_kernel import launches
+
+from jetbot_mjx.compiler.one_kernel import as_one_kernel
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.task import GoalTask
+from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
+
+EVERY_KIND = np.float32([1.0, -2.5, 0.0, 3e7, -1e9, 1e14, np.nan, np.inf, -np.inf])
+
+OF_ANY_NUMBER = {
+    "nothing of it": lambda x: x * 0.0,
+    "without itself": lambda x: x - x,
+    "a share of nothing": lambda x: 0.0 / x,
+    "at most NaN": lambda x: jnp.minimum(x, jnp.nan),
+    "at least NaN": lambda x: jnp.maximum(jnp.nan, x),
+    "clipped by NaN": lambda x: jnp.clip(x, 0.0, jnp.nan),
+    "its sine": jnp.sin,
+    "its cosine": jnp.cos,
+    "the largest of it and others": lambda x: jnp.argmax(jnp.stack([x * 0 + 2, x, x + 1])),
+    "the smallest of it and others": lambda x: jnp.argmin(jnp.stack([x * 0 - 2, -x, x])),
+    "summed with zeros": lambda x: jnp.zeros((1, 2)) @ jnp.stack([x, x]),
+}
+
+
+@pytest.mark.parametrize("name", OF_ANY_NUMBER)
+def test_what_is_not_finite_stays_so(name):
+    function = jax.vmap(as_one_kernel(OF_ANY_NUMBER[name]))
+    assert launches(function, EVERY_KIND) == 1
+    expected = jax.vmap(OF_ANY_NUMBER[name])(EVERY_KIND)
+    np.testing.assert_allclose(jax.jit(function)(EVERY_KIND), expected, rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("reduce", [jnp.bitwise_or, jnp.bitwise_and, jnp.bitwise_xor])
+@pytest.mark.parametrize("dtype", [np.int32, np.uint32])
+def test_the_bits_of_whole_numbers_are_combined(reduce, dtype):
+    numbers = np.random.default_rng(0).integers(0, 2**31, (17, 5)).astype(dtype)
+    ours = jax.jit(jax.vmap(as_one_kernel(lambda x: reduce.reduce(x))))(numbers)
+    np.testing.assert_array_equal(ours, jax.vmap(lambda x: reduce.reduce(x))(numbers))
+
+
+def typed(words):
+    return jax.random.wrap_key_data(words)
+
+
+WITH_KEYS = {
+    "poisson": lambda key: jax.random.poisson(key, 3.0, (2,)),
+    "binomial": lambda key: jax.random.binomial(key, 5, 0.4),
+    "one of two keys": lambda key: jax.random.bits(
+        jnp.where(key[0] % 2 == 0, typed(key), jax.random.split(typed(key))[1])
+    ),
+    "a key of a branch": lambda key: jax.random.bits(
+        jax.lax.cond(key[0] % 2 == 0, lambda k: k, lambda k: jax.random.split(k)[0], typed(key))
+    ),
+    "a key of a loop": lambda key: jax.random.bits(
+        jax.lax.fori_loop(0, 200, lambda i, k: jax.random.fold_in(k, i), typed(key))
+    ),
+    "a key as a result": lambda key: jax.random.split(typed(key)),
+}
+
+
+@pytest.mark.parametrize("name", WITH_KEYS)
+def test_what_chooses_between_keys_stays_as_it_is(name):
+    keys = np.random.default_rng(1).integers(0, 2**32, (9, 2), np.uint32)
+    ours = jax.jit(jax.vmap(as_one_kernel(WITH_KEYS[name])))(keys)
+    theirs = jax.jit(jax.vmap(WITH_KEYS[name]))(keys)
+    if name == "a key as a result":
+        ours, theirs = jax.random.key_data(ours), jax.random.key_data(theirs)
+    np.testing.assert_array_equal(ours, theirs)
+
+
+def test_a_key_as_an_argument_stays_as_it_is():
+    keys = jax.random.split(jax.random.key(3), 9)
+    ours = jax.jit(jax.vmap(as_one_kernel(jax.random.bits)))(keys)
+    np.testing.assert_array_equal(ours, jax.vmap(jax.random.bits)(keys))
+
+
+class WeighsWithZero(GoalTask):
+    """A reward whose last term is zero times the logarithm of what may be negative."""
+
+    def reward(self, before, after, goal, action):
+        reward, terms = super().reward(before, after, goal, action)
+        return reward + 0.0 * jnp.log(action[0]), terms
+
+
+def test_a_reward_that_is_no_number_ends_the_episode():
+    config = parse_config({"task": {"observation": "egocentric"}})
+    env = make_env(config, WeighsWithZero)
+    batch = wrap_for_training(env, 40)
+    plain = NewEpisodeWrapper(EpisodeWrapper(env, 40))
+    state = jax.jit(batch.reset)(jax.random.split(jax.random.PRNGKey(0), 8))
+    action = jnp.stack([jnp.linspace(-1.0, 1.0, 8), jnp.zeros(8)], axis=1)
+    ours = jax.jit(batch.step)(state, action)
+    theirs = jax.jit(jax.vmap(plain.step))(state, action)
+    np.testing.assert_array_equal(ours.metrics["nonfinite_envs"], action[:, 0] < 0)
+    np.testing.assert_array_equal(ours.done, theirs.done)
+    np.testing.assert_array_equal(ours.key, theirs.key)
