@@ -84,9 +84,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with cli.exit_on_interrupt():
         from jetbot_mjx.training import session
 
-        if loads:
-            # Import what writes checkpoints meanwhile; if not, there is time while XLA compiles.
-            from jetbot_mjx.runs import checkpoint_manager  # noqa: F401
+        session.import_writer(at_once=loads)
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
         print(

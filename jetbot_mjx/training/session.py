@@ -111,6 +111,16 @@ class Training(NamedTuple):
     """The source of the task that the run stores; None: it has none, or it is stored already."""
 
 
+def import_writer(*, at_once: bool) -> None:
+    """Import what writes checkpoints, unless the first of them does while programs compile.
+
+    Args:
+      at_once: whether no program is compiled, so that there will be no such time.
+    """
+    if at_once:
+        from jetbot_mjx.runs import checkpoint_manager  # noqa: F401
+
+
 def run(config: Config, run_dir: Path) -> Result:
     """Train a policy, from the beginning or from where the folder's run was stopped.
 
