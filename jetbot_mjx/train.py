@@ -80,11 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.training import ppo_trainer  # noqa: F401
     cli.prepare_device()
     programs = open_program_cache(config)
-    loads = programs.prefetch("advance", "init")
+    programs.prefetch("advance", "init")
     with cli.exit_on_interrupt():
         from jetbot_mjx.training import session
-
-        session.import_writer(at_once=loads)
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
         print(

@@ -48,16 +48,18 @@ class ProgramCache:
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
         self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
+        self.loads = False
+        """Whether programs are being loaded, and not one of them must be compiled."""
 
-    def prefetch(self, *names: str) -> bool:
-        """Start to load programs in threads, and return at once whether there are files of all."""
+    def prefetch(self, *names: str) -> None:
+        """Start to load programs in threads, and return at once."""
         if self._folder is None:
-            return False
+            return
         for name in names:
             pool = ThreadPoolExecutor(1)
             self._prefetched[name] = pool.submit(_load, self._path(name))
             pool.shutdown(wait=False)
-        return all(self._path(name).exists() for name in names)
+        self.loads = all(self._path(name).exists() for name in names)
 
     def find(self, name: str) -> jax.stages.Compiled | None:
         """Return a program if it was compiled before.

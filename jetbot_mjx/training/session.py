@@ -111,16 +111,6 @@ class Training(NamedTuple):
     """The source of the task that the run stores; None: it has none, or it is stored already."""
 
 
-def import_writer(*, at_once: bool) -> None:
-    """Import what writes checkpoints, unless the first of them does while programs compile.
-
-    Args:
-      at_once: whether no program is compiled, so that there will be no such time.
-    """
-    if at_once:
-        from jetbot_mjx.runs import checkpoint_manager  # noqa: F401
-
-
 def run(config: Config, run_dir: Path) -> Result:
     """Train a policy, from the beginning or from where the folder's run was stopped.
 
@@ -158,6 +148,9 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
         written; the task cannot be built; the environments cannot be divided among the devices,
         the CPU is divided otherwise, or the devices have too little memory.
     """
+    if programs.loads:
+        # Import what writes checkpoints meanwhile; if not, there is time while programs compile.
+        from jetbot_mjx.runs import checkpoint_manager  # noqa: F401
     # Refuse what cannot be trained before anything is built.
     if jax.process_count() > 1:
         distributed.check(config)
