@@ -340,6 +340,10 @@ class LlvmEmitter:
         if kind == "u":
             # LLVM's integers have no sign, but its text has.
             x = x.view(np.int32)
+        if kind == "f" and np.isnan(x):
+            # Bits of whole numbers may be such a float, which LLVM's text would change.
+            whole = self._splat("i", str(int(x.view(np.int32))))
+            return self.do(f"bitcast {self.type('i')} {whole} to {self.type('f')}")
         return self._splat(kind, _float(x) if kind == "f" else str(int(x)))
 
     def _any(self, condition: str) -> str:

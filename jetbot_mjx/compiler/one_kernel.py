@@ -28,6 +28,9 @@ from jetbot_mjx.compiler.backends import default_backend
 from jetbot_mjx.compiler.lower_jaxpr import scalarize_part
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 
+_SETTINGS = ("jax_threefry_partitionable", "jax_enable_x64", "jax_default_matmul_precision")
+"""JAX's settings on which the kernel of a function depends."""
+
 
 def as_one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
     """Return a function of one robot that is one kernel if it can be, and as it is otherwise.
@@ -47,7 +50,9 @@ def as_one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
             # The user wants to see every operation.
             return function(*arguments)
         leaves, structure = jax.tree.flatten(arguments)
-        key = structure, tuple((x.shape, x.dtype) for x in map(jnp.asarray, leaves))
+        arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
+        settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
+        key = (structure, settings, *((x.shape, x.dtype, x.aval.weak_type) for x in arrays))
         if key not in known:
             traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
             compiled = _compiled(traced), jax.tree.structure(shapes)
@@ -96,6 +101,8 @@ def _lowered(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
       UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
     """
     arguments, results = _arguments(traced, places), traced.jaxpr.outvars
+    if not arguments:
+        raise UnsupportedError("a function of nothing")
     # Whether a state is finite is decided here: NaN must stay NaN.
     lower = functools.partial(scalarize_part, traced, words=True, finite=False)
     calls = [x for x in traced.jaxpr.eqns if kernel.called_by(x) is not None]
@@ -107,6 +114,8 @@ def _lowered(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
     step = kernel.called_by(calls[0])
     if len(calls) > 1 or step is None or step.table is not None or step.before or step.after:
         raise UnsupportedError("more than one kernel")
+    if [tuple(x.aval.shape) for x in calls[0].invars] != step.argument_shapes:
+        raise UnsupportedError("a kernel for several robots")
     before = lower(arguments, calls[0].invars)
     after = lower([*arguments, *calls[0].outvars], results)
     for program in (before, after):

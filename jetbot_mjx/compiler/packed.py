@@ -16,16 +16,20 @@ from jaxtyping import Array, Float, PyTree
 _Shape = tuple[tuple[int, ...], Any]
 
 
-def _is_word(dtype: Any) -> bool:
-    """Return whether numbers of a dtype have 32 bits; random keys are no numbers."""
-    return isinstance(dtype, np.dtype) and dtype.itemsize == 4
+def _is_packed(shape: tuple[int, ...], dtype: Any) -> bool:
+    """Return whether an array is packed: its numbers have 32 bits, and there are some.
+
+    Random keys are no numbers. XLA aborts where it slices nothing from an array that it made of
+    others and an empty one.
+    """
+    return isinstance(dtype, np.dtype) and dtype.itemsize == 4 and math.prod(shape) > 0
 
 
 class Packed(struct.PyTreeNode):
     """A `Packed` holds a tree of arrays, with any batch axes in front, on host or device."""
 
     words: Float[Array, "*batch columns"]
-    """The bits of all arrays with 32 bits, one after the other."""
+    """The bits of all arrays with numbers of 32 bits, one after the other."""
     others: list[Array]
     """The other arrays."""
     structure: Any = struct.field(pytree_node=False)
@@ -38,7 +42,7 @@ class Packed(struct.PyTreeNode):
         others, start = iter(self.others), 0
         leaves = []
         for shape, dtype in self.shapes:
-            if not _is_word(dtype):
+            if not _is_packed(shape, dtype):
                 leaves.append(next(others))
                 continue
             end = start + math.prod(shape)
@@ -60,11 +64,16 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     leaves, structure = jax.tree.flatten(tree)
     shapes = tuple((x.shape[batch_axes:], x.dtype) for x in leaves)
     library: Any = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
-    batch = leaves[0].shape[:batch_axes]
+    packed = [_is_packed(*one) for one in shapes]
     words = [
-        library.asarray(x).view(np.float32).reshape(*batch, -1) for x in leaves if _is_word(x.dtype)
+        library.asarray(x).view(np.float32).reshape(*x.shape[:batch_axes], math.prod(shape))
+        for x, (shape, _), one in zip(leaves, shapes, packed, strict=True)
+        if one
     ]
-    others = [x for x in leaves if not _is_word(x.dtype)]
+    others = [x for x, one in zip(leaves, packed, strict=True) if not one]
+    if not words:
+        batch = leaves[0].shape[:batch_axes] if leaves else (0,) * batch_axes
+        words = [library.zeros((*batch, 0), np.float32)]
     return Packed(library.concatenate(words, axis=-1), others, structure, shapes)
 
 

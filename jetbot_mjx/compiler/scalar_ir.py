@@ -229,7 +229,7 @@ class ExprGraph:
         if is_constant(condition):
             return on_true if condition else on_false
         check_scalars([on_false, on_true])
-        if on_false is on_true or (_are_constant(on_true, on_false) and on_false == on_true):
+        if is_same(on_false, on_true):
             return on_false
         if condition.op == "not":
             return self.select(condition.operands[0], on_true, on_false)
@@ -373,13 +373,14 @@ def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 
 
 def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    _simplify_rem(graph, dtype, x, y)
     if _equals(x, 0) and graph.is_exact(dtype):
         return dtype.type(0)
     if _equals(y, 1):
         return x
     if is_constant(y) and dtype == _FLOAT and y != 0:
         return graph.apply("mul", x, np.float32(1 / np.float64(y)))
-    return _simplify_rem(graph, dtype, x, y)
+    return None
 
 
 def _simplify_rem(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> None:

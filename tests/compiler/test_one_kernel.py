@@ -22,6 +22,7 @@ from jetbot_mjx.errors import UserError
 
 LANES = llvm_backend.host_processor().lanes
 STEPS = 3
+TWO = np.float32(2)
 
 
 def agree(ours, theirs, *, atol=2e-6):
@@ -474,20 +475,20 @@ def test_the_same_shapes_are_lowered_once_and_others_anew(monkeypatch):
         run(*arguments)
         return len(lowered)
 
-    assert number_after(tree(3), 2.0) == 1
+    assert number_after(tree(3), TWO) == 1
     assert number_after(tree(3), np.float32(5)) == 1
-    jax.jit(lambda *x: run(*x))(tree(3), 2.0)
+    jax.jit(lambda *x: run(*x))(tree(3), TWO)
     jax.vmap(run, in_axes=(None, 0))(tree(3), np.ones(7, np.float32))
-    assert number_after(tree(3), 2.0) == 1
-    assert number_after(tree(4), 2.0) == 2
-    assert number_after(tree(3, dtype=np.int32), 2.0) == 3
-    assert number_after({**tree(3), "flag": np.float32(1)}, 2.0) == 4
-    assert number_after({**tree(3), "more": 1.0}, 2.0) == 5
+    assert number_after(tree(3), TWO) == 1
+    assert number_after(tree(4), TWO) == 2
+    assert number_after(tree(3, dtype=np.int32), TWO) == 3
+    assert number_after({**tree(3), "flag": np.float32(1)}, TWO) == 4
+    assert number_after({**tree(3), "more": 1.0}, TWO) == 5
     other = as_one_kernel(lambda tree: tree["a"] if "a" in tree else -tree["b"])
     assert [float(other({name: 1.0})) for name in "abab"] == [1, -1, 1, -1]
     assert len(lowered) == 7
     for shape, dtype in ((3, np.int32), (4, np.float32), (3, np.float32)):
-        result, flag = run(tree(shape, dtype=dtype), 3.0)
+        result, flag = run(tree(shape, dtype=dtype), np.float32(3))
         np.testing.assert_array_equal(result, np.full(shape, 3))
         assert flag.dtype == bool
     assert len(lowered) == 7

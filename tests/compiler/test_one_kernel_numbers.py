@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_kernel import launches
+from test_kernel import launches, made
 
 from jetbot_mjx.compiler.one_kernel import as_one_kernel
 from jetbot_mjx.config import parse_config
@@ -101,3 +101,46 @@ def test_a_reward_that_is_no_number_ends_the_episode():
     np.testing.assert_array_equal(ours.metrics["nonfinite_envs"], action[:, 0] < 0)
     np.testing.assert_array_equal(ours.done, theirs.done)
     np.testing.assert_array_equal(ours.key, theirs.key)
+
+
+def test_whole_numbers_keep_their_bits_where_those_are_no_number():
+    """As floats, some are NaNs of the kind that a conversion would change."""
+    numbers = np.int32([-5_000_000, 0x7F800001, 0x7FBFFFFF, -1])
+    ours = jax.jit(jax.vmap(as_one_kernel(lambda x: (x, jnp.asarray(numbers)))))(np.ones(5))
+    np.testing.assert_array_equal(ours[1], np.tile(numbers, (5, 1)))
+
+
+def test_a_zero_keeps_its_sign_in_a_choice():
+    one = as_one_kernel(lambda x: jnp.where(x > 0, -0.0, 0.0))
+    np.testing.assert_array_equal(np.signbit(jax.vmap(one)(np.float32([1, -1]))), [True, False])
+
+
+def test_nothing_divided_by_a_whole_number_is_what_jax_makes_of_it():
+    one = as_one_kernel(lambda n: jax.lax.div(jnp.int32(0), n))
+    np.testing.assert_array_equal(jax.vmap(one)(np.int32([0, 3])), [-1, 0])
+
+
+def test_other_settings_and_weak_types_are_lowered_anew():
+    key = jax.random.PRNGKey(1)
+    draw = as_one_kernel(lambda key: jax.random.bits(key, (2,)))
+    draw(key)
+    with jax.threefry_partitionable(False):
+        np.testing.assert_array_equal(draw(key), jax.random.bits(key, (2,)))
+    product = as_one_kernel(lambda a, b: a * b)
+    assert product(jnp.uint32(5), 3).dtype == jnp.uint32
+    assert product(jnp.uint32(5), jnp.int32(3)).dtype == jnp.int32
+
+
+def test_a_function_of_nothing_stays_as_it_is():
+    np.testing.assert_array_equal(as_one_kernel(lambda: jnp.ones(3))(), np.ones(3))
+
+
+def test_a_kernel_for_several_robots_stays_as_it_is():
+    step = made()
+
+    def each(x):
+        return jax.vmap(lambda row: step({"x": row, "n": row[0]}, jnp.float32(2))["x"])(x)
+
+    robots = np.random.default_rng(0).normal(size=(4, 2, 3)).astype(np.float32)
+    ours = jax.jit(jax.vmap(as_one_kernel(each)))(robots)
+    np.testing.assert_allclose(ours, robots * 4, rtol=1e-6)

@@ -185,3 +185,20 @@ def test_of_a_tree_the_small_arrays_are_in_one(most):
     assert contents(condensed.restore()) == contents(robot)
     on_device = jax.jit(lambda tree: condense(tree, most))(jax.tree.map(jnp.asarray, robot))
     assert contents(jax.jit(Condensed.restore)(on_device)) == contents(robot)
+
+
+@pytest.mark.parametrize("empty", [(0,), (2, 0)])
+def test_an_empty_array_is_not_among_the_words(empty):
+    tree = [np.ones(3, np.float32), np.zeros(empty, np.float32), np.zeros(empty, np.int32)]
+    packed = pack(tree)
+    assert packed.words.shape == (3,)
+    for ours, theirs in zip(jax.jit(lambda x: pack(x).unpack())(tree), tree, strict=True):
+        assert (ours.shape, ours.dtype) == (theirs.shape, theirs.dtype)
+        np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("tree", [[np.ones((4, 3), bool)], {}, [np.zeros((4, 0), np.float32)]])
+def test_without_any_words_there_is_an_empty_array(tree):
+    packed = pack(tree, batch_axes=1)
+    assert packed.words.shape[-1] == 0
+    jax.tree.map(np.testing.assert_array_equal, packed.unpack(), tree)
