@@ -1,16 +1,16 @@
-"""Compute the gradient of PPO's loss by two kernels instead of a hundred.
+"""Draw the actions of a step by one kernel, and compute the gradient of PPO's loss by two.
 
 Motivation: XLA passes the activations of every layer through memory between its kernels. It
-launches 140 of them for a minibatch, and takes seconds to compile them. Here two kernels compute
-values, advantages and the gradient of both networks; docs/update.md explains them.
+launches 140 of them for a minibatch, and takes seconds to compile them. Here one kernel runs the
+policy in all environments, and two compute values, advantages and the gradient of both networks;
+docs/update.md explains them.
 
 Protocol: the parameters and Adam's moments are one vector each during an update (`pack`, `unpack`).
-On GPUs, products round their operands to float16; everything else is float32. The random keys are
-those of Brax's loss.
+On GPUs, products round their operands to float16; everything else is float32.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -130,6 +130,7 @@ class FusedUpdate:
         unrolls = config.batch_size // device_count
         self.batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
         """A minibatch on one device."""
+        self._environments = config.num_envs // device_count
         self._places = _places(shape)
         mask = np.zeros(shape.size, bool)
         for place in self._places:
@@ -138,7 +139,7 @@ class FusedUpdate:
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        launch.prepare(self._shape, self.batch, policies)
+        launch.prepare(self._shape, self.batch, self._environments, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`, on host or device."""
@@ -194,12 +195,44 @@ class FusedUpdate:
             data.discount[..., None],
             extras["state_extras"]["truncation"][..., None],
         ]
-        size = self._shape.observations
-        mean, scale = jnp.zeros(size), jnp.ones(size)
-        if self._config.normalize_observations:
-            mean, scale = normalizer.mean, 1.0 / normalizer.std
         last = data.next_observation[:, -1]
-        return Collected(jnp.concatenate(rows, axis=-1), last, mean, scale)
+        return Collected(jnp.concatenate(rows, axis=-1), last, *self._statistics(normalizer))
+
+    def _statistics(self, normalizer: Any) -> tuple[Array, Array]:
+        """Return what is subtracted from the observations, and what they are multiplied by."""
+        if self._config.normalize_observations:
+            return normalizer.mean, 1.0 / normalizer.std
+        size = self._shape.observations
+        return jnp.zeros(size), jnp.ones(size)
+
+    def policy(
+        self, params: Float[Array, " size"], normalizer: Any
+    ) -> Callable[[Array, Array], tuple[Array, dict[str, Any]]]:
+        """Return the policy of a collection.
+
+        Args:
+          params: the parameters, from `pack`.
+          normalizer: the statistics of the observations.
+
+        Returns:
+          A function from the observations of all environments, of shape (environments, obs), and
+          standard normal noise, of shape (environments, actions), to the actions and what Brax
+          keeps of them.
+        """
+        statistics = self._statistics(normalizer)
+
+        def act(observations: Array, noise: Array) -> tuple[Array, dict[str, Any]]:
+            drawn = launch.actions(self._shape, params, *statistics, observations, noise)
+            kept = drawn._asdict()
+            if self._shape.distribution == "normal":
+                kept["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
+            return kept.pop("action"), kept
+
+        return act
+
+    def action_noise(self, key: UInt32[Array, "2"]) -> Float[Array, "time environments actions"]:
+        """Draw the noise of all actions of an unroll."""
+        return jax.random.normal(key, (self.batch.time, self._environments, self._shape.actions))
 
     def noise(
         self, keys: UInt32[Array, "minibatches 2"], unrolls: int, time: int

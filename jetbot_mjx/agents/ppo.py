@@ -424,15 +424,15 @@ class PPO:
           The environment states after the last unroll; the unrolls, of shape (unrolls, time, ...),
           with `next_observation` of their last step only; and the first non-finite state.
         """
-        if self._fused:
-            state = state.replace(params=self._fused.network_params(state.params))
-        policy = self._make_policy(tuple(state.policy_params))
+        fused, length = self._fused, self.config.unroll_length
+        if fused:
+            policy: Any = fused.policy(state.params, state.normalizer)
+        else:
+            policy = self._make_policy(tuple(state.policy_params))
 
-        def step(carry: Any, _: None) -> Any:
-            start, key = carry
-            key, next_key = jax.random.split(key)
+        def step(start: Packed, drawn: Array) -> tuple[Packed, Packed]:
             before = start.unpack()
-            action, extras = policy(before.obs, key)
+            action, extras = policy(before.obs, drawn)
             packed = self._env.step_packed(start, action)
             after = packed.unpack()
             # The loss needs the next observation only at the end of an unroll, where it is in the
@@ -448,12 +448,13 @@ class PPO:
                 next_observation=nothing,
                 extras=all_extras,
             )
-            return (packed, next_key), pack(transition, batch_axes=1)
+            return packed, pack(transition, batch_axes=1)
 
         def unroll(carry: Any, _: None) -> Any:
             start, key = carry
             key, next_key = jax.random.split(key)
-            (after, _), steps = jax.lax.scan(step, (start, key), length=self.config.unroll_length)
+            drawn = fused.action_noise(key) if fused else _action_keys(key, length)
+            after, steps = jax.lax.scan(step, start, drawn)
             data: Any = steps.unpack()
             nan_dump = _find_nan_dump(start, data)
             ends = jax.tree.map(lambda x: x[None], after.unpack().obs)
@@ -675,6 +676,16 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     if config.max_grad_norm is None:
         return optax.chain(adam)
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
+
+
+def _action_keys(key: UInt32[Array, "2"], time: int) -> UInt32[Array, "time 2"]:
+    """Return Brax's keys of the actions of an unroll, each of which follows from the one before."""
+
+    def split(key: Array, _: None) -> tuple[Array, Array]:
+        own, following = jax.random.split(key)
+        return following, own
+
+    return jax.lax.scan(split, key, length=time)[1]
 
 
 def _encoded(

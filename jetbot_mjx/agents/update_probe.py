@@ -1,13 +1,16 @@
-"""Check the kernels of PPO's update on this machine before a training relies on them.
+"""Check the kernels of PPO on this machine before a training relies on them.
 
-The check is a small gradient, compared with central differences of the loss in NumPy, since XLA
-would take longer to compile one than a training takes to begin.
+The check is a few actions and a small gradient, compared with NumPy and central differences of the
+loss, since XLA would take longer to compile them than a training takes to begin.
 """
 
 import functools
+from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.compiler.update.shapes import LossTerms, UpdateShape
@@ -16,13 +19,14 @@ _SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh", normalizes=False)
 _TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0)
 _UNROLLS, _TIME = 8, 4
 _MOST_ERROR = 0.01
-"""Largest difference of the gradients, relative to their norm; GPUs have products of float16."""
+"""Largest difference of the gradients, relative to their norm, and of actions and logarithms of
+probabilities; GPUs have products of float16."""
 _STEP = 1e-4
 
 
 @functools.cache
 def runs_correctly() -> bool:
-    """Return whether the kernels compute a small gradient correctly."""
+    """Return whether the kernels draw a few actions and compute a small gradient correctly."""
     backend = launch.backend()
     if not backend.is_available():
         return False
@@ -40,19 +44,36 @@ def runs_correctly() -> bool:
         shift = _STEP * (np.arange(_SHAPE.size) == i)
         higher, lower = (_loss(x, rows, noise, estimates) for x in (params + shift, params - shift))
         expected[i] = (higher - lower) / (2 * _STEP)
-    statistics = np.zeros(_SHAPE.observations), np.ones(_SHAPE.observations)
-    arrays = [np.asarray(x, np.float32) for x in (params, *statistics, rows, last)]
+    # The actions of the first step of each unroll.
+    raw = mean[:, 0] + scale[:, 0] * noise[0]
+    drawn = rows[:, 0].copy()
+    drawn[:, _SHAPE.columns["raw_action"] :][:, : _SHAPE.actions] = raw
+    log_prob = _log_prob(mean[:, 0], scale[:, 0], drawn)
+
+    def run(params: Array, rows: Array, last: Array, order: Array, noise: Array) -> Any:
+        statistics = jnp.zeros(_SHAPE.observations), jnp.ones(_SHAPE.observations)
+        network = _SHAPE, params, *statistics
+        gradient = launch.gradient(*network, rows, last, order, noise, jnp.asarray(_TERMS))
+        observations = rows[:, 0, : _SHAPE.observations]
+        return gradient, launch.actions(*network, observations, noise[0])
+
     order = np.arange(_UNROLLS, dtype=np.int32)
+    arrays = [np.asarray(x, np.float32) for x in (params, rows, last)]
+    arguments = *arrays, order, np.asarray(noise, np.float32)
     with jax.default_device(jax.local_devices(backend=backend.PLATFORM)[0]):
-        last_arrays = (np.asarray(x, np.float32) for x in (noise, _TERMS))
-        arguments = jax.device_put((*arrays, order, *last_arrays))
         try:
-            result = jax.jit(functools.partial(launch.gradient, _SHAPE))(*arguments)
+            result, actions = jax.jit(run)(*jax.device_put(arguments))
         except jax.errors.JaxRuntimeError:
             return False
         # Beside the gradient, the vector has the sums of the metrics, on which nothing depends.
         ours = np.where(expected == 0, 0, np.asarray(result, np.float64))
-    return bool(np.linalg.norm(ours - expected) <= _MOST_ERROR * np.linalg.norm(expected))
+        kept = actions.action, actions.raw_action, actions.log_prob
+        errors = [
+            np.abs(np.asarray(one) - other).max()
+            for one, other in zip(kept, (np.tanh(raw), raw, log_prob), strict=True)
+        ]
+    error = np.linalg.norm(ours - expected) / np.linalg.norm(expected)
+    return bool(max(error, *errors) <= _MOST_ERROR)
 
 
 def _network(params: np.ndarray, outputs: int, x: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from jetbot_mjx.agents import fused_update, update_probe
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.compiler import llvm_backend, ptx_backend
-from jetbot_mjx.compiler.update import advantages, gradient, launch, launch_gpu
+from jetbot_mjx.compiler.update import actions, advantages, gradient, launch, launch_gpu
 from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.errors import UserError
@@ -221,7 +221,7 @@ def modelled(shape, *arrays):
     def run(*arrays):
         params, mean, scale, rows, last, unrolls, noise, terms = (np.array(x) for x in arrays)
         batch = Minibatch(len(rows), len(unrolls), rows.shape[1])
-        tiling = Tiling(shape, 64, 1, 16)
+        tiling = Tiling(shape, 64, 1, "advantages")
         blocks = min(2, advantages.tile_count(tiling, batch))
         sizes = batch.samples, batch.samples, (blocks, 2)
         estimates = [np.full(size, np.nan, np.float32) for size in sizes]
@@ -237,11 +237,40 @@ def modelled(shape, *arrays):
     return jax.pure_callback(run, result, *arrays)
 
 
+def modelled_actions(shape, *arrays):
+    """`launch.actions` on the model of a GPU, for one policy."""
+    count = arrays[3].shape[0]
+    results = [jax.ShapeDtypeStruct(size, np.float32) for size in shape.drawn_shapes(count)]
+
+    def run(*arrays):
+        drawn = [np.full(x.shape, np.nan, np.float32) for x in results]
+        text = actions.actions_text(Tiling(shape, 32, 1, "actions"), count)
+        Gpu(text, [*(np.array(x) for x in arrays), *drawn]).run(1)
+        return drawn
+
+    return launch.Actions(*jax.pure_callback(run, results, *arrays))
+
+
 @pytest.mark.cpu
 def test_the_probe_agrees_with_the_model(monkeypatch):
     monkeypatch.setattr(launch, "gradient", modelled)
+    monkeypatch.setattr(launch, "actions", modelled_actions)
     assert update_probe.runs_correctly.__wrapped__()
     monkeypatch.setattr(launch, "gradient", lambda *arrays: 1.1 * modelled(*arrays))
+    assert not update_probe.runs_correctly.__wrapped__()
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("name", ["action", "raw_action", "log_prob"])
+def test_the_probe_sees_wrong_actions(monkeypatch, name):
+    right = launch.actions
+
+    def wrong(*arrays):
+        drawn = right(*arrays)
+        return drawn._replace(**{name: getattr(drawn, name) + 0.05})
+
+    assert update_probe.runs_correctly.__wrapped__()
+    monkeypatch.setattr(launch, "actions", wrong)
     assert not update_probe.runs_correctly.__wrapped__()
 
 

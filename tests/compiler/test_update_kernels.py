@@ -12,7 +12,7 @@ from gpu_model import Gpu
 
 from jetbot_mjx.agents.gae import compute_gae
 from jetbot_mjx.compiler import llvm_backend, ptx_backend
-from jetbot_mjx.compiler.update import advantages, launch_cpu, shapes
+from jetbot_mjx.compiler.update import actions, advantages, launch_cpu, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
 from jetbot_mjx.compiler.update.launch_gpu import PTX_VERSION
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, Tiling, UpdateShape
@@ -239,7 +239,7 @@ def terms_of(case):
 def test_the_advantages_are_those_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
-    tiling = Tiling(case.shape, case.rows, -(-case.rows // 128), 16)
+    tiling = Tiling(case.shape, case.rows, -(-case.rows // 128), "advantages")
     blocks = min(case.blocks, advantages.tile_count(tiling, case.batch))
     results = [
         np.full((case.seeds, *rest), np.nan, np.float32)
@@ -309,7 +309,7 @@ def test_the_gradient_on_a_cpu_is_that_of_float64(name, lanes, registers, monkey
     case = CPU_CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
     arrays = [*stacked(made, *NETWORK, "last", "unrolls", "noise"), terms_of(case)]
-    result = jax.jit(lambda *arrays: launch_cpu.launch(case.shape, arrays))(*arrays)
+    result = jax.jit(lambda *arrays: launch_cpu.launch_gradient(case.shape, arrays)[0])(*arrays)
     for data, vector in zip(made, np.asarray(result), strict=True):
         assert_is_gradient(vector, data, 2e-4)
 
@@ -319,7 +319,7 @@ def test_the_gradient_on_a_cpu_does_not_depend_on_the_policies_beside_it():
     case = CPU_CASES["several parts"]
     made = [make_data(case, seed) for seed in range(2)]
     arrays = [*stacked(made, *NETWORK, "last", "unrolls", "noise"), terms_of(case)]
-    run = jax.jit(lambda *arrays: launch_cpu.launch(case.shape, arrays))
+    run = jax.jit(lambda *arrays: launch_cpu.launch_gradient(case.shape, arrays)[0])
     both = run(*arrays)
     for i in range(2):
         np.testing.assert_array_equal(run(*(x[i : i + 1] for x in arrays))[0], both[i])
@@ -346,14 +346,95 @@ def test_it_says_what_a_cpu_cannot_compute(shape, batch, reason):
     assert reason in launch_cpu.refusal(shape, batch)
 
 
+def make_actions(shape, environments, seed):
+    """What the kernel of the actions is given for one policy, and what it should give."""
+    rng = np.random.default_rng(seed)
+    leaves = (
+        network(rng, shape, shape.outputs[0]),
+        [np.abs(rng.normal(size=shape.actions)) + 0.5] if shape.deviations else [],
+    )
+    flat = [np.ravel(x) for x in (*leaves[0], *leaves[1])]
+    flat.append(np.full(shape.size - sum(map(len, flat)), np.nan))
+    data = {
+        "mean": rng.normal(size=shape.observations),
+        "scale": 1 / (0.5 + np.abs(rng.normal(size=shape.observations))),
+        "observation": rng.normal(size=(environments, shape.observations)),
+        "noise": rng.normal(size=(environments, shape.actions)),
+    }
+    with jax.enable_x64(True):
+        brax, parameters = policy(leaves, data, shape)
+        distribution = brax.create_dist(parameters)
+        raw = distribution.loc + distribution.scale * data["noise"]
+        expected = brax.postprocess(raw), raw, brax.log_prob(parameters, raw)
+    if shape.deviations:
+        parameters = np.concatenate(parameters, axis=-1)
+    arrays = [np.concatenate(flat), *data.values()]
+    return [x.astype(np.float32) for x in arrays], [*map(np.asarray, expected), parameters]
+
+
+def assert_are_actions(results, shape, expected, bound):
+    for ours, wanted in zip(results, expected, strict=True):
+        assert ours.shape == wanted.shape
+        np.testing.assert_allclose(ours, wanted, atol=bound, rtol=bound)
+    # The probability is that of the action which was drawn, not of the exact one.
+    _, raw, log_prob, parameters = (np.asarray(x, np.float64) for x in results)
+    brax = NormalTanhDistribution(shape.actions)
+    if shape.deviations:
+        brax, parameters = NormalDistribution(shape.actions), np.split(parameters, 2, axis=-1)
+    with jax.enable_x64(True):
+        np.testing.assert_allclose(log_prob, brax.log_prob(parameters, raw), atol=3e-5)
+
+
+@pytest.mark.parametrize("rows", [32, 64, 256])
+@pytest.mark.parametrize("name", CASES)
+def test_the_actions_are_those_of_float64(name, rows):
+    shape, environments = CASES[name].shape, rows + 23
+    made = [make_actions(shape, environments, seed) for seed in range(2)]
+    tiling = Tiling(shape, rows, -(-rows // 128), "actions")
+    given = [np.stack(x) for x in zip(*(arrays for arrays, _ in made), strict=True)]
+    sizes = shape.drawn_shapes(environments)
+    results = [np.full((2, *size), np.nan, np.float32) for size in sizes]
+    Gpu(actions.actions_text(tiling, environments), [*given, *results]).run(1, 1, 2)
+    for i, (_, expected) in enumerate(made):
+        assert_are_actions([x[i] for x in results], shape, expected, 0.02)
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("environments", [1, 150, 4100])
+@pytest.mark.parametrize("name", CPU_CASES)
+def test_the_actions_on_a_cpu_are_those_of_float64(name, environments):
+    shape = CPU_CASES[name].shape
+    made = [make_actions(shape, environments, seed) for seed in range(2)]
+    given = [np.stack(x) for x in zip(*(arrays for arrays, _ in made), strict=True)]
+    run = jax.jit(lambda *arrays: launch_cpu.launch_actions(shape, arrays))
+    results = run(*given)
+    for i, (arrays, expected) in enumerate(made):
+        ours = [np.asarray(x[i]) for x in results]
+        assert_are_actions(ours, shape, expected, 2e-5)
+        alone = run(*(x[None] for x in arrays))
+        for one, other in zip(alone, ours, strict=True):
+            np.testing.assert_array_equal(one[0], other)
+
+
+@pytest.mark.parametrize(
+    ("environments", "memory", "rows"),
+    [(4096, 232_448, 32), (65_536, 232_448, 256), (65_536, 166_912, 128), (65_536, 101_376, 32)],
+)
+def test_a_tile_of_actions_fills_the_gpu(environments, memory, rows):
+    shape = UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh")
+    assert shapes.action_tiling(shape, environments, 132, memory).rows == rows
+
+
 @pytest.mark.parametrize("architecture", [80, 90])
 @pytest.mark.parametrize("name", CASES)
 def test_llvm_compiles_them(name, architecture):
     case = CASES[name]
-    tilings = Tiling(case.shape, *case.gradient), Tiling(case.shape, 64, 1, 16)
+    others = (Tiling(case.shape, 64, 1, purpose) for purpose in ("advantages", "actions"))
+    tilings = Tiling(case.shape, *case.gradient), *others
     texts = (
         gradient_kernel.gradient_text(tilings[0], Minibatch(4096, 512, 16), 74),
         advantages.advantages_text(tilings[1], Minibatch(4096, 512, 16)),
+        actions.actions_text(tilings[2], 4096),
     )
     for tiling, text in zip(tilings, texts, strict=True):
         ptx = ptx_backend.assembled(text, architecture, PTX_VERSION)

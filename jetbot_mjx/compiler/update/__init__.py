@@ -1,4 +1,4 @@
-"""Write and launch the kernels of PPO's update, as docs/update.md explains them.
+"""Write and launch the kernels of PPO, as docs/update.md explains them.
 
 - `shapes`: the networks and the minibatch, and their division into tiles
 - `launch`: the kernels as one JAX function, for every platform
@@ -6,7 +6,9 @@
 On GPUs:
 
 - `tensor_core`: LLVM IR with products on tensor cores
-- `network`: what both kernels share: loading a network, and its forward pass
+- `network`: what all kernels share: loading a network, and its forward pass
+- `distribution`: the distribution of an action
+- `actions`: the kernel that draws the actions of all environments
 - `advantages`: the kernel that computes values, advantages and value targets
 - `gradient`: the kernel that computes the gradient of both networks
 - `launch_gpu`: their launch
@@ -14,7 +16,9 @@ On GPUs:
 On CPUs:
 
 - `vector_code`: LLVM IR with loops, vectors and products of matrices
-- `sample_loss`: the loss of one sample with its derivatives, as JAX functions
-- `cpu_kernels`: a kernel for each network
+- `sample_loss`: the action of one sample, and its loss with derivatives, as JAX functions
+- `cpu_network`: what all kernels share: loading a network, and its forward pass
+- `cpu_actions`: the kernel that draws the actions of all environments
+- `cpu_gradient`: the kernels of the gradient, one for each network
 - `launch_cpu`: their launch
 """

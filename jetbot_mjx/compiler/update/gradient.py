@@ -5,13 +5,17 @@ tiles of samples. Weights and activations are in shared memory as float16, all s
 and the sums of the gradient stay in registers until the last tile.
 """
 
-import math
-
+from jetbot_mjx.compiler.update.distribution import (
+    HALF_LOG_TWO_PI,
+    OUTPUT_BYTES,
+    Distribution,
+    log_prob,
+    log_slope,
+    old_scale,
+)
 from jetbot_mjx.compiler.update.network import NetworkKernel
 from jetbot_mjx.compiler.update.shapes import (
-    MOST_OUTPUTS,
     PAD,
-    POLICY_METRICS,
     VALUE_METRICS,
     LossTerms,
     Minibatch,
@@ -23,8 +27,6 @@ from jetbot_mjx.compiler.update.tensor_core import LANES, TILE, IrWriter, Sums, 
 NAME = "ppo_gradient"
 """Name of the kernel."""
 
-_MIN_STD = 0.001
-_HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)
 _ONES = 0x3C003C00
 """Two ones in float16."""
 
@@ -92,7 +94,7 @@ class _GradientKernel(NetworkKernel):
         self._begin_sums()
         self._load_tile(tile)
         ir.synchronize()
-        self._store_outputs(self.forward())
+        self.store_outputs(self.forward())
         ir.synchronize()
         with ir.when(self.thread < self.tiling.rows):
             self._loss(tile)
@@ -182,16 +184,6 @@ class _GradientKernel(NetworkKernel):
         groups = [*self.weight_sums, *self.bias_sums, self.head_sums]
         return [x for group in groups for row in group for four in row for x in four]
 
-    def _store_outputs(self, sums: Sums) -> None:
-        """Store the outputs of the network in shared memory, a row for each sample."""
-        ir, stride = self.ir, 4 * (MOST_OUTPUTS + 1)
-        pointer = ir.shared(
-            (self.row + self.sum_row) * stride + self.sum_column * 4, self.bytes_of("outputs")
-        )
-        for m, (four,) in enumerate(sums):
-            for i, value in enumerate(four):
-                ir.write(value, ir.moved(pointer, stride * (TILE * m + 8 * (i // 2)) + 4 * (i % 2)))
-
     def _extra(self, index: int) -> Value:
         """Return a number that the loss of the thread's sample reads."""
         return self.ir.read(self.ir.moved(self.extras, 4 * index))
@@ -200,7 +192,7 @@ class _GradientKernel(NetworkKernel):
         """Write the derivative of the loss by the outputs of one sample, a thread for each."""
         ir = self.ir
         self.is_there = tile * self.tiling.rows + self.thread < self.batch.samples
-        self.own = ir.shared(self.thread * (4 * (MOST_OUTPUTS + 1)), self.bytes_of("outputs"))
+        self.own = ir.shared(self.thread * OUTPUT_BYTES, self.bytes_of("outputs"))
         self.extras = ir.shared(self.thread * (4 * self.tiling.extras), self.bytes_of("extras"))
         with ir.when(self.is_policy):
             self._policy_loss()
@@ -213,25 +205,14 @@ class _GradientKernel(NetworkKernel):
         ir, shape, terms, samples = self.ir, self.shape, self.terms, self.batch.samples
         actions, count = range(shape.actions), shape.actions
         tanh = shape.distribution == "tanh_normal"
-        if tanh:
-            raw = [ir.read(ir.moved(self.own, 4 * (count + i))) for i in actions]
-            scale = [ir.softplus(x) + _MIN_STD for x in raw]
-        else:
-            raw = []
-            place = ir.constant(shape.policy_size - len(POLICY_METRICS) - count, "i32")
-            scale = [ir.fetch(self.params, place + i) for i in actions]
-        mean = [ir.read(ir.moved(self.own, 4 * i)) for i in actions]
+        mean, scale, raw = Distribution.of(ir, shape, self.own, self.params)
         inverse, log_scale = [ir.reciprocal(x) for x in scale], [ir.log(x) for x in scale]
         action = [self._extra(i) for i in actions]
         noise = [self._extra(3 * count + 1 + i) for i in actions]
         distance = [(action[i] - mean[i]) * inverse[i] for i in actions]
         # The clipped surrogate objective.
-        log_ratio = self._extra(count) * -1.0
-        for i in actions:
-            log_ratio += distance[i] * distance[i] * -0.5 - log_scale[i] - _HALF_LOG_TWO_PI
-            if tanh:
-                log_ratio -= _log_slope(ir, action[i])
-        ratio, advantage = ir.exp(log_ratio), self._advantage()
+        log = log_prob(ir, distance, log_scale, action if tanh else [])
+        ratio, advantage = ir.exp(log - self._extra(count)), self._advantage()
         low, high = 1.0 - terms.clipping_epsilon, 1.0 + terms.clipping_epsilon
         clipped = ir.select(ratio < low, low, ir.minimum(ratio, high)) * advantage
         surrogate = ratio * advantage
@@ -241,16 +222,16 @@ class _GradientKernel(NetworkKernel):
         entropy = ir.constant(0.0)
         by_mean, by_scale = [], []
         for i in actions:
-            entropy += log_scale[i] + (0.5 + _HALF_LOG_TWO_PI)
+            entropy += log_scale[i] + (0.5 + HALF_LOG_TWO_PI)
             pull, push = by_log * distance[i] * inverse[i], inverse[i] * weight
             if tanh:
                 sample = noise[i] * scale[i] + mean[i]
-                entropy += _log_slope(ir, sample)
+                entropy += log_slope(ir, sample)
                 slope = (ir.sigmoid(sample * -2.0) * 4.0 - 2.0) * weight
                 pull, push = pull + slope, push + slope * noise[i]
             by_mean.append(pull)
             by_scale.append(by_log * (distance[i] * distance[i] - 1.0) * inverse[i] + push)
-        divergence = self._divergence(mean, scale, inverse, tanh=tanh)
+        divergence = self._divergence(mean, scale, inverse)
         spread = sum(scale[1:], scale[0])
         metrics = [ir.minimum(surrogate, clipped) * -1.0, entropy, divergence, spread]
         if tanh:
@@ -268,19 +249,16 @@ class _GradientKernel(NetworkKernel):
         mean, scale = (self.ir.read(self.ir.shared(place + 4 * i)) for i in (0, 1))
         return (advantage - mean) * scale
 
-    def _divergence(
-        self, mean: list[Value], scale: list[Value], inverse: list[Value], *, tanh: bool
-    ) -> Value:
+    def _divergence(self, mean: list[Value], scale: list[Value], inverse: list[Value]) -> Value:
         """Return the KL divergence of the current distribution from that of the collection."""
         ir, count = self.ir, self.shape.actions
         total = ir.constant(0.0)
         for i in range(count):
-            old_mean, old_scale = (self._extra(count + 1 + i + count * j) for j in (0, 1))
-            if tanh:
-                old_scale = ir.softplus(old_scale) + _MIN_STD
+            old_mean, old = (self._extra(count + 1 + i + count * j) for j in (0, 1))
+            before = old_scale(ir, self.shape, old)
             difference = old_mean - mean[i]
-            square = (old_scale * old_scale + difference * difference) * 0.5
-            log = ir.log(scale[i] * ir.reciprocal(old_scale) + 1e-5)
+            square = (before * before + difference * difference) * 0.5
+            log = ir.log(scale[i] * ir.reciprocal(before) + 1e-5)
             total += log + square * inverse[i] * inverse[i] - 0.5
         return total
 
@@ -435,11 +413,6 @@ class _GradientKernel(NetworkKernel):
             for i in range(self.tiling.rows):
                 total += ir.read(ir.moved(first, 4 * i))
             ir.put(total, self.part, self.outputs * self.width + self.thread + offset)
-
-
-def _log_slope(ir: IrWriter, x: Value) -> Value:
-    """Return log(1 - tanh(x)^2), as Brax computes it."""
-    return (math.log(2.0) - x - ir.softplus(x * -2.0)) * 2.0
 
 
 def _slope(ir: IrWriter, activation: str, value: Value, factor: Value) -> Value:

@@ -1,11 +1,12 @@
-"""Compute PPO's gradient by kernels as one JAX function, which `jax.vmap` batches over seeds."""
+"""Run the kernels of PPO as JAX functions, which `jax.vmap` batches over seeds."""
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
 from jax.interpreters import batching, mlir
@@ -37,15 +38,49 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return launcher.refusal(shape, batch)
 
 
-def prepare(shape: UpdateShape, batch: Minibatch, policies: int) -> None:
+def prepare(shape: UpdateShape, batch: Minibatch, environments: int, policies: int) -> None:
     """Begin to compile the kernels, before a program is traced that launches them.
 
     Args:
       shape: the networks.
       batch: the minibatch.
+      environments: the number of environments of a policy.
       policies: the number of policies that are trained at once.
     """
-    _LAUNCHERS[jax.default_backend()].prepare(shape, batch, policies)
+    _LAUNCHERS[jax.default_backend()].prepare(shape, batch, environments, policies)
+
+
+class Actions(NamedTuple):
+    """An `Actions` holds actions and how likely they were, under Brax's names."""
+
+    action: Float[Array, "environments action"]
+    raw_action: Float[Array, "environments action"]
+    """The action before its tanh, if the distribution has one."""
+    log_prob: Float[Array, " environments"]
+    """Logarithm of the probability of the raw action."""
+    distribution_params: Float[Array, "environments 2*action"]
+    """Parameters of the distribution; of a `normal` one, means and standard deviations."""
+
+
+def actions(
+    shape: UpdateShape,
+    params: Float[Array, " size"],
+    mean: Float[Array, " obs"],
+    scale: Float[Array, " obs"],
+    observations: Float[Array, "environments obs"],
+    noise: Float[Array, "environments action"],
+) -> Actions:
+    """Run the policy network and draw actions.
+
+    Args:
+      shape: the networks.
+      params: the parameters of both networks, in the order of `UpdateShape`.
+      mean: what is subtracted from the observations.
+      scale: what they are then multiplied by.
+      observations: the observations.
+      noise: standard normal noise, from which the actions follow.
+    """
+    return Actions(*_actions_p.bind(params, mean, scale, observations, noise, shape=shape))
 
 
 def gradient(
@@ -76,59 +111,59 @@ def gradient(
       The gradient, with the sums of the metrics at their places.
     """
     arguments = (params, mean, scale, rows, last, unrolls, noise, terms)
-    return _gradient_p.bind(*arguments, shape=shape)
+    return _gradient_p.bind(*arguments, shape=shape)[0]
 
 
-_gradient_p = Primitive("ppo_gradient")
+def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primitive:
+    """Return a primitive that the function `launch_{name}` of a launcher computes.
 
+    Args:
+      name: its name.
+      sizes: a function from the networks and the arguments' shapes to the results' shapes.
+    """
+    primitive = Primitive(f"ppo_{name}")
+    primitive.multiple_results = True
+    compiled = jax.jit(primitive.bind, static_argnames="shape")
 
-@_gradient_p.def_abstract_eval
-def _abstract(params: Any, *_: Any, shape: UpdateShape) -> ShapedArray:
-    return ShapedArray(params.shape, params.dtype)
-
-
-@_gradient_p.def_impl
-def _run(*arguments: Array, shape: UpdateShape) -> Array:
-    # Enable jit here: within `jax.disable_jit` this function would call itself.
-    with jax.disable_jit(False):
-        return _compiled(*arguments, shape=shape)
-
-
-_compiled = jax.jit(_gradient_p.bind, static_argnames="shape")
-
-
-def _batch(
-    arguments: Sequence[Array],
-    axes: Sequence[int | None],
-    *,
-    shape: UpdateShape,
-) -> tuple[Array, int]:
-    (size,) = {x.shape[i] for x, i in zip(arguments, axes, strict=True) if i is not None}
-    moved = [
-        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
-        for x, axis in zip(arguments, axes, strict=True)
-    ]
-    return _gradient_p.bind(*moved, shape=shape), 0
-
-
-batching.primitive_batchers[_gradient_p] = _batch
-
-
-def _lowered(launcher: Any) -> Callable[..., Array]:
-    """Return the function that JAX lowers for a platform."""
-
-    def lowered(*arguments: Array, shape: UpdateShape) -> Array:
+    @primitive.def_abstract_eval
+    def abstract(*arguments: Any, shape: UpdateShape) -> list[ShapedArray]:
+        # All arguments have the policies, if any, as their first axes.
         batch = arguments[0].shape[:-1]
-        policies, depth = math.prod(batch), len(batch)
-        flat = [x.reshape(policies, *x.shape[depth:]) for x in arguments]
-        return launcher.launch(shape, flat).reshape(*batch, shape.size)
+        inner = [x.shape[len(batch) :] for x in arguments]
+        return [ShapedArray((*batch, *size), np.float32) for size in sizes(shape, *inner)]
 
-    return lowered
+    @primitive.def_impl
+    def run(*arguments: Array, shape: UpdateShape) -> list[Array]:
+        # Enable jit here: within `jax.disable_jit` this function would call itself.
+        with jax.disable_jit(False):
+            return compiled(*arguments, shape=shape)
+
+    def batched(
+        arguments: Sequence[Array], axes: Sequence[int | None], *, shape: UpdateShape
+    ) -> tuple[list[Array], list[int]]:
+        (size,) = {x.shape[i] for x, i in zip(arguments, axes, strict=True) if i is not None}
+        moved = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(arguments, axes, strict=True)
+        ]
+        results = primitive.bind(*moved, shape=shape)
+        return results, [0] * len(results)
+
+    def lowered_by(launch: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
+        def lowered(*arguments: Array, shape: UpdateShape) -> list[Array]:
+            batch = arguments[0].shape[:-1]
+            policies, depth = math.prod(batch), len(batch)
+            flat = [x.reshape(policies, *x.shape[depth:]) for x in arguments]
+            return [x.reshape(*batch, *x.shape[1:]) for x in launch(shape, flat)]
+
+        return lowered
+
+    batching.primitive_batchers[primitive] = batched
+    for launcher in _LAUNCHERS.values():
+        lowering = mlir.lower_fun(lowered_by(getattr(launcher, f"launch_{name}")))
+        mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
+    return primitive
 
 
-for _launcher in _LAUNCHERS.values():
-    mlir.register_lowering(
-        _gradient_p,
-        mlir.lower_fun(_lowered(_launcher), multiple_results=False),
-        platform=_launcher.BACKEND.PLATFORM,
-    )
+_gradient_p = _primitive("gradient", lambda shape, *_: [(shape.size,)])
+_actions_p = _primitive("actions", lambda shape, *sizes: shape.drawn_shapes(sizes[3][0]))

@@ -1,22 +1,24 @@
-"""Launch the kernels of PPO's update on CPUs.
+"""Launch the kernels of PPO on CPUs.
 
-The kernel of the value network also returns the advantages, which that of the policy takes. Each
-part of a minibatch writes a vector, and XLA adds them up in a fixed order.
+The value network's kernel of the gradient also returns the advantages, which that of the policy
+takes. Each part of a minibatch writes a vector, and XLA adds them up in a fixed order.
 """
 
 import functools
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array
 
 from jetbot_mjx.compiler import llvm_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
-from jetbot_mjx.compiler.update import cpu_kernels
-from jetbot_mjx.compiler.update.cpu_kernels import Division
+from jetbot_mjx.compiler.update.cpu_actions import ActionDivision, ActionKernel
+from jetbot_mjx.compiler.update.cpu_gradient import GradientDivision, gradient_kernel
+from jetbot_mjx.compiler.update.cpu_network import HEAD, Division, Kernel
 from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
 
 BACKEND: Backend = llvm_backend
@@ -37,8 +39,8 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     if not llvm_backend.is_available():
         return f"it needs {llvm_backend.NEEDS}"
     outputs = max(shape.outputs)
-    if outputs > cpu_kernels.HEAD:
-        return f"it takes at most {cpu_kernels.HEAD} outputs, not {outputs}"
+    if outputs > HEAD:
+        return f"it takes at most {HEAD} outputs, not {outputs}"
     if shape.width % _WIDTH_STEP:
         return f"it takes layers of 16, 32, 48, ... units, not {shape.width}"
     if max(4 * x.layout["size"] for x in _divisions(shape, batch)) > _MOST_MEMORY:
@@ -46,36 +48,59 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return None
 
 
-def _divisions(shape: UpdateShape, batch: Minibatch) -> tuple[Division, Division]:
+def _divisions(shape: UpdateShape, batch: Minibatch) -> tuple[GradientDivision, GradientDivision]:
     """Return how the values' kernel and the policy's kernel divide a minibatch."""
     lanes = llvm_backend.host_processor().lanes
-    return Division(shape, batch, False, lanes), Division(shape, batch, True, lanes)
+    values, policy = (GradientDivision(shape, batch, x, lanes) for x in (False, True))
+    return values, policy
 
 
 @functools.cache
-def _text(division: Division) -> str:
+def _text(kernel: Callable[[Any], Kernel], division: Division) -> str:
     """Return the LLVM module of a kernel."""
     host = llvm_backend.host_processor()
-    return cpu_kernels.kernel_text(
-        division, registers=host.registers, name=llvm_backend.NAME, machine=host.machine
+    return kernel(division).text(
+        registers=host.registers, name=llvm_backend.NAME, machine=host.machine
     )
 
 
-def prepare(shape: UpdateShape, batch: Minibatch, policies: int) -> None:
-    """Begin to compile both kernels, which serve any number of policies, as `launch.prepare`."""
-    for division in _divisions(shape, batch):
-        in_background(lambda division=division: llvm_backend.registered(_text(division)))
+def prepare(shape: UpdateShape, batch: Minibatch, environments: int, policies: int) -> None:
+    """Begin to compile all kernels, which serve any number of policies, as `launch.prepare`."""
+    lanes = llvm_backend.host_processor().lanes
+    texts = [functools.partial(_text, ActionKernel, ActionDivision(shape, environments, lanes))]
+    texts += [functools.partial(_text, gradient_kernel, x) for x in _divisions(shape, batch)]
+    for text in texts:
+        in_background(lambda text=text: llvm_backend.registered(text()))
 
 
-def launch(shape: UpdateShape, arguments: Sequence[Array]) -> Float[Array, "policies size"]:
-    """Run both kernels, while JAX lowers a program for CPUs.
+def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
+    """Draw actions, while JAX lowers a program for CPUs.
+
+    Args:
+      shape: the networks.
+      arguments: those of `launch.actions`, with the policies as their first axis.
+
+    Returns:
+      The arrays of `launch.Actions`.
+    """
+    policies, environments = arguments[3].shape[:2]
+    division = ActionDivision(shape, environments, llvm_backend.host_processor().lanes)
+    like = [
+        jax.ShapeDtypeStruct((policies, *sizes), np.float32)
+        for sizes in shape.drawn_shapes(environments)
+    ]
+    return llvm_backend.launch_text(_text(ActionKernel, division), arguments, like)
+
+
+def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
+    """Run both kernels of a minibatch, while JAX lowers a program for CPUs.
 
     Args:
       shape: the networks.
       arguments: those of `launch.gradient`, with the policies as their first axis.
 
     Returns:
-      The gradients, with the sums of the metrics at their places.
+      The gradients, with the sums of the metrics at their places, as the only array.
     """
     params, mean, scale, rows, last, unrolls, noise, terms = arguments
     policies = params.shape[0]
@@ -85,14 +110,14 @@ def launch(shape: UpdateShape, arguments: Sequence[Array]) -> Float[Array, "poli
     def floats(*sizes: int) -> jax.ShapeDtypeStruct:
         return jax.ShapeDtypeStruct((policies, *sizes), np.float32)
 
-    def run(division: Division, others: Sequence[Array], *results: int) -> list[Array]:
+    def run(division: GradientDivision, others: Sequence[Array], *results: int) -> list[Array]:
         like = [floats(division.parts, division.size), *map(floats, results)]
         given = [params, mean, scale, rows, unrolls, terms, *others]
-        vectors, *rest = llvm_backend.launch_text(_text(division), given, like)
+        vectors, *rest = llvm_backend.launch_text(_text(gradient_kernel, division), given, like)
         # XLA's own reduction takes longer than a part does.
         total = functools.reduce(jnp.add, [vectors[:, i] for i in range(division.parts)])
         return [total, *rest]
 
     of_values, advantages = run(values, [last], batch.samples)
     (of_policy,) = run(policy, [noise, advantages])
-    return jnp.concatenate([of_policy, of_values], axis=1)
+    return [jnp.concatenate([of_policy, of_values], axis=1)]

@@ -1,6 +1,6 @@
-"""Launch the kernels of PPO's update on NVIDIA GPUs.
+"""Launch the kernels of PPO on NVIDIA GPUs.
 
-All policies of a batch are updated by the same launches: the policies are the third axis of the
+All policies of a batch share the launches: the policies are the third axis of the
 grid, and each gets its share of the GPU's multiprocessors. The blocks of a policy write a vector
 each, which XLA adds up in a fixed order.
 """
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
-from jetbot_mjx.compiler.update import advantages, shapes
+from jetbot_mjx.compiler.update import actions, advantages, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
 from jetbot_mjx.compiler.update.shapes import (
     MOST_OBSERVATIONS,
@@ -81,7 +81,7 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
 
 
 class _Kernel(NamedTuple):
-    """A `_Kernel` is one of the two kernels, ready to launch."""
+    """A `_Kernel` is a kernel, ready to launch."""
 
     name: str
     text: Future[str]
@@ -107,60 +107,91 @@ class _Kernel(NamedTuple):
         )
 
 
+def _kernel(
+    name: str, write: Callable[[], str], tiling: Tiling, grid: tuple[int, int, int]
+) -> _Kernel:
+    """Begin to compile a kernel to PTX."""
+    architecture = ptx_backend.target_architecture()
+
+    def compiled() -> str:
+        text = ptx_backend.assembled(write(), architecture, PTX_VERSION)
+        ptx_backend.assemble_ahead(text)
+        return text
+
+    return _Kernel(name, in_background(compiled), grid, tiling.threads, tiling.layout["size"])
+
+
+def _most_blocks(policies: int) -> int:
+    """Return the multiprocessors for each of the policies that share the GPU."""
+    return max(1, ptx_backend.processor_count() // policies)
+
+
 @functools.cache
-def prepare(shape: UpdateShape, size: Minibatch, policies: int) -> tuple[_Kernel, _Kernel]:
-    """Divide the work among the blocks, and begin to compile both kernels to PTX.
+def _action_kernel(shape: UpdateShape, environments: int, policies: int) -> _Kernel:
+    """Return the kernel of the actions."""
+    most = _most_blocks(policies)
+    tiling = shapes.action_tiling(shape, environments, most, _shared_memory())
+    assert tiling is not None
+    blocks = min(most, actions.tile_count(tiling, environments))
+    write = functools.partial(actions.actions_text, tiling, environments)
+    return _kernel(actions.NAME, write, tiling, (blocks, 1, policies))
 
-    Args:
-      shape: the networks.
-      size: the minibatch.
-      policies: the number of policies that share the GPU.
 
-    Returns:
-      The kernels of the advantages and of the gradient.
-    """
-
-    def kernel(name: str, write: Callable[[], str], tiling: Tiling, x: int, y: int) -> _Kernel:
-        architecture = ptx_backend.target_architecture()
-
-        def compiled() -> str:
-            text = ptx_backend.assembled(write(), architecture, PTX_VERSION)
-            ptx_backend.assemble_ahead(text)
-            return text
-
-        return _Kernel(
-            name, in_background(compiled), (x, y, policies), tiling.threads, tiling.layout["size"]
-        )
-
-    # Share the multiprocessors among all policies.
-    most = max(1, ptx_backend.processor_count() // policies)
+@functools.cache
+def _gradient_kernels(
+    shape: UpdateShape, size: Minibatch, policies: int
+) -> tuple[_Kernel, _Kernel]:
+    """Return the kernels of the advantages and of the gradient."""
+    most = _most_blocks(policies)
     tiling = shapes.advantage_tiling(shape, size, most, _shared_memory())
     assert tiling is not None
     parts = min(most, advantages.tile_count(tiling, size))
     write = functools.partial(advantages.advantages_text, tiling, size)
-    first = kernel(advantages.NAME, write, tiling, parts, 1)
+    first = _kernel(advantages.NAME, write, tiling, (parts, 1, policies))
     # Half of the blocks compute the policy's gradient, and half the values'.
     tiling = shapes.gradient_tiling(shape, _shared_memory())
     assert tiling is not None
     blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
     write = functools.partial(gradient_kernel.gradient_text, tiling, size, parts)
-    return first, kernel(gradient_kernel.NAME, write, tiling, blocks, 2)
+    return first, _kernel(gradient_kernel.NAME, write, tiling, (blocks, 2, policies))
 
 
-def launch(shape: UpdateShape, arguments: Sequence[Array]) -> Float[Array, "policies size"]:
-    """Run both kernels, while JAX lowers a program for an NVIDIA GPU.
+def prepare(shape: UpdateShape, batch: Minibatch, environments: int, policies: int) -> None:
+    """Divide the work among the blocks, and begin to compile all kernels, as `launch.prepare`."""
+    _action_kernel(shape, environments, policies)
+    _gradient_kernels(shape, batch, policies)
+
+
+def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
+    """Draw actions, while JAX lowers a program for an NVIDIA GPU.
+
+    Args:
+      shape: the networks.
+      arguments: those of `launch.actions`, with the policies as their first axis.
+
+    Returns:
+      The arrays of `launch.Actions`.
+    """
+    policies, environments = arguments[3].shape[:2]
+    kernel = _action_kernel(shape, environments, policies)
+    results = [(policies, *sizes) for sizes in shape.drawn_shapes(environments)]
+    return kernel.launch(arguments, *results)
+
+
+def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
+    """Run both kernels of a minibatch, while JAX lowers a program for an NVIDIA GPU.
 
     Args:
       shape: the networks.
       arguments: those of `launch.gradient`, with the policies as their first axis.
 
     Returns:
-      The gradients, with the sums of the metrics at their places.
+      The gradients, with the sums of the metrics at their places, as the only array.
     """
     params, mean, scale, rows, last, unrolls, noise, terms = arguments
     policies = params.shape[0]
     size = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
-    first, second = prepare(shape, size, policies)
+    first, second = _gradient_kernels(shape, size, policies)
     parts, blocks = first.grid[0], second.grid[0]
     samples = policies, size.samples
     estimates = first.launch(
@@ -170,7 +201,7 @@ def launch(shape: UpdateShape, arguments: Sequence[Array]) -> Float[Array, "poli
         [params, mean, scale, rows, unrolls, noise, *estimates, terms],
         (policies, blocks, shape.size),
     )
-    return vectors.sum(1)
+    return [vectors.sum(1)]
 
 
 def _shared_memory() -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
+from jetbot_mjx.compiler.update.distribution import OUTPUT_BYTES
 from jetbot_mjx.compiler.update.shapes import (
     MOST_OUTPUTS,
     PAD,
@@ -220,6 +221,16 @@ class NetworkKernel:
             lambda row, k: ir.matrices(left, 32 * row * self.stride + 32 * k, transposed=False),
             lambda _, k: ir.matrices(right, 32 * k * (TILE + PAD), transposed=True),
         )
+
+    def store_outputs(self, sums: Sums) -> None:
+        """Store the outputs of the network in shared memory, a row for each sample."""
+        ir, stride = self.ir, OUTPUT_BYTES
+        pointer = ir.shared(
+            (self.row + self.sum_row) * stride + self.sum_column * 4, self.bytes_of("outputs")
+        )
+        for m, (four,) in enumerate(sums):
+            for i, value in enumerate(four):
+                ir.write(value, ir.moved(pointer, stride * (TILE * m + 8 * (i // 2)) + 4 * (i % 2)))
 
     def _biases(self, pointer: Value, row_tiles: int, columns: int) -> Sums:
         ir = self.ir

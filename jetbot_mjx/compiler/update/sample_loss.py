@@ -1,4 +1,4 @@
-"""Define PPO's loss of one sample, with its derivatives, for the update's kernels on CPUs.
+"""Define the action of one sample and PPO's loss, with its derivatives, for the kernels on CPUs.
 
 These are JAX functions of scalars and short vectors, which `lower_jaxpr` lowers. The loss is that
 of `brax.training.agents.ppo.losses`, the distributions those of `brax.training.distribution`.
@@ -35,6 +35,37 @@ def activation(name: str, z: Float[Array, ""]) -> tuple[Float[Array, ""], Float[
     gate = _sigmoid(z)
     value = z * gate
     return value, gate + value * (1.0 - gate)
+
+
+class ActionSample(NamedTuple):
+    """An `ActionSample` holds what an action of the collection depends on."""
+
+    outputs: Float[Array, " outputs"]
+    """Outputs of the policy network."""
+    deviations: Float[Array, " actions"]
+    """The standard deviations that are parameters; without meaning for `tanh_normal`."""
+    noise: Float[Array, " actions"]
+    """Standard normal noise."""
+
+
+def action_sample(sample: ActionSample, *, tanh: bool) -> tuple[Array, Array, Array, Array]:
+    """Draw an action.
+
+    Args:
+      sample: the sample.
+      tanh: whether the distribution is `tanh_normal`.
+
+    Returns:
+      The action, the action before its tanh, the logarithm of its probability, and the parameters
+      of the distribution.
+    """
+    outputs, deviations, noise = sample
+    mean, scale = _distribution(outputs, deviations, tanh)
+    raw = noise * scale + mean
+    log_prob = _density(raw, mean, scale, tanh).log_probs.sum()
+    if tanh:
+        return jnp.tanh(raw), raw, log_prob, outputs
+    return raw, raw, log_prob, jnp.concatenate([mean, scale])
 
 
 class PolicySample(NamedTuple):
@@ -74,16 +105,10 @@ def policy_sample(
       `POLICY_METRICS`.
     """
     outputs, deviations, action, log_prob, old, noise, advantage, weight = sample
-    mean, raw = jnp.split(outputs, 2) if tanh else (outputs, outputs)
-    scale = _softplus(raw) + _MIN_STD if tanh else deviations
-    old_mean, old_scale = jnp.split(old, 2)
-    old_scale = _softplus(old_scale) + _MIN_STD if tanh else old_scale
+    mean, scale = _distribution(outputs, deviations, tanh)
+    old_mean, old_scale = _distribution(old, old[len(action) :], tanh)
     # The clipped surrogate objective.
-    inverse, log_scale = 1.0 / scale, jnp.log(scale)
-    distance = (action - mean) * inverse
-    log_probs = -0.5 * distance * distance - log_scale - _HALF_LOG_TWO_PI
-    if tanh:
-        log_probs -= _log_slope(action)
+    inverse, log_scale, distance, log_probs = _density(action, mean, scale, tanh)
     ratio = jnp.exp(log_probs.sum() - log_prob)
     bounds = 1.0 - terms.clipping_epsilon, 1.0 + terms.clipping_epsilon
     clipped, surrogate = jnp.clip(ratio, *bounds) * advantage, ratio * advantage
@@ -109,8 +134,34 @@ def policy_sample(
         scale.sum() * weight,
     )
     if tanh:
-        return jnp.concatenate([by_mean, by_scale * _sigmoid(raw)]), *metrics
+        slopes = _sigmoid(outputs[len(action) :])
+        return jnp.concatenate([by_mean, by_scale * slopes]), *metrics
     return by_mean, by_scale, *metrics
+
+
+class _Density(NamedTuple):
+    """A `_Density` holds the logarithms of the probabilities of an action, and their parts."""
+
+    inverse: Array
+    log_scale: Array
+    distance: Array
+    log_probs: Array
+
+
+def _density(action: Array, mean: Array, scale: Array, tanh: bool) -> _Density:
+    """Return the logarithms of the probabilities of an action before its tanh."""
+    inverse, log_scale = 1.0 / scale, jnp.log(scale)
+    distance = (action - mean) * inverse
+    log_probs = -0.5 * distance * distance - log_scale - _HALF_LOG_TWO_PI
+    if tanh:
+        log_probs -= _log_slope(action)
+    return _Density(inverse, log_scale, distance, log_probs)
+
+
+def _distribution(outputs: Array, deviations: Array, tanh: bool) -> tuple[Array, Array]:
+    """Return mean and standard deviation of the action before its tanh."""
+    actions = len(deviations)
+    return outputs[:actions], _softplus(outputs[actions:]) + _MIN_STD if tanh else deviations
 
 
 class ValueStep(NamedTuple):

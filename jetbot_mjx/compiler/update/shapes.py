@@ -2,6 +2,8 @@
 
 import dataclasses
 import functools
+import math
+from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 from jetbot_mjx.compiler.update.tensor_core import LANES, TILE
@@ -21,7 +23,8 @@ PAD = 8
 """Numbers between the rows of a matrix in shared memory, so that eight rows meet all banks."""
 
 _GRADIENT_WARPS = 8
-_ADVANTAGE_WARPS = 16
+_WARPS = {"gradient": _GRADIENT_WARPS, "advantages": 16, "actions": 16}
+"""Warps of a block, by the purpose of the kernel."""
 
 
 class UpdateShape(NamedTuple):
@@ -87,6 +90,16 @@ class UpdateShape(NamedTuple):
     def sums(self) -> int:
         """Return how many sums of the gradient of the weights a thread holds."""
         return sum(8 * share.row_tiles * share.pairs for share in self.shares)
+
+    @property
+    def drawn(self) -> list[int]:
+        """Return how many numbers of each array of `launch.Actions` an environment has."""
+        return [math.prod(shape) for shape in self.drawn_shapes(1)]
+
+    def drawn_shapes(self, environments: int) -> list[tuple[int, ...]]:
+        """Return the shapes of the arrays of `launch.Actions`."""
+        each = environments, self.actions
+        return [each, each, (environments,), (environments, 2 * self.actions)]
 
     @property
     def columns(self) -> dict[str, int]:
@@ -167,7 +180,13 @@ class Tiling:
     """Rows of a tile, one for each observation."""
     row_tiles: int
     """Row tiles of a warp in a layer's product."""
-    warps: int = _GRADIENT_WARPS
+    purpose: str = "gradient"
+    """What the kernel computes: `gradient`, `advantages` or `actions`."""
+
+    @property
+    def warps(self) -> int:
+        """Return the number of warps of a block."""
+        return _WARPS[self.purpose]
 
     @property
     def threads(self) -> int:
@@ -187,7 +206,7 @@ class Tiling:
     @property
     def is_gradient(self) -> bool:
         """Return whether all layers are kept, for a backward pass."""
-        return self.warps == _GRADIENT_WARPS
+        return self.purpose == "gradient"
 
     @property
     def extras(self) -> int:
@@ -199,7 +218,7 @@ class Tiling:
         """Return the byte of shared memory where each array begins, and their `size`."""
         shape, rows = self.shape, self.rows
         stride = shape.width + PAD
-        first = padded(shape.observations)
+        first, outputs = padded(shape.observations), 4 * rows * (MOST_OUTPUTS + 1)
         sizes = {f"weights{i}": 2 * padded(n) * stride for i, n in enumerate(shape.inputs[:-1])}
         sizes["head"] = 2 * shape.width * (TILE + PAD)
         sizes |= {f"biases{i}": 4 * shape.width for i in range(shape.layers)}
@@ -209,11 +228,13 @@ class Tiling:
             sizes |= {f"layer{i + 1}": 2 * rows * stride for i in range(shape.layers)}
             if shape.activation == "swish":
                 sizes |= {f"slopes{i + 1}": 2 * rows * stride for i in range(shape.layers)}
-            sizes["outputs"] = 4 * rows * (MOST_OUTPUTS + 1)
+            sizes["outputs"] = outputs
             sizes["errors"] = 2 * rows * (TILE + PAD)
             sizes["extras"] = 4 * rows * self.extras
             sizes["statistics"] = 4 * (2 * LANES + 2)
             sizes["slots"] = 4 * shape.slots * (rows + 1)
+        elif self.purpose == "actions":
+            sizes |= {"layer1": 2 * rows * stride, "outputs": outputs}
         else:
             sizes["layer1"] = 2 * rows * stride
             sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
@@ -250,13 +271,42 @@ def advantage_tiling(
     Returns:
       The tiling; None: no tile that holds an unroll fits.
     """
-    tilings = [Tiling(shape, rows, -(-rows // 128), _ADVANTAGE_WARPS) for rows in (256, 128, 64)]
-    fitting = [x for x in tilings if x.rows > batch.time and x.layout["size"] <= shared_memory]
+    tilings = [Tiling(shape, n, -(-n // 128), "advantages") for n in (256, 128, 64)]
+    return _fastest(
+        (x for x in tilings if x.rows > batch.time),
+        lambda rows: -(-batch.unrolls // (rows // (batch.time + 1))),
+        blocks,
+        shared_memory,
+    )
+
+
+def action_tiling(
+    shape: UpdateShape, environments: int, blocks: int, shared_memory: int
+) -> Tiling | None:
+    """Return the tiling of the actions that is likely fastest.
+
+    Args:
+      shape: the networks.
+      environments: the number of environments.
+      blocks: the number of blocks that run at the same time.
+      shared_memory: bytes of shared memory that a block may have.
+
+    Returns:
+      The tiling; None: not even the smallest tile fits.
+    """
+    tilings = [Tiling(shape, n, -(-n // 128), "actions") for n in (256, 128, 64, 32)]
+    return _fastest(tilings, lambda rows: -(-environments // rows), blocks, shared_memory)
+
+
+def _fastest(
+    tilings: Iterable[Tiling], tiles: Callable[[int], int], blocks: int, shared_memory: int
+) -> Tiling | None:
+    """Return the tiling that fits and is likely fastest, from the number of tiles by their rows."""
+    fitting = [x for x in tilings if x.layout["size"] <= shared_memory]
 
     def cost(tiling: Tiling) -> int:
-        tiles = -(-batch.unrolls // (tiling.rows // (batch.time + 1)))
         # A tile takes some time for its barriers, whatever its size.
-        return -(-tiles // blocks) * (tiling.rows + 64)
+        return -(-tiles(tiling.rows) // blocks) * (tiling.rows + 64)
 
     return min(fitting, key=cost, default=None)
 

@@ -1,22 +1,17 @@
 """Write the kernels that compute PPO's gradient on CPUs, one for each network.
 
-A kernel divides the minibatch into parts of whole unrolls, which XLA's threads compute. A part goes
-through its unrolls tile by tile: forward through all layers, the loss and its derivatives by the
-outputs, and backward, where it adds to the part's gradient. Everything is float32. The number of
-parts follows from the minibatch alone, so no result depends on the number of threads.
-
-A column of ones beside the activations has the biases as its weights, so that one product computes
-a layer with its biases, and another one the gradient of both.
+A kernel divides the minibatch into parts of whole unrolls. A part goes through its unrolls tile by
+tile: forward through all layers, the loss and its derivatives by the outputs, and backward, where
+it adds to the part's gradient. Since a column of ones stands beside the activations, one product
+adds to the gradient of weights and biases.
 """
 
 import dataclasses
 import functools
-import itertools
 
-from jetbot_mjx.compiler import ffi_wrapper
-from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
-from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
+from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.update import sample_loss
+from jetbot_mjx.compiler.update.cpu_network import HEAD, MOST_PARTS, Division, Kernel
 from jetbot_mjx.compiler.update.sample_loss import PolicySample, ValueStep, vector_of
 from jetbot_mjx.compiler.update.shapes import (
     POLICY_METRICS,
@@ -25,71 +20,38 @@ from jetbot_mjx.compiler.update.shapes import (
     Minibatch,
     UpdateShape,
 )
-from jetbot_mjx.compiler.update.vector_code import (
-    ROWS,
-    VectorCode,
-    number,
-    product_declarations,
-    product_text,
-)
-
-HEAD = 16
-"""Columns of the last layer, of which those beyond its outputs are zero."""
-
-_PAD = 16
-"""Numbers between the rows of a matrix, so that they do not share few places of the cache."""
-
-_TILE_ROWS = 64
-"""Rows of a tile, at least, if there are as many."""
+from jetbot_mjx.compiler.update.vector_code import number
 
 _PART_SAMPLES = 256
-"""Samples of a part, about, if the minibatch has no more than `_MOST_PARTS` times as many."""
-
-_MOST_PARTS = 32
+"""Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""
 
 _TERMS = LossTerms(*[vector_of()] * len(LossTerms._fields))
 
 
 @dataclasses.dataclass(frozen=True)
-class Division:
-    """A `Division` divides a minibatch among the parts of a kernel."""
+class GradientDivision(Division):
+    """A `GradientDivision` divides the unrolls of a minibatch."""
 
     shape: UpdateShape
     batch: Minibatch
     is_policy: bool
     lanes: int
-    """Number of float32 values in a vector register."""
 
     @property
-    def unrolls(self) -> int:
-        """Return the number of unrolls of a part; the last parts may have fewer."""
+    def items(self) -> int:
+        """Return the number of unrolls."""
+        return self.batch.unrolls
+
+    @property
+    def part_items(self) -> int:
+        """Return the number of unrolls of a part."""
         wanted = max(1, round(_PART_SAMPLES / self.batch.time))
-        return max(wanted, -(-self.batch.unrolls // _MOST_PARTS))
-
-    @property
-    def parts(self) -> int:
-        """Return the number of parts."""
-        return -(-self.batch.unrolls // self.unrolls)
+        return max(wanted, -(-self.batch.unrolls // MOST_PARTS))
 
     @property
     def steps(self) -> int:
         """Return the rows of an unroll: its steps and, of the values, its last observation."""
         return self.batch.time + (not self.is_policy)
-
-    @property
-    def tile_unrolls(self) -> int:
-        """Return the number of unrolls of a tile."""
-        return min(self.unrolls, -(-_TILE_ROWS // self.steps))
-
-    @property
-    def rows(self) -> int:
-        """Return the number of rows of a tile that are stored."""
-        return _rounded(self.tile_unrolls * self.steps, ROWS)
-
-    @property
-    def outputs(self) -> int:
-        """Return the number of outputs of the network."""
-        return self.shape.outputs[not self.is_policy]
 
     @property
     def slots(self) -> int:
@@ -105,43 +67,24 @@ class Division:
         return policy if self.is_policy else self.shape.size - policy
 
     @property
-    def stride(self) -> int:
-        """Return the stride of the rows of a layer."""
-        return self.shape.width + _PAD
-
-    @property
-    def first_stride(self) -> int:
-        """Return the stride of the rows of the observations."""
-        return _rounded(self.shape.observations + 1, _PAD)
-
-    @property
     def reads(self) -> int:
         """Return how many numbers the loss of a sample reads."""
         return 6 * self.shape.actions + self.outputs + 3 + len(LossTerms._fields)
 
-    @functools.cached_property
-    def layout(self) -> dict[str, int]:
-        """Return where each array begins in a part's scratch memory, and its `size`, in floats."""
-        shape, stride = self.shape, self.stride
-        sizes = {f"weights{i}": (n + 1) * stride for i, n in enumerate(shape.inputs[:-1])}
-        sizes |= {f"turned{i}": shape.width * stride for i in range(1, shape.layers)}
-        sizes |= {"head": (shape.width + 1) * HEAD, "turned_head": self.outputs * stride}
-        sizes["layer0"] = self.rows * self.first_stride
-        for i in range(1, shape.layers + 1):
-            sizes |= {f"layer{i}": self.rows * stride, f"slopes{i}": self.rows * stride}
+    def extra_sizes(self) -> dict[str, int]:
+        """Return the floats of what the backward pass and the loss need."""
+        shape, stride, lanes = self.shape, self.stride, self.lanes
+        sizes = {f"turned{i}": shape.width * stride for i in range(1, shape.layers)}
+        sizes["turned_head"] = self.outputs * stride
+        sizes |= {f"slopes{i}": self.rows * stride for i in range(1, shape.layers + 1)}
         sizes |= dict.fromkeys(("deltas0", "deltas1"), self.rows * stride)
-        sizes |= dict.fromkeys(("outputs", "errors"), self.rows * HEAD)
-        sizes["head_sums"] = (shape.width + 1) * HEAD
-        sizes |= {"sums": self.slots * self.lanes, "statistics": self.lanes}
-        sizes |= {"loss": self.reads * self.lanes}
-        sizes |= {"results": (HEAD + self.slots) * self.lanes}
-        padded = [_rounded(size, _PAD) for size in sizes.values()]
-        starts = list(itertools.accumulate(padded, initial=0))
-        return {**dict(zip(sizes, starts, strict=False)), "size": starts[-1]}
+        sizes |= {"errors": self.rows * HEAD, "head_sums": (shape.width + 1) * HEAD}
+        sizes |= {"sums": self.slots * lanes, "statistics": lanes, "loss": self.reads * lanes}
+        return sizes | {"results": (HEAD + self.slots) * lanes}
 
 
-def kernel_text(division: Division, *, registers: int, name: str, machine: str) -> str:
-    """Write the LLVM module of a kernel, whose function XLA calls.
+def gradient_kernel(division: GradientDivision) -> Kernel:
+    """Return the kernel of one network.
 
     The values' kernel takes the parameters of both networks, mean and 1 / std of the observations,
     the collected rows, the unrolls of the minibatch, the `LossTerms` and the last observations,
@@ -151,52 +94,26 @@ def kernel_text(division: Division, *, registers: int, name: str, machine: str) 
 
     Args:
       division: the division of the minibatch.
-      registers: the number of vector registers.
-      name: the name of the function.
-      machine: the processor, one of `ffi_wrapper.MACHINES`.
     """
-    kernel = (_PolicyKernel if division.is_policy else _ValueKernel)(division)
-    lanes = division.lanes
-    functions = [*kernel.functions(), product_text(lanes, registers), kernel.block()]
-    lines = [product_declarations(lanes), "declare float @llvm.sqrt.f32(float)"]
-    lines += [line for program in kernel.programs for line in program.declarations()]
-    return ffi_wrapper.call_text(
-        "\n".join([*dict.fromkeys(lines), *functions]),
-        arguments=len(kernel.arguments),
-        results=len(kernel.results),
-        blocks_per_robot=division.parts,
-        blocks_per_thread=1,
-        scratch=4 * division.layout["size"],
-        name=name,
-        machine=machine,
-    )
+    return (_PolicyKernel if division.is_policy else _ValueKernel)(division)
 
 
-class _Kernel:
-    """A `_Kernel` writes what both kernels share."""
+class _GradientKernel(Kernel):
+    """A `_GradientKernel` writes what both kernels share."""
 
-    arguments: tuple[str, ...]
-    results: tuple[str, ...]
+    by_part = ("vectors",)
 
-    def __init__(self, division: Division) -> None:
-        self.division, self.shape, self.batch = division, division.shape, division.batch
-        self.programs: list[LlvmEmitter] = []
-        self.code = VectorCode(division.lanes)
+    def __init__(self, division: GradientDivision) -> None:
+        super().__init__(division)
+        self.batch = division.batch
 
     def functions(self) -> list[str]:
-        """Return the texts of the functions that `block` calls."""
         scalar = vector_of()
-        activation = functools.partial(sample_loss.activation, self.shape.activation)
+        activated, both = scalarize(self.activation(), scalar), ["%one", "%other"]
+        scaled = scalarize(lambda one, other: one * other, scalar, scalar)
         return [
-            self._on_layers(
-                "activate", scalarize(activation, scalar), ["%one"], ["%one", "%other"]
-            ),
-            self._on_layers(
-                "multiply",
-                scalarize(lambda one, other: one * other, scalar, scalar),
-                ["%one", "%other"],
-                ["%one"],
-            ),
+            self.on_layers("activate", activated, ["%one"], both),
+            self.on_layers("multiply", scaled, both, ["%one"]),
             self.loss_function(),
         ]
 
@@ -224,65 +141,7 @@ class _Kernel:
             f"sext i32 {code.load(code.at(self.arrays['unrolls'], unroll), 'i32')} to i64"
         )
 
-    def _on_layers(
-        self, name: str, program: ScalarProgram, reads: list[str], writes: list[str]
-    ) -> str:
-        """Write a function of two layers that applies a program to each of their numbers."""
-        code = VectorCode(self.division.lanes)
-        self.programs.append(LlvmEmitter(program, code.lanes))
-        with code.loop("%rows") as row:
-            start = code.mul(row, self.division.stride)
-            with code.loop(self.shape.width // code.lanes) as i:
-                place = code.add(start, code.mul(i, code.lanes))
-                at = {array: code.at(array, place) for array in ("%one", "%other")}
-                results = code.run(program, [code.load(at[x], code.vector) for x in reads])
-                for result, array in zip(results, writes, strict=True):
-                    code.store(result, at[array], code.vector)
-        return code.function(name, ["ptr noalias %one", "ptr noalias %other", "i64 %rows"])
-
-    def _on_sample(self, name: str, program: ScalarProgram, lanes: int) -> str:
-        """Write a function that applies a program to the rows of one array, into another."""
-        code = VectorCode(lanes)
-        self.programs.append(LlvmEmitter(program, lanes))
-        count = sum(array.size for array in program.inputs)
-        arguments = [code.load(code.at("%reads", i * lanes), code.vector) for i in range(count)]
-        for i, result in enumerate(code.run(program, arguments)):
-            code.store(result, code.at("%writes", i * lanes), code.vector)
-        return code.function(name, ["ptr noalias %reads", "ptr noalias %writes"])
-
-    def block(self) -> str:
-        """Write the function that computes one part of one policy."""
-        code, division, batch = self.code, self.division, self.batch
-        policy = code.let(f"udiv i64 %index, {division.parts}")
-        part = code.sub("%index", code.mul(policy, division.parts))
-        sizes = self._sizes()
-        self.arrays = {}
-        for i, name in enumerate((*self.arguments, *self.results)):
-            code.do(ffi_wrapper.address(i))
-            of = "%index" if name == "vectors" else policy
-            self.arrays[name] = code.at(f"%a{i}", code.mul(of, sizes[name]))
-        start = 0 if division.is_policy else self.shape.policy_size
-        self.params = code.at(self.arrays["params"], start)
-        self.places = {
-            name: code.at("%scratch", place)
-            for name, place in division.layout.items()
-            if name != "size"
-        }
-        self._begin()
-        # Take the part's unrolls tile by tile.
-        first = code.mul(part, division.unrolls)
-        there = code.smaller(code.sub(batch.unrolls, first), division.unrolls)
-        per_tile = division.tile_unrolls
-        tiles = code.let(f"sdiv i64 {code.add(there, per_tile - 1)}, {per_tile}")
-        with code.loop(tiles) as tile:
-            done = code.mul(tile, per_tile)
-            count = code.smaller(code.sub(there, done), per_tile)
-            self._tile(code.add(first, done), count)
-        self._end()
-        return code.function("block", ["ptr %job", "i64 %index", "ptr %scratch"])
-
-    def _sizes(self) -> dict[str, int]:
-        """Return the number of floats of one policy, or of one part, in each array."""
+    def sizes(self) -> dict[str, int]:
         shape, batch = self.shape, self.batch
         return {
             "params": shape.size,
@@ -297,52 +156,22 @@ class _Kernel:
             "vectors": self.division.size,
         }
 
-    def _hidden(self) -> list[tuple[int, int, int]]:
-        """Return number, inputs and first parameter of each hidden layer."""
-        sizes = [(n + 1) * self.shape.width for n in self.shape.inputs[:-1]]
-        starts = itertools.accumulate(sizes, initial=0)
-        return [
-            (i, n, start)
-            for i, (n, start) in enumerate(zip(self.shape.inputs[:-1], starts, strict=False))
-        ]
-
-    def _begin(self) -> None:
-        """Arrange the weights, and set to zero what is added to."""
+    def begin(self) -> None:
+        super().begin()
         code, shape, division, places = self.code, self.shape, self.division, self.places
-        width, stride, lanes = shape.width, division.stride, code.lanes
-        for i, inputs, start in self._hidden():
+        for i, inputs, start in self.hidden():
             source = code.at(self.params, start)
-            with code.loop(inputs + 1) as row, code.loop(width // lanes) as j:
-                place = code.add(code.mul(row, width), code.mul(j, lanes))
-                target = code.add(code.mul(row, stride), code.mul(j, lanes))
-                code.copy(
-                    code.at(source, place), code.at(places[f"weights{i}"], target), code.vector
-                )
-                to = code.at(self.arrays["vectors"], start, place)
-                code.store("zeroinitializer", to, code.vector)
+            code.fill(code.at(self.arrays["vectors"], start), (inputs + 1) * shape.width)
             if i:
-                self._turn(source, places[f"turned{i}"], inputs, width)
+                self._turn(source, places[f"turned{i}"], inputs, shape.width)
+        source = code.at(self.params, shape.hidden)
+        self._turn(source, places["turned_head"], shape.width, division.outputs)
         for name, count in (
-            ("head", (width + 1) * HEAD),
-            ("layer0", division.rows * division.first_stride),
             ("errors", division.rows * HEAD),
-            ("head_sums", (width + 1) * HEAD),
-            ("sums", division.slots * lanes),
+            ("head_sums", (shape.width + 1) * HEAD),
+            ("sums", division.slots * code.lanes),
         ):
             code.fill(places[name], count)
-        source, outputs = code.at(self.params, shape.hidden), division.outputs
-        with code.loop(width + 1) as row, code.loop(outputs) as j:
-            place = code.add(code.mul(row, outputs), j)
-            target = code.add(code.mul(row, HEAD), j)
-            code.copy(code.at(source, place), code.at(places["head"], target))
-        self._turn(source, places["turned_head"], width, outputs)
-        with code.loop(division.rows) as row:
-            one = number(1.0)
-            at = code.at(places["layer0"], code.mul(row, division.first_stride))
-            code.store(one, code.at(at, shape.observations))
-            for i in range(1, shape.layers + 1):
-                at = code.at(places[f"layer{i}"], code.mul(row, stride))
-                code.store(one, code.at(at, width))
 
     def _turn(self, source: str, target: str, rows: int, columns: int) -> None:
         """Transpose a matrix of weights."""
@@ -358,49 +187,33 @@ class _Kernel:
             for k, turned in enumerate(code.transposed(square)):
                 code.store(turned, code.at(to, k * stride), kind)
 
-    def _tile(self, first: str, count: str) -> None:
+    def tile(self, first: str, count: str) -> None:
         """Add the gradient of some unrolls, from the given one on."""
         code, shape, division, places = self.code, self.shape, self.division, self.places
         rows = code.mul(count, division.steps)
-        stored = code.mul(code.let(f"udiv i64 {code.add(rows, ROWS - 1)}, {ROWS}"), ROWS)
+        stored = self.stored_rows(rows)
         with code.loop(count) as i:
             unroll = code.add(first, i)
             with code.loop(division.steps) as step:
                 row = code.add(code.mul(i, division.steps), step)
-                self._load_observation(unroll, step, row)
-        # Forward.
-        width, stride = shape.width, division.stride
-        strides = [division.first_stride, *[stride] * shape.layers]
-        layers = [places[f"layer{i}"] for i in range(shape.layers + 1)]
-        slopes = [places.get(f"slopes{i}", "") for i in range(shape.layers + 1)]
-        for i, inputs, _ in self._hidden():
-            code.product(
-                (layers[i], strides[i], 1),
-                (places[f"weights{i}"], stride),
-                (layers[i + 1], stride),
-                (stored, width, inputs + 1),
-            )
-            code.call("activate", f"ptr {layers[i + 1]}", f"ptr {slopes[i + 1]}", f"i64 {stored}")
-        outputs, errors = (places["outputs"], HEAD), (places["errors"], HEAD)
-        code.product(
-            (layers[-1], stride, 1), (places["head"], HEAD), outputs, (stored, HEAD, width + 1)
-        )
+                self.load_observation(self.observation(unroll, step), row)
+        self.forward(stored)
         self.add_losses(first, count)
         # Backward.
-        code.product(
-            (layers[-1], 1, stride),
-            errors,
-            (places["head_sums"], HEAD),
-            (width + 1, HEAD, rows),
-            adds=True,
-        )
+        width, stride, layers = shape.width, division.stride, self.layers
+        errors, (last, last_stride) = (places["errors"], HEAD), layers[-1]
+        sums = places["head_sums"], HEAD
+        code.product((last, 1, last_stride), errors, sums, (width + 1, HEAD, rows), adds=True)
         left, right, length = (*errors, 1), places["turned_head"], division.outputs
-        for i, inputs, start in reversed(self._hidden()):
+        for i, inputs, start in reversed(self.hidden()):
             deltas = places[f"deltas{i % 2}"]
             code.product(left, (right, stride), (deltas, stride), (stored, width, length))
-            code.call("multiply", f"ptr {deltas}", f"ptr {slopes[i + 1]}", f"i64 {stored}")
+            code.call(
+                "multiply", f"ptr {deltas}", f"ptr {places[f'slopes{i + 1}']}", f"i64 {stored}"
+            )
+            layer, layer_stride = layers[i]
             code.product(
-                (layers[i], 1, strides[i]),
+                (layer, 1, layer_stride),
                 (deltas, stride),
                 (code.at(self.arrays["vectors"], start), width),
                 (inputs + 1, width, rows),
@@ -408,28 +221,12 @@ class _Kernel:
             )
             left, right, length = (deltas, stride, 1), places.get(f"turned{i}", ""), width
 
-    def _load_observation(self, unroll: str, step: str, row: str) -> None:
-        """Copy a normalised observation to a row of the tile."""
-        code, division, size = self.code, self.division, self.shape.observations
-        source = self.row_of(unroll, step)
-        if not division.is_policy:
-            # The row behind the steps has the observation after them.
-            is_step = code.let(f"icmp slt i64 {step}, {self.batch.time}")
-            collected = self.collected(unroll)
-            last = code.at(self.arrays["last"], code.mul(collected, size))
-            # An address beyond the array is computed, but not read from.
-            source = code.select(is_step, "ptr", source, f"{last}")
-        target = code.at(self.places["layer0"], code.mul(row, division.first_stride))
-        with code.loop(size) as i:
-            value, mean, scale = (
-                code.load(code.at(array, i))
-                for array in (source, self.arrays["mean"], self.arrays["scale"])
-            )
-            centred = code.arithmetic("fsub", value, mean)
-            code.store(code.arithmetic("fmul", centred, scale), code.at(target, i))
+    def observation(self, unroll: str, step: str) -> str:
+        """Return the address of the observation of a step."""
+        return self.row_of(unroll, step)
 
-    def _end(self) -> None:
-        """Copy the sums of the head and of the samples to the part's vector."""
+    def end(self) -> None:
+        # Copy the sums of the head and of the samples to the part's vector.
         code, shape, division = self.code, self.shape, self.division
         outputs, vector = division.outputs, self.arrays["vectors"]
         with code.loop(shape.width + 1) as row, code.loop(outputs) as j:
@@ -448,7 +245,7 @@ class _Kernel:
         code.store(code.arithmetic("fadd", code.load(target, kind), value, kind), target, kind)
 
 
-class _ValueKernel(_Kernel):
+class _ValueKernel(_GradientKernel):
     """Values, advantages, and the gradient of the value network."""
 
     arguments = ("params", "mean", "scale", "rows", "unrolls", "terms", "last")
@@ -460,7 +257,16 @@ class _ValueKernel(_Kernel):
             ValueStep(*[vector_of()] * len(ValueStep._fields)),
             _TERMS,
         )
-        return self._on_sample("loss", program, 1)
+        return self.on_sample("loss", program, 1)
+
+    def observation(self, unroll: str, step: str) -> str:
+        # The row behind the steps has the observation after them. An address beyond the array is
+        # computed, but not read from.
+        code = self.code
+        is_step = code.let(f"icmp slt i64 {step}, {self.batch.time}")
+        place = code.mul(self.collected(unroll), self.shape.observations)
+        last = code.at(self.arrays["last"], place)
+        return code.select(is_step, "ptr", self.row_of(unroll, step), last)
 
     def add_losses(self, first: str, count: str) -> None:
         """Run backwards through each unroll of the tile."""
@@ -492,7 +298,7 @@ class _ValueKernel(_Kernel):
                     code.copy(code.at(writes, 3 + place), code.at(reads, 4 + place))
 
 
-class _PolicyKernel(_Kernel):
+class _PolicyKernel(_GradientKernel):
     """The gradient of the policy network."""
 
     arguments = ("params", "mean", "scale", "rows", "unrolls", "terms", "noise", "advantages")
@@ -515,10 +321,10 @@ class _PolicyKernel(_Kernel):
             samples=self.batch.samples,
             tanh=self.shape.distribution == "tanh_normal",
         )
-        return self._on_sample("loss", scalarize(loss, sample, _TERMS), self.division.lanes)
+        return self.on_sample("loss", scalarize(loss, sample, _TERMS), self.division.lanes)
 
-    def _begin(self) -> None:
-        super()._begin()
+    def begin(self) -> None:
+        super().begin()
         if self.shape.normalizes:
             self._load_statistics()
 
@@ -617,7 +423,3 @@ class _PolicyKernel(_Kernel):
         target = code.at(self.places["loss"], lane)
         for i, value in enumerate(values):
             code.store(value, code.at(target, i * code.lanes))
-
-
-def _rounded(size: int, multiple: int) -> int:
-    return -(-size // multiple) * multiple

@@ -1,0 +1,135 @@
+"""Write the kernel that draws the actions of all environments on CPUs."""
+
+import dataclasses
+import functools
+
+from jetbot_mjx.compiler.lower_jaxpr import scalarize
+from jetbot_mjx.compiler.update import sample_loss
+from jetbot_mjx.compiler.update.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, Division, Kernel
+from jetbot_mjx.compiler.update.sample_loss import ActionSample, vector_of
+from jetbot_mjx.compiler.update.shapes import UpdateShape
+
+_PART_ROWS = 2 * TILE_ROWS
+"""Environments of a part if there are no more than `MOST_PARTS` times as many; each part copies the
+weights."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ActionDivision(Division):
+    """An `ActionDivision` divides the environments."""
+
+    shape: UpdateShape
+    environments: int
+    lanes: int
+    is_policy: bool = True
+
+    @property
+    def items(self) -> int:
+        """Return the number of environments."""
+        return self.environments
+
+    @property
+    def part_items(self) -> int:
+        """Return the number of environments of a part."""
+        return max(_PART_ROWS, -(-self.environments // MOST_PARTS))
+
+    @property
+    def steps(self) -> int:
+        """Return 1: an environment has one row."""
+        return 1
+
+    @property
+    def reads(self) -> int:
+        """Return how many numbers an action depends on."""
+        return self.outputs + 2 * self.shape.actions
+
+    def extra_sizes(self) -> dict[str, int]:
+        """Return the floats of what the sample reads and writes."""
+        lanes = self.lanes
+        return {"sample": self.reads * lanes, "drawn": sum(self.shape.drawn) * lanes}
+
+
+class ActionKernel(Kernel):
+    """An `ActionKernel` runs the policy network and draws an action from each distribution.
+
+    The kernel takes the parameters of both networks, mean and 1 / std of the observations, the
+    observations and standard normal noise, each with the policies as the first axis.
+    """
+
+    arguments = ("params", "mean", "scale", "observations", "noise")
+    results = ("action", "raw_action", "log_prob", "distribution_params")
+
+    def functions(self) -> list[str]:
+        """Return the activation and the sample."""
+        scalar, actions = vector_of(), vector_of(self.shape.actions)
+        activate = self.activation()
+        activated = scalarize(lambda z: activate(z)[0], scalar)
+        draw = functools.partial(
+            sample_loss.action_sample, tanh=self.shape.distribution == "tanh_normal"
+        )
+        sample = ActionSample(vector_of(self.division.outputs), actions, actions)
+        return [
+            self.on_layers("activate", activated, ["%one"], ["%one"]),
+            self.on_sample("draw", scalarize(draw, sample), self.division.lanes),
+        ]
+
+    def sizes(self) -> dict[str, int]:
+        """Return the number of floats of one policy in each array."""
+        shape, environments = self.shape, self.division.environments
+        sizes = {"observations": shape.observations, "noise": shape.actions}
+        sizes |= zip(self.results, self.shape.drawn, strict=True)
+        sizes = {name: environments * size for name, size in sizes.items()}
+        return {
+            **sizes,
+            "params": shape.size,
+            "mean": shape.observations,
+            "scale": shape.observations,
+        }
+
+    def tile(self, first: str, count: str) -> None:
+        """Draw the actions of some environments."""
+        code, size = self.code, self.shape.observations
+        with code.loop(count) as row:
+            place = code.mul(code.add(first, row), size)
+            self.load_observation(code.at(self.arrays["observations"], place), row)
+        self.forward(self.stored_rows(count))
+        groups = code.let(f"udiv i64 {code.add(count, code.lanes - 1)}, {code.lanes}")
+        with code.loop(groups) as group:
+            start = code.mul(group, code.lanes)
+            there = code.smaller(code.sub(count, start), code.lanes)
+            self._draw(code.add(first, start), start, there)
+
+    def _draw(self, first: str, start: str, there: str) -> None:
+        """Draw the actions of as many environments at once as a vector has lanes.
+
+        Args:
+          first: the first environment.
+          start: its row.
+          there: the number of environments.
+        """
+        code, shape, places = self.code, self.shape, self.places
+        lanes, actions = code.lanes, shape.actions
+        deviations = code.at(self.params, shape.hidden + (shape.width + 1) * self.division.outputs)
+        with code.loop(lanes) as lane:
+            # Lanes beyond the last environment repeat it.
+            within = code.smaller(lane, code.sub(there, 1))
+            outputs = code.at(places["outputs"], code.mul(code.add(start, within), HEAD))
+            noise = code.mul(code.add(first, within), actions)
+            sources = [
+                (outputs, self.division.outputs),
+                (deviations if shape.deviations else outputs, actions),
+                (code.at(self.arrays["noise"], noise), actions),
+            ]
+            target = code.at(places["sample"], lane)
+            numbers = [(source, i) for source, count in sources for i in range(count)]
+            for place, (source, i) in enumerate(numbers):
+                code.copy(code.at(source, i), code.at(target, place * lanes))
+        code.call("draw", f"ptr {places['sample']}", f"ptr {places['drawn']}")
+        with code.loop(there) as lane:
+            place = 0
+            for name, size in zip(self.results, self.shape.drawn, strict=True):
+                row = code.mul(code.add(first, lane), size)
+                for i in range(size):
+                    source = code.at(places["drawn"], place * lanes, lane)
+                    code.copy(source, code.at(self.arrays[name], row, i))
+                    place += 1
