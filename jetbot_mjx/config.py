@@ -512,6 +512,11 @@ class PPOConfig(_Section):
         """Return the number of training steps that reach `num_timesteps`."""
         return -(-self.num_timesteps // self.steps_per_training_step)
 
+    @property
+    def gradient_steps(self) -> int:
+        """Return the number of minibatches of all training steps."""
+        return self.training_steps * self.num_minibatches * self.num_updates_per_batch
+
     @model_validator(mode="after")
     def _whole_batches(self) -> Self:
         unrolls = self.batch_size * self.num_minibatches

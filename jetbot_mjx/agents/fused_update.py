@@ -10,7 +10,7 @@ On GPUs, products round their operands to float16; everything else is float32.
 """
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -20,7 +20,8 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.compiler.update import launch
+from jetbot_mjx.compiler.update import adam, launch
+from jetbot_mjx.compiler.update.adam import AdamRule, AdamTerms, Progress
 from jetbot_mjx.compiler.update.shapes import (
     POLICY_METRICS,
     VALUE_METRICS,
@@ -131,15 +132,12 @@ class FusedUpdate:
         self.batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
         """A minibatch on one device."""
         self._environments = config.num_envs // device_count
+        self._rule = AdamRule(shape, self.batch.samples, config.learning_rate_schedule)
         self._places = _places(shape)
-        mask = np.zeros(shape.size, bool)
-        for place in self._places:
-            mask[place.start : place.stop] = True
-        self._is_parameter = mask
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        launch.prepare(self._shape, self.batch, self._environments, policies)
+        launch.prepare(self._rule, self.batch, self._environments, policies)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`, on host or device."""
@@ -234,6 +232,50 @@ class FusedUpdate:
         """Draw the noise of all actions of an unroll."""
         return jax.random.normal(key, (self.batch.time, self._environments, self._shape.actions))
 
+    def update(
+        self,
+        params: Float[Array, " size"],
+        optimizer_state: PyTree,
+        normalizer: Any,
+        data: Transition,
+        key: UInt32[Array, "2"],
+    ) -> tuple[Float[Array, " size"], PyTree, dict[str, Array]]:
+        """Update the networks in several passes over the collected data, in minibatches.
+
+        Args:
+          params: the parameters, from `pack`.
+          optimizer_state: the state of the optimizer, from `pack`.
+          normalizer: the statistics of the observations.
+          data: the unrolls, of shape (unrolls, time, ...).
+          key: the random key of the shuffles and of the samples that estimate the entropy.
+
+        Returns:
+          The new parameters and state; and by Brax's names the sums of the metrics over the
+          minibatches whose gradient was finite, with their number as `applied`.
+        """
+        config, unrolls = self._config, data.reward.shape[0]
+        passes, count = config.num_updates_per_batch, config.num_minibatches
+        collected = self.collected(data, normalizer)
+        terms = self._adam_terms(optimizer_state)
+
+        def step(state: tuple[Array, ...], batch: tuple[Array, Array]) -> tuple[Any, None]:
+            params, mu, nu, progress = state
+            gradient = self.gradient(params, collected, *batch)
+            return launch.adam(self._rule, params, mu, nu, gradient, progress, terms), None
+
+        def one_pass(state: Any, drawn: tuple[Array, Array]) -> tuple[Any, None]:
+            order, keys = drawn
+            batches = order.reshape(count, -1), self.noise(keys, *data.reward.shape)
+            return jax.lax.scan(step, state, batches)
+
+        # All keys at once, unlike Brax's.
+        first, second = jax.random.split(key)
+        shuffle_keys = jax.random.split(first, passes)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
+        drawn = orders, jax.random.split(second, (passes, count))
+        state, _ = jax.lax.scan(one_pass, self._begin(params, optimizer_state), drawn)
+        return self._end(state, optimizer_state)
+
     def noise(
         self, keys: UInt32[Array, "minibatches 2"], unrolls: int, time: int
     ) -> Float[Array, "minibatches time unrolls actions"]:
@@ -248,14 +290,14 @@ class FusedUpdate:
         shape = time, unrolls // len(keys), self._shape.actions
         return jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
 
-    def loss_and_gradient(
+    def gradient(
         self,
         params: Float[Array, " size"],
         collected: Collected,
         unrolls: Int[Array, " unrolls"],
         noise: Float[Array, "time unrolls actions"],
-    ) -> tuple[tuple[Array, dict[str, Array]], Float[Array, " size"]]:
-        """Compute Brax's PPO loss and its gradient.
+    ) -> Float[Array, " size"]:
+        """Compute the gradient of Brax's PPO loss, the mean of all devices.
 
         Args:
           params: the parameters, from `pack`.
@@ -264,37 +306,90 @@ class FusedUpdate:
           noise: the noise of the minibatch, from `noise`.
 
         Returns:
-          The loss with its metrics under Brax's names, and the gradient as a vector.
+          The gradient as a vector, with the sums of the metrics at their places.
         """
-        shape, time = self._shape, collected.rows.shape[1]
         rows, last, mean, scale = collected
         terms = [getattr(self._config, name) for name in LossTerms._fields]
-        terms = jnp.stack([jnp.asarray(term, jnp.float32) for term in terms])
-        result = launch.gradient(shape, params, mean, scale, rows, last, unrolls, noise, terms)
-        gradient = jnp.where(self._is_parameter, result, 0.0)
-        if self._axis is not None:
-            gradient = jax.lax.pmean(gradient, self._axis)
-        return self._metrics(result, unrolls.shape[0] * time), gradient
+        arrays = params, mean, scale, rows, last, unrolls, noise, _array(terms)
+        gradient = launch.gradient(self._shape, *arrays)
+        return gradient if self._axis is None else jax.lax.pmean(gradient, self._axis)
 
-    def _metrics(self, result: Array, samples: int) -> tuple[Array, dict[str, Array]]:
-        """Return the loss and the metrics from their sums."""
-        config, shape = self._config, self._shape
-        sums = {}
-        for names, end in ((POLICY_METRICS, shape.policy_size), (VALUE_METRICS, shape.size)):
-            sums |= {name: result[end - len(names) + i] for i, name in enumerate(names)}
-        mean = {name: total / samples for name, total in sums.items()}
+    def metrics(self, sums: Float[Array, " metrics"]) -> dict[str, Array]:
+        """Return the sums of some minibatches' metrics under Brax's names.
+
+        Args:
+          sums: the sums of `adam.METRICS` over all of their samples.
+        """
+        config = self._config
+        mean = dict(zip(adam.METRICS, sums / self._rule.samples, strict=True))
         losses = {
             "policy_loss": mean["policy_loss"],
             "v_loss": mean["value_loss"] * (0.5 * config.vf_loss_coefficient),
             "entropy_loss": mean["entropy"] * -config.entropy_cost,
         }
-        loss = sum(losses.values(), jnp.zeros(()))
-        return loss, {
+        return {
             **losses,
-            "total_loss": loss,
+            "total_loss": sum(losses.values(), jnp.zeros(())),
             "kl_mean": mean["kl"],
-            "policy_dist_mean_std": mean["std"] / shape.actions,
+            "policy_dist_mean_std": mean["std"] / self._shape.actions,
         }
+
+    # The state of the optimizer as vectors and an array of `adam.Progress`.
+
+    def _adam_terms(self, optimizer_state: PyTree) -> Float[Array, " terms"]:
+        config, (adam_state, *_) = self._config, optimizer_state[-1].inner_state
+        share = 1.0 / config.gradient_steps
+        return _array(
+            AdamTerms(
+                max_grad_norm=jnp.inf if config.max_grad_norm is None else config.max_grad_norm,
+                learning_rate=config.learning_rate,
+                begun=adam_state.count * share,
+                share=share,
+                desired_kl=config.desired_kl,
+                min_rate=config.learning_rate_schedule_min_lr,
+                max_rate=config.learning_rate_schedule_max_lr,
+            )
+        )
+
+    def _begin(self, params: Array, optimizer_state: PyTree) -> tuple[Array, Array, Array, Array]:
+        """Return the parameters, Adam's means, and the progress before the first minibatch."""
+        adam_state, *_ = optimizer_state[-1].inner_state
+        progress = Progress(
+            rate=optimizer_state[-1].hyperparams["learning_rate"],
+            power_1=adam.BETA_1**adam_state.count,
+            power_2=adam.BETA_2**adam_state.count,
+            sums=[0.0] * len(adam.METRICS),
+            rates=0.0,
+            applied=0.0,
+        )
+        return params, adam_state.mu, adam_state.nu, _array(jax.tree.leaves(progress))
+
+    def _end(
+        self, state: tuple[Array, ...], optimizer_state: PyTree
+    ) -> tuple[Array, PyTree, dict[str, Array]]:
+        """Return the parameters, the state of the optimizer, and the sums of the metrics."""
+        params, mu, nu, (rate, _, _, *sums, rates, applied) = state
+        *before, injected = optimizer_state
+        adam_state, *rest = injected.inner_state
+
+        def later(count: Array) -> Array:
+            return count + applied.astype(count.dtype)
+
+        after = injected._replace(
+            count=later(injected.count),
+            hyperparams={"learning_rate": rate},
+            hyperparams_states=jax.tree.map(later, injected.hyperparams_states),
+            inner_state=(
+                adam_state._replace(count=later(adam_state.count), mu=mu, nu=nu),
+                *rest,
+            ),
+        )
+        metrics = {**self.metrics(jnp.stack(sums)), "learning_rate": rates, "applied": applied}
+        return params, (*before, after), metrics
+
+
+def _array(numbers: Iterable[Any]) -> Float[Array, " numbers"]:
+    return jnp.stack([jnp.asarray(x, jnp.float32) for x in numbers])
 
 
 def _places(shape: UpdateShape) -> list[_Place]:

@@ -46,7 +46,7 @@ google/brax v0.14.2, brax/training/agents/ppo.
 """
 
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 import jax
@@ -501,19 +501,24 @@ class PPO:
             "state_extras": {"truncation": data.extras["state_extras"]["truncation"]},
         }
         data = data._replace(extras=extras)
-        fused = self._fused
-        collected = fused.collected(data, normalizer) if fused else None
+        if self._fused:
+            update = self._fused.update
+            params, optimizer_state, means = update(params, optimizer_state, normalizer, data, key)
+            totals = jnp.stack([*(means[name] for name in LOSSES), means["applied"]])
+        else:
+            update = self._update_by_xla
+            params, optimizer_state, totals = update(params, optimizer_state, normalizer, data, key)
+        return params, optimizer_state, self._mean_metrics(totals)
 
-        def loss_and_gradient(params: PyTree, batch: Any, drawn: Array) -> Any:
-            if fused and collected:
-                return fused.loss_and_gradient(params, collected, batch, drawn)
-            return self._loss_and_gradient(params, normalizer, batch, drawn)
+    def _update_by_xla(
+        self, params: PyTree, optimizer_state: PyTree, normalizer: Any, data: Transition, key: Array
+    ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
+        """Update the networks; return the sums of the metrics and the number of updates, too."""
 
         def step(carry: Condensed, batch: Any) -> tuple[Condensed, None]:
             params, optimizer_state, totals = carry.restore()
-            minibatch, drawn = batch
             params, optimizer_state, metrics = self._minibatch_step(
-                params, optimizer_state, minibatch, drawn, loss_and_gradient
+                params, optimizer_state, normalizer, *batch
             )
             # A metric of an update that was not applied may be NaN.
             totals += jnp.where(metrics[-1] > 0, metrics, 0.0)
@@ -523,21 +528,17 @@ class PPO:
             order, loss_keys = drawn
 
             def minibatches(x: Array) -> Array:
-                return x.reshape((self.config.num_minibatches, -1, *x.shape[1:]))
+                return x[order].reshape((self.config.num_minibatches, -1, *x.shape[1:]))
 
-            # The kernels read the unrolls where they are, and their noise from one array.
-            shuffled = order if fused else jax.tree.map(lambda x: x[order], data)
-            noise = fused.noise(loss_keys, *data.reward.shape) if fused else loss_keys
-            return jax.lax.scan(step, carry, (jax.tree.map(minibatches, shuffled), noise))
+            return jax.lax.scan(step, carry, (jax.tree.map(minibatches, data), loss_keys))
 
         # XLA computes each array that a loop carries by a kernel of its own.
         start = condense((params, optimizer_state, jnp.zeros(len(LOSSES) + 1)))
         end, _ = jax.lax.scan(one_pass, start, self._draw_passes(key, data.reward.shape[0]))
-        params, optimizer_state, totals = end.restore()
-        return params, optimizer_state, self._mean_metrics(totals)
+        return end.restore()
 
     def _draw_passes(self, key: Array, unrolls: int) -> tuple[Array, Array]:
-        """Draw the order of the unrolls in each pass, and the keys of its minibatches."""
+        """Draw the order of the unrolls in each pass, and the keys of its minibatches, as Brax."""
         passes, count = self.config.num_updates_per_batch, self.config.num_minibatches
 
         def draw_loss_keys(key: Array) -> Array:
@@ -547,17 +548,10 @@ class PPO:
             key, shuffle_key, minibatch_key = jax.random.split(key, 3)
             return key, (shuffle_key, minibatch_key)
 
-        if self._fused:
-            first, second = jax.random.split(key)
-            shuffle_keys = jax.random.split(first, passes)
-            loss_keys = jax.random.split(second, (passes, count))
-        else:
-            # As in Brax, each key follows from the one before.
-            _, (shuffle_keys, minibatch_keys) = jax.lax.scan(draw, key, length=passes)
-            loss_keys = jax.vmap(draw_loss_keys)(minibatch_keys)
+        _, (shuffle_keys, minibatch_keys) = jax.lax.scan(draw, key, length=passes)
         # Shuffle for all passes at once: a GPU takes about as long for one.
         orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
-        return orders, loss_keys
+        return orders, jax.vmap(draw_loss_keys)(minibatch_keys)
 
     def _mean_metrics(self, totals: Float[Array, " metrics"]) -> Float[Array, " metrics"]:
         """Average the metrics over the applied updates of all devices, and count the others.
@@ -575,9 +569,9 @@ class PPO:
         self,
         params: PyTree,
         optimizer_state: PyTree,
+        normalizer: Any,
         batch: Any,
-        drawn: Array,
-        loss_and_gradient: Callable[..., Any],
+        key: Array,
     ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
         """Apply one gradient step, or skip it if the gradient is not finite.
 
@@ -585,7 +579,7 @@ class PPO:
           The new parameters and state of the optimizer; the metrics of `LOSSES`, and whether the
           step was applied.
         """
-        (_, metrics), gradient = loss_and_gradient(params, batch, drawn)
+        (_, metrics), gradient = self._loss_and_gradient(params, normalizer, batch, key)
         finite = jnp.isfinite(optax.tree.norm(gradient))
         # Adapt the step size to the KL divergence, and compute the update.
         before = params, optimizer_state
@@ -669,8 +663,7 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     """
     rate: Any = config.learning_rate
     if config.learning_rate_schedule == "LINEAR":
-        updates = config.training_steps * config.num_minibatches * config.num_updates_per_batch
-        rate = optax.linear_schedule(config.learning_rate, 0.0, updates)
+        rate = optax.linear_schedule(config.learning_rate, 0.0, config.gradient_steps)
     fixed = ("b1", "b2", "eps", "eps_root")
     adam = optax.inject_hyperparams(optax.adam, static_args=fixed)(learning_rate=rate)
     if config.max_grad_norm is None:

@@ -1,6 +1,7 @@
 """The fused update: what networks it takes, its vectors, and on a GPU its gradient and launches."""
 
 import dataclasses
+import functools
 import re
 import sys
 
@@ -15,9 +16,9 @@ from gpu_model import Gpu
 
 from jetbot_mjx.agents import fused_update, update_probe
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.agents.ppo import PPO
+from jetbot_mjx.agents.ppo import LOSSES, PPO
 from jetbot_mjx.compiler import llvm_backend, ptx_backend
-from jetbot_mjx.compiler.update import actions, advantages, gradient, launch, launch_gpu
+from jetbot_mjx.compiler.update import actions, adam, advantages, gradient, launch, launch_gpu
 from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.errors import UserError
@@ -206,7 +207,7 @@ def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
     def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
         drawn = noise(fused, jax.random.PRNGKey(0), settings)
-        return fused.loss_and_gradient(fused.pack(params), collected, order, drawn)[1]
+        return fused.gradient(fused.pack(params), collected, order, drawn)
 
     made = jax.tree.map(lambda x: jnp.stack([x] * policies), one)
     traced = jax.jit(jax.vmap(one_gradient)).trace(*made)
@@ -402,13 +403,84 @@ def assert_gradient_is_xlas(settings):
         shuffled = fused.collected(jax.tree.map(lambda x: x[order], batch), statistics)
         places = jnp.argsort(order).astype(jnp.int32)
         drawn = noise(fused, key, settings)
-        return fused.loss_and_gradient(fused.pack(params), shuffled, places, drawn)
+        return fused.gradient(fused.pack(params), shuffled, places, drawn)
 
-    (_, found), vector = ours(params)
+    vector = ours(params)
+    places = jnp.asarray(fused._rule.places)
+    found, vector = fused.metrics(vector[places]), vector.at[places].set(0.0)
     error = jnp.linalg.norm(vector - fused.pack(expected)) / jnp.linalg.norm(vector)
     assert error < 0.01
     for name, value in found.items():
         np.testing.assert_allclose(value, metrics[name], rtol=0.01, atol=1e-3, err_msg=name)
+
+
+SCHEDULES = {
+    "NONE": {"max_grad_norm": None},
+    "LINEAR": {"max_grad_norm": 0.5, "num_timesteps": 256 * 3},
+    "ADAPTIVE_KL": {"max_grad_norm": 2.0, "desired_kl": 0.02},
+}
+
+
+@pytest.mark.parametrize("compute", [launch.adam, adam.step], ids=["kernel", "xla"])
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+@pytest.mark.parametrize("schedule", SCHEDULES)
+def test_adam_is_that_of_optax(schedule, distribution, compute):
+    """Six minibatches after two of another training step, of which one has no finite gradient."""
+    settings = config(
+        learning_rate_schedule=schedule,
+        network={"distribution_type": distribution},
+        **SCHEDULES[schedule],
+    )
+    ppo, rng = make_ppo(settings), np.random.default_rng(0)
+    fused = ppo._fused
+    params, statistics, _ = minibatch(rng, settings, ppo.networks)
+    state = params, ppo._optimizer.init(params)
+    ours, totals = fused.pack(state), jnp.zeros(8)
+    adam_step = jax.jit(compute, static_argnums=0)
+    sizes = np.asarray(fused._rule.places)
+    for call, count in enumerate((2, 6)):
+        totals, vectors = jnp.zeros_like(totals), fused._begin(*ours)
+        terms = fused._adam_terms(ours[1])
+        for i in range(count):
+            sums = jnp.asarray(rng.normal(size=5) * 64, jnp.float32)
+            # The divergence lowers the step size, raises it, or leaves it.
+            sums = sums.at[2].set([4.0, 0.1, 1.2, -1.0][i % 4])
+            gradient = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape) * 0.1), params)
+            if (call, i) == (1, 2):
+                gradient = jax.tree.map(lambda x: x.at[(0,) * x.ndim].set(jnp.nan), gradient)
+                sums = sums * jnp.nan
+            gradient = jax.tree.map(lambda x: x.astype(jnp.float32), gradient)
+            given = (jnp.zeros(()), fused.metrics(sums)), gradient
+            ppo._loss_and_gradient = lambda *_, given=given: given
+            *state, row = ppo._minibatch_step(*state, statistics, None, jnp.zeros(2))
+            totals += jnp.where(row[-1] > 0, row, 0.0)
+            vector = fused.pack(gradient).at[sizes].set(sums)
+            vectors = adam_step(fused._rule, *vectors[:3], vector, vectors[3], terms)
+        *ours, means = fused._end(vectors, ours[1])
+    found = fused.unpack(tuple(ours))
+    assert jax.tree.structure(found) == jax.tree.structure(tuple(state))
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(state), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
+    named = [*(means[name] for name in LOSSES), means["applied"]]
+    np.testing.assert_allclose(named, totals, rtol=1e-5)
+    assert float(means["applied"]) == 5
+    assert int(found[1][-1].count) == 7
+
+
+def test_adam_serves_several_policies_at_once():
+    fused, rng = make_ppo(config())._fused, np.random.default_rng(0)
+    size = fused._shape.size
+    vectors = [np.abs(rng.normal(size=(3, size))).astype(np.float32) for _ in range(4)]
+    progress = np.tile(np.asarray([1e-3, 0.9, 0.999, *[0.0] * 7], np.float32), (3, 1))
+    terms = np.asarray([[limit, 1e-3, 0, 0, 0, 0, 0] for limit in (1, 9, np.inf)], np.float32)
+    vectors[3][1] = np.inf
+    run = functools.partial(launch.adam, fused._rule)
+    together = jax.jit(jax.vmap(run))(*vectors, progress, terms)
+    for i in range(3):
+        alone = jax.jit(run)(*(x[i] for x in (*vectors, progress, terms)))
+        for one, other in zip(alone, together, strict=True):
+            np.testing.assert_array_equal(one, other[i])
+        assert float(alone[3][-1]) == (i != 1)
 
 
 @on_a_gpu
@@ -422,7 +494,7 @@ def test_several_policies_take_the_same_launches():
     def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
         drawn = noise(fused, key, settings)
-        return fused.loss_and_gradient(fused.pack(params), collected, order, drawn)[1]
+        return fused.gradient(fused.pack(params), collected, order, drawn)
 
     together = jax.jit(jax.vmap(one_gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
     for one, ours in zip(made, together, strict=True):

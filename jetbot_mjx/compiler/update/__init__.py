@@ -1,7 +1,8 @@
 """Write and launch the kernels of PPO, as docs/update.md explains them.
 
 - `shapes`: the networks and the minibatch, and their division into tiles
-- `launch`: the kernels as one JAX function, for every platform
+- `adam`: a step of Adam along the gradient
+- `launch`: the kernels as JAX functions, for every platform
 
 On GPUs:
 
@@ -20,5 +21,6 @@ On CPUs:
 - `cpu_network`: what all kernels share: loading a network, and its forward pass
 - `cpu_actions`: the kernel that draws the actions of all environments
 - `cpu_gradient`: the kernels of the gradient, one for each network
+- `cpu_adam`: the kernel of Adam
 - `launch_cpu`: their launch
 """

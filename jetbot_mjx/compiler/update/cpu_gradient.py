@@ -346,7 +346,7 @@ class _PolicyKernel(_GradientKernel):
         def add(place: str, kind: str) -> None:
             value = code.load(code.at(self.arrays["advantages"], place), kind)
             if centre is not None:
-                centres = centre if kind == "float" else self._splat(centre)
+                centres = centre if kind == "float" else code.splat(centre)
                 value = code.arithmetic("fsub", value, centres, kind)
                 value = code.arithmetic("fmul", value, value, kind)
             self.accumulate(total, value, kind)
@@ -359,12 +359,6 @@ class _PolicyKernel(_GradientKernel):
         with code.loop(lanes - 1) as i:
             self.accumulate(total, code.load(code.at(total, code.add(i, 1))))
         return code.arithmetic("fmul", code.load(total), number(1 / samples))
-
-    def _splat(self, value: str) -> str:
-        code = self.code
-        first = code.let(f"insertelement {code.vector} poison, float {value}, i64 0")
-        mask = f"<{code.lanes} x i32> zeroinitializer"
-        return code.let(f"shufflevector {code.vector} {first}, {code.vector} poison, {mask}")
 
     def add_losses(self, first: str, count: str) -> None:
         """Compute the losses of as many samples at once as a vector has lanes."""

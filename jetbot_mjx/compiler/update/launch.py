@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import launch_cpu, launch_gpu
+from jetbot_mjx.compiler.update.adam import AdamRule
 from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
 
 _LAUNCHERS: dict[str, Any] = {"gpu": launch_gpu, "cpu": launch_cpu}
@@ -38,16 +39,16 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return launcher.refusal(shape, batch)
 
 
-def prepare(shape: UpdateShape, batch: Minibatch, environments: int, policies: int) -> None:
+def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
     """Begin to compile the kernels, before a program is traced that launches them.
 
     Args:
-      shape: the networks.
+      rule: the networks, and how the step size changes.
       batch: the minibatch.
       environments: the number of environments of a policy.
       policies: the number of policies that are trained at once.
     """
-    _LAUNCHERS[jax.default_backend()].prepare(shape, batch, environments, policies)
+    _LAUNCHERS[jax.default_backend()].prepare(rule, batch, environments, policies)
 
 
 class Actions(NamedTuple):
@@ -80,7 +81,7 @@ def actions(
       observations: the observations.
       noise: standard normal noise, from which the actions follow.
     """
-    return Actions(*_actions_p.bind(params, mean, scale, observations, noise, shape=shape))
+    return Actions(*_actions_p.bind(params, mean, scale, observations, noise, spec=shape))
 
 
 def gradient(
@@ -111,7 +112,21 @@ def gradient(
       The gradient, with the sums of the metrics at their places.
     """
     arguments = (params, mean, scale, rows, last, unrolls, noise, terms)
-    return _gradient_p.bind(*arguments, shape=shape)[0]
+    return _gradient_p.bind(*arguments, spec=shape)[0]
+
+
+def adam(
+    rule: AdamRule,
+    params: Float[Array, " size"],
+    mu: Float[Array, " size"],
+    nu: Float[Array, " size"],
+    gradient: Float[Array, " size"],
+    progress: Float[Array, " progress"],
+    terms: Float[Array, " terms"],
+) -> tuple[Array, Array, Array, Array]:
+    """Make a step of Adam, as `jetbot_mjx.compiler.update.adam.step`."""
+    made = _adam_p.bind(params, mu, nu, gradient, progress, terms, spec=rule)
+    return made[0], made[1], made[2], made[3]
 
 
 def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primitive:
@@ -119,42 +134,43 @@ def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primit
 
     Args:
       name: its name.
-      sizes: a function from the networks and the arguments' shapes to the results' shapes.
+      sizes: a function from what the launcher is told, and the shapes of the arguments, to those of
+        the results.
     """
     primitive = Primitive(f"ppo_{name}")
     primitive.multiple_results = True
-    compiled = jax.jit(primitive.bind, static_argnames="shape")
+    compiled = jax.jit(primitive.bind, static_argnames="spec")
 
     @primitive.def_abstract_eval
-    def abstract(*arguments: Any, shape: UpdateShape) -> list[ShapedArray]:
+    def abstract(*arguments: Any, spec: Any) -> list[ShapedArray]:
         # All arguments have the policies, if any, as their first axes.
         batch = arguments[0].shape[:-1]
         inner = [x.shape[len(batch) :] for x in arguments]
-        return [ShapedArray((*batch, *size), np.float32) for size in sizes(shape, *inner)]
+        return [ShapedArray((*batch, *size), np.float32) for size in sizes(spec, *inner)]
 
     @primitive.def_impl
-    def run(*arguments: Array, shape: UpdateShape) -> list[Array]:
+    def run(*arguments: Array, spec: Any) -> list[Array]:
         # Enable jit here: within `jax.disable_jit` this function would call itself.
         with jax.disable_jit(False):
-            return compiled(*arguments, shape=shape)
+            return compiled(*arguments, spec=spec)
 
     def batched(
-        arguments: Sequence[Array], axes: Sequence[int | None], *, shape: UpdateShape
+        arguments: Sequence[Array], axes: Sequence[int | None], *, spec: Any
     ) -> tuple[list[Array], list[int]]:
         (size,) = {x.shape[i] for x, i in zip(arguments, axes, strict=True) if i is not None}
         moved = [
             jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             for x, axis in zip(arguments, axes, strict=True)
         ]
-        results = primitive.bind(*moved, shape=shape)
+        results = primitive.bind(*moved, spec=spec)
         return results, [0] * len(results)
 
     def lowered_by(launch: Callable[..., list[Array]]) -> Callable[..., list[Array]]:
-        def lowered(*arguments: Array, shape: UpdateShape) -> list[Array]:
+        def lowered(*arguments: Array, spec: Any) -> list[Array]:
             batch = arguments[0].shape[:-1]
             policies, depth = math.prod(batch), len(batch)
             flat = [x.reshape(policies, *x.shape[depth:]) for x in arguments]
-            return [x.reshape(*batch, *x.shape[1:]) for x in launch(shape, flat)]
+            return [x.reshape(*batch, *x.shape[1:]) for x in launch(spec, flat)]
 
         return lowered
 
@@ -167,3 +183,4 @@ def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primit
 
 _gradient_p = _primitive("gradient", lambda shape, *_: [(shape.size,)])
 _actions_p = _primitive("actions", lambda shape, *sizes: shape.drawn_shapes(sizes[3][0]))
+_adam_p = _primitive("adam", lambda rule, *sizes: [*sizes[:3], sizes[4]])

@@ -16,7 +16,9 @@ from jaxtyping import Array
 from jetbot_mjx.compiler import llvm_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
+from jetbot_mjx.compiler.update.adam import AdamRule
 from jetbot_mjx.compiler.update.cpu_actions import ActionDivision, ActionKernel
+from jetbot_mjx.compiler.update.cpu_adam import adam_text
 from jetbot_mjx.compiler.update.cpu_gradient import GradientDivision, gradient_kernel
 from jetbot_mjx.compiler.update.cpu_network import HEAD, Division, Kernel
 from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
@@ -64,11 +66,18 @@ def _text(kernel: Callable[[Any], Kernel], division: Division) -> str:
     )
 
 
-def prepare(shape: UpdateShape, batch: Minibatch, environments: int, policies: int) -> None:
+@functools.cache
+def _adam_text(rule: AdamRule) -> str:
+    host = llvm_backend.host_processor()
+    return adam_text(rule, host.lanes, name=llvm_backend.NAME, machine=host.machine)
+
+
+def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
     """Begin to compile all kernels, which serve any number of policies, as `launch.prepare`."""
-    lanes = llvm_backend.host_processor().lanes
+    shape, lanes = rule.shape, llvm_backend.host_processor().lanes
     texts = [functools.partial(_text, ActionKernel, ActionDivision(shape, environments, lanes))]
     texts += [functools.partial(_text, gradient_kernel, x) for x in _divisions(shape, batch)]
+    texts.append(functools.partial(_adam_text, rule))
     for text in texts:
         in_background(lambda text=text: llvm_backend.registered(text()))
 
@@ -121,3 +130,18 @@ def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Arra
     of_values, advantages = run(values, [last], batch.samples)
     (of_policy,) = run(policy, [noise, advantages])
     return [jnp.concatenate([of_policy, of_values], axis=1)]
+
+
+def launch_adam(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
+    """Make a step of Adam, while JAX lowers a program for CPUs.
+
+    Args:
+      rule: what the vectors hold.
+      arguments: those of `launch.adam`, with the policies as their first axis.
+
+    Returns:
+      Its results.
+    """
+    params, mu, nu, _, progress, _ = arguments
+    like = [jax.ShapeDtypeStruct(x.shape, np.float32) for x in (params, mu, nu, progress)]
+    return llvm_backend.launch_text(_adam_text(rule), arguments, like)

@@ -17,8 +17,9 @@ from jaxtyping import Array, Float
 from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
-from jetbot_mjx.compiler.update import actions, advantages, shapes
+from jetbot_mjx.compiler.update import actions, adam, advantages, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
+from jetbot_mjx.compiler.update.adam import AdamRule
 from jetbot_mjx.compiler.update.shapes import (
     MOST_OBSERVATIONS,
     MOST_OUTPUTS,
@@ -156,10 +157,10 @@ def _gradient_kernels(
     return first, _kernel(gradient_kernel.NAME, write, tiling, (blocks, 2, policies))
 
 
-def prepare(shape: UpdateShape, batch: Minibatch, environments: int, policies: int) -> None:
+def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
     """Divide the work among the blocks, and begin to compile all kernels, as `launch.prepare`."""
-    _action_kernel(shape, environments, policies)
-    _gradient_kernels(shape, batch, policies)
+    _action_kernel(rule.shape, environments, policies)
+    _gradient_kernels(rule.shape, batch, policies)
 
 
 def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
@@ -202,6 +203,19 @@ def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Arra
         (policies, blocks, shape.size),
     )
     return [vectors.sum(1)]
+
+
+def launch_adam(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
+    """Make a step of Adam by XLA, while JAX lowers a program for an NVIDIA GPU.
+
+    Args:
+      rule: what the vectors hold.
+      arguments: those of `launch.adam`, with the policies as their first axis.
+
+    Returns:
+      Its results.
+    """
+    return list(jax.vmap(functools.partial(adam.step, rule))(*arguments))
 
 
 def _shared_memory() -> int:

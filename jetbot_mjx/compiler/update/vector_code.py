@@ -133,6 +133,13 @@ class VectorCode:
         """Return the result of an operation of floats or vectors, for example `fadd`."""
         return self.let(f"{op} contract {kind} {one}, {other}")
 
+    def splat(self, value: str) -> str:
+        """Return a vector of one number."""
+        if self.lanes == 1:
+            return value
+        first = self.let(f"insertelement {self.vector} poison, float {value}, i64 0")
+        return self._shuffle(first, "poison", [0] * self.lanes)
+
     def transposed(self, rows: Sequence[str]) -> list[str]:
         """Return the columns of a square of vectors, whose number is a power of two."""
         size, result = len(rows), list(rows)

@@ -1,0 +1,218 @@
+"""Define a step of Adam along a gradient, with all that a training counts, as JAX functions.
+
+Equation, with the gradient g clipped to a global norm, as `optax.adam` has it:
+
+    m' = β₁ m + (1 - β₁) g,    v' = β₂ v + (1 - β₂) g²
+    p' = p - η (m' / (1 - β₁ⁿ)) / (√(v' / (1 - β₂ⁿ)) + 10⁻⁸)
+
+for the n-th step, of size η. A step whose gradient is not finite is left out. The powers of β are
+carried from step to step.
+
+`step` computes it by XLA, and `cpu_adam` lowers `factors` and `element` for a kernel.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jetbot_mjx.compiler.update.shapes import POLICY_METRICS, VALUE_METRICS, UpdateShape
+
+BETA_1, BETA_2 = 0.9, 0.999
+_EPSILON = 1e-8
+
+METRICS = (*POLICY_METRICS, *VALUE_METRICS)
+
+
+class AdamRule(NamedTuple):
+    """An `AdamRule` says what the vectors hold, and how the step size changes."""
+
+    shape: UpdateShape
+    samples: int
+    """Number of samples of a minibatch."""
+    schedule: str
+    """One of `ppo.learning_rate_schedule`."""
+
+    @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """Return the ranges of the vector that hold parameters; metrics are behind each."""
+        policy, size = self.shape.policy_size, self.shape.size
+        return [(0, policy - len(POLICY_METRICS)), (policy, size - len(VALUE_METRICS))]
+
+    @property
+    def places(self) -> list[int]:
+        """Return where the gradient's vector has the sums of `METRICS`."""
+        ends = [(self.shape.policy_size, POLICY_METRICS), (self.shape.size, VALUE_METRICS)]
+        return [end - len(names) + i for end, names in ends for i in range(len(names))]
+
+
+class AdamTerms(NamedTuple):
+    """An `AdamTerms` holds what does not change during a training step.
+
+    The kernels read them from an array, because they may differ between policies.
+    """
+
+    max_grad_norm: Any
+    learning_rate: Any
+    """Size of the first step of all, for the schedule `LINEAR`."""
+    begun: Any
+    """Part of all steps that were done before this training step."""
+    share: Any
+    """Part of all steps that one step is."""
+    desired_kl: Any
+    min_rate: Any
+    max_rate: Any
+
+
+class Progress(NamedTuple):
+    """A `Progress` holds what a step of Adam carries on beside the vectors."""
+
+    rate: Any
+    """Step size."""
+    power_1: Any
+    """Power of β₁ whose exponent is the number of steps."""
+    power_2: Any
+    sums: Any
+    """Sums of `METRICS` over the steps, whose samples they sum themselves."""
+    rates: Any
+    """Sum of the step sizes."""
+    applied: Any
+    """Number of steps of this training step."""
+
+
+class Factors(NamedTuple):
+    """A `Factors` holds what all elements of the vectors have in common."""
+
+    is_applied: Any
+    """1, or 0 if the gradient is not finite."""
+    clipping: Any
+    """What the gradient is multiplied by."""
+    rate: Any
+    inverse_1: Any
+    """1 / (1 - β₁ⁿ)."""
+    inverse_2: Any
+
+
+SIZES = {"terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
+"""Lengths of the arrays of `AdamTerms` and `Progress`."""
+
+
+def step(
+    rule: AdamRule,
+    params: Float[Array, " size"],
+    mu: Float[Array, " size"],
+    nu: Float[Array, " size"],
+    gradient: Float[Array, " size"],
+    progress: Float[Array, " progress"],
+    terms: Float[Array, " terms"],
+) -> tuple[Array, Array, Array, Array]:
+    """Make a step.
+
+    Args:
+      rule: what the vectors hold.
+      params: the parameters.
+      mu: mean of the gradients.
+      nu: mean of their squares.
+      gradient: the gradient, with the sums of the metrics at their places.
+      progress: an array of `Progress`.
+      terms: an array of `AdamTerms`.
+
+    Returns:
+      The next parameters, means and progress.
+    """
+    index = jnp.arange(len(params))
+    is_parameter = jnp.zeros(len(params), bool)
+    for start, stop in rule.ranges:
+        is_parameter |= (start <= index) & (index < stop)
+    gradient, metrics = jnp.where(is_parameter, gradient, 0.0), gradient[jnp.asarray(rule.places)]
+    square = jnp.sum(gradient * gradient)
+    common, progress = factors(square, metrics, progress, terms, rule)
+    after = element(params, mu, nu, gradient, *common)
+    return *after, progress
+
+
+def factors(
+    square: Float[Array, ""],
+    metrics: Float[Array, " metrics"],
+    progress: Float[Array, " progress"],
+    terms: Float[Array, " terms"],
+    rule: AdamRule,
+) -> tuple[Factors, Float[Array, " progress"]]:
+    """Return what all elements have in common, and the next progress.
+
+    Args:
+      square: the sum of the squares of the gradient.
+      metrics: the sums of the metrics of the minibatch.
+      progress: an array of `Progress`.
+      terms: an array of `AdamTerms`.
+      rule: what the vectors hold.
+    """
+    given = AdamTerms(*(terms[i] for i in range(SIZES["terms"])))
+    rate, power_1, power_2, *rest = (progress[i] for i in range(SIZES["progress"]))
+    old = Progress(rate, power_1, power_2, rest[: len(METRICS)], *rest[len(METRICS) :])
+    norm = jnp.sqrt(square)
+    is_applied = jnp.isfinite(norm)
+    clipping = jnp.where(norm < given.max_grad_norm, 1.0, given.max_grad_norm / norm)
+    if rule.schedule == "LINEAR":
+        done = given.begun + old.applied * given.share
+        rate = given.learning_rate * (1.0 - jnp.minimum(done, 1.0))
+    elif rule.schedule == "ADAPTIVE_KL":
+        divergence = metrics[METRICS.index("kl")] * (1.0 / rule.samples)
+        slower = jnp.maximum(given.min_rate, rate / 1.5)
+        rate = jnp.where(divergence > 2.0 * given.desired_kl, slower, rate)
+        faster = jnp.minimum(given.max_rate, rate * 1.5)
+        is_small = (divergence < 0.5 * given.desired_kl) & (divergence > 0.0)
+        rate = jnp.where(is_small, faster, rate)
+    power_1, power_2 = power_1 * BETA_1, power_2 * BETA_2
+    common = Factors(
+        jnp.where(is_applied, 1.0, 0.0),
+        clipping,
+        rate,
+        1.0 / (1.0 - power_1),
+        1.0 / (1.0 - power_2),
+    )
+    new = Progress(
+        rate,
+        power_1,
+        power_2,
+        [total + metrics[i] for i, total in enumerate(old.sums)],
+        old.rates + rate,
+        old.applied + 1.0,
+    )
+    # Metrics of a step that is left out may not be finite.
+    kept = [jnp.where(is_applied, *x) for x in zip(jax.tree.leaves(new), progress, strict=True)]
+    return common, jnp.stack(kept)
+
+
+def element(
+    param: Array,
+    mu: Array,
+    nu: Array,
+    gradient: Array,
+    is_applied: Array,
+    clipping: Array,
+    rate: Array,
+    inverse_1: Array,
+    inverse_2: Array,
+) -> tuple[Array, Array, Array]:
+    """Return the next parameter and means of one element, or of many.
+
+    Args:
+      param: the parameter.
+      mu: mean of its gradients.
+      nu: mean of their squares.
+      gradient: the gradient.
+      is_applied: the first of the `Factors`, which the others are, too.
+      clipping: what the gradient is multiplied by.
+      rate: the step size.
+      inverse_1: 1 / (1 - β₁ⁿ).
+      inverse_2: 1 / (1 - β₂ⁿ).
+    """
+    clipped = gradient * clipping
+    new_mu = BETA_1 * mu + (1.0 - BETA_1) * clipped
+    new_nu = BETA_2 * nu + (1.0 - BETA_2) * (clipped * clipped)
+    change = rate * (new_mu * inverse_1) / (jnp.sqrt(new_nu * inverse_2) + _EPSILON)
+    new, old = (param - change, new_mu, new_nu), (param, mu, nu)
+    first, second, third = (jnp.where(is_applied > 0.0, *x) for x in zip(new, old, strict=True))
+    return first, second, third
