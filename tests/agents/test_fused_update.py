@@ -216,6 +216,69 @@ def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
     assert re.findall(r"grid_z = (\d+)", text) == [str(policies)] * 2
 
 
+@pytest.mark.parametrize(
+    ("policies", "environments", "grid"),
+    [(1, 4096, (128, 1, 1)), (3, 40, (2, 1, 3)), (64, 4096, (2, 1, 64))],
+)
+def test_the_actions_of_several_policies_are_one_launch(monkeypatch, policies, environments, grid):
+    pytest.importorskip("llvmlite")
+    monkeypatch.setattr(ptx_backend, "compute_capability", lambda: 90)
+    monkeypatch.setattr(ptx_backend, "processor_count", lambda: 132)
+    shape = fused_update.shape_of(config(update="xla").ppo, OBSERVATIONS, ACTIONS)
+    sizes = (shape.size,), (OBSERVATIONS,), (OBSERVATIONS,)
+    sizes += (environments, OBSERVATIONS), (environments, ACTIONS)
+    arrays = [jax.ShapeDtypeStruct((policies, *size), np.float32) for size in sizes]
+    run = jax.jit(jax.vmap(functools.partial(launch.actions, shape)))
+    text = run.trace(*arrays).lower(lowering_platforms=("cuda",)).as_text()
+    assert text.count("custom_call @__gpu$xla.gpu.ptx") == 1
+    found = [re.findall(rf"grid_{axis} = (\d+)", text) for axis in "xyz"]
+    assert found == [[str(size)] for size in grid]
+
+
+@pytest.mark.parametrize("wrong", range(5))
+def test_actions_of_other_shapes_are_refused(wrong):
+    shape = fused_update.shape_of(config(update="xla").ppo, OBSERVATIONS, ACTIONS)
+    sizes = [(shape.size,), (OBSERVATIONS,), (OBSERVATIONS,), (7, OBSERVATIONS), (7, ACTIONS)]
+    arrays = [jnp.zeros(size) for size in sizes]
+    arrays[wrong] = arrays[wrong][..., :-1]
+    with pytest.raises(TypeError, match="actions: "):
+        launch.actions(shape, *arrays)
+    arrays[wrong] = jnp.zeros(sizes[wrong], jnp.float16)
+    with pytest.raises(TypeError, match=r"actions: .*32 bits"):
+        launch.actions(shape, *arrays)
+
+
+@pytest.mark.parametrize("normalizes", [True, False])
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+def test_what_a_collection_keeps_is_as_brax_has_it(distribution, normalizes):
+    settings = config(
+        network={"distribution_type": distribution}, normalize_observations=normalizes
+    )
+    ppo, rng = make_ppo(settings), np.random.default_rng(0)
+    params, statistics, _ = minibatch(rng, settings, ppo.networks)
+    observations = jnp.asarray(rng.normal(size=(64, OBSERVATIONS)), jnp.float32)
+    noise = ppo._fused.action_noise(jax.random.PRNGKey(3))
+    assert noise.shape == (4, 64, ACTIONS)
+    np.testing.assert_allclose(noise.mean((0, 1)), 0, atol=0.2)
+    np.testing.assert_allclose(noise.std((0, 1)), 1, atol=0.15)
+    assert float(jnp.abs(noise).max()) > 2.5
+    assert len(np.unique(noise)) == noise.size
+    action, kept = ppo._fused.policy(ppo._fused.pack(params), statistics)(observations, noise[0])
+    with jax.default_matmul_precision("highest"):
+        expected = ppo.networks.policy_network.apply(statistics, params.policy, observations)
+    rounding = 2e-2 if jax.default_backend() == "gpu" else 1e-5
+    for one, other in zip(
+        jax.tree.leaves(kept["distribution_params"]), jax.tree.leaves(expected), strict=True
+    ):
+        np.testing.assert_allclose(one, other, atol=rounding)
+    brax = ppo.networks.parametric_action_distribution
+    made = brax.create_dist(kept["distribution_params"])
+    np.testing.assert_allclose(kept["raw_action"], made.loc + made.scale * noise[0], atol=1e-5)
+    np.testing.assert_allclose(action, brax.postprocess(kept["raw_action"]), atol=1e-5)
+    log_prob = brax.log_prob(kept["distribution_params"], kept["raw_action"])
+    np.testing.assert_allclose(kept["log_prob"], log_prob, atol=2e-5)
+
+
 def modelled(shape, *arrays):
     """`launch.gradient` on the model of a GPU, for one policy."""
 
@@ -262,13 +325,14 @@ def test_the_probe_agrees_with_the_model(monkeypatch):
 
 
 @pytest.mark.cpu
-@pytest.mark.parametrize("name", ["action", "raw_action", "log_prob"])
-def test_the_probe_sees_wrong_actions(monkeypatch, name):
+@pytest.mark.parametrize("error", [0.05, np.nan])
+@pytest.mark.parametrize("name", launch.Actions._fields)
+def test_the_probe_sees_wrong_actions(monkeypatch, name, error):
     right = launch.actions
 
     def wrong(*arrays):
         drawn = right(*arrays)
-        return drawn._replace(**{name: getattr(drawn, name) + 0.05})
+        return drawn._replace(**{name: getattr(drawn, name) + error})
 
     assert update_probe.runs_correctly.__wrapped__()
     monkeypatch.setattr(launch, "actions", wrong)
@@ -414,6 +478,35 @@ def assert_gradient_is_xlas(settings):
         np.testing.assert_allclose(value, metrics[name], rtol=0.01, atol=1e-3, err_msg=name)
 
 
+@on_a_gpu
+@pytest.mark.parametrize("activation", ["tanh", "relu", "elu", "swish"])
+@pytest.mark.parametrize("environments", [1, 1000, 4096, 40_000])
+def test_the_actions_are_xlas(activation, environments):
+    settings = config(hidden=[128] * 3, network={"activation": activation}, update="xla")
+    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
+    networks, rng = make_ppo(settings).networks, np.random.default_rng(0)
+    made = [minibatch(rng, settings, networks)[:2] for _ in range(3)]
+    observations = jnp.asarray(rng.normal(size=(3, environments, OBSERVATIONS)), jnp.float32)
+    noise = jnp.asarray(rng.normal(size=(3, environments, ACTIONS)), jnp.float32)
+    params, statistics = jax.tree.map(lambda *x: jnp.stack(x), *made)
+
+    @jax.jit
+    @jax.vmap
+    def ours(params, statistics, observations, noise):
+        return fused.policy(fused.pack(params), statistics)(observations, noise)
+
+    together = ours(params, statistics, observations, noise)
+    for i, (one, statistic) in enumerate(made):
+        with jax.default_matmul_precision("highest"):
+            expected = networks.policy_network.apply(statistic, one.policy, observations[i])
+        _, kept = jax.tree.map(lambda x, i=i: x[i], together)
+        np.testing.assert_allclose(kept["distribution_params"], expected, atol=0.02)
+        brax = networks.parametric_action_distribution
+        log_prob = brax.log_prob(kept["distribution_params"], kept["raw_action"])
+        np.testing.assert_allclose(kept["log_prob"], log_prob, atol=1e-3)
+
+
 SCHEDULES = {
     "NONE": {"max_grad_norm": None},
     "LINEAR": {"max_grad_norm": 0.5, "num_timesteps": 256 * 3},
@@ -476,6 +569,12 @@ def test_adam_serves_several_policies_at_once():
     vectors[3][1] = np.inf
     run = functools.partial(launch.adam, fused._rule)
     together = jax.jit(jax.vmap(run))(*vectors, progress, terms)
+    turned = jax.vmap(run, in_axes=1)(*(x.T for x in (*vectors, progress, terms)))
+    with jax.disable_jit():
+        first = run(*(x[0] for x in (*vectors, progress, terms)))
+    for one, other, alone in zip(together, turned, first, strict=True):
+        np.testing.assert_array_equal(one, other)
+        np.testing.assert_array_equal(one[0], alone)
     for i in range(3):
         alone = jax.jit(run)(*(x[i] for x in (*vectors, progress, terms)))
         for one, other in zip(alone, together, strict=True):

@@ -346,13 +346,19 @@ def test_it_says_what_a_cpu_cannot_compute(shape, batch, reason):
     assert reason in launch_cpu.refusal(shape, batch)
 
 
-def make_actions(shape, environments, seed):
-    """What the kernel of the actions is given for one policy, and what it should give."""
+def make_actions(shape, environments, seed, spread=None):
+    """What the kernel of the actions is given for one policy, and what it should give.
+
+    With a spread, the outputs are far from zero, and from environment to environment the same.
+    """
     rng = np.random.default_rng(seed)
     leaves = (
         network(rng, shape, shape.outputs[0]),
         [np.abs(rng.normal(size=shape.actions)) + 0.5] if shape.deviations else [],
     )
+    if spread is not None:
+        leaves[0][-2][:] = 0
+        leaves[0][-1][:] = spread * rng.choice([-1.0, 1.0], size=shape.outputs[0])
     flat = [np.ravel(x) for x in (*leaves[0], *leaves[1])]
     flat.append(np.full(shape.size - sum(map(len, flat)), np.nan))
     data = {
@@ -388,13 +394,15 @@ def assert_are_actions(results, shape, expected, bound):
 @pytest.mark.parametrize("rows", [32, 64, 256])
 @pytest.mark.parametrize("name", CASES)
 def test_the_actions_are_those_of_float64(name, rows):
-    shape, environments = CASES[name].shape, rows + 23
+    shape, environments = CASES[name].shape, 2 * rows + 23
     made = [make_actions(shape, environments, seed) for seed in range(2)]
     tiling = Tiling(shape, rows, -(-rows // 128), "actions")
     given = [np.stack(x) for x in zip(*(arrays for arrays, _ in made), strict=True)]
     sizes = shape.drawn_shapes(environments)
     results = [np.full((2, *size), np.nan, np.float32) for size in sizes]
-    Gpu(actions.actions_text(tiling, environments), [*given, *results]).run(1, 1, 2)
+    # Of two blocks, the model runs the one with the second tile after that with the third.
+    for blocks in (1, 2):
+        Gpu(actions.actions_text(tiling, environments), [*given, *results]).run(blocks, 1, 2)
     for i, (_, expected) in enumerate(made):
         assert_are_actions([x[i] for x in results], shape, expected, 0.02)
 
@@ -414,6 +422,23 @@ def test_the_actions_on_a_cpu_are_those_of_float64(name, environments):
         alone = run(*(x[None] for x in arrays))
         for one, other in zip(alone, ours, strict=True):
             np.testing.assert_array_equal(one[0], other)
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("spread", [50.0, 1e4])
+@pytest.mark.parametrize("name", ["two seeds, one step", "80 units, normal"])
+def test_the_actions_at_the_ends_of_their_ranges_are_those_of_float64(name, spread):
+    shape = CASES[name].shape
+    arrays, expected = make_actions(shape, 40, 0, spread)
+    on_a_cpu = jax.jit(lambda *x: launch_cpu.launch_actions(shape, [one[None] for one in x]))
+    on_a_gpu = [np.full(size, np.nan, np.float32) for size in shape.drawn_shapes(40)]
+    text = actions.actions_text(Tiling(shape, 32, 1, "actions"), 40)
+    Gpu(text, [*arrays, *on_a_gpu]).run(2)
+    for results in ([np.asarray(x[0]) for x in on_a_cpu(*arrays)], on_a_gpu):
+        for ours, wanted in zip(results, expected, strict=True):
+            # Of the largest numbers, the distance from the mean is what rounding leaves of it.
+            np.testing.assert_allclose(ours, wanted, rtol=1e-3, atol=spread * 1e-3)
+        assert np.isfinite(np.concatenate([np.ravel(x) for x in results])).all()
 
 
 @pytest.mark.parametrize(

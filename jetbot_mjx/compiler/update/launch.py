@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, Int
 
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import launch_cpu, launch_gpu
-from jetbot_mjx.compiler.update.adam import AdamRule
-from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
+from jetbot_mjx.compiler.update.adam import SIZES, AdamRule
+from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, UpdateShape
 
 _LAUNCHERS: dict[str, Any] = {"gpu": launch_gpu, "cpu": launch_cpu}
 """The modules that launch the kernels, by the kind of JAX's default device."""
@@ -146,6 +146,8 @@ def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primit
         # All arguments have the policies, if any, as their first axes.
         batch = arguments[0].shape[:-1]
         inner = [x.shape[len(batch) :] for x in arguments]
+        if any(x.shape[: len(batch)] != batch or x.dtype.itemsize != 4 for x in arguments):
+            raise TypeError(f"{name}: not of one batch and 32 bits: {arguments}")
         return [ShapedArray((*batch, *size), np.float32) for size in sizes(spec, *inner)]
 
     @primitive.def_impl
@@ -181,6 +183,38 @@ def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primit
     return primitive
 
 
-_gradient_p = _primitive("gradient", lambda shape, *_: [(shape.size,)])
-_actions_p = _primitive("actions", lambda shape, *sizes: shape.drawn_shapes(sizes[3][0]))
-_adam_p = _primitive("adam", lambda rule, *sizes: [*sizes[:3], sizes[4]])
+_Size = tuple[int, ...]
+
+
+def _gradient_sizes(shape: UpdateShape, *given: _Size) -> list[_Size]:
+    (collected, time, _), (unrolls,) = given[3], given[5]
+    statistics, terms = (shape.observations,), (len(LossTerms._fields),)
+    rows, last = (collected, time, shape.columns["size"]), (collected, shape.observations)
+    noise = time, unrolls, shape.actions
+    size = (shape.size,)
+    _check("gradient", given, (size, statistics, statistics, rows, last, (unrolls,), noise, terms))
+    return [size]
+
+
+def _actions_sizes(shape: UpdateShape, *given: _Size) -> list[_Size]:
+    statistics, environments = (shape.observations,), given[3][0]
+    rows, noise = (environments, shape.observations), (environments, shape.actions)
+    _check("actions", given, ((shape.size,), statistics, statistics, rows, noise))
+    return shape.drawn_shapes(environments)
+
+
+def _adam_sizes(rule: AdamRule, *given: _Size) -> list[_Size]:
+    size, progress, terms = (rule.shape.size,), (SIZES["progress"],), (SIZES["terms"],)
+    _check("adam", given, (size, size, size, size, progress, terms))
+    return [size, size, size, progress]
+
+
+def _check(name: str, given: tuple[_Size, ...], wanted: tuple[_Size, ...]) -> None:
+    """Refuse what a kernel would read beyond its end."""
+    if given != wanted:
+        raise TypeError(f"{name}: the shapes are {given} instead of {wanted}")
+
+
+_gradient_p = _primitive("gradient", _gradient_sizes)
+_actions_p = _primitive("actions", _actions_sizes)
+_adam_p = _primitive("adam", _adam_sizes)
