@@ -11,6 +11,7 @@ carried from step to step.
 `step` computes it by XLA, and `cpu_adam` lowers `factors` and `element` for a kernel.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -125,7 +126,8 @@ def step(
     is_parameter = jnp.zeros(len(params), bool)
     for start, stop in rule.ranges:
         is_parameter |= (start <= index) & (index < stop)
-    gradient, metrics = jnp.where(is_parameter, gradient, 0.0), gradient[jnp.asarray(rule.places)]
+    metrics = [gradient[place] for place in rule.places]
+    gradient = jnp.where(is_parameter, gradient, 0.0)
     square = jnp.sum(gradient * gradient)
     common, progress = factors(square, metrics, progress, terms, rule)
     after = element(params, mu, nu, gradient, *common)
@@ -134,7 +136,7 @@ def step(
 
 def factors(
     square: Float[Array, ""],
-    metrics: Float[Array, " metrics"],
+    metrics: Float[Array, " metrics"] | Sequence[Array],
     progress: Float[Array, " progress"],
     terms: Float[Array, " terms"],
     rule: AdamRule,
