@@ -496,9 +496,9 @@ class PPOConfig(_Section):
     normalize_advantage: bool = True
     """Normalise advantages within a minibatch."""
     update: Literal["auto", "fused", "xla"] = "auto"
-    """How the gradient of a minibatch is computed. `fused`: by two kernels, in float32 on CPUs and
-    with products of float16 on NVIDIA GPUs; `xla`: by XLA; `auto`: by the kernels where the device
-    and the networks allow it."""
+    """How the actions of a collection and the gradient of a minibatch are computed. `fused`: by
+    kernels of this package, in float32 on CPUs and with products of float16 on NVIDIA GPUs; `xla`:
+    by XLA; `auto`: by the kernels where the device and the networks allow it."""
     network: NetworkConfig = NetworkConfig()
     """Network sizes."""
 
