@@ -128,11 +128,14 @@ class FusedUpdate:
           axis_name: the mesh axis over which gradients are averaged; None: none.
         """
         self._config, self._shape, self._axis = config, shape, axis_name
-        unrolls = config.batch_size // device_count
-        self.batch = Minibatch(unrolls * config.num_minibatches, unrolls, config.unroll_length)
+        unrolls, steps = config.batch_size // device_count, config.num_minibatches
+        self.batch = Minibatch(
+            unrolls * steps, unrolls, config.unroll_length, steps * config.num_updates_per_batch
+        )
         """A minibatch on one device."""
         self._environments = config.num_envs // device_count
-        self._rule = AdamRule(shape, self.batch.samples, config.learning_rate_schedule)
+        schedule = config.learning_rate_schedule
+        self._rule = AdamRule(shape, self.batch.samples, schedule, self.batch.count)
         self._places = _places(shape)
 
     def prepare(self, policies: int) -> None:
@@ -253,64 +256,57 @@ class FusedUpdate:
           The new parameters and state; and by Brax's names the sums of the metrics over the
           minibatches whose gradient was finite, with their number as `applied`.
         """
-        config, unrolls = self._config, data.reward.shape[0]
-        passes, count = config.num_updates_per_batch, config.num_minibatches
         collected = self.collected(data, normalizer)
         terms = self._adam_terms(optimizer_state)
-
-        def step(state: tuple[Array, ...], batch: tuple[Array, Array]) -> tuple[Any, None]:
-            params, mu, nu, progress = state
-            gradient = self.gradient(params, collected, *batch)
-            return launch.adam(self._rule, params, mu, nu, gradient, progress, terms), None
-
-        def one_pass(state: Any, drawn: tuple[Array, Array]) -> tuple[Any, None]:
-            order, keys = drawn
-            batches = order.reshape(count, -1), self.noise(keys, *data.reward.shape)
-            return jax.lax.scan(step, state, batches)
-
         # All keys at once, unlike Brax's.
-        first, second = jax.random.split(key)
-        shuffle_keys = jax.random.split(first, passes)
-        orders = jax.vmap(lambda key: jax.random.permutation(key, unrolls))(shuffle_keys)
-        drawn = orders, jax.random.split(second, (passes, count))
-        state, _ = jax.lax.scan(one_pass, self._begin(params, optimizer_state), drawn)
-        return self._end(state, optimizer_state)
+        shuffle_key, noise_key = jax.random.split(key)
+        shuffle_keys = jax.random.split(shuffle_key, self._config.num_updates_per_batch)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, self.batch.collected))
+        unrolls = orders(shuffle_keys).reshape(self.batch.count, -1)
+        noise = self.noise(jax.random.split(noise_key, self.batch.count))
+
+        def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            index, params, mu, nu, progress = state
+            gradient = self.gradient(params, collected, unrolls, noise, index)
+            made = launch.adam(self._rule, gradient, params, mu, nu, progress, index, terms)
+            return index + 1, *made
+
+        # One counter, unlike that of `scan` beside its own, which would be another launch.
+        begun = jnp.zeros((), jnp.int32), *self._begin(params, optimizer_state)
+        state = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
+        return self._end(state[1:], optimizer_state)
 
     def noise(
-        self, keys: UInt32[Array, "minibatches 2"], unrolls: int, time: int
+        self, keys: UInt32[Array, "minibatches 2"]
     ) -> Float[Array, "minibatches time unrolls actions"]:
-        """Draw the noise that estimates the entropy in all minibatches of a pass.
-
-        Args:
-          keys: the key of each minibatch.
-          unrolls: the number of unrolls of the pass.
-          time: their length.
-        """
+        """Draw the noise that estimates the entropy, from the key of each minibatch."""
         # Brax draws the noise with time as the first axis.
-        shape = time, unrolls // len(keys), self._shape.actions
+        shape = self.batch.time, self.batch.unrolls, self._shape.actions
         return jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
 
     def gradient(
         self,
         params: Float[Array, " size"],
         collected: Collected,
-        unrolls: Int[Array, " unrolls"],
-        noise: Float[Array, "time unrolls actions"],
+        unrolls: Int[Array, "minibatches unrolls"],
+        noise: Float[Array, "minibatches time unrolls actions"],
+        index: Int[Array, ""],
     ) -> Float[Array, " size"]:
         """Compute the gradient of Brax's PPO loss, the mean of all devices.
 
         Args:
           params: the parameters, from `pack`.
           collected: all data, from `collected`.
-          unrolls: the unrolls of the minibatch.
-          noise: the noise of the minibatch, from `noise`.
+          unrolls: the unrolls of all minibatches.
+          noise: their noise, from `noise`.
+          index: the minibatch.
 
         Returns:
           The gradient as a vector, with the sums of the metrics at their places.
         """
         rows, last, mean, scale = collected
         terms = [getattr(self._config, name) for name in LossTerms._fields]
-        arrays = params, mean, scale, rows, last, unrolls, noise, _array(terms)
+        arrays = params, mean, scale, rows, last, unrolls, noise, index, _array(terms)
         gradient = launch.gradient(self._shape, *arrays)
         return gradient if self._axis is None else jax.lax.pmean(gradient, self._axis)
 
@@ -362,13 +358,16 @@ class FusedUpdate:
             rates=0.0,
             applied=0.0,
         )
-        return params, adam_state.mu, adam_state.nu, _array(jax.tree.leaves(progress))
+        row = _array(jax.tree.leaves(progress))
+        rows = jnp.zeros((self._rule.steps, len(row)))
+        return params, adam_state.mu, adam_state.nu, jnp.concatenate([row[None], rows])
 
     def _end(
         self, state: tuple[Array, ...], optimizer_state: PyTree
     ) -> tuple[Array, PyTree, dict[str, Array]]:
         """Return the parameters, the state of the optimizer, and the sums of the metrics."""
-        params, mu, nu, (rate, _, _, *sums, rates, applied) = state
+        params, mu, nu, progress = state
+        rate, _, _, *sums, rates, applied = progress[-1]
         *before, injected = optimizer_state
         adam_state, *rest = injected.inner_state
 

@@ -53,7 +53,8 @@ def runs_correctly() -> bool:
     def run(params: Array, rows: Array, last: Array, order: Array, noise: Array) -> Any:
         statistics = jnp.zeros(_SHAPE.observations), jnp.ones(_SHAPE.observations)
         network = _SHAPE, params, *statistics
-        gradient = launch.gradient(*network, rows, last, order, noise, jnp.asarray(_TERMS))
+        given = rows, last, order[None], noise[None], jnp.zeros((), jnp.int32)
+        gradient = launch.gradient(*network, *given, jnp.asarray(_TERMS))
         observations = rows[:, 0, : _SHAPE.observations]
         return gradient, launch.actions(*network, observations, noise[0])
 

@@ -96,7 +96,10 @@ def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
 
 
 def launch_text(
-    text: str, arguments: Sequence[Array], results: Sequence[jax.ShapeDtypeStruct]
+    text: str,
+    arguments: Sequence[Array],
+    results: Sequence[jax.ShapeDtypeStruct],
+    aliases: Mapping[int, int] | None = None,
 ) -> list[Array]:
     """Call a function, while JAX lowers a program for CPUs.
 
@@ -104,11 +107,15 @@ def launch_text(
       text: an LLVM module with the function `NAME`, from `ffi_wrapper`.
       arguments: the arrays that it reads.
       results: shapes and dtypes of the arrays that it writes.
+      aliases: which arguments it changes, and as which results it returns them.
 
     Returns:
       The results.
     """
-    return list(jax.ffi.ffi_call(registered(text), list(results))(*arguments))
+    call = jax.ffi.ffi_call(
+        registered(text), list(results), input_output_aliases=dict(aliases or {})
+    )
+    return list(call(*arguments))
 
 
 def registered(text: str) -> str:

@@ -11,7 +11,7 @@ import ctypes
 import functools
 import importlib
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from string import Template
 from typing import Any
@@ -124,6 +124,7 @@ def launch_ptx(
     grid: tuple[int, int, int],
     threads: int,
     shared_memory: int = 0,
+    aliases: Mapping[int, int] | None = None,
 ) -> list[Array]:
     """Launch a kernel, while JAX lowers a program for an NVIDIA GPU.
 
@@ -135,6 +136,7 @@ def launch_ptx(
       grid: the number of blocks along each axis.
       threads: the number of threads of a block.
       shared_memory: dynamic shared memory of a block [bytes].
+      aliases: which arguments it changes, and as which results it returns them.
 
     Returns:
       The results.
@@ -143,7 +145,7 @@ def launch_ptx(
     sizes = {f"grid_{axis}": np.int64(n) for axis, n in zip("xyz", grid, strict=True)}
     sizes |= {f"block_{axis}": np.int64(n) for axis, n in zip("xyz", (threads, 1, 1), strict=True)}
     return list(
-        jax.ffi.ffi_call(_TARGET, list(results))(
+        jax.ffi.ffi_call(_TARGET, list(results), input_output_aliases=dict(aliases or {}))(
             *arguments,
             name=name,
             kernel_type="ptx",

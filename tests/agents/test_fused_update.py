@@ -18,7 +18,15 @@ from jetbot_mjx.agents import fused_update, update_probe
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.agents.ppo import LOSSES, PPO
 from jetbot_mjx.compiler import llvm_backend, ptx_backend
-from jetbot_mjx.compiler.update import actions, adam, advantages, gradient, launch, launch_gpu
+from jetbot_mjx.compiler.update import (
+    actions,
+    adam,
+    advantages,
+    gpu_adam,
+    gradient,
+    launch,
+    launch_gpu,
+)
 from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.errors import UserError
@@ -192,28 +200,42 @@ def minibatch(rng, settings, networks):
     return params, statistics, jax.tree.map(lambda x: x.astype(jnp.float32), batch)
 
 
-@pytest.mark.parametrize("policies", [1, 3])
-def test_a_minibatch_of_several_policies_is_two_launches(monkeypatch, policies):
+def traced_update(policies):
+    """The update of one policy (None) or of several, traced; it takes one minibatch six times."""
+    settings = config(update="xla", num_envs=16, num_minibatches=1, num_updates_per_batch=6)
+    ppo = make_ppo(settings)
+    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
+    fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
+    params, *data = minibatch(np.random.default_rng(0), settings, ppo.networks)
+    vectors = fused.pack((params, ppo._optimizer.init(params)))
+    given = *vectors, *data, jax.random.PRNGKey(0)
+    if policies is None:
+        return jax.jit(fused.update).trace(*given), shape.size
+    made = jax.tree.map(lambda x: jnp.stack([x] * policies), given)
+    return jax.jit(jax.vmap(fused.update)).trace(*made), shape.size
+
+
+@pytest.mark.parametrize("policies", [None, 3])
+def test_a_minibatch_of_several_policies_is_three_launches(monkeypatch, policies):
     pytest.importorskip("llvmlite")
     monkeypatch.setattr(ptx_backend, "compute_capability", lambda: 90)
     monkeypatch.setattr(ptx_backend, "processor_count", lambda: 132)
-    settings = config(update="xla")
-    networks = make_ppo(settings).networks
-    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
-    fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
-    one = minibatch(np.random.default_rng(0), settings, networks)
-    order = jnp.arange(settings.ppo.batch_size)
+    text = traced_update(policies)[0].lower(lowering_platforms=("cuda",)).as_text()
+    calls = [line for line in text.splitlines() if "custom_call @__gpu$xla.gpu.ptx" in line]
+    names = [re.search(r' name = "(\w+)"', call)[1] for call in calls]
+    assert names == ["ppo_advantages", "ppo_gradient", "ppo_adam"]
+    assert re.findall(r"grid_z = (\d+)", text) == [str(policies or 1)] * 3
 
-    def one_gradient(params, statistics, batch):
-        collected = fused.collected(batch, statistics)
-        drawn = noise(fused, jax.random.PRNGKey(0), settings)
-        return fused.gradient(fused.pack(params), collected, order, drawn)
 
-    made = jax.tree.map(lambda x: jnp.stack([x] * policies), one)
-    traced = jax.jit(jax.vmap(one_gradient)).trace(*made)
-    text = traced.lower(lowering_platforms=("cuda",)).as_text()
-    assert text.count("custom_call @__gpu$xla.gpu.ptx") == 2
-    assert re.findall(r"grid_z = (\d+)", text) == [str(policies)] * 2
+@pytest.mark.cpu
+@pytest.mark.parametrize("policies", [None, 3])
+def test_a_minibatch_changes_the_vectors_in_place(policies):
+    traced, size = traced_update(policies)
+    text = traced.lower().compile().as_text()
+    (body,) = (part for part in text.split("\n\n") if part.count("jetbot_mjx_") == 3)
+    assert (f"f32[{policies},{size}]" if policies else f"f32[{size}]") in body
+    copies = [line for line in body.splitlines() if " copy(" in line or "_copy_" in line]
+    assert not [line for line in copies if str(size) in line]
 
 
 @pytest.mark.parametrize(
@@ -283,18 +305,20 @@ def modelled(shape, *arrays):
     """`launch.gradient` on the model of a GPU, for one policy."""
 
     def run(*arrays):
-        params, mean, scale, rows, last, unrolls, noise, terms = (np.array(x) for x in arrays)
-        batch = Minibatch(len(rows), len(unrolls), rows.shape[1])
+        given = [np.array(x) for x in arrays]
+        params, mean, scale, rows, last, unrolls, noise, index, terms = given
+        batch = Minibatch(len(rows), unrolls.shape[1], rows.shape[1], len(unrolls))
         tiling = Tiling(shape, 64, 1, "advantages")
         blocks = min(2, advantages.tile_count(tiling, batch))
         sizes = batch.samples, batch.samples, (blocks, 2)
         estimates = [np.full(size, np.nan, np.float32) for size in sizes]
         text = advantages.advantages_text(tiling, batch)
-        Gpu(text, [params, mean, scale, rows, last, unrolls, terms, *estimates]).run(blocks)
+        Gpu(text, [params, mean, scale, rows, last, unrolls, index, terms, *estimates]).run(blocks)
         tiling = Tiling(shape, 32, 1)
         vector = np.full((1, shape.size), np.nan, np.float32)
         text = gradient.gradient_text(tiling, batch, blocks)
-        Gpu(text, [params, mean, scale, rows, unrolls, noise, *estimates, terms, vector]).run(1, 2)
+        drawn = unrolls, noise, index
+        Gpu(text, [params, mean, scale, rows, *drawn, *estimates, terms, vector]).run(1, 2)
         return vector[0]
 
     result = jax.ShapeDtypeStruct((shape.size,), np.float32)
@@ -441,9 +465,12 @@ def rounding(settings, networks):
     return dataclasses.replace(networks, policy_network=policy, value_network=value)
 
 
-def noise(fused, key, settings):
-    """The noise of one minibatch."""
-    return fused.noise(key[None], settings.ppo.batch_size, settings.ppo.unroll_length)[0]
+def drawn_for(fused, order, key):
+    """Unrolls and noise of some minibatches, and the index of the one with the given ones."""
+    count, index = fused.batch.count, fused.batch.count - 1
+    keys = jnp.zeros((count, 2), jnp.uint32).at[index].set(key)
+    unrolls = jnp.full((count, len(order)), -1, jnp.int32).at[index].set(order)
+    return unrolls, fused.noise(keys), jnp.int32(index)
 
 
 def assert_gradient_is_xlas(settings):
@@ -466,8 +493,7 @@ def assert_gradient_is_xlas(settings):
     def ours(params):
         shuffled = fused.collected(jax.tree.map(lambda x: x[order], batch), statistics)
         places = jnp.argsort(order).astype(jnp.int32)
-        drawn = noise(fused, key, settings)
-        return fused.gradient(fused.pack(params), shuffled, places, drawn)
+        return fused.gradient(fused.pack(params), shuffled, *drawn_for(fused, places, key))
 
     vector = ours(params)
     places = jnp.asarray(fused._rule.places)
@@ -514,7 +540,20 @@ SCHEDULES = {
 }
 
 
-@pytest.mark.parametrize("compute", [launch.adam, adam.step], ids=["kernel", "xla"])
+def modelled_adam(rule, *arrays):
+    """`launch.adam` on the model of a GPU, for one policy."""
+
+    def run(*arrays):
+        given = {name: np.array(x) for name, x in zip(adam.ARRAYS, arrays, strict=True)}
+        results = [given[name] for name in adam.UPDATED]
+        Gpu(gpu_adam.adam_text(rule, 2), [*given.values(), *results]).run(2)
+        return results
+
+    like = [jax.ShapeDtypeStruct(arrays[i].shape, np.float32) for i in adam.ALIASES]
+    return jax.pure_callback(run, like, *arrays)
+
+
+@pytest.mark.parametrize("compute", [launch.adam, modelled_adam], ids=["kernel", "model"])
 @pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
 @pytest.mark.parametrize("schedule", SCHEDULES)
 def test_adam_is_that_of_optax(schedule, distribution, compute):
@@ -533,6 +572,8 @@ def test_adam_is_that_of_optax(schedule, distribution, compute):
     sizes = np.asarray(fused._rule.places)
     for call, count in enumerate((2, 6)):
         totals, vectors = jnp.zeros_like(totals), fused._begin(*ours)
+        vectors = *vectors[:3], vectors[3][: count + 1]
+        rule = fused._rule._replace(steps=count)
         terms = fused._adam_terms(ours[1])
         for i in range(count):
             sums = jnp.asarray(rng.normal(size=5) * 64, jnp.float32)
@@ -548,7 +589,7 @@ def test_adam_is_that_of_optax(schedule, distribution, compute):
             *state, row = ppo._minibatch_step(*state, statistics, None, jnp.zeros(2))
             totals += jnp.where(row[-1] > 0, row, 0.0)
             vector = fused.pack(gradient).at[sizes].set(sums)
-            vectors = adam_step(fused._rule, *vectors[:3], vector, vectors[3], terms)
+            vectors = adam_step(rule, vector, *vectors, jnp.int32(i), terms)
         *ours, means = fused._end(vectors, ours[1])
     found = fused.unpack(tuple(ours))
     assert jax.tree.structure(found) == jax.tree.structure(tuple(state))
@@ -564,22 +605,28 @@ def test_adam_serves_several_policies_at_once():
     fused, rng = make_ppo(config())._fused, np.random.default_rng(0)
     size = fused._shape.size
     vectors = [np.abs(rng.normal(size=(3, size))).astype(np.float32) for _ in range(4)]
-    progress = np.tile(np.asarray([1e-3, 0.9, 0.999, *[0.0] * 7], np.float32), (3, 1))
+    progress = np.asarray([1e-3, 0.9, 0.999, *[0.0] * 7], np.float32)
+    # Policies may even be at different steps.
+    index = np.arange(3, dtype=np.int32)
+    rows = np.tile(np.full_like(progress, np.nan), (3, fused._rule.steps + 1, 1))
+    rows[index, index] = progress
     terms = np.asarray([[limit, 1e-3, 0, 0, 0, 0, 0] for limit in (1, 9, np.inf)], np.float32)
-    vectors[3][1] = np.inf
+    vectors[0][1] = np.inf
     run = functools.partial(launch.adam, fused._rule)
-    together = jax.jit(jax.vmap(run))(*vectors, progress, terms)
-    turned = jax.vmap(run, in_axes=1)(*(x.T for x in (*vectors, progress, terms)))
+    arrays = *vectors, rows, index, terms
+    together = jax.jit(jax.vmap(run))(*arrays)
+    turned = [np.moveaxis(x, 0, -1) for x in arrays]
+    turned = jax.vmap(run, in_axes=-1)(*turned)
     with jax.disable_jit():
-        first = run(*(x[0] for x in (*vectors, progress, terms)))
+        first = run(*(x[0] for x in arrays))
     for one, other, alone in zip(together, turned, first, strict=True):
         np.testing.assert_array_equal(one, other)
         np.testing.assert_array_equal(one[0], alone)
     for i in range(3):
-        alone = jax.jit(run)(*(x[i] for x in (*vectors, progress, terms)))
+        alone = jax.jit(run)(*(x[i] for x in arrays))
         for one, other in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one, other[i])
-        assert float(alone[3][-1]) == (i != 1)
+        assert float(alone[3][i + 1, -1]) == (i != 1)
 
 
 @on_a_gpu
@@ -592,8 +639,7 @@ def test_several_policies_take_the_same_launches():
 
     def one_gradient(params, statistics, batch):
         collected = fused.collected(batch, statistics)
-        drawn = noise(fused, key, settings)
-        return fused.gradient(fused.pack(params), collected, order, drawn)
+        return fused.gradient(fused.pack(params), collected, *drawn_for(fused, order, key))
 
     together = jax.jit(jax.vmap(one_gradient))(*jax.tree.map(lambda *x: jnp.stack(x), *made))
     for one, ours in zip(made, together, strict=True):

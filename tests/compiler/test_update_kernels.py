@@ -35,6 +35,10 @@ ACTIVATIONS = {
 }
 
 
+COUNT, INDEX = 3, 1
+"""Minibatches of a training step, and the one that the kernels compute."""
+
+
 class Case(NamedTuple):
     """A minibatch, and how it is divided among blocks."""
 
@@ -161,7 +165,7 @@ def loss(leaves, data, case):
 
 def random_data(rng, case):
     """A minibatch: `unrolls` of it are taken from the collected ones, which are random as well."""
-    shape, (collected, unrolls, time) = case.shape, case.batch
+    shape, (collected, unrolls, time, _) = case.shape, case.batch
     steps = unrolls, time
     data = {
         "mean": rng.normal(size=shape.observations),
@@ -219,6 +223,12 @@ def make_data(case, seed):
         name: np.asarray(x, np.int32 if name == "unrolls" else np.float32)
         for name, x in arguments.items()
     }
+    # The other minibatches have no noise, and their unrolls are not there.
+    for name, nothing in (("unrolls", -1), ("noise", np.nan)):
+        whole = np.full((COUNT, *arguments[name].shape), nothing, arguments[name].dtype)
+        whole[INDEX] = arguments[name]
+        arguments[name] = whole
+    arguments["index"] = np.array(INDEX, np.int32)
     estimated = (np.asarray(data[name]) for name in ("advantage", "target"))
     return Data(arguments, *estimated, [np.ravel(x) for x in parts])
 
@@ -229,6 +239,7 @@ def stacked(made, *names):
 
 
 NETWORK = ("params", "mean", "scale", "rows")
+DRAWN = ("last", "unrolls", "noise", "index")
 
 
 def terms_of(case):
@@ -243,10 +254,10 @@ def test_the_advantages_are_those_of_float64(name):
     blocks = min(case.blocks, advantages.tile_count(tiling, case.batch))
     results = [
         np.full((case.seeds, *rest), np.nan, np.float32)
-        for rest in (case.batch[1:], case.batch[1:], (blocks, 2))
+        for rest in (case.batch[1:3], case.batch[1:3], (blocks, 2))
     ]
-    text = advantages.advantages_text(tiling, case.batch)
-    arrays = [*stacked(made, *NETWORK, "last", "unrolls"), terms_of(case), *results]
+    text = advantages.advantages_text(tiling, case.batch._replace(count=COUNT))
+    arrays = [*stacked(made, *NETWORK, "last", "unrolls", "index"), terms_of(case), *results]
     Gpu(text, arrays).run(blocks, 1, case.seeds)
     for data, advantage, target, parts in zip(made, *results, strict=True):
         np.testing.assert_allclose(advantage, data.advantages, atol=0.01)
@@ -269,8 +280,8 @@ def test_the_gradient_is_that_of_float64(name):
     thirds = [np.array_split(data.advantages.ravel(), 3) for data in made]
     parts = np.array([[[x.sum(), (x**2).sum()] for x in third] for third in thirds], np.float32)
     result = np.full((case.seeds, blocks, case.shape.size), np.nan, np.float32)
-    text = gradient_kernel.gradient_text(tiling, case.batch, 3)
-    arrays = [*stacked(made, *NETWORK, "unrolls", "noise"), *estimated, parts]
+    text = gradient_kernel.gradient_text(tiling, case.batch._replace(count=COUNT), 3)
+    arrays = [*stacked(made, *NETWORK, "unrolls", "noise", "index"), *estimated, parts]
     arrays += [terms_of(case), result]
     Gpu(text, arrays).run(blocks, 2, case.seeds)
     for data, vectors in zip(made, result, strict=True):
@@ -308,7 +319,7 @@ def test_the_gradient_on_a_cpu_is_that_of_float64(name, lanes, registers, monkey
         monkeypatch.setattr(llvm_backend, "host_processor", lambda: host)
     case = CPU_CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
-    arrays = [*stacked(made, *NETWORK, "last", "unrolls", "noise"), terms_of(case)]
+    arrays = [*stacked(made, *NETWORK, *DRAWN), terms_of(case)]
     result = jax.jit(lambda *arrays: launch_cpu.launch_gradient(case.shape, arrays)[0])(*arrays)
     for data, vector in zip(made, np.asarray(result), strict=True):
         assert_is_gradient(vector, data, 2e-4)
@@ -318,7 +329,7 @@ def test_the_gradient_on_a_cpu_is_that_of_float64(name, lanes, registers, monkey
 def test_the_gradient_on_a_cpu_does_not_depend_on_the_policies_beside_it():
     case = CPU_CASES["several parts"]
     made = [make_data(case, seed) for seed in range(2)]
-    arrays = [*stacked(made, *NETWORK, "last", "unrolls", "noise"), terms_of(case)]
+    arrays = [*stacked(made, *NETWORK, *DRAWN), terms_of(case)]
     run = jax.jit(lambda *arrays: launch_cpu.launch_gradient(case.shape, arrays)[0])
     both = run(*arrays)
     for i in range(2):

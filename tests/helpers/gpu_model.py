@@ -18,7 +18,6 @@ _ARITHMETIC = {
     "udiv": np.floor_divide,
     "urem": np.remainder,
     "shl": np.left_shift,
-    "and": np.bitwise_and,
     "fadd contract": np.add,
     "fsub contract": np.subtract,
     "fmul contract": np.multiply,
@@ -26,6 +25,15 @@ _ARITHMETIC = {
     "icmp eq": np.equal,
     "fcmp olt": np.less,
     "fcmp ole": np.less_equal,
+    "fcmp ogt": np.greater,
+    "fdiv contract": np.divide,
+    "and": np.bitwise_and,
+}
+_INTRINSICS = {
+    "fabs": np.abs,
+    "maximum": np.maximum,
+    "minimum": np.minimum,
+    "sqrt": np.sqrt,
 }
 _FUNCTIONS = {
     "ex2.approx.ftz.f32": np.exp2,
@@ -237,6 +245,9 @@ class Gpu:
             return np.stack([low, high], axis=-1).view(np.uint32)[:, 0]
         return _FUNCTIONS[name](given[0])
 
+    def _intrinsic(self, name, operands):
+        return _INTRINSICS[name](*(self._get(*x.split()) for x in operands.split(", ")))
+
     def _matrices(self, transposed, pointer):
         """Four matrices of 8 x 8 numbers, whose rows the lanes of each warp point at."""
         place = self.values[pointer].reshape(-1, 4, 8)
@@ -309,6 +320,7 @@ _INSTRUCTIONS = [
         (r"extractelement <2 x half> (\S+), i32 (\d)", Gpu._half),
         (r"fpext half (\S+) to float", lambda gpu, value: gpu.values[value].astype(np.float32)),
         (r"extractvalue \{.*\} (\S+), (\d+)", Gpu._extract),
+        (r"call float @llvm\.(\w+)\.f32\((.*)\)", Gpu._intrinsic),
         (r'(call void asm sideeffect "bar.*)', Gpu._barrier),
         (r'call \w+ asm "(\S+) [^"]*", "[^"]*"\((.*)\)', Gpu._assembly),
         (

@@ -8,16 +8,19 @@ Equation, with the gradient g clipped to a global norm, as `optax.adam` has it:
 for the n-th step, of size η. A step whose gradient is not finite is left out. The powers of β are
 carried from step to step.
 
-`step` computes it by XLA, and `cpu_adam` lowers `factors` and `element` for a kernel.
+`cpu_adam` and `gpu_adam` lower `factors` and `element` for a kernel.
 """
 
-from collections.abc import Sequence
+import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize_part
+from jetbot_mjx.compiler.update.sample_loss import vector_of
 from jetbot_mjx.compiler.update.shapes import POLICY_METRICS, VALUE_METRICS, UpdateShape
 
 BETA_1, BETA_2 = 0.9, 0.999
@@ -34,12 +37,20 @@ class AdamRule(NamedTuple):
     """Number of samples of a minibatch."""
     schedule: str
     """One of `ppo.learning_rate_schedule`."""
+    steps: int
+    """Number of steps of a training step."""
 
     @property
     def ranges(self) -> list[tuple[int, int]]:
         """Return the ranges of the vector that hold parameters; metrics are behind each."""
         policy, size = self.shape.policy_size, self.shape.size
         return [(0, policy - len(POLICY_METRICS)), (policy, size - len(VALUE_METRICS))]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """Return the number of elements of each of the `ARRAYS` for one policy."""
+        sizes = dict.fromkeys(ARRAYS, self.shape.size) | SIZES
+        return {**sizes, "progress": (self.steps + 1) * SIZES["progress"], "index": 1}
 
     @property
     def places(self) -> list[int]:
@@ -98,45 +109,37 @@ class Factors(NamedTuple):
 SIZES = {"terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
 """Lengths of the arrays of `AdamTerms` and `Progress`."""
 
+ARRAYS = ("gradient", "params", "mu", "nu", "progress", "index", "terms")
+"""The arrays that the kernels take, as `launch.adam` does."""
 
-def step(
-    rule: AdamRule,
-    params: Float[Array, " size"],
-    mu: Float[Array, " size"],
-    nu: Float[Array, " size"],
-    gradient: Float[Array, " size"],
-    progress: Float[Array, " progress"],
-    terms: Float[Array, " terms"],
-) -> tuple[Array, Array, Array, Array]:
-    """Make a step.
+UPDATED = ("params", "mu", "nu", "progress")
+"""Those which they change in place, and return."""
+
+ALIASES = {ARRAYS.index(name): i for i, name in enumerate(UPDATED)}
+"""The arguments whose memory the results take."""
+
+
+def programs(rule: AdamRule) -> tuple[ScalarProgram, ScalarProgram]:
+    """Lower `factors` and `element` to programs on scalars.
 
     Args:
       rule: what the vectors hold.
-      params: the parameters.
-      mu: mean of the gradients.
-      nu: mean of their squares.
-      gradient: the gradient, with the sums of the metrics at their places.
-      progress: an array of `Progress`.
-      terms: an array of `AdamTerms`.
-
-    Returns:
-      The next parameters, means and progress.
     """
-    index = jnp.arange(len(params))
-    is_parameter = jnp.zeros(len(params), bool)
-    for start, stop in rule.ranges:
-        is_parameter |= (start <= index) & (index < stop)
-    metrics = [gradient[place] for place in rule.places]
-    gradient = jnp.where(is_parameter, gradient, 0.0)
-    square = jnp.sum(gradient * gradient)
-    common, progress = factors(square, metrics, progress, terms, rule)
-    after = element(params, mu, nu, gradient, *common)
-    return *after, progress
+    scalar, metrics = vector_of(), vector_of(len(METRICS))
+    arrays = vector_of(SIZES["progress"]), vector_of(SIZES["terms"])
+    common = _lowered(functools.partial(factors, rule=rule), scalar, metrics, *arrays)
+    return common, _lowered(element, *[scalar] * (4 + len(Factors._fields)))
+
+
+def _lowered(function: Callable[..., Any], *arguments: jax.ShapeDtypeStruct) -> ScalarProgram:
+    """Lower a function whose numbers may not be finite."""
+    closed = jax.make_jaxpr(function)(*arguments)
+    return scalarize_part(closed, closed.jaxpr.invars, closed.jaxpr.outvars, finite=False)
 
 
 def factors(
     square: Float[Array, ""],
-    metrics: Float[Array, " metrics"] | Sequence[Array],
+    metrics: Float[Array, " metrics"],
     progress: Float[Array, " progress"],
     terms: Float[Array, " terms"],
     rule: AdamRule,

@@ -23,8 +23,9 @@ def advantages_text(tiling: Tiling, batch: Minibatch) -> str:
     """Write the kernel.
 
     Its arguments are the parameters, mean and 1 / std of the observations, the collected rows,
-    the last observations, the unrolls of the minibatch, and the `LossTerms`; its results the
-    advantages, the targets, and for each block the sums of the advantages and of their squares.
+    the last observations, the unrolls of all minibatches, which of them to compute, and the
+    `LossTerms`; its results the advantages, the targets, and for each block the sums of the
+    advantages and of their squares.
 
     Args:
       tiling: the division of the work.
@@ -47,12 +48,13 @@ class _AdvantageKernel(NetworkKernel):
         seed = ir.register("ctaid.z")
         sizes = [shape.size, shape.observations, shape.observations]
         sizes += [batch.collected * batch.time * shape.columns["size"]]
-        sizes += [batch.collected * shape.observations, batch.unrolls, len(LossTerms._fields)]
-        sizes += [batch.samples, batch.samples]
+        sizes += [batch.collected * shape.observations, batch.count * batch.unrolls, 1]
+        sizes += [len(LossTerms._fields), batch.samples, batch.samples]
         self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
         part = seed * self.blocks + self.block
-        self.statistics = ir.row(Value(ir, "%a9", "ptr addrspace(1)"), part, 2)
-        self.terms = self.load_terms(self.arrays[6])
+        self.statistics = ir.row(Value(ir, "%a10", "ptr addrspace(1)"), part, 2)
+        self.unrolls = ir.row(self.arrays[5], self.minibatch(self.arrays[6]), batch.unrolls)
+        self.terms = self.load_terms(self.arrays[7])
         params = ir.element(self.arrays[0], ir.constant(shape.policy_size, "i32"))
         self.load_network(params, ir.constant(1, "i32"), self.arrays[1], self.arrays[2])
         ir.synchronize()
@@ -63,7 +65,7 @@ class _AdvantageKernel(NetworkKernel):
         ends = total + advantage, squares + advantage * advantage
         self.end_tiles(tile, [(total, ends[0]), (squares, ends[1])])
         self._store_statistics(*ends)
-        return self.text(NAME, 10)
+        return self.text(NAME, 11)
 
     def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
         """Return the unroll of a row of a tile, which may not exist, and the step in it."""
@@ -74,7 +76,7 @@ class _AdvantageKernel(NetworkKernel):
         """Return the unroll among the collected ones, and the pointer to the row of its step."""
         ir, time = self.ir, self.batch.time
         kept = ir.minimum(unroll, self.batch.unrolls - 1)
-        collected = ir.fetch(self.arrays[5], kept, "i32")
+        collected = ir.fetch(self.unrolls, kept, "i32")
         sample = collected * time + ir.minimum(step, time - 1)
         return collected, ir.row(self.arrays[3], sample, self.shape.columns["size"])
 
@@ -120,8 +122,8 @@ class _AdvantageKernel(NetworkKernel):
         there = ir.select(self.thread < rows, unroll, beyond) < beyond
         with ir.when(there):
             place = unroll * time + step
-            ir.put(advantage, self.arrays[7], place)
-            ir.put(self._read("targets", own), self.arrays[8], place)
+            ir.put(advantage, self.arrays[8], place)
+            ir.put(self._read("targets", own), self.arrays[9], place)
         return ir.select(there, advantage, 0.0)
 
     def _store_values(self) -> None:

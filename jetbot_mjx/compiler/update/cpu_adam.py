@@ -4,22 +4,14 @@ One thread serves a policy: it adds up the squares of the gradient, computes wha
 in common, and then goes through the vectors once.
 """
 
-import functools
-from collections.abc import Callable
-from typing import Any
-
-import jax
-
 from jetbot_mjx.compiler import ffi_wrapper
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
-from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize_part
+from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 from jetbot_mjx.compiler.update import adam
-from jetbot_mjx.compiler.update.adam import METRICS, SIZES, AdamRule, Factors
-from jetbot_mjx.compiler.update.sample_loss import vector_of
+from jetbot_mjx.compiler.update.adam import ARRAYS, METRICS, SIZES, UPDATED, AdamRule, Factors
 from jetbot_mjx.compiler.update.vector_code import VectorCode
 
-_ARRAYS = ("params", "mu", "nu", "gradient", "progress", "terms")
-_RESULTS = ("params", "mu", "nu", "progress")
+_VECTORS = (*UPDATED[:3], "gradient")
 
 _SUMS = 4
 """Vectors of sums of squares, so that no addition waits for the one before."""
@@ -28,8 +20,7 @@ _SUMS = 4
 def adam_text(rule: AdamRule, lanes: int, *, name: str, machine: str) -> str:
     """Write the LLVM module of the kernel, whose function XLA calls.
 
-    It takes the arrays of `adam.step` and returns its results, with the policies as their first
-    axis.
+    It takes `adam.ARRAYS` with the policies as their first axis, and changes `adam.UPDATED`.
 
     Args:
       rule: what the vectors hold.
@@ -42,8 +33,8 @@ def adam_text(rule: AdamRule, lanes: int, *, name: str, machine: str) -> str:
     lines = [line for program in writer.programs for line in program.declarations()]
     return ffi_wrapper.call_text(
         "\n".join([*dict.fromkeys(lines), *functions]),
-        arguments=len(_ARRAYS),
-        results=len(_RESULTS),
+        arguments=len(ARRAYS),
+        results=len(UPDATED),
         blocks_per_thread=1,
         scratch=writer.scratch,
         name=name,
@@ -63,12 +54,7 @@ class _Writer:
 
     def functions(self) -> list[str]:
         """Return the texts of the functions that `block` calls."""
-        scalar, metrics = vector_of(), vector_of(len(METRICS))
-        arrays = vector_of(SIZES["progress"]), vector_of(SIZES["terms"])
-        factors = _program(
-            functools.partial(adam.factors, rule=self.rule), scalar, metrics, *arrays
-        )
-        element = _program(adam.element, *[scalar] * (4 + len(Factors._fields)))
+        factors, element = adam.programs(self.rule)
         return [self._factors(factors), *(self._elements(element, n) for n in {self.lanes, 1})]
 
     def _factors(self, program: ScalarProgram) -> str:
@@ -88,48 +74,41 @@ class _Writer:
         common = [code.splat(x) for x in common]
         with code.loop("%count") as i:
             place = code.mul(i, lanes)
-            read = [code.load(code.at(f"%{x}", place), code.vector) for x in _ARRAYS[:4]]
-            results = code.run(program, [*read, *common])
-            for x, result in zip(_RESULTS, results, strict=False):
-                code.store(result, code.at(f"%new.{x}", place), code.vector)
-        names = [*_ARRAYS[:4], *(f"new.{x}" for x in _RESULTS[:3]), "factors"]
-        return code.function(
-            f"elements.{lanes}", [*(f"ptr noalias %{x}" for x in names), "i64 %count"]
-        )
+            at = {x: code.at(f"%{x}", place) for x in _VECTORS}
+            values = [code.load(at[x], code.vector) for x in _VECTORS]
+            for x, result in zip(UPDATED, code.run(program, [*values, *common]), strict=False):
+                code.store(result, at[x], code.vector)
+        parameters = [f"ptr noalias %{x}" for x in (*_VECTORS, "factors")]
+        return code.function(f"elements.{lanes}", [*parameters, "i64 %count"])
 
     def block(self) -> str:
         """Write the function that makes the step of one policy."""
         code, rule, lanes = VectorCode(self.lanes), self.rule, self.lanes
-        sizes = dict.fromkeys(_ARRAYS, rule.shape.size) | SIZES
-        arrays = []
-        for i, name in enumerate((*_ARRAYS, *_RESULTS)):
+        arrays, sizes = {}, rule.sizes
+        for i, name in enumerate(ARRAYS):
             code.do(ffi_wrapper.address(i))
-            arrays.append(code.at(f"%a{i}", code.mul("%index", sizes[name])))
-        given = dict(zip(_ARRAYS, arrays, strict=False))
-        new = dict(zip(_RESULTS, arrays[len(_ARRAYS) :], strict=True))
+            arrays[name] = code.at(f"%a{i}", code.mul("%index", sizes[name]))
         # What `factors` reads: the sum of squares, the metrics, the progress, and the terms.
         reads, writes = code.at("%scratch", self.reads), code.at("%scratch", self.writes)
-        code.store(self._square(code, given["gradient"]), reads)
-        sources = [code.at(given["gradient"], place) for place in rule.places]
-        sources += [code.at(given[x], i) for x in ("progress", "terms") for i in range(SIZES[x])]
+        code.store(self._square(code, arrays["gradient"]), reads)
+        rows = code.mul(code.index(arrays["index"]), SIZES["progress"])
+        before = code.at(arrays["progress"], rows)
+        sources = [code.at(arrays["gradient"], place) for place in rule.places]
+        sources += [code.at(before, i) for i in range(SIZES["progress"])]
+        sources += [code.at(arrays["terms"], i) for i in range(SIZES["terms"])]
         for i, source in enumerate(sources):
             code.copy(source, code.at(reads, i + 1))
         code.call("factors", f"ptr {reads}", f"ptr {writes}")
-        progress = code.at(writes, len(Factors._fields))
+        progress, after = code.at(writes, len(Factors._fields)), code.at(before, SIZES["progress"])
         for i in range(SIZES["progress"]):
-            code.copy(code.at(progress, i), code.at(new["progress"], i))
+            code.copy(code.at(progress, i), code.at(after, i))
         for start, stop in rule.ranges:
             whole = (stop - start) // lanes
             rest = start + whole * lanes
             for width, first, count in ((lanes, start, whole), (1, rest, stop - rest)):
-                places = [code.at(given[x], first) for x in _ARRAYS[:4]]
-                places += [code.at(new[x], first) for x in _RESULTS[:3]]
+                places = [code.at(arrays[x], first) for x in _VECTORS]
                 pointers = [f"ptr {x}" for x in (*places, writes)]
                 code.call(f"elements.{width}", *pointers, f"i64 {count}")
-        # Where the gradient has the metrics, the vectors stay as they are.
-        for place in rule.places:
-            for name in _RESULTS[:3]:
-                code.copy(code.at(given[name], place), code.at(new[name], place))
         return code.function("block", ["ptr %job", "i64 %index", "ptr %scratch"])
 
     def _square(self, code: VectorCode, gradient: str) -> str:
@@ -155,9 +134,3 @@ class _Writer:
             at = code.at(total, code.add(i, 1))
             code.store(code.arithmetic("fadd", code.load(total), code.load(at)), total)
         return code.load(total)
-
-
-def _program(function: Callable[..., Any], *arguments: jax.ShapeDtypeStruct) -> ScalarProgram:
-    """Lower a function whose numbers may not be finite."""
-    closed = jax.make_jaxpr(function)(*arguments)
-    return scalarize_part(closed, closed.jaxpr.invars, closed.jaxpr.outvars, finite=False)

@@ -87,10 +87,10 @@ def gradient_kernel(division: GradientDivision) -> Kernel:
     """Return the kernel of one network.
 
     The values' kernel takes the parameters of both networks, mean and 1 / std of the observations,
-    the collected rows, the unrolls of the minibatch, the `LossTerms` and the last observations,
-    each with the policies as the first axis. It returns the gradient of each part and the
-    advantages. The policy's kernel takes noise, of shape (time, unrolls, action), and advantages
-    instead of the last observations, and returns no advantages.
+    the collected rows, the unrolls of all minibatches, which of them to compute, the `LossTerms`
+    and the last observations, each with the policies as the first axis. It returns the gradient of
+    each part and the advantages. The policy's kernel takes noise, of shape (minibatches, time,
+    unrolls, action), and advantages instead of the last observations, and returns no advantages.
 
     Args:
       division: the division of the minibatch.
@@ -136,10 +136,7 @@ class _GradientKernel(Kernel):
 
     def collected(self, unroll: str) -> str:
         """Return the index of an unroll of the minibatch among the collected ones."""
-        code = self.code
-        return code.let(
-            f"sext i32 {code.load(code.at(self.arrays['unrolls'], unroll), 'i32')} to i64"
-        )
+        return self.code.index(self.code.at(self.arrays["unrolls"], unroll))
 
     def sizes(self) -> dict[str, int]:
         shape, batch = self.shape, self.batch
@@ -148,10 +145,11 @@ class _GradientKernel(Kernel):
             "mean": shape.observations,
             "scale": shape.observations,
             "rows": batch.collected * batch.time * shape.columns["size"],
-            "unrolls": batch.unrolls,
+            "unrolls": batch.count * batch.unrolls,
+            "index": 1,
             "terms": len(LossTerms._fields),
             "last": batch.collected * shape.observations,
-            "noise": batch.samples * shape.actions,
+            "noise": batch.count * batch.samples * shape.actions,
             "advantages": batch.samples,
             "vectors": self.division.size,
         }
@@ -159,6 +157,13 @@ class _GradientKernel(Kernel):
     def begin(self) -> None:
         super().begin()
         code, shape, division, places = self.code, self.shape, self.division, self.places
+        minibatch = code.index(self.arrays["index"])
+        for name, size in (
+            ("unrolls", self.batch.unrolls),
+            ("noise", self.batch.samples * shape.actions),
+        ):
+            if name in self.arrays:
+                self.arrays[name] = code.at(self.arrays[name], code.mul(minibatch, size))
         for i, inputs, start in self.hidden():
             source = code.at(self.params, start)
             code.fill(code.at(self.arrays["vectors"], start), (inputs + 1) * shape.width)
@@ -248,7 +253,7 @@ class _GradientKernel(Kernel):
 class _ValueKernel(_GradientKernel):
     """Values, advantages, and the gradient of the value network."""
 
-    arguments = ("params", "mean", "scale", "rows", "unrolls", "terms", "last")
+    arguments = ("params", "mean", "scale", "rows", "unrolls", "index", "terms", "last")
     results = ("vectors", "advantages")
 
     def loss_function(self) -> str:
@@ -301,7 +306,10 @@ class _ValueKernel(_GradientKernel):
 class _PolicyKernel(_GradientKernel):
     """The gradient of the policy network."""
 
-    arguments = ("params", "mean", "scale", "rows", "unrolls", "terms", "noise", "advantages")
+    arguments = (
+        *("params", "mean", "scale", "rows", "unrolls", "index", "terms"),
+        *("noise", "advantages"),
+    )
     results = ("vectors",)
 
     def loss_function(self) -> str:

@@ -44,9 +44,9 @@ def gradient_text(tiling: Tiling, batch: Minibatch, parts: int) -> str:
     """Write the kernel.
 
     Its arguments are the parameters, mean and 1 / std of the observations, the collected rows, the
-    unrolls of the minibatch, the noise, of shape (time, unrolls, action), the results of the kernel
-    of the advantages, and the `LossTerms`; its result is a vector for each block, whose sum is the
-    gradient.
+    unrolls of all minibatches and their noise, of shape (time, unrolls, action) each, which of them
+    to compute, the results of the kernel of the advantages, and the `LossTerms`; its result is a
+    vector for each block, whose sum is the gradient.
 
     Args:
       tiling: the division of the work.
@@ -72,16 +72,20 @@ class _GradientKernel(NetworkKernel):
         self.network, seed = ir.register("ctaid.y"), ir.register("ctaid.z")
         self.is_policy = self.network.equals(0)
         sizes = [shape.size, shape.observations, shape.observations]
-        sizes += [batch.collected * batch.time * shape.columns["size"], batch.unrolls]
-        sizes += [batch.samples * shape.actions, batch.samples, batch.samples, 2 * self.parts]
-        sizes += [len(LossTerms._fields)]
+        drawn, noise = batch.unrolls, batch.samples * shape.actions
+        sizes += [batch.collected * batch.time * shape.columns["size"]]
+        sizes += [batch.count * drawn, batch.count * noise, 1]
+        sizes += [batch.samples, batch.samples, 2 * self.parts, len(LossTerms._fields)]
         self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
+        minibatch = self.minibatch(self.arrays[6])
+        self.unrolls = ir.row(self.arrays[4], minibatch, drawn)
+        self.noise = ir.row(self.arrays[5], minibatch, noise)
         part = seed * self.blocks + self.block
         start = self.network * shape.policy_size
-        parts = ir.row(Value(ir, "%a10", "ptr addrspace(1)"), part, shape.size)
+        parts = ir.row(Value(ir, "%a11", "ptr addrspace(1)"), part, shape.size)
         self.part = ir.element(parts, start)
         self.params = ir.element(self.arrays[0], start)
-        self.terms = self.load_terms(self.arrays[9])
+        self.terms = self.load_terms(self.arrays[10])
         self.outputs = ir.select(
             self.is_policy, ir.constant(shape.outputs[0], "i32"), ir.constant(1, "i32")
         )
@@ -103,7 +107,7 @@ class _GradientKernel(NetworkKernel):
         ir.synchronize()
         self.end_tiles(tile, list(zip(self.begun, self._all_sums(), strict=True)))
         self._store_gradient()
-        return self.text(NAME, 11)
+        return self.text(NAME, 12)
 
     def _clear(self) -> None:
         ir = self.ir
@@ -120,7 +124,7 @@ class _GradientKernel(NetworkKernel):
                 total = ir.constant(0.0)
                 for j in range(0, self.parts, LANES):
                     part = self.thread + j
-                    value = ir.fetch(self.arrays[8], ir.minimum(part, self.parts - 1) * 2 + i)
+                    value = ir.fetch(self.arrays[9], ir.minimum(part, self.parts - 1) * 2 + i)
                     total += ir.select(part < self.parts, value, 0.0)
                 ir.write(total, ir.shared(self.thread * 4, place + 4 * LANES * i))
         ir.synchronize()
@@ -145,7 +149,7 @@ class _GradientKernel(NetworkKernel):
         def place(row: Value) -> tuple[Value, Value, Value, Value]:
             sample = ir.minimum(tile * self.tiling.rows + row, self.batch.samples - 1)
             unroll, step = sample // time, sample % time
-            collected = ir.fetch(self.arrays[4], unroll, "i32")
+            collected = ir.fetch(self.unrolls, unroll, "i32")
             start = ir.row(self.arrays[3], collected * time + step, columns["size"])
             return sample, unroll, step, start
 
@@ -154,8 +158,8 @@ class _GradientKernel(NetworkKernel):
         first, last = columns["raw_action"], columns["reward"]
         extras = [ir.fetch(start, ir.constant(i, "i32")) for i in range(first, last)]
         noise = (step * self.batch.unrolls + unroll) * self.shape.actions
-        extras += [ir.fetch(self.arrays[5], noise + i) for i in range(self.shape.actions)]
-        extras += [ir.fetch(self.arrays[i], sample) for i in (6, 7)]
+        extras += [ir.fetch(self.noise, noise + i) for i in range(self.shape.actions)]
+        extras += [ir.fetch(self.arrays[i], sample) for i in (7, 8)]
         self.load_observations(lambda row: place(row)[3])()
         pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
         for i, value in enumerate(extras):

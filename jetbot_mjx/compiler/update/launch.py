@@ -1,7 +1,8 @@
 """Run the kernels of PPO as JAX functions, which `jax.vmap` batches over seeds."""
 
 import math
-from collections.abc import Callable, Sequence
+import types
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -14,7 +15,7 @@ from jaxtyping import Array, Float, Int
 
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import launch_cpu, launch_gpu
-from jetbot_mjx.compiler.update.adam import SIZES, AdamRule
+from jetbot_mjx.compiler.update.adam import ALIASES, SIZES, AdamRule
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, UpdateShape
 
 _LAUNCHERS: dict[str, Any] = {"gpu": launch_gpu, "cpu": launch_cpu}
@@ -91,8 +92,9 @@ def gradient(
     scale: Float[Array, " obs"],
     rows: Float[Array, "collected time columns"],
     last: Float[Array, "collected obs"],
-    unrolls: Int[Array, " unrolls"],
-    noise: Float[Array, "time unrolls action"],
+    unrolls: Int[Array, "minibatches unrolls"],
+    noise: Float[Array, "minibatches time unrolls action"],
+    index: Int[Array, ""],
     terms: Float[Array, " terms"],
 ) -> Float[Array, " size"]:
     """Compute the gradient of PPO's loss by the parameters of both networks.
@@ -104,38 +106,60 @@ def gradient(
       scale: what they are then multiplied by.
       rows: the collected steps, with the columns of `UpdateShape.columns`.
       last: the observations after the last steps.
-      unrolls: the unrolls of the minibatch, as indices of the collected ones.
+      unrolls: the unrolls of all minibatches, as indices of the collected ones.
       noise: standard normal noise, which estimates the entropy.
+      index: the minibatch.
       terms: the coefficients of the loss, in the order of `LossTerms`.
 
     Returns:
       The gradient, with the sums of the metrics at their places.
     """
-    arguments = (params, mean, scale, rows, last, unrolls, noise, terms)
+    arguments = (params, mean, scale, rows, last, unrolls, noise, index, terms)
     return _gradient_p.bind(*arguments, spec=shape)[0]
 
 
 def adam(
     rule: AdamRule,
+    gradient: Float[Array, " size"],
     params: Float[Array, " size"],
     mu: Float[Array, " size"],
     nu: Float[Array, " size"],
-    gradient: Float[Array, " size"],
-    progress: Float[Array, " progress"],
+    progress: Float[Array, "steps+1 progress"],
+    index: Int[Array, ""],
     terms: Float[Array, " terms"],
 ) -> tuple[Array, Array, Array, Array]:
-    """Make a step of Adam, as `jetbot_mjx.compiler.update.adam.step`."""
-    made = _adam_p.bind(params, mu, nu, gradient, progress, terms, spec=rule)
+    """Make a step of Adam, whose equations are in `jetbot_mjx.compiler.update.adam`.
+
+    Args:
+      rule: what the vectors hold, and how the step size changes.
+      gradient: the gradient, with the sums of the metrics at their places.
+      params: the parameters.
+      mu: mean of the gradients.
+      nu: mean of their squares.
+      progress: a row of `Progress` before each step, and one after the last.
+      index: the step, whose row is read and whose next row is written.
+      terms: an array of `AdamTerms`.
+
+    Returns:
+      The next parameters, means and progress.
+    """
+    made = _adam_p.bind(gradient, params, mu, nu, progress, index, terms, spec=rule)
     return made[0], made[1], made[2], made[3]
 
 
-def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primitive:
+def _primitive(
+    name: str,
+    sizes: Callable[..., list[tuple[int, ...]]],
+    aliases: Mapping[int, int] = types.MappingProxyType({}),
+) -> Primitive:
     """Return a primitive that the function `launch_{name}` of a launcher computes.
 
     Args:
       name: its name.
       sizes: a function from what the launcher is told, and the shapes of the arguments, to those of
         the results.
+      aliases: which arguments it changes, and as which results it returns them. XLA would copy
+        them if they had another shape, so the launcher gets and returns them as they are.
     """
     primitive = Primitive(f"ppo_{name}")
     primitive.multiple_results = True
@@ -171,8 +195,14 @@ def _primitive(name: str, sizes: Callable[..., list[tuple[int, ...]]]) -> Primit
         def lowered(*arguments: Array, spec: Any) -> list[Array]:
             batch = arguments[0].shape[:-1]
             policies, depth = math.prod(batch), len(batch)
-            flat = [x.reshape(policies, *x.shape[depth:]) for x in arguments]
-            return [x.reshape(*batch, *x.shape[1:]) for x in launch(spec, flat)]
+            flat = [
+                x if i in aliases else x.reshape(policies, *x.shape[depth:])
+                for i, x in enumerate(arguments)
+            ]
+            return [
+                x if i in aliases.values() else x.reshape(*batch, *x.shape[1:])
+                for i, x in enumerate(launch(spec, flat))
+            ]
 
         return lowered
 
@@ -187,12 +217,13 @@ _Size = tuple[int, ...]
 
 
 def _gradient_sizes(shape: UpdateShape, *given: _Size) -> list[_Size]:
-    (collected, time, _), (unrolls,) = given[3], given[5]
+    (collected, time, _), (minibatches, unrolls) = given[3], given[5]
     statistics, terms = (shape.observations,), (len(LossTerms._fields),)
     rows, last = (collected, time, shape.columns["size"]), (collected, shape.observations)
-    noise = time, unrolls, shape.actions
-    size = (shape.size,)
-    _check("gradient", given, (size, statistics, statistics, rows, last, (unrolls,), noise, terms))
+    noise = minibatches, time, unrolls, shape.actions
+    size, drawn = (shape.size,), (minibatches, unrolls)
+    wanted = size, statistics, statistics, rows, last, drawn, noise, (), terms
+    _check("gradient", given, wanted)
     return [size]
 
 
@@ -204,8 +235,9 @@ def _actions_sizes(shape: UpdateShape, *given: _Size) -> list[_Size]:
 
 
 def _adam_sizes(rule: AdamRule, *given: _Size) -> list[_Size]:
-    size, progress, terms = (rule.shape.size,), (SIZES["progress"],), (SIZES["terms"],)
-    _check("adam", given, (size, size, size, size, progress, terms))
+    size, terms = (rule.shape.size,), (SIZES["terms"],)
+    progress = rule.steps + 1, SIZES["progress"]
+    _check("adam", given, (size, size, size, size, progress, (), terms))
     return [size, size, size, progress]
 
 
@@ -217,4 +249,4 @@ def _check(name: str, given: tuple[_Size, ...], wanted: tuple[_Size, ...]) -> No
 
 _gradient_p = _primitive("gradient", _gradient_sizes)
 _actions_p = _primitive("actions", _actions_sizes)
-_adam_p = _primitive("adam", _adam_sizes)
+_adam_p = _primitive("adam", _adam_sizes, ALIASES)

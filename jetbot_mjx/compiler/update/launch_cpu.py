@@ -16,6 +16,7 @@ from jaxtyping import Array
 from jetbot_mjx.compiler import llvm_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
+from jetbot_mjx.compiler.update import adam
 from jetbot_mjx.compiler.update.adam import AdamRule
 from jetbot_mjx.compiler.update.cpu_actions import ActionDivision, ActionKernel
 from jetbot_mjx.compiler.update.cpu_adam import adam_text
@@ -111,9 +112,9 @@ def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Arra
     Returns:
       The gradients, with the sums of the metrics at their places, as the only array.
     """
-    params, mean, scale, rows, last, unrolls, noise, terms = arguments
-    policies = params.shape[0]
-    batch = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
+    params, mean, scale, rows, last, unrolls, noise, index, terms = arguments
+    policies, count, each = unrolls.shape
+    batch = Minibatch(rows.shape[1], each, rows.shape[2], count)
     values, policy = _divisions(shape, batch)
 
     def floats(*sizes: int) -> jax.ShapeDtypeStruct:
@@ -121,7 +122,7 @@ def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Arra
 
     def run(division: GradientDivision, others: Sequence[Array], *results: int) -> list[Array]:
         like = [floats(division.parts, division.size), *map(floats, results)]
-        given = [params, mean, scale, rows, unrolls, terms, *others]
+        given = [params, mean, scale, rows, unrolls, index, terms, *others]
         vectors, *rest = llvm_backend.launch_text(_text(gradient_kernel, division), given, like)
         # XLA's own reduction takes longer than a part does.
         total = functools.reduce(jnp.add, [vectors[:, i] for i in range(division.parts)])
@@ -137,11 +138,10 @@ def launch_adam(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
 
     Args:
       rule: what the vectors hold.
-      arguments: those of `launch.adam`, with the policies as their first axis.
+      arguments: those of `launch.adam`; the first one has the policies as its first axis.
 
     Returns:
-      Its results.
+      Its results, in place of the arguments.
     """
-    params, mu, nu, _, progress, _ = arguments
-    like = [jax.ShapeDtypeStruct(x.shape, np.float32) for x in (params, mu, nu, progress)]
-    return llvm_backend.launch_text(_adam_text(rule), arguments, like)
+    like = [jax.ShapeDtypeStruct(arguments[i].shape, np.float32) for i in adam.ALIASES]
+    return llvm_backend.launch_text(_adam_text(rule), arguments, like, adam.ALIASES)

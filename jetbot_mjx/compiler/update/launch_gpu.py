@@ -6,7 +6,7 @@ each, which XLA adds up in a fixed order.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from typing import NamedTuple
 
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 from jetbot_mjx.compiler import ptx_backend
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
-from jetbot_mjx.compiler.update import actions, adam, advantages, shapes
+from jetbot_mjx.compiler.update import actions, adam, advantages, gpu_adam, shapes
 from jetbot_mjx.compiler.update import gradient as gradient_kernel
 from jetbot_mjx.compiler.update.adam import AdamRule
 from jetbot_mjx.compiler.update.shapes import (
@@ -38,6 +38,9 @@ _LEAST_CAPABILITY = 80
 
 PTX_VERSION = 81
 """Ten times the first version of PTX whose conversions to float16 saturate."""
+
+_ELEMENTS = 2
+"""Elements of the vectors that a thread updates, if the GPU has enough multiprocessors."""
 
 _SHARED_MEMORY = {
     80: 166_912,
@@ -93,7 +96,10 @@ class _Kernel(NamedTuple):
     """Dynamic shared memory of a block [bytes]."""
 
     def launch(
-        self, arguments: Sequence[Array], *results: tuple[int, ...]
+        self,
+        arguments: Sequence[Array],
+        *results: tuple[int, ...],
+        aliases: Mapping[int, int] | None = None,
     ) -> list[Float[Array, "..."]]:
         """Run the kernel, and return float32 arrays of the given shapes."""
         like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in results]
@@ -105,11 +111,16 @@ class _Kernel(NamedTuple):
             self.grid,
             self.threads,
             self.shared_memory,
+            aliases,
         )
 
 
 def _kernel(
-    name: str, write: Callable[[], str], tiling: Tiling, grid: tuple[int, int, int]
+    name: str,
+    write: Callable[[], str],
+    grid: tuple[int, int, int],
+    threads: int,
+    shared_memory: int,
 ) -> _Kernel:
     """Begin to compile a kernel to PTX."""
     architecture = ptx_backend.target_architecture()
@@ -119,7 +130,14 @@ def _kernel(
         ptx_backend.assemble_ahead(text)
         return text
 
-    return _Kernel(name, in_background(compiled), grid, tiling.threads, tiling.layout["size"])
+    return _Kernel(name, in_background(compiled), grid, threads, shared_memory)
+
+
+def _tiled(
+    name: str, write: Callable[[], str], tiling: Tiling, grid: tuple[int, int, int]
+) -> _Kernel:
+    """Begin to compile a kernel whose blocks loop over tiles."""
+    return _kernel(name, write, grid, tiling.threads, tiling.layout["size"])
 
 
 def _most_blocks(policies: int) -> int:
@@ -135,7 +153,7 @@ def _action_kernel(shape: UpdateShape, environments: int, policies: int) -> _Ker
     assert tiling is not None
     blocks = min(most, actions.tile_count(tiling, environments))
     write = functools.partial(actions.actions_text, tiling, environments)
-    return _kernel(actions.NAME, write, tiling, (blocks, 1, policies))
+    return _tiled(actions.NAME, write, tiling, (blocks, 1, policies))
 
 
 @functools.cache
@@ -148,19 +166,30 @@ def _gradient_kernels(
     assert tiling is not None
     parts = min(most, advantages.tile_count(tiling, size))
     write = functools.partial(advantages.advantages_text, tiling, size)
-    first = _kernel(advantages.NAME, write, tiling, (parts, 1, policies))
+    first = _tiled(advantages.NAME, write, tiling, (parts, 1, policies))
     # Half of the blocks compute the policy's gradient, and half the values'.
     tiling = shapes.gradient_tiling(shape, _shared_memory())
     assert tiling is not None
     blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
     write = functools.partial(gradient_kernel.gradient_text, tiling, size, parts)
-    return first, _kernel(gradient_kernel.NAME, write, tiling, (blocks, 2, policies))
+    return first, _tiled(gradient_kernel.NAME, write, tiling, (blocks, 2, policies))
+
+
+@functools.cache
+def _adam_kernel(rule: AdamRule, policies: int) -> _Kernel:
+    """Return the kernel of Adam."""
+    wanted = -(-rule.shape.size // (_ELEMENTS * gpu_adam.THREADS))
+    blocks = min(_most_blocks(policies), wanted)
+    write = functools.partial(gpu_adam.adam_text, rule, blocks)
+    grid = blocks, 1, policies
+    return _kernel(gpu_adam.NAME, write, grid, gpu_adam.THREADS, gpu_adam.SHARED_MEMORY)
 
 
 def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
     """Divide the work among the blocks, and begin to compile all kernels, as `launch.prepare`."""
     _action_kernel(rule.shape, environments, policies)
     _gradient_kernels(rule.shape, batch, policies)
+    _adam_kernel(rule, policies)
 
 
 def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
@@ -189,33 +218,36 @@ def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Arra
     Returns:
       The gradients, with the sums of the metrics at their places, as the only array.
     """
-    params, mean, scale, rows, last, unrolls, noise, terms = arguments
-    policies = params.shape[0]
-    size = Minibatch(rows.shape[1], unrolls.shape[1], rows.shape[2])
+    params, mean, scale, rows, last, unrolls, noise, index, terms = arguments
+    policies, count, each = unrolls.shape
+    size = Minibatch(rows.shape[1], each, rows.shape[2], count)
     first, second = _gradient_kernels(shape, size, policies)
     parts, blocks = first.grid[0], second.grid[0]
     samples = policies, size.samples
     estimates = first.launch(
-        [params, mean, scale, rows, last, unrolls, terms], samples, samples, (policies, parts, 2)
+        [params, mean, scale, rows, last, unrolls, index, terms],
+        *(samples, samples, (policies, parts, 2)),
     )
     (vectors,) = second.launch(
-        [params, mean, scale, rows, unrolls, noise, *estimates, terms],
+        [params, mean, scale, rows, unrolls, noise, index, *estimates, terms],
         (policies, blocks, shape.size),
     )
     return [vectors.sum(1)]
 
 
 def launch_adam(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
-    """Make a step of Adam by XLA, while JAX lowers a program for an NVIDIA GPU.
+    """Make a step of Adam, while JAX lowers a program for an NVIDIA GPU.
 
     Args:
       rule: what the vectors hold.
-      arguments: those of `launch.adam`, with the policies as their first axis.
+      arguments: those of `launch.adam`; the first one has the policies as its first axis.
 
     Returns:
-      Its results.
+      Its results, in place of the arguments.
     """
-    return list(jax.vmap(functools.partial(adam.step, rule))(*arguments))
+    kernel = _adam_kernel(rule, arguments[0].shape[0])
+    results = [arguments[i].shape for i in adam.ALIASES]
+    return kernel.launch(arguments, *results, aliases=adam.ALIASES)
 
 
 def _shared_memory() -> int:

@@ -12,12 +12,12 @@ from jetbot_mjx.compiler.update.shapes import (
     padded,
 )
 from jetbot_mjx.compiler.update.tensor_core import (
-    DECLARATIONS,
     LANES,
     TILE,
     IrWriter,
     Sums,
     Value,
+    module_text,
 )
 
 
@@ -54,6 +54,10 @@ class NetworkKernel:
     def argument(self, index: int, seed: Value, size: int) -> Value:
         """Return the array of a seed."""
         return self.ir.row(Value(self.ir, f"%a{index}", "ptr addrspace(1)"), seed, size)
+
+    def minibatch(self, array: Value) -> Value:
+        """Return which minibatch to compute."""
+        return self.ir.fetch(array, self.ir.constant(0, "i32"), "i32")
 
     def load_terms(self, array: Value) -> LossTerms:
         """Return the coefficients of the loss."""
@@ -266,16 +270,9 @@ class NetworkKernel:
           name: the name of the kernel.
           arguments: the number of its arrays.
         """
-        parameters = ", ".join(f"ptr addrspace(1) %a{i}" for i in range(arguments))
-        body = "\n  ".join(self.ir.lines)
         carried = "\n  ".join(self.carries)
-        return (
-            f"{DECLARATIONS}define ptx_kernel void @{name}({parameters}) {{\nentry:\n  "
-            + body.replace("CARRIES", carried)
-            + "\n  ret void\n}\nattributes #0 = { convergent nounwind }\n"
-            "!nvvm.annotations = !{!0}\n"
-            f'!0 = !{{ptr @{name}, !"maxntidx", i32 {self.tiling.threads}}}\n'
-        )
+        lines = [carried if line == "CARRIES" else line for line in self.ir.lines]
+        return module_text(name, arguments, lines, self.tiling.threads)
 
     def begin_tiles(self) -> Value:
         """Begin the loop over the tiles of a block, and return the tile."""

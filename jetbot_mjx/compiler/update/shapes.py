@@ -125,6 +125,8 @@ class Minibatch(NamedTuple):
     unrolls: int
     time: int
     """Steps of an unroll."""
+    count: int = 1
+    """Number of minibatches of a training step, in all passes."""
 
     @property
     def samples(self) -> int:

@@ -12,7 +12,7 @@ row at an address that one lane gives. With `.trans` each matrix is transposed o
 
 import dataclasses
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Self
 
 LANES = 32
@@ -26,7 +26,7 @@ _SUMS = "{float, float, float, float}"
 _MMA = "@llvm.nvvm.mma.m16n8k16.row.col.f32.f32"
 _LDMATRIX = "@llvm.nvvm.ldmatrix.sync.aligned.m8n8.x4"
 
-DECLARATIONS = f"""\
+_DECLARATIONS = f"""\
 declare {_SUMS} {_MMA}({", ".join(["<2 x half>"] * 6 + ["float"] * 4)})
 declare {_QUAD} {_LDMATRIX}.b16.p3(ptr addrspace(3))
 declare {_QUAD} {_LDMATRIX}.trans.b16.p3(ptr addrspace(3))
@@ -38,6 +38,34 @@ declare i32 @llvm.nvvm.read.ptx.sreg.nctaid.x()
 @shared = external addrspace(3) global [0 x i8], align 16
 """
 """What a module declares before a function of an `IrWriter`."""
+
+
+def module_text(
+    name: str,
+    arguments: int,
+    lines: Sequence[str],
+    threads: int,
+    declarations: Iterable[str] = (),
+) -> str:
+    """Return the module of a kernel.
+
+    Args:
+      name: the name of the kernel.
+      arguments: the number of its arrays.
+      lines: its instructions, from an `IrWriter`.
+      threads: the number of threads of a block.
+      declarations: what the module declares beside what an `IrWriter` needs.
+    """
+    parameters = ", ".join(f"ptr addrspace(1) %a{i}" for i in range(arguments))
+    parts = [
+        _DECLARATIONS + "\n".join(declarations),
+        f"define ptx_kernel void @{name}({parameters}) {{\nentry:",
+        "\n  ".join(["", *lines, "ret void"])[1:],
+        "}\nattributes #0 = { convergent nounwind }",
+        f'!nvvm.annotations = !{{!0}}\n!0 = !{{ptr @{name}, !"maxntidx", i32 {threads}}}\n',
+    ]
+    return "\n".join(parts)
+
 
 _OPERATIONS = {
     ("i32", "+"): "add",

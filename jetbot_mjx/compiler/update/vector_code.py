@@ -116,6 +116,10 @@ class VectorCode:
         """Return a value from memory."""
         return self.let(f"load {kind}, ptr {address}, align 4")
 
+    def index(self, address: str) -> str:
+        """Return an integer of 32 bits from memory, as one of 64."""
+        return self.let(f"sext i32 {self.load(address, 'i32')} to i64")
+
     def store(self, value: str, address: str, kind: str = "float") -> None:
         """Write a value to memory."""
         self.do(f"store {kind} {value}, ptr {address}, align 4")
