@@ -6,7 +6,7 @@ for the evaluations during training, by which the best checkpoint is chosen, and
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
 import jax
@@ -218,7 +218,23 @@ class Evaluator:
         self._name = f"episodes of {self._names}{', recorded' if record else ''}{drawn}"
         self._robots = " on drawn robots" if drawn else ""
         self._programs = programs
+        self._compiling: dict[int, Callable[[], jax.stages.Compiled]] = {}
         self._compiled: dict[int, jax.stages.Compiled] = {}
+
+    def prepare(self, params: PolicyParams, episodes: int) -> None:
+        """Begin to compile the program in a thread, which `run` waits for.
+
+        Args:
+          params: parameters of a policy.
+          episodes: the number of episodes that will run at once.
+        """
+        if episodes in self._compiling:
+            return
+        like = jax.ShapeDtypeStruct((episodes, 2), np.uint32)
+        arguments = np.int32(0), jax.device_get(params), like
+        self._compiling[episodes] = self._programs.compile_later(
+            f"{episodes} {self._name}", lambda: self._run.trace(*arguments)
+        )
 
     def run(
         self, params: PolicyParams, keys: UInt32[Array, "n 2"], controller: str = "policy"
@@ -240,9 +256,8 @@ class Evaluator:
         count = len(keys)
         if count not in self._compiled:
             with stage("compiling the episodes"):
-                self._compiled[count] = self._programs.compile(
-                    f"{count} {self._name}", lambda: self._run.trace(*arguments)
-                )
+                self.prepare(params, count)
+                self._compiled[count] = self._compiling[count]()
         with stage(f"episodes, {controller}{self._robots}", count):
             return jax.block_until_ready(self._compiled[count](*arguments))
 

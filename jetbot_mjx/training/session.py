@@ -345,7 +345,12 @@ def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
         jitted = jax.jit(training_keys, static_argnums=0)
         return programs.compile(f"{episodes} keys", lambda: jitted.trace(episodes))()
 
-    return lambda params: summarize(evaluator.run(params, keys()), env.dt)
+    def evaluate(params: PolicyParams) -> Summary:
+        # Draw the keys while XLA compiles the episodes.
+        evaluator.prepare(params, episodes)
+        return summarize(evaluator.run(params, keys()), env.dt)
+
+    return evaluate
 
 
 def _check_folder(config: Config, run_dir: Path) -> None:
