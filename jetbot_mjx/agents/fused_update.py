@@ -127,7 +127,9 @@ class FusedUpdate:
           device_count: the number of devices that share a minibatch.
           axis_name: the mesh axis over which gradients are averaged; None: none.
         """
-        self._config, self._shape, self._axis = config, shape, axis_name
+        self._config, self._shape = config, shape
+        self._axis = axis_name if device_count > 1 else None
+        self._at_once = self._axis is None and launch.computes_at_once()
         unrolls, steps = config.batch_size // device_count, config.num_minibatches
         self.batch = Minibatch(
             unrolls * steps, unrolls, config.unroll_length, steps * config.num_updates_per_batch
@@ -140,7 +142,7 @@ class FusedUpdate:
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        launch.prepare(self._rule, self.batch, self._environments, policies)
+        launch.prepare(self._rule, self.batch, self._environments, policies, at_once=self._at_once)
 
     def pack(self, tree: PyTree) -> PyTree:
         """Return a tree with a vector in place of every `PPONetworkParams`, on host or device."""
@@ -264,6 +266,11 @@ class FusedUpdate:
         orders = jax.vmap(lambda key: jax.random.permutation(key, self.batch.collected))
         unrolls = orders(shuffle_keys).reshape(self.batch.count, -1)
         noise = self.noise(jax.random.split(noise_key, self.batch.count))
+        state = self._begin(params, optimizer_state)
+        if self._at_once:
+            rows, last, mean, scale = collected
+            given = mean, scale, rows, last, unrolls, noise, self._loss_terms(), terms
+            return self._end(launch.update(self._rule, *given, *state), optimizer_state)
 
         def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
             index, params, mu, nu, progress = state
@@ -272,9 +279,9 @@ class FusedUpdate:
             return index + 1, *made
 
         # One counter, unlike that of `scan` beside its own, which would be another launch.
-        begun = jnp.zeros((), jnp.int32), *self._begin(params, optimizer_state)
-        state = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
-        return self._end(state[1:], optimizer_state)
+        begun = jnp.zeros((), jnp.int32), *state
+        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
+        return self._end(ended[1:], optimizer_state)
 
     def noise(
         self, keys: UInt32[Array, "minibatches 2"]
@@ -305,10 +312,12 @@ class FusedUpdate:
           The gradient as a vector, with the sums of the metrics at their places.
         """
         rows, last, mean, scale = collected
-        terms = [getattr(self._config, name) for name in LossTerms._fields]
-        arrays = params, mean, scale, rows, last, unrolls, noise, index, _array(terms)
+        arrays = params, mean, scale, rows, last, unrolls, noise, index, self._loss_terms()
         gradient = launch.gradient(self._shape, *arrays)
         return gradient if self._axis is None else jax.lax.pmean(gradient, self._axis)
+
+    def _loss_terms(self) -> Float[Array, " terms"]:
+        return _array(getattr(self._config, name) for name in LossTerms._fields)
 
     def metrics(self, sums: Float[Array, " metrics"]) -> dict[str, Array]:
         """Return the sums of some minibatches' metrics under Brax's names.

@@ -23,6 +23,33 @@ done:
   ret void
 }
 
+; Waits until so many blocks have ended; those are in other threads' hands, and begun.
+define internal void @wait_for(ptr %job, i64 %count) {
+entry:
+  %ended.at = getelementptr %Job, ptr %job, i32 0, i32 1
+  br label %check
+check:
+  %ended = load atomic i64, ptr %ended.at acquire, align 8
+  %enough = icmp uge i64 %ended, %count
+  br i1 %enough, label %done, label %wait
+wait:
+  ; A block takes microseconds: who gives the core away at once has it back later than that.
+  %round = phi i64 [0, %check], [%round.next, %relax]
+  %round.next = add i64 %round, 1
+  %long = icmp uge i64 %round, $patience
+  br i1 %long, label %yield, label %relax
+relax:
+  call void @relax()
+  %seen = load atomic i64, ptr %ended.at acquire, align 8
+  %over = icmp uge i64 %seen, %count
+  br i1 %over, label %done, label %wait
+yield:
+  %ignored = call i32 @sched_yield()
+  br label %check
+done:
+  ret void
+}
+
 ; Takes blocks as long as there are any.
 define internal void @work(ptr %job) {
 entry:
@@ -38,8 +65,10 @@ take:
   %is.left = icmp ult i64 %index, %blocks
   br i1 %is.left, label %do, label %done
 do:
+  %needed = $needed
+  call void @wait_for(ptr %job, i64 %needed)
   call void @block(ptr %job, i64 %index, ptr %scratch)
-  %old = atomicrmw add ptr %ended, i64 1 release
+  %old = atomicrmw add ptr %ended, i64 1 acq_rel
   br label %take
 done:
   call void @free(ptr %scratch)
@@ -203,28 +232,7 @@ ask:
   br label %help
 start:
   call void @work(ptr %job)
-  %ended.at = getelementptr %Job, ptr %job, i32 0, i32 1
-  br label %check
-check:
-  ; Those that are begun and not ended are in other threads' hands, and none of them waits.
-  %ended = load atomic i64, ptr %ended.at acquire, align 8
-  %all = icmp eq i64 %ended, %blocks
-  br i1 %all, label %done, label %wait
-wait:
-  ; A block takes microseconds: who gives the core away at once has it back later than that.
-  %round = phi i64 [0, %check], [%round.next, %relax]
-  %round.next = add i64 %round, 1
-  %long = icmp uge i64 %round, $patience
-  br i1 %long, label %yield, label %relax
-relax:
-  call void @relax()
-  %seen = load atomic i64, ptr %ended.at acquire, align 8
-  %over = icmp eq i64 %seen, %blocks
-  br i1 %over, label %done, label %wait
-yield:
-  %ignored = call i32 @sched_yield()
-  br label %check
-done:
+  call void @wait_for(ptr %job, i64 %blocks)
   call void @release(ptr %job)
   ret ptr null
 }

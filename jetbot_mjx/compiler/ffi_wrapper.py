@@ -85,6 +85,7 @@ def call_text(
     blocks_per_robot: int = 1,
     blocks_per_thread: int,
     scratch: int = 0,
+    needed: str = "add i64 0, 0",
     name: str,
     machine: str,
 ) -> str:
@@ -100,6 +101,8 @@ def call_text(
       blocks_per_robot: the number of blocks of as many robots.
       blocks_per_thread: the smallest number of blocks for which a thread is worth its start.
       scratch: bytes of scratch memory, a multiple of 64.
+      needed: an instruction whose result is the number of blocks that must have ended before block
+        `%index` of `%job` begins. Blocks begin in their order.
       name: the name of the function, a C identifier.
       machine: the processor, one of `MACHINES`.
     """
@@ -113,6 +116,7 @@ def call_text(
         "major": VERSION[0],
         "minor": VERSION[1],
         "name": name,
+        "needed": needed,
         "patience": _PATIENCE,
         "pointers": "\n  ".join(_pointer(i, arguments) for i in range(arrays)),
         "robots_per_block": robots_per_block,

@@ -200,12 +200,13 @@ def minibatch(rng, settings, networks):
     return params, statistics, jax.tree.map(lambda x: x.astype(jnp.float32), batch)
 
 
-def traced_update(policies):
+def traced_update(policies, *, at_once):
     """The update of one policy (None) or of several, traced; it takes one minibatch six times."""
     settings = config(update="xla", num_envs=16, num_minibatches=1, num_updates_per_batch=6)
     ppo = make_ppo(settings)
     shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
     fused = fused_update.FusedUpdate(settings.ppo, shape, 1, None)
+    fused._at_once = at_once
     params, *data = minibatch(np.random.default_rng(0), settings, ppo.networks)
     vectors = fused.pack((params, ppo._optimizer.init(params)))
     given = *vectors, *data, jax.random.PRNGKey(0)
@@ -220,7 +221,7 @@ def test_a_minibatch_of_several_policies_is_three_launches(monkeypatch, policies
     pytest.importorskip("llvmlite")
     monkeypatch.setattr(ptx_backend, "compute_capability", lambda: 90)
     monkeypatch.setattr(ptx_backend, "processor_count", lambda: 132)
-    text = traced_update(policies)[0].lower(lowering_platforms=("cuda",)).as_text()
+    text = traced_update(policies, at_once=False)[0].lower(lowering_platforms=("cuda",)).as_text()
     calls = [line for line in text.splitlines() if "custom_call @__gpu$xla.gpu.ptx" in line]
     names = [re.search(r' name = "(\w+)"', call)[1] for call in calls]
     assert names == ["ppo_advantages", "ppo_gradient", "ppo_adam"]
@@ -230,9 +231,9 @@ def test_a_minibatch_of_several_policies_is_three_launches(monkeypatch, policies
 @pytest.mark.cpu
 @pytest.mark.parametrize("policies", [None, 3])
 def test_a_minibatch_changes_the_vectors_in_place(policies):
-    traced, size = traced_update(policies)
+    traced, size = traced_update(policies, at_once=False)
     text = traced.lower().compile().as_text()
-    (body,) = (part for part in text.split("\n\n") if part.count("jetbot_mjx_") == 3)
+    (body,) = (part for part in text.split("\n\n") if part.count("jetbot_mjx_") == 2)
     assert (f"f32[{policies},{size}]" if policies else f"f32[{size}]") in body
     copies = [line for line in body.splitlines() if " copy(" in line or "_copy_" in line]
     assert not [line for line in copies if str(size) in line]
@@ -627,6 +628,44 @@ def test_adam_serves_several_policies_at_once():
         for one, other in zip(alone, together, strict=True):
             np.testing.assert_array_equal(one, other[i])
         assert float(alone[3][i + 1, -1]) == (i != 1)
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("schedule", SCHEDULES)
+@pytest.mark.parametrize("distribution", ["tanh_normal", "normal"])
+@pytest.mark.parametrize("policies", [1, 3])
+def test_a_cpu_computes_all_minibatches_at_once_as_one_by_one(policies, distribution, schedule):
+    settings = config(
+        num_minibatches=3,
+        num_envs=48,
+        batch_size=16,
+        unroll_length=40,
+        learning_rate_schedule=schedule,
+        network={"distribution_type": distribution},
+        **SCHEDULES[schedule],
+    )
+    ppo, rng = make_ppo(settings), np.random.default_rng(0)
+    fused, made = ppo._fused, []
+    for policy in range(policies):
+        params, statistics, _ = minibatch(rng, settings, ppo.networks)
+        several = [minibatch(rng, settings, ppo.networks)[2] for _ in range(3)]
+        data = jax.tree.map(lambda *x: jnp.concatenate(x), *several)
+        if policy == 0:
+            # A minibatch of each pass has no finite gradient.
+            data = data._replace(reward=data.reward.at[0, 0].set(jnp.inf))
+        vectors = fused.pack((params, ppo._optimizer.init(params)))
+        made.append((*vectors, statistics, data, jax.random.PRNGKey(policy)))
+    made = jax.tree.map(lambda *x: jnp.stack(x), *made)
+    results = []
+    for at_once in (True, False):
+        fused._at_once = at_once
+        results.append(jax.jit(jax.vmap(lambda *x: fused.update(*x)))(*made))
+    jax.tree.map(np.testing.assert_array_equal, *results)
+    passes = settings.ppo.num_updates_per_batch
+    applied = np.asarray(results[0][2]["applied"])
+    np.testing.assert_array_equal(applied, [2 * passes, *[3 * passes] * (policies - 1)])
+    assert np.isfinite(results[0][0]).all()
+    assert (np.asarray(results[0][0]) != np.asarray(made[0])).mean() > 0.9
 
 
 @on_a_gpu

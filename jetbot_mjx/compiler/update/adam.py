@@ -106,10 +106,10 @@ class Factors(NamedTuple):
     inverse_2: Any
 
 
-SIZES = {"terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
+SIZES = {"adam_terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
 """Lengths of the arrays of `AdamTerms` and `Progress`."""
 
-ARRAYS = ("gradient", "params", "mu", "nu", "progress", "index", "terms")
+ARRAYS = ("gradient", "params", "mu", "nu", "progress", "index", "adam_terms")
 """The arrays that the kernels take, as `launch.adam` does."""
 
 UPDATED = ("params", "mu", "nu", "progress")
@@ -126,7 +126,7 @@ def programs(rule: AdamRule) -> tuple[ScalarProgram, ScalarProgram]:
       rule: what the vectors hold.
     """
     scalar, metrics = vector_of(), vector_of(len(METRICS))
-    arrays = vector_of(SIZES["progress"]), vector_of(SIZES["terms"])
+    arrays = vector_of(SIZES["progress"]), vector_of(SIZES["adam_terms"])
     common = _lowered(functools.partial(factors, rule=rule), scalar, metrics, *arrays)
     return common, _lowered(element, *[scalar] * (4 + len(Factors._fields)))
 
@@ -153,7 +153,7 @@ def factors(
       terms: an array of `AdamTerms`.
       rule: what the vectors hold.
     """
-    given = AdamTerms(*(terms[i] for i in range(SIZES["terms"])))
+    given = AdamTerms(*(terms[i] for i in range(SIZES["adam_terms"])))
     rate, power_1, power_2, *rest = (progress[i] for i in range(SIZES["progress"]))
     old = Progress(rate, power_1, power_2, rest[: len(METRICS)], *rest[len(METRICS) :])
     norm = jnp.sqrt(square)

@@ -5,7 +5,14 @@ import functools
 
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.update import sample_loss
-from jetbot_mjx.compiler.update.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, Division, Kernel
+from jetbot_mjx.compiler.update.cpu_network import (
+    HEAD,
+    MOST_PARTS,
+    TILE_ROWS,
+    Division,
+    NetworkStage,
+)
+from jetbot_mjx.compiler.update.cpu_stages import Call
 from jetbot_mjx.compiler.update.sample_loss import ActionSample, vector_of
 from jetbot_mjx.compiler.update.shapes import UpdateShape
 
@@ -49,15 +56,29 @@ class ActionDivision(Division):
         return {"sample": self.reads * lanes, "drawn": sum(self.shape.drawn) * lanes}
 
 
-class ActionKernel(Kernel):
-    """An `ActionKernel` runs the policy network and draws an action from each distribution.
+_ARGUMENTS = ("params", "mean", "scale", "observations", "noise")
+_RESULTS = ("action", "raw_action", "log_prob", "distribution_params")
 
-    The kernel takes the parameters of both networks, mean and 1 / std of the observations, the
-    observations and standard normal noise, each with the policies as the first axis.
+
+def action_call(division: ActionDivision) -> Call:
+    """Return the call, which takes and returns the arrays of `launch.actions`.
+
+    Args:
+      division: the division of the environments.
     """
+    shape = division.shape
+    sizes = {"observations": shape.observations, "noise": shape.actions}
+    sizes |= zip(_RESULTS, shape.drawn, strict=True)
+    sizes = {name: division.environments * size for name, size in sizes.items()}
+    sizes |= {"params": shape.size, "mean": shape.observations, "scale": shape.observations}
+    return Call(_ARGUMENTS, _RESULTS, sizes, [_ActionStage(division)])
 
-    arguments = ("params", "mean", "scale", "observations", "noise")
-    results = ("action", "raw_action", "log_prob", "distribution_params")
+
+class _ActionStage(NetworkStage):
+    """Runs the policy network and draws an action from each distribution."""
+
+    name = "actions"
+    arrays_of = (*_ARGUMENTS, *_RESULTS)
 
     def functions(self) -> list[str]:
         """Return the activation and the sample."""
@@ -72,19 +93,6 @@ class ActionKernel(Kernel):
             self.on_layers("activate", activated, ["%one"], ["%one"]),
             self.on_sample("draw", scalarize(draw, sample), self.division.lanes),
         ]
-
-    def sizes(self) -> dict[str, int]:
-        """Return the number of floats of one policy in each array."""
-        shape, environments = self.shape, self.division.environments
-        sizes = {"observations": shape.observations, "noise": shape.actions}
-        sizes |= zip(self.results, self.shape.drawn, strict=True)
-        sizes = {name: environments * size for name, size in sizes.items()}
-        return {
-            **sizes,
-            "params": shape.size,
-            "mean": shape.observations,
-            "scale": shape.observations,
-        }
 
     def tile(self, first: str, count: str) -> None:
         """Draw the actions of some environments."""
@@ -127,7 +135,7 @@ class ActionKernel(Kernel):
         code.call("draw", f"ptr {places['sample']}", f"ptr {places['drawn']}")
         with code.loop(there) as lane:
             place = 0
-            for name, size in zip(self.results, self.shape.drawn, strict=True):
+            for name, size in zip(_RESULTS, self.shape.drawn, strict=True):
                 row = code.mul(code.add(first, lane), size)
                 for i in range(size):
                     source = code.at(places["drawn"], place * lanes, lane)

@@ -1,61 +1,53 @@
-"""Write the kernel that makes a step of Adam on CPUs.
+"""Write a step of Adam on CPUs: first the squares of the gradient, and then all elements."""
 
-One thread serves a policy: it adds up the squares of the gradient, computes what all elements have
-in common, and then goes through the vectors once.
-"""
-
-from jetbot_mjx.compiler import ffi_wrapper
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 from jetbot_mjx.compiler.update import adam
 from jetbot_mjx.compiler.update.adam import ARRAYS, METRICS, SIZES, UPDATED, AdamRule, Factors
-from jetbot_mjx.compiler.update.vector_code import VectorCode
+from jetbot_mjx.compiler.update.cpu_stages import SQUARES, Call, SquareStage, Stage, VectorStage
+from jetbot_mjx.compiler.update.vector_code import VectorCode, number
 
 _VECTORS = (*UPDATED[:3], "gradient")
 
-_SUMS = 4
-"""Vectors of sums of squares, so that no addition waits for the one before."""
 
-
-def adam_text(rule: AdamRule, lanes: int, *, name: str, machine: str) -> str:
-    """Write the LLVM module of the kernel, whose function XLA calls.
-
-    It takes `adam.ARRAYS` with the policies as their first axis, and changes `adam.UPDATED`.
+def adam_call(rule: AdamRule, lanes: int) -> Call:
+    """Return the call of a step, which takes `adam.ARRAYS` and changes `adam.UPDATED`.
 
     Args:
       rule: what the vectors hold.
       lanes: the number of float32 values in a vector register.
-      name: the name of the function.
-      machine: the processor, one of `ffi_wrapper.MACHINES`.
     """
-    writer = _Writer(rule, lanes)
-    functions = [*writer.functions(), writer.block()]
-    lines = [line for program in writer.programs for line in program.declarations()]
-    return ffi_wrapper.call_text(
-        "\n".join([*dict.fromkeys(lines), *functions]),
-        arguments=len(ARRAYS),
-        results=len(UPDATED),
-        blocks_per_thread=1,
-        scratch=writer.scratch,
-        name=name,
-        machine=machine,
-    )
+    sizes = {**rule.sizes, "squares": SQUARES}
+    return Call(ARRAYS, (*UPDATED, "squares"), sizes, adam_stages(rule, lanes), minibatches=None)
 
 
-class _Writer:
+def adam_stages(rule: AdamRule, lanes: int) -> list[Stage]:
+    """Return the stages that change `adam.UPDATED` by the array `gradient`.
+
+    Args:
+      rule: what the vectors hold.
+      lanes: the number of float32 values in a vector register.
+    """
+    return [SquareStage(lanes, rule.ranges), _AdamStage(rule, lanes)]
+
+
+class _AdamStage(VectorStage):
+    """Computes what all elements have in common in each chunk, and then updates its elements."""
+
+    name = "adam"
+
     def __init__(self, rule: AdamRule, lanes: int) -> None:
+        super().__init__()
         self.rule, self.lanes = rule, lanes
-        self.programs: list[LlvmEmitter] = []
-        # Scratch memory: sums of squares, what `factors` reads, and what it returns.
-        self.reads = _SUMS * lanes
-        self.writes = self.reads + 1 + len(METRICS) + sum(SIZES.values())
-        size = 4 * (self.writes + len(Factors._fields) + SIZES["progress"])
-        self.scratch = -(-size // 64) * 64
+        # Scratch memory: what `factors` reads, and what it returns.
+        self.writes = 1 + len(METRICS) + sum(SIZES.values())
+        self.scratch = self.writes + len(Factors._fields) + SIZES["progress"]
 
-    def functions(self) -> list[str]:
-        """Return the texts of the functions that `block` calls."""
+    def texts(self, call: Call) -> list[str]:
+        """Return the texts of the function, and of those that it calls."""
         factors, element = adam.programs(self.rule)
-        return [self._factors(factors), *(self._elements(element, n) for n in {self.lanes, 1})]
+        elements = [self._elements(element, n) for n in (self.lanes, 1)]
+        return [self._factors(factors), *elements, self._step(call)]
 
     def _factors(self, program: ScalarProgram) -> str:
         code = VectorCode(1)
@@ -81,56 +73,34 @@ class _Writer:
         parameters = [f"ptr noalias %{x}" for x in (*_VECTORS, "factors")]
         return code.function(f"elements.{lanes}", [*parameters, "i64 %count"])
 
-    def block(self) -> str:
-        """Write the function that makes the step of one policy."""
+    def _step(self, call: Call) -> str:
         code, rule, lanes = VectorCode(self.lanes), self.rule, self.lanes
-        arrays, sizes = {}, rule.sizes
-        for i, name in enumerate(ARRAYS):
-            code.do(ffi_wrapper.address(i))
-            arrays[name] = code.at(f"%a{i}", code.mul("%index", sizes[name]))
+        names = *_VECTORS, "progress", "adam_terms", "squares"
+        *vectors, rows, terms, squares = (call.array(code, name) for name in names)
         # What `factors` reads: the sum of squares, the metrics, the progress, and the terms.
-        reads, writes = code.at("%scratch", self.reads), code.at("%scratch", self.writes)
-        code.store(self._square(code, arrays["gradient"]), reads)
-        rows = code.mul(code.index(arrays["index"]), SIZES["progress"])
-        before = code.at(arrays["progress"], rows)
-        sources = [code.at(arrays["gradient"], place) for place in rule.places]
+        reads, writes = "%scratch", code.at("%scratch", self.writes)
+        code.store(number(0.0), reads)
+        code.accumulate(squares, SQUARES, reads)
+        before = code.at(rows, code.mul("%minibatch", SIZES["progress"]))
+        sources = [code.at(vectors[-1], place) for place in rule.places]
         sources += [code.at(before, i) for i in range(SIZES["progress"])]
-        sources += [code.at(arrays["terms"], i) for i in range(SIZES["terms"])]
+        sources += [code.at(terms, i) for i in range(SIZES["adam_terms"])]
         for i, source in enumerate(sources):
             code.copy(source, code.at(reads, i + 1))
         code.call("factors", f"ptr {reads}", f"ptr {writes}")
+        # The other chunks still read the row before.
         progress, after = code.at(writes, len(Factors._fields)), code.at(before, SIZES["progress"])
-        for i in range(SIZES["progress"]):
+        is_first = code.let("icmp eq i64 %part, 0")
+        with code.loop(code.select(is_first, "i64", SIZES["progress"], 0)) as i:
             code.copy(code.at(progress, i), code.at(after, i))
         for start, stop in rule.ranges:
-            whole = (stop - start) // lanes
-            rest = start + whole * lanes
-            for width, first, count in ((lanes, start, whole), (1, rest, stop - rest)):
-                places = [code.at(arrays[x], first) for x in _VECTORS]
-                pointers = [f"ptr {x}" for x in (*places, writes)]
-                code.call(f"elements.{width}", *pointers, f"i64 {count}")
-        return code.function("block", ["ptr %job", "i64 %index", "ptr %scratch"])
-
-    def _square(self, code: VectorCode, gradient: str) -> str:
-        """Return the sum of the squares of the gradient's parameters."""
-        lanes, total = self.lanes, "%scratch"
-        code.fill(total, _SUMS * lanes)
-
-        def add(place: str, at: str, kind: str) -> None:
-            value = code.load(code.at(gradient, place), kind)
-            square = code.arithmetic("fmul", value, value, kind)
-            code.store(code.arithmetic("fadd", code.load(at, kind), square, kind), at, kind)
-
-        for start, stop in self.rule.ranges:
-            step = _SUMS * lanes
-            whole = (stop - start) // step
-            with code.loop(whole) as i:
-                for j in range(_SUMS):
-                    place = code.add(code.mul(i, step), start + j * lanes)
-                    add(place, code.at(total, j * lanes), code.vector)
-            with code.loop((stop - start) % step) as i:
-                add(code.add(i, start + whole * step), total, "float")
-        with code.loop(_SUMS * lanes - 1) as i:
-            at = code.at(total, code.add(i, 1))
-            code.store(code.arithmetic("fadd", code.load(total), code.load(at)), total)
-        return code.load(total)
+            first, count = self.chunk(code, start, stop)
+            whole = code.let(f"udiv i64 {count}, {lanes}")
+            done = code.mul(whole, lanes)
+            for width, begin, length in (
+                (lanes, first, whole),
+                (1, code.add(first, done), code.sub(count, done)),
+            ):
+                pointers = [f"ptr {code.at(x, begin)}" for x in vectors]
+                code.call(f"elements.{width}", *pointers, f"ptr {writes}", f"i64 {length}")
+        return self.function(code)

@@ -11,7 +11,8 @@ import functools
 
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.update import sample_loss
-from jetbot_mjx.compiler.update.cpu_network import HEAD, MOST_PARTS, Division, Kernel
+from jetbot_mjx.compiler.update.cpu_network import HEAD, MOST_PARTS, Division, NetworkStage
+from jetbot_mjx.compiler.update.cpu_stages import Call, Stage, SumStage
 from jetbot_mjx.compiler.update.sample_loss import PolicySample, ValueStep, vector_of
 from jetbot_mjx.compiler.update.shapes import (
     POLICY_METRICS,
@@ -83,25 +84,75 @@ class GradientDivision(Division):
         return sizes | {"results": (HEAD + self.slots) * lanes}
 
 
-def gradient_kernel(division: GradientDivision) -> Kernel:
-    """Return the kernel of one network.
+GRADIENT_ARGUMENTS = (
+    *("params", "mean", "scale", "rows", "last"),
+    *("unrolls", "noise", "index", "terms"),
+)
+"""The arrays of `launch.gradient`."""
 
-    The values' kernel takes the parameters of both networks, mean and 1 / std of the observations,
-    the collected rows, the unrolls of all minibatches, which of them to compute, the `LossTerms`
-    and the last observations, each with the policies as the first axis. It returns the gradient of
-    each part and the advantages. The policy's kernel takes noise, of shape (minibatches, time,
-    unrolls, action), and advantages instead of the last observations, and returns no advantages.
+BETWEEN = ("values_vectors", "policy_vectors", "advantages")
+"""The arrays that the stages of a gradient hand on."""
+
+
+def divisions(
+    shape: UpdateShape, batch: Minibatch, lanes: int
+) -> tuple[GradientDivision, GradientDivision]:
+    """Return how the values' stage and the policy's stage divide a minibatch."""
+    return GradientDivision(shape, batch, False, lanes), GradientDivision(shape, batch, True, lanes)
+
+
+def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> list[Stage]:
+    """Return the stages that compute the array `gradient`, from values to the sum of all parts.
 
     Args:
-      division: the division of the minibatch.
+      shape: the networks.
+      batch: the minibatch.
+      lanes: the number of float32 values in a vector register.
     """
-    return (_PolicyKernel if division.is_policy else _ValueKernel)(division)
+    values, policy = divisions(shape, batch, lanes)
+    end = shape.policy_size
+    ranges = {
+        "policy_vectors": (policy.parts, 0, end),
+        "values_vectors": (values.parts, end, shape.size),
+    }
+    return [_ValueStage(values), _PolicyStage(policy), SumStage(lanes, ranges)]
 
 
-class _GradientKernel(Kernel):
-    """A `_GradientKernel` writes what both kernels share."""
+def gradient_sizes(shape: UpdateShape, batch: Minibatch, lanes: int) -> dict[str, int]:
+    """Return the numbers of one policy in each array of these stages."""
+    values, policy = divisions(shape, batch, lanes)
+    return {
+        "params": shape.size,
+        "mean": shape.observations,
+        "scale": shape.observations,
+        "rows": batch.collected * batch.time * shape.columns["size"],
+        "last": batch.collected * shape.observations,
+        "unrolls": batch.count * batch.unrolls,
+        "noise": batch.count * batch.samples * shape.actions,
+        "index": 1,
+        "terms": len(LossTerms._fields),
+        "values_vectors": values.parts * values.size,
+        "policy_vectors": policy.parts * policy.size,
+        "advantages": batch.samples,
+        "gradient": shape.size,
+    }
 
-    by_part = ("vectors",)
+
+def gradient_call(shape: UpdateShape, batch: Minibatch, lanes: int) -> Call:
+    """Return the call of a minibatch's gradient, which takes the arrays of `launch.gradient`.
+
+    Args:
+      shape: the networks.
+      batch: the minibatch.
+      lanes: the number of float32 values in a vector register.
+    """
+    sizes, results = gradient_sizes(shape, batch, lanes), ("gradient", *BETWEEN)
+    stages = gradient_stages(shape, batch, lanes)
+    return Call(GRADIENT_ARGUMENTS, results, sizes, stages, minibatches=None)
+
+
+class _GradientStage(NetworkStage):
+    """A `_GradientStage` writes what both networks share."""
 
     def __init__(self, division: GradientDivision) -> None:
         super().__init__(division)
@@ -114,10 +165,10 @@ class _GradientKernel(Kernel):
         return [
             self.on_layers("activate", activated, ["%one"], both),
             self.on_layers("multiply", scaled, both, ["%one"]),
-            self.loss_function(),
+            self.loss_function(f"{self.name}_loss"),
         ]
 
-    def loss_function(self) -> str:
+    def loss_function(self, name: str) -> str:
         raise NotImplementedError
 
     def add_losses(self, first: str, count: str) -> None:
@@ -138,35 +189,20 @@ class _GradientKernel(Kernel):
         """Return the index of an unroll of the minibatch among the collected ones."""
         return self.code.index(self.code.at(self.arrays["unrolls"], unroll))
 
-    def sizes(self) -> dict[str, int]:
-        shape, batch = self.shape, self.batch
-        return {
-            "params": shape.size,
-            "mean": shape.observations,
-            "scale": shape.observations,
-            "rows": batch.collected * batch.time * shape.columns["size"],
-            "unrolls": batch.count * batch.unrolls,
-            "index": 1,
-            "terms": len(LossTerms._fields),
-            "last": batch.collected * shape.observations,
-            "noise": batch.count * batch.samples * shape.actions,
-            "advantages": batch.samples,
-            "vectors": self.division.size,
-        }
-
     def begin(self) -> None:
         super().begin()
         code, shape, division, places = self.code, self.shape, self.division, self.places
-        minibatch = code.index(self.arrays["index"])
+        vectors = self.arrays[f"{self.name}_vectors"]
+        self.vector = code.at(vectors, code.mul("%part", division.size))
         for name, size in (
             ("unrolls", self.batch.unrolls),
             ("noise", self.batch.samples * shape.actions),
         ):
             if name in self.arrays:
-                self.arrays[name] = code.at(self.arrays[name], code.mul(minibatch, size))
+                self.arrays[name] = code.at(self.arrays[name], code.mul("%minibatch", size))
         for i, inputs, start in self.hidden():
             source = code.at(self.params, start)
-            code.fill(code.at(self.arrays["vectors"], start), (inputs + 1) * shape.width)
+            code.fill(code.at(self.vector, start), (inputs + 1) * shape.width)
             if i:
                 self._turn(source, places[f"turned{i}"], inputs, shape.width)
         source = code.at(self.params, shape.hidden)
@@ -220,7 +256,7 @@ class _GradientKernel(Kernel):
             code.product(
                 (layer, 1, layer_stride),
                 (deltas, stride),
-                (code.at(self.arrays["vectors"], start), width),
+                (code.at(self.vector, start), width),
                 (inputs + 1, width, rows),
                 adds=True,
             )
@@ -233,16 +269,15 @@ class _GradientKernel(Kernel):
     def end(self) -> None:
         # Copy the sums of the head and of the samples to the part's vector.
         code, shape, division = self.code, self.shape, self.division
-        outputs, vector = division.outputs, self.arrays["vectors"]
+        outputs, vector = division.outputs, self.vector
         with code.loop(shape.width + 1) as row, code.loop(outputs) as j:
             source = code.at(self.places["head_sums"], code.mul(row, HEAD), j)
             code.copy(source, code.at(vector, shape.hidden, code.mul(row, outputs), j))
         with code.loop(division.slots) as slot:
             target = code.at(vector, shape.hidden + (shape.width + 1) * outputs, slot)
             code.store(number(0.0), target)
-            with code.loop(code.lanes) as lane:
-                source = code.at(self.places["sums"], code.mul(slot, code.lanes), lane)
-                self.accumulate(target, code.load(source))
+            source = code.at(self.places["sums"], code.mul(slot, code.lanes))
+            code.accumulate(source, code.lanes, target)
 
     def accumulate(self, target: str, value: str, kind: str = "float") -> None:
         """Add a value to one in memory."""
@@ -250,19 +285,22 @@ class _GradientKernel(Kernel):
         code.store(code.arithmetic("fadd", code.load(target, kind), value, kind), target, kind)
 
 
-class _ValueKernel(_GradientKernel):
+class _ValueStage(_GradientStage):
     """Values, advantages, and the gradient of the value network."""
 
-    arguments = ("params", "mean", "scale", "rows", "unrolls", "index", "terms", "last")
-    results = ("vectors", "advantages")
+    name = "values"
+    arrays_of = (
+        *("params", "mean", "scale", "rows", "last", "unrolls", "terms"),
+        *("values_vectors", "advantages"),
+    )
 
-    def loss_function(self) -> str:
+    def loss_function(self, name: str) -> str:
         program = scalarize(
             functools.partial(sample_loss.value_step, samples=self.batch.samples),
             ValueStep(*[vector_of()] * len(ValueStep._fields)),
             _TERMS,
         )
-        return self.on_sample("loss", program, 1)
+        return self.on_sample(name, program, 1)
 
     def observation(self, unroll: str, step: str) -> str:
         # The row behind the steps has the observation after them. An address beyond the array is
@@ -294,7 +332,7 @@ class _ValueKernel(_GradientKernel):
                 code.copy(code.at(places["outputs"], row), reads)
                 for place, name in enumerate(("reward", "discount", "truncation"), start=1):
                     code.copy(code.at(source, shape.columns[name]), code.at(reads, place))
-                code.call("loss", f"ptr {reads}", f"ptr {writes}")
+                code.call("values_loss", f"ptr {reads}", f"ptr {writes}")
                 sample = code.add(code.mul(unroll, time), step)
                 code.copy(writes, code.at(self.arrays["advantages"], sample))
                 code.copy(code.at(writes, 1), code.at(places["errors"], row))
@@ -303,16 +341,16 @@ class _ValueKernel(_GradientKernel):
                     code.copy(code.at(writes, 3 + place), code.at(reads, 4 + place))
 
 
-class _PolicyKernel(_GradientKernel):
+class _PolicyStage(_GradientStage):
     """The gradient of the policy network."""
 
-    arguments = (
-        *("params", "mean", "scale", "rows", "unrolls", "index", "terms"),
-        *("noise", "advantages"),
+    name = "policy"
+    arrays_of = (
+        *("params", "mean", "scale", "rows", "unrolls", "noise", "terms"),
+        *("policy_vectors", "advantages"),
     )
-    results = ("vectors",)
 
-    def loss_function(self) -> str:
+    def loss_function(self, name: str) -> str:
         actions = self.shape.actions
         sample = PolicySample(
             outputs=vector_of(self.division.outputs),
@@ -329,7 +367,7 @@ class _PolicyKernel(_GradientKernel):
             samples=self.batch.samples,
             tanh=self.shape.distribution == "tanh_normal",
         )
-        return self.on_sample("loss", scalarize(loss, sample, _TERMS), self.division.lanes)
+        return self.on_sample(name, scalarize(loss, sample, _TERMS), self.division.lanes)
 
     def begin(self) -> None:
         super().begin()
@@ -385,7 +423,7 @@ class _PolicyKernel(_GradientKernel):
                 within = code.let(f"udiv i64 {row}, {time}")
                 step = code.sub(row, code.mul(within, time))
                 self._load_sample(code.add(first, within), step, row, is_there, lane)
-            code.call("loss", f"ptr {places['loss']}", f"ptr {results}")
+            code.call("policy_loss", f"ptr {places['loss']}", f"ptr {results}")
             with code.loop(there) as lane, code.loop(division.outputs) as j:
                 source = code.at(results, code.mul(j, lanes), lane)
                 row = code.mul(code.add(start, lane), HEAD)

@@ -1,8 +1,7 @@
 """Write what the kernels of PPO on CPUs share: loading a network, and its forward pass.
 
-A kernel divides its rows into parts, which XLA's threads compute, and a part into tiles. Everything
-is float32. The number of parts follows from the number of rows alone, so no result depends on the
-number of threads.
+A stage divides its rows into parts, which XLA's threads compute, and a part into tiles. Everything
+is float32.
 
 A column of ones beside the activations has the biases as its weights, so that one product computes
 a layer with its biases.
@@ -14,18 +13,12 @@ import itertools
 from collections.abc import Callable
 from typing import Any
 
-from jetbot_mjx.compiler import ffi_wrapper
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram
 from jetbot_mjx.compiler.update import sample_loss
+from jetbot_mjx.compiler.update.cpu_stages import Call, Stage
 from jetbot_mjx.compiler.update.shapes import UpdateShape
-from jetbot_mjx.compiler.update.vector_code import (
-    ROWS,
-    VectorCode,
-    number,
-    product_declarations,
-    product_text,
-)
+from jetbot_mjx.compiler.update.vector_code import ROWS, VectorCode, number
 
 HEAD = 16
 """Columns of the last layer, of which those beyond its outputs are zero."""
@@ -110,14 +103,11 @@ class Division(abc.ABC):
         return {**dict(zip(sizes, starts, strict=False)), "size": starts[-1]}
 
 
-class Kernel:
-    """A `Kernel` writes a kernel that takes tiles of rows through one of the networks."""
+class NetworkStage(Stage):
+    """A `NetworkStage` takes tiles of rows through one of the networks."""
 
-    arguments: tuple[str, ...]
-    """Names of the arrays that it reads; all have the policies as their first axis."""
-    results: tuple[str, ...]
-    by_part: tuple[str, ...] = ()
-    """Results that have a row for each part."""
+    arrays_of: tuple[str, ...]
+    """Names of the arrays that it reads or writes."""
 
     def __init__(self, division: Any) -> None:
         """Prepare.
@@ -125,16 +115,13 @@ class Kernel:
         Args:
           division: the `Division` of its rows.
         """
+        super().__init__()
         self.division, self.shape = division, division.shape
-        self.programs: list[LlvmEmitter] = []
+        self.parts, self.scratch = division.parts, division.layout["size"]
         self.code = VectorCode(division.lanes)
 
     def functions(self) -> list[str]:
-        """Return the texts of the functions that `_block` calls; `activate` is one of them."""
-        raise NotImplementedError
-
-    def sizes(self) -> dict[str, int]:
-        """Return the number of floats of one policy, or of one part, in each array."""
+        """Return the texts of the functions that a part calls; `activate` is one of them."""
         raise NotImplementedError
 
     def tile(self, first: str, count: str) -> None:
@@ -145,29 +132,6 @@ class Kernel:
           count: their number.
         """
         raise NotImplementedError
-
-    def text(self, *, registers: int, name: str, machine: str) -> str:
-        """Return the LLVM module of the kernel, whose function XLA calls.
-
-        Args:
-          registers: the number of vector registers.
-          name: the name of the function.
-          machine: the processor, one of `ffi_wrapper.MACHINES`.
-        """
-        division, lanes = self.division, self.division.lanes
-        functions = [*self.functions(), product_text(lanes, registers), self._block()]
-        lines = [product_declarations(lanes), "declare float @llvm.sqrt.f32(float)"]
-        lines += [line for program in self.programs for line in program.declarations()]
-        return ffi_wrapper.call_text(
-            "\n".join([*dict.fromkeys(lines), *functions]),
-            arguments=len(self.arguments),
-            results=len(self.results),
-            blocks_per_robot=division.parts,
-            blocks_per_thread=1,
-            scratch=4 * division.layout["size"],
-            name=name,
-            machine=machine,
-        )
 
     def on_layers(
         self, name: str, program: ScalarProgram, reads: list[str], writes: list[str]
@@ -199,17 +163,10 @@ class Kernel:
             code.store(result, code.at("%writes", i * lanes), code.vector)
         return code.function(name, ["ptr noalias %reads", "ptr noalias %writes"])
 
-    def _block(self) -> str:
-        """Write the function that computes one part of one policy."""
-        code, division = self.code, self.division
-        policy = code.let(f"udiv i64 %index, {division.parts}")
-        part = code.sub("%index", code.mul(policy, division.parts))
-        sizes = self.sizes()
-        self.arrays = {}
-        for i, name in enumerate((*self.arguments, *self.results)):
-            code.do(ffi_wrapper.address(i))
-            of = "%index" if name in self.by_part else policy
-            self.arrays[name] = code.at(f"%a{i}", code.mul(of, sizes[name]))
+    def texts(self, call: Call) -> list[str]:
+        """Return the texts of the function that computes one part, and of those that it calls."""
+        functions, code, division = self.functions(), self.code, self.division
+        self.arrays = {name: call.array(code, name) for name in self.arrays_of}
         start = 0 if division.is_policy else self.shape.policy_size
         self.params = code.at(self.arrays["params"], start)
         self.places = {
@@ -218,7 +175,7 @@ class Kernel:
             if name != "size"
         }
         self.begin()
-        first = code.mul(part, division.part_items)
+        first = code.mul("%part", division.part_items)
         there = code.smaller(code.sub(division.items, first), division.part_items)
         per_tile = division.tile_items
         tiles = code.let(f"sdiv i64 {code.add(there, per_tile - 1)}, {per_tile}")
@@ -227,7 +184,7 @@ class Kernel:
             count = code.smaller(code.sub(there, done), per_tile)
             self.tile(code.add(first, done), count)
         self.end()
-        return code.function("block", ["ptr %job", "i64 %index", "ptr %scratch"])
+        return [*functions, self.function(code)]
 
     def hidden(self) -> list[tuple[int, int, int]]:
         """Return number, inputs and first parameter of each hidden layer."""

@@ -61,7 +61,8 @@ class _AdamKernel:
         before = ir.row(arrays["progress"], index, SIZES["progress"])
         # Begin to load everything before the threads wait for each other.
         given = [ir.fetch(gradient, ir.constant(place, "i32")) for place in rule.places]
-        given += self._all(before, SIZES["progress"]) + self._all(arrays["terms"], SIZES["terms"])
+        for name, array in (("progress", before), ("adam_terms", arrays["adam_terms"])):
+            given += self._all(array, SIZES[name])
         places = self._places()
         early = [self._fetch(arrays, place) for place in places[:_EARLY]]
         square = self._sum(self._squares(gradient))

@@ -40,7 +40,14 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return launcher.refusal(shape, batch)
 
 
-def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
+def computes_at_once() -> bool:
+    """Return whether one kernel computes all minibatches on JAX's default device: `update`."""
+    return hasattr(_LAUNCHERS[jax.default_backend()], "launch_update")
+
+
+def prepare(
+    rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
+) -> None:
     """Begin to compile the kernels, before a program is traced that launches them.
 
     Args:
@@ -48,8 +55,10 @@ def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) 
       batch: the minibatch.
       environments: the number of environments of a policy.
       policies: the number of policies that are trained at once.
+      at_once: whether `update` is what it launches, and not `gradient` and `adam`.
     """
-    _LAUNCHERS[jax.default_backend()].prepare(rule, batch, environments, policies)
+    launcher = _LAUNCHERS[jax.default_backend()]
+    launcher.prepare(rule, batch, environments, policies, at_once=at_once)
 
 
 class Actions(NamedTuple):
@@ -147,6 +156,46 @@ def adam(
     return made[0], made[1], made[2], made[3]
 
 
+def update(
+    rule: AdamRule,
+    mean: Float[Array, " obs"],
+    scale: Float[Array, " obs"],
+    rows: Float[Array, "collected time columns"],
+    last: Float[Array, "collected obs"],
+    unrolls: Int[Array, "minibatches unrolls"],
+    noise: Float[Array, "minibatches time unrolls action"],
+    terms: Float[Array, " terms"],
+    adam_terms: Float[Array, " adam_terms"],
+    params: Float[Array, " size"],
+    mu: Float[Array, " size"],
+    nu: Float[Array, " size"],
+    progress: Float[Array, "steps+1 progress"],
+) -> tuple[Array, Array, Array, Array]:
+    """Make a step of Adam along the gradient of each minibatch, as `gradient` and `adam` do.
+
+    Args:
+      rule: the networks, and how the step size changes.
+      mean: what is subtracted from the observations.
+      scale: what they are then multiplied by.
+      rows: the collected steps, with the columns of `UpdateShape.columns`.
+      last: the observations after the last steps.
+      unrolls: the unrolls of all minibatches, as indices of the collected ones.
+      noise: standard normal noise, which estimates the entropy.
+      terms: the coefficients of the loss, in the order of `LossTerms`.
+      adam_terms: an array of `AdamTerms`.
+      params: the parameters of both networks, in the order of `UpdateShape`.
+      mu: mean of the gradients.
+      nu: mean of their squares.
+      progress: a row of `Progress` before each step, and one after the last.
+
+    Returns:
+      The parameters, means and progress after the last minibatch.
+    """
+    given = mean, scale, rows, last, unrolls, noise, terms, adam_terms, params, mu, nu, progress
+    made = _update_p.bind(*given, spec=rule)
+    return made[0], made[1], made[2], made[3]
+
+
 def _primitive(
     name: str,
     sizes: Callable[..., list[tuple[int, ...]]],
@@ -208,8 +257,9 @@ def _primitive(
 
     batching.primitive_batchers[primitive] = batched
     for launcher in _LAUNCHERS.values():
-        lowering = mlir.lower_fun(lowered_by(getattr(launcher, f"launch_{name}")))
-        mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
+        if launch := getattr(launcher, f"launch_{name}", None):
+            lowering = mlir.lower_fun(lowered_by(launch))
+            mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
     return primitive
 
 
@@ -235,9 +285,21 @@ def _actions_sizes(shape: UpdateShape, *given: _Size) -> list[_Size]:
 
 
 def _adam_sizes(rule: AdamRule, *given: _Size) -> list[_Size]:
-    size, terms = (rule.shape.size,), (SIZES["terms"],)
+    size, terms = (rule.shape.size,), (SIZES["adam_terms"],)
     progress = rule.steps + 1, SIZES["progress"]
     _check("adam", given, (size, size, size, size, progress, (), terms))
+    return [size, size, size, progress]
+
+
+def _update_sizes(rule: AdamRule, *given: _Size) -> list[_Size]:
+    shape, time = rule.shape, given[2][1]
+    (count, unrolls), size = given[4], (shape.size,)
+    gradient = size, *given[:6], (), given[6]
+    _gradient_sizes(shape, *gradient)
+    progress = rule.steps + 1, SIZES["progress"]
+    _check("update", given[7:], ((SIZES["adam_terms"],), size, size, size, progress))
+    if (count, unrolls * time) != (rule.steps, rule.samples):
+        raise TypeError(f"update: {count} x {unrolls} unrolls of {time} steps do not fit {rule}")
     return [size, size, size, progress]
 
 
@@ -250,3 +312,4 @@ def _check(name: str, given: tuple[_Size, ...], wanted: tuple[_Size, ...]) -> No
 _gradient_p = _primitive("gradient", _gradient_sizes)
 _actions_p = _primitive("actions", _actions_sizes)
 _adam_p = _primitive("adam", _adam_sizes, ALIASES)
+_update_p = _primitive("update", _update_sizes, launch_cpu.ALIASES)

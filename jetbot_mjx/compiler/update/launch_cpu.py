@@ -1,15 +1,10 @@
-"""Launch the kernels of PPO on CPUs.
-
-The value network's kernel of the gradient also returns the advantages, which that of the policy
-takes. Each part of a minibatch writes a vector, and XLA adds them up in a fixed order.
-"""
+"""Launch the kernels of PPO on CPUs, of which one computes a whole update."""
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
@@ -18,10 +13,12 @@ from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import adam
 from jetbot_mjx.compiler.update.adam import AdamRule
-from jetbot_mjx.compiler.update.cpu_actions import ActionDivision, ActionKernel
-from jetbot_mjx.compiler.update.cpu_adam import adam_text
-from jetbot_mjx.compiler.update.cpu_gradient import GradientDivision, gradient_kernel
-from jetbot_mjx.compiler.update.cpu_network import HEAD, Division, Kernel
+from jetbot_mjx.compiler.update.cpu_actions import ActionDivision, action_call
+from jetbot_mjx.compiler.update.cpu_adam import adam_call
+from jetbot_mjx.compiler.update.cpu_gradient import divisions, gradient_call
+from jetbot_mjx.compiler.update.cpu_network import HEAD
+from jetbot_mjx.compiler.update.cpu_stages import Call
+from jetbot_mjx.compiler.update.cpu_update import ALIASES, update_call
 from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
 
 BACKEND: Backend = llvm_backend
@@ -46,41 +43,70 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
         return f"it takes at most {HEAD} outputs, not {outputs}"
     if shape.width % _WIDTH_STEP:
         return f"it takes layers of 16, 32, 48, ... units, not {shape.width}"
-    if max(4 * x.layout["size"] for x in _divisions(shape, batch)) > _MOST_MEMORY:
+    lanes = llvm_backend.host_processor().lanes
+    if max(4 * x.layout["size"] for x in divisions(shape, batch, lanes)) > _MOST_MEMORY:
         return f"unrolls of {batch.time} steps do not fit in {_MOST_MEMORY >> 20} MiB"
     return None
 
 
-def _divisions(shape: UpdateShape, batch: Minibatch) -> tuple[GradientDivision, GradientDivision]:
-    """Return how the values' kernel and the policy's kernel divide a minibatch."""
-    lanes = llvm_backend.host_processor().lanes
-    values, policy = (GradientDivision(shape, batch, x, lanes) for x in (False, True))
-    return values, policy
-
-
 @functools.cache
-def _text(kernel: Callable[[Any], Kernel], division: Division) -> str:
-    """Return the LLVM module of a kernel."""
-    host = llvm_backend.host_processor()
-    return kernel(division).text(
-        registers=host.registers, name=llvm_backend.NAME, machine=host.machine
+def _text(host: llvm_backend.Host, write: Callable[..., Call], *given: Any) -> str:
+    """Return the LLVM module of a call.
+
+    Args:
+      host: the processor.
+      write: a function that returns the call.
+      *given: its arguments before the number of lanes.
+    """
+    return write(*given, host.lanes).text(
+        lanes=host.lanes, registers=host.registers, name=llvm_backend.NAME, machine=host.machine
     )
 
 
-@functools.cache
-def _adam_text(rule: AdamRule) -> str:
-    host = llvm_backend.host_processor()
-    return adam_text(rule, host.lanes, name=llvm_backend.NAME, machine=host.machine)
+def _action_call(shape: UpdateShape, environments: int, lanes: int) -> Call:
+    return action_call(ActionDivision(shape, environments, lanes))
 
 
-def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
+def prepare(
+    rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
+) -> None:
     """Begin to compile all kernels, which serve any number of policies, as `launch.prepare`."""
-    shape, lanes = rule.shape, llvm_backend.host_processor().lanes
-    texts = [functools.partial(_text, ActionKernel, ActionDivision(shape, environments, lanes))]
-    texts += [functools.partial(_text, gradient_kernel, x) for x in _divisions(shape, batch)]
-    texts.append(functools.partial(_adam_text, rule))
-    for text in texts:
-        in_background(lambda text=text: llvm_backend.registered(text()))
+    calls: list[tuple[Any, ...]] = [(_action_call, rule.shape, environments)]
+    if at_once:
+        calls.append((update_call, rule, batch))
+    else:
+        calls += [(gradient_call, rule.shape, batch), (adam_call, rule)]
+    host = llvm_backend.host_processor()
+    for call in calls:
+        in_background(lambda call=call: llvm_backend.registered(_text(host, *call)))
+
+
+def _launch(
+    arguments: Sequence[Array],
+    policies: int,
+    write: Callable[..., Call],
+    *given: Any,
+    aliases: Mapping[int, int] | None = None,
+) -> list[Array]:
+    """Call a function, while JAX lowers a program for CPUs.
+
+    Args:
+      arguments: its arrays.
+      policies: the number of policies.
+      write: a function that returns the call.
+      *given: its arguments before the number of lanes.
+      aliases: which arguments it changes, and as which results it returns them.
+
+    Returns:
+      Its results, of shape (policies, numbers) unless they are arguments.
+    """
+    host = llvm_backend.host_processor()
+    call = write(*given, host.lanes)
+    shapes: list[tuple[int, ...]] = [(policies, call.sizes[name]) for name in call.results]
+    for argument, result in (aliases or {}).items():
+        shapes[result] = arguments[argument].shape
+    like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
+    return llvm_backend.launch_text(_text(host, write, *given), arguments, like, aliases)
 
 
 def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
@@ -94,16 +120,13 @@ def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array
       The arrays of `launch.Actions`.
     """
     policies, environments = arguments[3].shape[:2]
-    division = ActionDivision(shape, environments, llvm_backend.host_processor().lanes)
-    like = [
-        jax.ShapeDtypeStruct((policies, *sizes), np.float32)
-        for sizes in shape.drawn_shapes(environments)
-    ]
-    return llvm_backend.launch_text(_text(ActionKernel, division), arguments, like)
+    drawn = _launch(arguments, policies, _action_call, shape, environments)
+    shapes = shape.drawn_shapes(environments)
+    return [x.reshape(policies, *sizes) for x, sizes in zip(drawn, shapes, strict=True)]
 
 
 def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
-    """Run both kernels of a minibatch, while JAX lowers a program for CPUs.
+    """Compute the gradient of a minibatch, while JAX lowers a program for CPUs.
 
     Args:
       shape: the networks.
@@ -112,25 +135,10 @@ def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Arra
     Returns:
       The gradients, with the sums of the metrics at their places, as the only array.
     """
-    params, mean, scale, rows, last, unrolls, noise, index, terms = arguments
+    rows, unrolls = arguments[3], arguments[5]
     policies, count, each = unrolls.shape
     batch = Minibatch(rows.shape[1], each, rows.shape[2], count)
-    values, policy = _divisions(shape, batch)
-
-    def floats(*sizes: int) -> jax.ShapeDtypeStruct:
-        return jax.ShapeDtypeStruct((policies, *sizes), np.float32)
-
-    def run(division: GradientDivision, others: Sequence[Array], *results: int) -> list[Array]:
-        like = [floats(division.parts, division.size), *map(floats, results)]
-        given = [params, mean, scale, rows, unrolls, index, terms, *others]
-        vectors, *rest = llvm_backend.launch_text(_text(gradient_kernel, division), given, like)
-        # XLA's own reduction takes longer than a part does.
-        total = functools.reduce(jnp.add, [vectors[:, i] for i in range(division.parts)])
-        return [total, *rest]
-
-    of_values, advantages = run(values, [last], batch.samples)
-    (of_policy,) = run(policy, [noise, advantages])
-    return [jnp.concatenate([of_policy, of_values], axis=1)]
+    return _launch(arguments, policies, gradient_call, shape, batch)[:1]
 
 
 def launch_adam(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
@@ -143,5 +151,23 @@ def launch_adam(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
     Returns:
       Its results, in place of the arguments.
     """
-    like = [jax.ShapeDtypeStruct(arguments[i].shape, np.float32) for i in adam.ALIASES]
-    return llvm_backend.launch_text(_adam_text(rule), arguments, like, adam.ALIASES)
+    made = _launch(arguments, arguments[0].shape[0], adam_call, rule, aliases=adam.ALIASES)
+    return made[: len(adam.ALIASES)]
+
+
+def launch_update(rule: AdamRule, arguments: Sequence[Array]) -> list[Array]:
+    """Compute all minibatches, while JAX lowers a program for CPUs.
+
+    Args:
+      rule: the networks, and how the step size changes.
+      arguments: those of `launch.update`, of which those that it does not change have the policies
+        as their first axis.
+
+    Returns:
+      Its results, in place of the arguments.
+    """
+    rows, unrolls = arguments[2], arguments[4]
+    policies, count, each = unrolls.shape
+    batch = Minibatch(rows.shape[1], each, rows.shape[2], count)
+    made = _launch(arguments, policies, update_call, rule, batch, aliases=ALIASES)
+    return made[: len(ALIASES)]

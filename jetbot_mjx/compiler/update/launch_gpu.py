@@ -185,8 +185,11 @@ def _adam_kernel(rule: AdamRule, policies: int) -> _Kernel:
     return _kernel(gpu_adam.NAME, write, grid, gpu_adam.THREADS, gpu_adam.SHARED_MEMORY)
 
 
-def prepare(rule: AdamRule, batch: Minibatch, environments: int, policies: int) -> None:
+def prepare(
+    rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
+) -> None:
     """Divide the work among the blocks, and begin to compile all kernels, as `launch.prepare`."""
+    assert not at_once
     _action_kernel(rule.shape, environments, policies)
     _gradient_kernels(rule.shape, batch, policies)
     _adam_kernel(rule, policies)

@@ -128,6 +128,29 @@ class VectorCode:
         """Copy a value from one address to another."""
         self.store(self.load(source, kind), target, kind)
 
+    def each(self, first: str, count: str) -> Iterator[tuple[str, str]]:
+        """Repeat what is appended for all vectors of a range, and for all numbers that are left.
+
+        Args:
+          first: the first number.
+          count: how many there are.
+
+        Yields:
+          Twice: the place of the vector or number, and its type.
+        """
+        whole = self.let(f"udiv i64 {count}, {self.lanes}")
+        with self.loop(whole) as i:
+            yield self.add(first, self.mul(i, self.lanes)), self.vector
+        done = self.mul(whole, self.lanes)
+        with self.loop(self.sub(count, done)) as i:
+            yield self.add(first, self.add(done, i)), "float"
+
+    def accumulate(self, source: str, count: int, target: str) -> None:
+        """Add numbers in memory to another one."""
+        with self.loop(count) as i:
+            value = self.load(self.at(source, i))
+            self.store(self.arithmetic("fadd", self.load(target), value), target)
+
     def fill(self, address: str, count: str | int, value: float = 0.0) -> None:
         """Write a number to an array of floats."""
         with self.loop(count) as i:

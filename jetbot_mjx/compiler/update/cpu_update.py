@@ -1,0 +1,38 @@
+"""Write all minibatches of a training step on CPUs as one call.
+
+Each minibatch has the stages of its gradient, and then those of Adam.
+"""
+
+from jetbot_mjx.compiler.update.adam import UPDATED, AdamRule
+from jetbot_mjx.compiler.update.cpu_adam import adam_stages
+from jetbot_mjx.compiler.update.cpu_gradient import BETWEEN, gradient_sizes, gradient_stages
+from jetbot_mjx.compiler.update.cpu_stages import SQUARES, Call
+from jetbot_mjx.compiler.update.shapes import Minibatch
+
+ARGUMENTS = (
+    *("mean", "scale", "rows", "last", "unrolls", "noise", "terms", "adam_terms"),
+    *UPDATED,
+)
+"""The arrays of `launch.update`; the last ones are changed in place, and returned."""
+
+
+ALIASES = {ARGUMENTS.index(name): i for i, name in enumerate(UPDATED)}
+"""The arguments whose memory the results take."""
+
+
+def update_call(rule: AdamRule, batch: Minibatch, lanes: int) -> Call:
+    """Return the call, which takes `ARGUMENTS`.
+
+    Args:
+      rule: the networks, and how the step size changes.
+      batch: the minibatch.
+      lanes: the number of float32 values in a vector register.
+    """
+    sizes = {
+        **rule.sizes,
+        **gradient_sizes(rule.shape, batch, lanes),
+        "squares": SQUARES,
+    }
+    stages = [*gradient_stages(rule.shape, batch, lanes), *adam_stages(rule, lanes)]
+    results = *UPDATED, "gradient", "squares", *BETWEEN
+    return Call(ARGUMENTS, results, sizes, stages, minibatches=batch.count)
