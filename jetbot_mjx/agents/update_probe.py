@@ -1,7 +1,7 @@
 """Check the kernels of PPO on this machine before a training relies on them.
 
-The check is a few actions and a small gradient, compared with NumPy and central differences of the
-loss, since XLA would take longer to compile them than a training takes to begin.
+The check is a few actions, a small gradient and a step of Adam, compared with NumPy and central
+differences of the loss, since XLA would take longer to compile them than a training takes to begin.
 """
 
 import functools
@@ -12,12 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from jetbot_mjx.compiler.update import launch
+from jetbot_mjx.compiler.update import adam, launch
+from jetbot_mjx.compiler.update.adam import AdamRule
 from jetbot_mjx.compiler.update.shapes import LossTerms, UpdateShape
 
 _SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh", normalizes=False)
 _TERMS = LossTerms(0.2, 0.01, 1.0, 0.9, 0.9, 1.0)
 _UNROLLS, _TIME = 8, 4
+_RULE = AdamRule(_SHAPE, _UNROLLS * _TIME, "NONE", steps=1)
+_MOST_NORM, _RATE = 0.3, 0.01
 _MOST_ERROR = 0.01
 """Largest difference of the gradients, relative to their norm, and of actions and logarithms of
 probabilities; GPUs have products of float16."""
@@ -26,7 +29,7 @@ _STEP = 1e-4
 
 @functools.cache
 def runs_correctly() -> bool:
-    """Return whether the kernels draw a few actions and compute a small gradient correctly."""
+    """Return whether the kernels draw actions, compute a gradient and make a step correctly."""
     backend = launch.backend()
     if not backend.is_available():
         return False
@@ -56,14 +59,21 @@ def runs_correctly() -> bool:
         given = rows, last, order[None], noise[None], jnp.zeros((), jnp.int32)
         gradient = launch.gradient(*network, *given, jnp.asarray(_TERMS))
         observations = rows[:, 0, : _SHAPE.observations]
-        return gradient, launch.actions(*network, observations, noise[0])
+        # Any vector serves as the means.
+        state = gradient, params, params, jnp.abs(params), jnp.asarray(progress), given[-1]
+        stepped = launch.adam(_RULE, *state, jnp.asarray(adam_terms))
+        return gradient, launch.actions(*network, observations, noise[0]), stepped
 
+    progress = np.zeros((2, adam.SIZES["progress"]), np.float32)
+    progress[0, :3] = _RATE, 1, 1
+    adam_terms = np.zeros(adam.SIZES["adam_terms"], np.float32)
+    adam_terms[0] = _MOST_NORM
     order = np.arange(_UNROLLS, dtype=np.int32)
     arrays = [np.asarray(x, np.float32) for x in (params, rows, last)]
     arguments = *arrays, order, np.asarray(noise, np.float32)
     with jax.default_device(jax.local_devices(backend=backend.PLATFORM)[0]):
         try:
-            result, actions = jax.jit(run)(*jax.device_put(arguments))
+            result, actions, stepped = jax.jit(run)(*jax.device_put(arguments))
         except jax.errors.JaxRuntimeError:
             return False
         # Beside the gradient, the vector has the sums of the metrics, on which nothing depends.
@@ -74,9 +84,28 @@ def runs_correctly() -> bool:
             np.abs(np.asarray(one) - other).max()
             for one, other in zip(actions, drawn_right, strict=True)
         ]
+        errors += [
+            np.abs(np.asarray(one) - other).max()
+            for one, other in zip(stepped, _step(params, ours, np.asarray(stepped[3])), strict=True)
+        ]
     errors.append(np.linalg.norm(ours - expected) / np.linalg.norm(expected))
     # What is no number is not smaller.
     return all(bool(error <= _MOST_ERROR) for error in errors)
+
+
+def _step(params: np.ndarray, gradient: np.ndarray, progress: np.ndarray) -> list[np.ndarray]:
+    """Return what `launch.adam` does; of the progress, what does not depend on the metrics."""
+    clipped = gradient * min(1.0, _MOST_NORM / np.linalg.norm(gradient))
+    is_parameter = np.ones(_SHAPE.size, bool)
+    is_parameter[_RULE.places] = False
+    one, two = adam.BETA_1, adam.BETA_2
+    mu = np.where(is_parameter, one * params + (1 - one) * clipped, params)
+    nu = np.abs(params)
+    nu = np.where(is_parameter, two * nu + (1 - two) * clipped**2, nu)
+    change = _RATE * mu / (1 - one) / (np.sqrt(nu / (1 - two)) + 1e-8)
+    after = progress.copy()
+    after[0, :3], after[1, :3], after[1, -2:] = (_RATE, 1, 1), (_RATE, one, two), (_RATE, 1)
+    return [np.where(is_parameter, params - change, params), mu, nu, after]
 
 
 def _network(params: np.ndarray, outputs: int, x: np.ndarray) -> np.ndarray:

@@ -344,6 +344,7 @@ def modelled_actions(shape, *arrays):
 def test_the_probe_agrees_with_the_model(monkeypatch):
     monkeypatch.setattr(launch, "gradient", modelled)
     monkeypatch.setattr(launch, "actions", modelled_actions)
+    monkeypatch.setattr(launch, "adam", modelled_adam)
     assert update_probe.runs_correctly.__wrapped__()
     monkeypatch.setattr(launch, "gradient", lambda *arrays: 1.1 * modelled(*arrays))
     assert not update_probe.runs_correctly.__wrapped__()
@@ -361,6 +362,21 @@ def test_the_probe_sees_wrong_actions(monkeypatch, name, error):
 
     assert update_probe.runs_correctly.__wrapped__()
     monkeypatch.setattr(launch, "actions", wrong)
+    assert not update_probe.runs_correctly.__wrapped__()
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("error", [0.05, np.nan])
+@pytest.mark.parametrize("place", range(4))
+def test_the_probe_sees_a_wrong_step(monkeypatch, place, error):
+    right = launch.adam
+
+    def wrong(*arrays):
+        made = list(right(*arrays))
+        made[place] = made[place].at[(0,) * made[place].ndim].add(error)
+        return tuple(made)
+
+    monkeypatch.setattr(launch, "adam", wrong)
     assert not update_probe.runs_correctly.__wrapped__()
 
 

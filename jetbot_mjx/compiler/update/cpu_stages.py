@@ -1,8 +1,8 @@
 """Write a function that XLA calls on a CPU, whose threads go through several stages together.
 
 A stage is divided into parts. The threads take the parts of all stages in order, and a part waits
-until all parts of the stages before have ended. XLA wakes its threads once for a call: between two
-calls they go to sleep, and a core comes back a twentieth of a millisecond late.
+until all parts of the stages before have ended. XLA wakes its threads once for a call; between two
+calls they go to sleep, and come back late.
 
 How many parts a stage has follows from the sizes alone, so no result depends on the number of
 threads.
