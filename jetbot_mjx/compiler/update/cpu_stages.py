@@ -49,11 +49,11 @@ class Call:
           name: the name of the function.
           machine: the processor, one of `ffi_wrapper.MACHINES`.
         """
-        functions = [line for stage in self.stages for line in stage.texts(self)]
+        functions = [text for stage in self.stages for text in stage.texts(self)]
         programs = [program for stage in self.stages for program in stage.programs]
         lines = [product_declarations(lanes), "declare float @llvm.sqrt.f32(float)"]
         lines += [line for program in programs for line in program.declarations()]
-        functions += [product_text(lanes, registers), self._place(), self._needed(), self._block()]
+        functions += [product_text(lanes, registers), self._needed(), self._block()]
         return ffi_wrapper.call_text(
             "\n".join(dict.fromkeys([*lines, *functions])),
             arguments=len(self.arguments),
@@ -66,11 +66,11 @@ class Call:
             machine=machine,
         )
 
-    def array(self, code: VectorCode, name: str) -> str:
+    def array(self, code: VectorCode, name: str, policy: str = "%policy") -> str:
         """Return the address of the array of a policy."""
         place = (*self.arguments, *self.results).index(name)
         address = code.let(f"getelementptr %Job, ptr %job, i32 0, i32 5, i64 {place}")
-        return code.at(code.let(f"load ptr, ptr {address}"), code.mul("%policy", self.sizes[name]))
+        return code.at(code.let(f"load ptr, ptr {address}"), code.mul(policy, self.sizes[name]))
 
     @property
     def _parts(self) -> int:
@@ -81,29 +81,14 @@ class Call:
         """Return the number of parts before each stage."""
         return [sum(x.parts for x in self.stages[:i]) for i in range(len(self.stages))]
 
-    def _place(self) -> str:
-        """Write a function of a block's index: its minibatch, and its place in it."""
-        code = VectorCode(1)
-        at = code.let("getelementptr %Job, ptr %job, i32 0, i32 4")
-        policies = code.let(f"load i64, ptr {at}")
-        blocks = code.mul(policies, self._parts)
-        parts = [policies, code.let(f"udiv i64 %index, {blocks}")]
-        parts.append(code.let(f"urem i64 %index, {blocks}"))
-        whole = "undef"
-        for i, part in enumerate(parts):
-            whole = code.let(f"insertvalue %Place {whole}, i64 {part}, {i}")
-        code.do(f"ret %Place {whole}")
-        lines = "\n".join(code.lines)
-        return (
-            "%Place = type { i64, i64, i64 }\n"
-            f"define internal %Place @place(ptr %job, i64 %index) {{\n{lines}\n}}\n"
-        )
-
     def _decoded(self, code: VectorCode) -> tuple[str, str, str]:
-        """Return the policies, the minibatch, and the block's place in it."""
-        whole = code.let("call %Place @place(ptr %job, i64 %index)")
-        first, second, third = (code.let(f"extractvalue %Place {whole}, {i}") for i in range(3))
-        return first, second, third
+        """Return the policies, and of block `%index` its minibatch and its place in that."""
+        policies = code.let(
+            f"load i64, ptr {code.let('getelementptr %Job, ptr %job, i32 0, i32 4')}"
+        )
+        blocks = code.mul(policies, self._parts)
+        minibatch, place = (code.let(f"{op} i64 %index, {blocks}") for op in ("udiv", "urem"))
+        return policies, minibatch, place
 
     def _needed(self) -> str:
         """Write a function that returns how many blocks must have ended before a block begins."""
@@ -115,8 +100,7 @@ class Call:
             is_there = code.let(f"icmp uge i64 {place}, {begins}")
             before = code.select(is_there, "i64", begins, before)
         done = code.mul(minibatch, code.mul(policies, self._parts))
-        code.do(f"ret i64 {code.add(done, before)}")
-        lines = "\n".join(code.lines)
+        lines = "\n".join([*code.lines, f"%needed = add i64 {done}, {before}", "ret i64 %needed"])
         return f"define internal i64 @needed(ptr %job, i64 %index) {{\n{lines}\n}}\n"
 
     def _block(self) -> str:
@@ -129,22 +113,16 @@ class Call:
             code.do(f"br i1 {is_here}, label %stage{i}, label %beyond{i}")
             code.do(f"stage{i}:")
             within = code.sub(place, code.mul(policies, start))
-            policy = code.let(f"udiv i64 {within}, {stage.parts}")
-            part = code.let(f"urem i64 {within}, {stage.parts}")
-            code.do(f"%policy{i} = add i64 {policy}, 0")
-            number = minibatch if self.minibatches else self._given(code, i)
-            arguments = f"i64 %policy{i}", f"i64 {part}", f"i64 {number}", "ptr %scratch"
-            code.call(stage.name, "ptr %job", *arguments)
+            policy, part = (
+                code.let(f"{op} i64 {within}, {stage.parts}") for op in ("udiv", "urem")
+            )
+            if self.minibatches is None:
+                minibatch = code.index(self.array(code, "index", policy))
+            numbers = (f"i64 {x}" for x in (policy, part, minibatch))
+            code.call(stage.name, "ptr %job", *numbers, "ptr %scratch")
             code.do("ret void")
             code.do(f"beyond{i}:")
         return code.function("block", ["ptr %job", "i64 %index", "ptr %scratch"])
-
-    def _given(self, code: VectorCode, stage: int) -> str:
-        """Return the minibatch that the array `index` holds."""
-        place = self.arguments.index("index")
-        address = code.let(f"getelementptr %Job, ptr %job, i32 0, i32 5, i64 {place}")
-        array = code.let(f"load ptr, ptr {address}")
-        return code.index(code.at(array, f"%policy{stage}"))
 
 
 class Stage(abc.ABC):
@@ -231,7 +209,6 @@ class SquareStage(VectorStage):
         code = VectorCode(self._lanes)
         gradient, squares = call.array(code, "gradient"), call.array(code, "squares")
         code.fill("%scratch", self._lanes)
-
         for start, stop in self._ranges:
             for place, kind in code.each(*self.chunk(code, start, stop)):
                 value = code.load(code.at(gradient, place), kind)
