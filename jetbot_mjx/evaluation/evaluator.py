@@ -228,7 +228,7 @@ class Evaluator:
           params: parameters of a policy.
           episodes: the number of episodes that will run at once.
         """
-        if episodes in self._compiling:
+        if episodes in self._compiling or episodes in self._compiled:
             return
         like = jax.ShapeDtypeStruct((episodes, 2), np.uint32)
         arguments = np.int32(0), jax.device_get(params), like
@@ -257,7 +257,7 @@ class Evaluator:
         if count not in self._compiled:
             with stage("compiling the episodes"):
                 self.prepare(params, count)
-                self._compiled[count] = self._compiling[count]()
+                self._compiled[count] = self._compiling.pop(count)()
         with stage(f"episodes, {controller}{self._robots}", count):
             return jax.block_until_ready(self._compiled[count](*arguments))
 

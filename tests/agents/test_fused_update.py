@@ -228,6 +228,76 @@ def test_a_minibatch_of_several_policies_is_three_launches(monkeypatch, policies
     assert re.findall(r"grid_z = (\d+)", text) == [str(policies or 1)] * 3
 
 
+def arrays_of(rule, batch):
+    """What the kernels take for one policy, by the name of the kernel."""
+    shape = rule.shape
+
+    def floats(*sizes):
+        return jnp.zeros(sizes)
+
+    vector, statistics = floats(shape.size), floats(shape.observations)
+    rows = floats(batch.collected, batch.time, shape.columns["size"])
+    last = floats(batch.collected, shape.observations)
+    unrolls = jnp.zeros((batch.count, batch.unrolls), jnp.int32)
+    noise = floats(batch.count, batch.time, batch.unrolls, shape.actions)
+    data, terms, index = (
+        (statistics, statistics, rows, last, unrolls, noise),
+        floats(6),
+        unrolls[0, 0],
+    )
+    progress, rates = floats(rule.steps + 1, 10), floats(7)
+    return {
+        "gradient": (vector, *data, index, terms),
+        "adam": (vector, vector, vector, vector, progress, index, rates),
+        "update": (*data, terms, rates, vector, vector, vector, progress),
+    }
+
+
+@pytest.mark.cpu
+@pytest.mark.parametrize("kernel", ["gradient", "adam", "update"])
+def test_a_kernel_refuses_what_it_would_misread(kernel):
+    fused = make_ppo(config())._fused
+    arrays = arrays_of(fused._rule, fused.batch)[kernel]
+    spec = fused._shape if kernel == "gradient" else fused._rule
+    run = functools.partial(jax.eval_shape, functools.partial(getattr(launch, kernel), spec))
+    run(*arrays)
+    for i, array in enumerate(arrays):
+        other = jnp.float32 if array.dtype == jnp.int32 else jnp.int32
+        for wrong in (
+            array.astype(other),
+            array[None],
+            array[..., :-1] if array.ndim else array[None],
+        ):
+            with pytest.raises((TypeError, ValueError)):
+                run(*arrays[:i], wrong, *arrays[i + 1 :])
+
+
+@pytest.mark.cpu
+def test_the_update_at_once_is_of_the_configured_minibatches():
+    fused = make_ppo(config())._fused
+    arrays = arrays_of(fused._rule, fused.batch)["update"]
+    for change in ({"steps": fused._rule.steps - 1}, {"samples": 1}):
+        with pytest.raises(TypeError, match="update: "):
+            jax.eval_shape(
+                functools.partial(launch.update, fused._rule._replace(**change)), *arrays
+            )
+
+
+@pytest.mark.cpu
+def test_several_devices_average_each_gradient():
+    settings = config()
+    shape = fused_update.shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
+    assert fused_update.FusedUpdate(settings.ppo, shape, 1, "i")._at_once
+    assert not fused_update.FusedUpdate(settings.ppo, shape, 2, "i")._at_once
+
+
+@pytest.mark.cpu
+def test_other_devices_leave_the_update_to_xla(monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "tpu")
+    found = fused_update.choose(config().ppo, OBSERVATIONS, ACTIONS, 1, None)
+    assert found == "it needs a CPU or an NVIDIA GPU, and this is tpu"
+
+
 @pytest.mark.cpu
 @pytest.mark.parametrize("policies", [None, 3])
 def test_a_minibatch_changes_the_vectors_in_place(policies):
@@ -267,7 +337,7 @@ def test_actions_of_other_shapes_are_refused(wrong):
     with pytest.raises(TypeError, match="actions: "):
         launch.actions(shape, *arrays)
     arrays[wrong] = jnp.zeros(sizes[wrong], jnp.float16)
-    with pytest.raises(TypeError, match=r"actions: .*32 bits"):
+    with pytest.raises(TypeError, match=r"actions: .*float32"):
         launch.actions(shape, *arrays)
 
 

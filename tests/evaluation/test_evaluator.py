@@ -9,6 +9,7 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import (
     BASELINES,
+    Evaluator,
     report_keys,
     summarize,
     training_keys,
@@ -151,3 +152,31 @@ def test_constant_actions_drive_straight_ahead_until_time_is_up(driven):
     np.testing.assert_array_equal(episodes.steps[missed], 256)
     np.testing.assert_array_equal(episodes.terminated, ~missed)
     assert np.all(np.abs(episodes.end_w[missed, 1]) < 0.02)
+
+
+def test_a_compilation_that_failed_is_tried_again():
+    tries = []
+
+    class Programs:
+        """A cache whose first compilation fails."""
+
+        def compile_later(self, name, trace):
+            tries.append(name)
+
+            def program():
+                if len(tries) == 1:
+                    raise RuntimeError("no memory")
+                return lambda *arguments: arguments[2]
+
+            return program
+
+    env = make_env(parse_config({}))
+    evaluator = Evaluator(env, networks=None, programs=Programs())
+    keys = report_keys(4)
+    evaluator.prepare({}, 4)
+    with pytest.raises(RuntimeError, match="no memory"):
+        evaluator.run({}, keys)
+    for _ in range(2):
+        np.testing.assert_array_equal(evaluator.run({}, keys), keys)
+    evaluator.prepare({}, 4)
+    assert tries == ["4 episodes of ['policy']"] * 2

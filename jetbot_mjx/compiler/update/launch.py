@@ -2,7 +2,7 @@
 
 import math
 import types
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -42,7 +42,7 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
 
 def computes_at_once() -> bool:
     """Return whether one kernel computes all minibatches on JAX's default device: `update`."""
-    return hasattr(_LAUNCHERS[jax.default_backend()], "launch_update")
+    return hasattr(_LAUNCHERS.get(jax.default_backend()), "launch_update")
 
 
 def prepare(
@@ -199,6 +199,7 @@ def update(
 def _primitive(
     name: str,
     sizes: Callable[..., list[tuple[int, ...]]],
+    integers: Collection[int] = (),
     aliases: Mapping[int, int] = types.MappingProxyType({}),
 ) -> Primitive:
     """Return a primitive that the function `launch_{name}` of a launcher computes.
@@ -207,6 +208,7 @@ def _primitive(
       name: its name.
       sizes: a function from what the launcher is told, and the shapes of the arguments, to those of
         the results.
+      integers: which arguments are int32; the others are float32.
       aliases: which arguments it changes, and as which results it returns them. XLA would copy
         them if they had another shape, so the launcher gets and returns them as they are.
     """
@@ -219,8 +221,10 @@ def _primitive(
         # All arguments have the policies, if any, as their first axes.
         batch = arguments[0].shape[:-1]
         inner = [x.shape[len(batch) :] for x in arguments]
-        if any(x.shape[: len(batch)] != batch or x.dtype.itemsize != 4 for x in arguments):
-            raise TypeError(f"{name}: not of one batch and 32 bits: {arguments}")
+        for i, x in enumerate(arguments):
+            dtype = np.int32 if i in integers else np.float32
+            if x.shape[: len(batch)] != batch or x.dtype != dtype:
+                raise TypeError(f"{name}: argument {i} is {x}, not {np.dtype(dtype)} of {batch}")
         return [ShapedArray((*batch, *size), np.float32) for size in sizes(spec, *inner)]
 
     @primitive.def_impl
@@ -309,7 +313,7 @@ def _check(name: str, given: tuple[_Size, ...], wanted: tuple[_Size, ...]) -> No
         raise TypeError(f"{name}: the shapes are {given} instead of {wanted}")
 
 
-_gradient_p = _primitive("gradient", _gradient_sizes)
+_gradient_p = _primitive("gradient", _gradient_sizes, (5, 7))
 _actions_p = _primitive("actions", _actions_sizes)
-_adam_p = _primitive("adam", _adam_sizes, ALIASES)
-_update_p = _primitive("update", _update_sizes, launch_cpu.ALIASES)
+_adam_p = _primitive("adam", _adam_sizes, (5,), ALIASES)
+_update_p = _primitive("update", _update_sizes, (4,), launch_cpu.ALIASES)
