@@ -57,6 +57,8 @@ class Sizes(NamedTuple):
     """The activations of both networks and of their convolutions for one sample."""
     gradient: int
     """What a gradient stores of one sample; nothing if the update is fused."""
+    noise: int
+    """The noise that estimates the entropy of one sample in all passes, if the update is fused."""
     parameters: int
     """One copy of the networks, Adam's moments, the normaliser and the sums of metrics."""
 
@@ -75,7 +77,7 @@ class Footprint(NamedTuple):
     collecting: int
     """One physics step or the actions of all environments, and the collected steps."""
     learning: int
-    """The collected steps, their shuffled copy, and the activations of a minibatch."""
+    """The collected steps, their shuffled copy, the noise, and the activations of a minibatch."""
     evaluation: int
     """The episodes of an evaluation, on the first device."""
 
@@ -125,6 +127,7 @@ def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
         unroll=ends // unrolls,
         layers=_FLOAT * units + encoded,
         gradient=0 if ppo.is_fused else int(_LAYERS * (_FLOAT * units + encoded)),
+        noise=_FLOAT * config.num_updates_per_batch * env.action_size if ppo.is_fused else 0,
         parameters=_bytes(state) - environments,
     )
 
@@ -175,6 +178,7 @@ def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
             + 2 * stepped
             + each.parameters
             + minibatch * each.gradient
+            + samples * each.noise
         ),
         evaluation=config.evaluation.episodes * (2 * each.environment + working),
     )

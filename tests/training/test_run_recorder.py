@@ -33,6 +33,9 @@ def recorder(root, tmp_path, monkeypatch):
         def __init__(self, env, networks, programs):
             pass
 
+        def prepare(self, params, episodes):
+            pass
+
         def run(self, params, keys):
             one, place = np.ones(len(keys)), np.zeros((len(keys), 2))
             return Episodes(
