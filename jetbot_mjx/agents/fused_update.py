@@ -1,9 +1,9 @@
-"""Draw the actions of a step by one kernel, and compute the gradient of PPO's loss by two.
+"""Draw the actions of a step, and compute PPO's update, by kernels of this package.
 
 Motivation: XLA passes the activations of every layer through memory between its kernels. It
 launches 140 of them for a minibatch, and takes seconds to compile them. Here one kernel runs the
-policy in all environments, and two compute values, advantages and the gradient of both networks;
-docs/update.md explains them.
+policy in all environments, and three compute advantages, the gradient of both networks and Adam's
+step on GPUs, or one all minibatches on CPUs; docs/update.md explains them.
 
 Protocol: the parameters and Adam's moments are one vector each during an update (`pack`, `unpack`).
 On GPUs, products round their operands to float16; everything else is float32.
