@@ -26,6 +26,19 @@ _ROOT = Path(__file__).parents[1]
 TRUSTED = frozenset({f"{_ROOT.name}:GoalTask"})
 """Tasks whose source is part of the package, and so of the key."""
 
+_NOT_IN_PROGRAMS = {
+    # The seed is an argument of the programs.
+    "seed",
+    "init_from",
+    "stop_at_success",
+    "checkpoint_interval",
+    "checkpoints_to_keep",
+    "preemption_notice",
+    "tensorboard",
+    "wandb",
+}
+"""Settings that no program depends on: when a training ends, and what it reads and writes."""
+
 SOURCES = {".ll", ".py", ".xml"}
 """Suffixes of the files from which programs are made."""
 
@@ -51,8 +64,7 @@ def open_program_cache(config: Config) -> ProgramCache:
         if not name.startswith(("jax_compilation_cache", "jax_persistent_cache", "jax_log"))
     }
     cache_key = [
-        # Leave out the seed, which is an argument of the programs.
-        config.model_copy(update={"seed": 0, "init_from": None}).model_dump(mode="json"),
+        config.model_dump(mode="json", exclude=_NOT_IN_PROGRAMS),
         _own_source(),
         _model(config),
         sys.version,

@@ -241,7 +241,27 @@ def paths(tmp_path, monkeypatch):
 def test_a_configuration_finds_its_own_programs_whatever_its_seed(paths):
     assert paths({}) == paths({}) == paths({"seed": 7})
     others = [{"seeds": 2}, {"ppo": {"unroll_length": 8}}, {"robot": {"preset": "real"}}]
-    assert len({paths({}), *map(paths, others)}) == 4
+    others += [{"ppo": {"num_timesteps": 9_000_000}}, {"task": {"episode_length": 9}}]
+    others += [{"physics": {"iterations": 3}}, {"evaluation": {"episodes": 7}}]
+    assert len({paths({}), *map(paths, others)}) == 8
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        {"stop_at_success": 0.5},
+        {"checkpoint_interval": 65_536},
+        {"checkpoints_to_keep": 7},
+        {"preemption_notice": 99.0},
+        {"tensorboard": False},
+        {"init_from": "runs/one"},
+        {"wandb": "mine"},
+    ],
+    ids=lambda setting: next(iter(setting)),
+)
+def test_what_a_training_reads_and_writes_and_when_it_ends_changes_no_program(paths, setting):
+    assert parse_config(setting) != parse_config({})
+    assert paths(setting) == paths({})
 
 
 def test_other_flags_of_xla_are_another_program(paths, monkeypatch):
