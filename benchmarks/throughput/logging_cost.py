@@ -28,7 +28,7 @@ from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.runs.metrics import CompileClock
-from jetbot_mjx.runs.run_dir import write_json
+from jetbot_mjx.runs.run_dir import versions, write_json
 from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
@@ -117,7 +117,8 @@ def _train_once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, 
         else:
             kind = _LogsAndCheckpoints if mode == "saved" else _LogsOnly
             run_dir, programs = Path(folder), ProgramCache(compiler_options(config))
-            parts = session.Training(config, run_dir, [run_dir], env, program.ppo, programs, None)
+            objects = env, program.ppo, programs, None, versions()
+            parts = session.Training(config, run_dir, [run_dir], *objects)
             with (
                 mock.patch.object(session, "RunRecorder", kind),
                 session.open_recorder(parts, clock, None) as recorder,

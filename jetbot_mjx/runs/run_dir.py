@@ -15,7 +15,7 @@ import platform
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -126,19 +126,20 @@ def occupied(run_dir: Path) -> Iterator[None]:
         yield
 
 
-def write_run(run_dir: Path, config: Config) -> None:
+def write_run(run_dir: Path, config: Config, made_with: Mapping[str, Any]) -> None:
     """Write the configuration and the versions, which are known before training.
 
     Args:
       run_dir: the run folder, which must exist.
       config: the resolved configuration.
+      made_with: the versions, from `versions`.
 
     Raises:
       UserError: the folder cannot be written.
     """
     with writing_to(run_dir):
         write_text(run_dir / CONFIG, config.to_yaml())
-        write_json(run_dir / _VERSIONS, versions())
+        write_json(run_dir / _VERSIONS, made_with)
 
 
 def changed_versions(run_dir: Path) -> list[str]:

@@ -10,7 +10,7 @@ import functools
 import importlib.util
 import pickle
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,6 +107,8 @@ class Training(NamedTuple):
     programs: ProgramCache
     warm_start: WarmStart | None
     """The parameters to begin with; None: those of the seed, or the run is resumed."""
+    versions: Mapping[str, Any]
+    """The versions that the folders of all seeds store."""
     task_code: TaskCode | None = None
     """The source of the task that the run stores; None: it has none, or it is stored already."""
 
@@ -163,7 +165,8 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
     env, task_code = _make_env(config, run_dirs)
     ppo = ppo_trainer.build_ppo(config, env)
     warm_start = _warm_start(config, env, run_dirs)
-    training = Training(config, run_dir, run_dirs, env, ppo, programs, warm_start, task_code)
+    objects = env, ppo, programs, warm_start, versions()
+    training = Training(config, run_dir, run_dirs, *objects, task_code)
     try:
         return _train_with_brax(training) if config.trainer == "brax" else _train(training)
     except jax.errors.JaxRuntimeError as error:
@@ -212,7 +215,7 @@ def _store_run(training: Training) -> None:
     if training.config.seeds > 1:
         folders |= dict(zip(training.run_dirs, training.config.of_each_seed(), strict=True))
     for folder, config in folders.items():
-        write_run(folder, config)
+        write_run(folder, config, training.versions)
         if training.task_code:
             write_task_code(folder, training.task_code)
 
@@ -323,7 +326,7 @@ def open_recorder(
     for index, seed_config in enumerate(config.of_each_seed()):
         folder, history = run_dirs[index], histories[index]
         sinks = open_sinks(seed_config, folder, history, terminal.say, len(run_dirs))
-        about = {**about_policy(seed_config, env), "versions": versions()}
+        about = {**about_policy(seed_config, env), "versions": training.versions}
         standing = Standing.from_json(resumed.progress[index])
         fingerprint = digest(resumed.states[index].policy_params) if resumption else ""
         seeds.append(SeedRecorder(seed_config, folder, sinks, about, standing, fingerprint))

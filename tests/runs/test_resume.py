@@ -707,7 +707,7 @@ def test_what_is_complete_says_so_and_how_to_go_on(run_copy, config, capsys):
 
 
 def test_a_run_that_ended_before_its_first_checkpoint_begins_as_another(config, tmp_path):
-    write_run(tmp_path, config.model_copy(update={"seed": 3}))
+    write_run(tmp_path, config.model_copy(update={"seed": 3}), {})
     (tmp_path / "metrics.jsonl").write_text("")
     (tmp_path / "checkpoints").mkdir()
     assert session.run(config, tmp_path).finished

@@ -85,7 +85,9 @@ def test_a_file_system_without_locks_refuses_nothing(tmp_path, monkeypatch):
     occupy(tmp_path)
 
 
-@pytest.mark.parametrize("use", [occupy, lambda path: write_run(path, parse_config({}))])
+@pytest.mark.parametrize(
+    "use", [occupy, lambda path: write_run(path, parse_config({}), versions())]
+)
 def test_a_folder_below_a_file_cannot_be_written(tmp_path, use):
     (tmp_path / "file").write_text("")
     assert "cannot be written: Not a directory" in refused(use, tmp_path / "file" / "run")
@@ -103,7 +105,7 @@ def test_a_run_is_known_by_its_resolved_configuration(tmp_path):
     assert stored_config(tmp_path) is None
     occupy(tmp_path)
     assert stored_config(tmp_path) is None
-    write_run(tmp_path, config)
+    write_run(tmp_path, config, versions())
     assert stored_config(tmp_path) == config
 
 
@@ -138,7 +140,7 @@ def test_each_seed_has_a_folder_of_its_own(tmp_path):
     assert seed_folders(tmp_path) == []
     for folder, config in zip(folders, many.of_each_seed(), strict=True):
         folder.mkdir()
-        write_run(folder, config)
+        write_run(folder, config, versions())
     (tmp_path / "seed-none").mkdir()
     assert seed_folders(tmp_path) == folders
 
@@ -174,7 +176,7 @@ def test_what_a_killed_process_left_half_written_does_not_make_a_folder_used(tmp
 
     monkeypatch.setattr(Path, "replace", die)
     with pytest.raises(Killed):
-        write_run(tmp_path, parse_config({}))
+        write_run(tmp_path, parse_config({}), versions())
     assert stored_config(tmp_path) is None
 
 
@@ -198,7 +200,7 @@ def store_versions(run_dir, change):
 
 
 def test_nothing_has_changed_where_all_is_as_it_was(tmp_path):
-    write_run(tmp_path, parse_config({}))
+    write_run(tmp_path, parse_config({}), versions())
     assert changed_versions(tmp_path) == []
 
 

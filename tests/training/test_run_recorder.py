@@ -64,7 +64,7 @@ def recorder(root, tmp_path, monkeypatch):
         clocks.append(CompileClock())
         env, programs = make_env(config), ProgramCache({})
         ppo = build_ppo(config, env)
-        parts = session.Training(config, tmp_path, folders, env, ppo, programs, None)
+        parts = session.Training(config, tmp_path, folders, env, ppo, programs, None, {})
         return session.open_recorder(parts, clocks[-1], None)
 
     yield recorder
