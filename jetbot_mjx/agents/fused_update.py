@@ -20,8 +20,10 @@ from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
+from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.compiler.update import adam, launch
 from jetbot_mjx.compiler.update.adam import AdamRule, AdamTerms, Progress
+from jetbot_mjx.compiler.update.cpu_unroll import Unroll
 from jetbot_mjx.compiler.update.shapes import (
     POLICY_METRICS,
     VALUE_METRICS,
@@ -226,12 +228,68 @@ class FusedUpdate:
 
         def act(observations: Array, noise: Array) -> tuple[Array, dict[str, Any]]:
             drawn = launch.actions(self._shape, params, *statistics, observations, noise)
-            kept = drawn._asdict()
-            if self._shape.distribution == "normal":
-                kept["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
-            return kept.pop("action"), kept
+            return drawn.action, self._kept(drawn)
 
         return act
+
+    def _kept(self, drawn: launch.Actions) -> dict[str, Any]:
+        """Return what Brax keeps of actions."""
+        kept = drawn._asdict()
+        del kept["action"]
+        if self._shape.distribution == "normal":
+            kept["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
+        return kept
+
+    def unroll(
+        self,
+        env: Any,
+        start: Packed,
+        params: Float[Array, " size"],
+        normalizer: Any,
+        keep: Callable[[Any], PyTree],
+    ) -> Callable[[Packed, Array], tuple[Packed, PyTree, Array, dict[str, Any]]] | None:
+        """Return a function that makes all steps of an unroll, if one kernel can.
+
+        Args:
+          env: the environment from `wrap_for_training`.
+          start: its states.
+          params: the parameters, from `pack`.
+          normalizer: the statistics of the observations.
+          keep: returns what is kept of the state after each step.
+
+        Returns:
+          A function from the states and the noise of all steps to the states after the last step,
+          what is kept of all states, the actions, and what Brax keeps of them. All but the first
+          have the steps as their first axis.
+        """
+        if not launch.unrolls_at_once():
+            return None
+        # A wrapper with a step of its own does not have the method of the one inside.
+        stepped = getattr(env.step_packed, "__self__", None)
+        find = getattr(type(stepped), "packed_kernel", None)
+        kernel = find and find(stepped, start)
+        if kernel is None or jax.eval_shape(lambda x: x.unpack().obs, start).dtype != jnp.float32:
+            return None
+        # Where each number of a state is.
+        numbers = np.arange(start.words.shape[-1], dtype=np.float32)
+        shapes = tuple((shape, np.dtype(np.float32)) for shape, _ in start.shapes)
+        places = start.replace(words=numbers, shapes=shapes).unpack()
+        kept = jax.eval_shape(lambda x: pack(keep(x.unpack()), batch_axes=1), start)
+        spec = Unroll(
+            self._shape,
+            kernel,
+            observation=int(places.obs[0]),
+            kept=tuple(int(x) for leaf in jax.tree.leaves(keep(places)) for x in leaf.reshape(-1)),
+        )
+        launch.prepare_unroll(spec, self._environments, self.batch.time)
+
+        def unroll(start: Packed, noise: Array) -> tuple[Packed, PyTree, Array, dict[str, Any]]:
+            given = *self._statistics(normalizer), start.words, noise
+            end, words, drawn = launch.unroll(spec, params, *given)
+            steps = kept.replace(words=words).unpack()
+            return start.replace(words=end), steps, drawn.action, self._kept(drawn)
+
+        return unroll
 
     def action_noise(self, key: UInt32[Array, "2"]) -> Float[Array, "time environments actions"]:
         """Draw the noise of all actions of an unroll."""

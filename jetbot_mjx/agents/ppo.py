@@ -425,37 +425,48 @@ class PPO:
           with `next_observation` of their last step only; and the first non-finite state.
         """
         fused, length = self._fused, self.config.unroll_length
+        at_once: Any = None
         if fused:
             policy: Any = fused.policy(state.params, state.normalizer)
+            given = state.env_state, state.params, state.normalizer, _kept
+            at_once = fused.unroll(self._env, *given)
         else:
             policy = self._make_policy(tuple(state.policy_params))
 
-        def step(start: Packed, drawn: Array) -> tuple[Packed, Packed]:
-            before = start.unpack()
-            action, extras = policy(before.obs, drawn)
-            packed = self._env.step_packed(start, action)
-            after = packed.unpack()
+        def transition(obs: Any, action: Array, extras: Any, kept: dict[str, Any]) -> Transition:
             # The loss needs the next observation only at the end of an unroll, where it is in the
             # state: the others, possibly images, are not even stored.
             nothing: Any = None
-            state_extras = {name: after.info[name] for name in _EXTRA_FIELDS}
-            all_extras: Any = {"policy_extras": extras, "state_extras": state_extras}
-            transition = Transition(
-                observation=before.obs,
+            all_extras: Any = {"policy_extras": extras, "state_extras": kept["info"]}
+            return Transition(
+                observation=obs,
                 action=action,
-                reward=after.reward,
-                discount=1 - after.done,
+                reward=kept["reward"],
+                discount=1 - kept["done"],
                 next_observation=nothing,
                 extras=all_extras,
             )
-            return packed, pack(transition, batch_axes=1)
+
+        def step(start: Packed, drawn: Array) -> tuple[Packed, Packed]:
+            obs = start.unpack().obs
+            action, extras = policy(obs, drawn)
+            after = self._env.step_packed(start, action)
+            data = transition(obs, action, extras, _kept(after.unpack()))
+            return after, pack(data, batch_axes=1)
+
+        def steps(start: Packed, drawn: Array) -> tuple[Packed, Transition]:
+            if at_once is None:
+                after, packed = jax.lax.scan(step, start, drawn)
+                return after, packed.unpack()
+            after, kept, action, extras = at_once(start, drawn)
+            obs = jnp.concatenate([start.unpack().obs[None], kept["obs"][:-1]])
+            return after, transition(obs, action, extras, kept)
 
         def unroll(carry: Any, _: None) -> Any:
             start, key = carry
             key, next_key = jax.random.split(key)
             drawn = fused.action_noise(key) if fused else _action_keys(key, length)
-            after, steps = jax.lax.scan(step, start, drawn)
-            data: Any = steps.unpack()
+            after, data = steps(start, drawn)
             nan_dump = _find_nan_dump(start, data)
             ends = jax.tree.map(lambda x: x[None], after.unpack().obs)
             return (after, next_key), (data._replace(next_observation=ends), nan_dump)
@@ -669,6 +680,12 @@ def make_optimizer(config: PPOConfig) -> optax.GradientTransformation:
     if config.max_grad_norm is None:
         return optax.chain(adam)
     return optax.chain(optax.clip_by_global_norm(config.max_grad_norm), adam)
+
+
+def _kept(state: Any) -> dict[str, Any]:
+    """Return what a collection keeps of the state after a step."""
+    info = {name: state.info[name] for name in _EXTRA_FIELDS}
+    return {"obs": state.obs, "reward": state.reward, "done": state.done, "info": info}
 
 
 def _action_keys(key: UInt32[Array, "2"], time: int) -> UInt32[Array, "time 2"]:

@@ -1,13 +1,9 @@
-; A block of the CPU's kernels that step. A template of `jetbot_mjx.compiler.ffi_wrapper`.
-; Takes a block of robots through all steps: rows of a tile are numbers, columns are robots.
-define internal void @block(ptr %job, i64 %index, ptr %scratch) {
+; A step of some robots on a CPU. A template of `jetbot_mjx.compiler.ffi_wrapper`.
+; Takes robots from the given one on through all steps: rows of a tile are numbers, columns are robots.
+define internal void @robots($pointers, i64 %first, i64 %robots) {
 entry:
   %tile = alloca [$rows x <$lanes x float>], align $alignment
-  %robots.at = getelementptr %Job, ptr %job, i32 0, i32 4
-  %robots = load i64, ptr %robots.at
   %last = sub i64 %robots, 1
-  %first = mul i64 %index, $lanes
-  $addresses
   br label %read
 read:
   %lane = phi i64 [0, %entry], [%lane.next, %read]

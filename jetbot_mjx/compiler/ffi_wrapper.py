@@ -60,7 +60,7 @@ def kernel_text(kernel: Kernel, *, lanes: int, name: str, machine: str) -> str:
     """
     sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     if kernel.table is None:
-        block = _step_block(kernel, sizes, lanes)
+        block = _step_block(kernel, lanes)
         arguments, results, robots = len(sizes), len(kernel.results()), lanes
     else:
         block = _map_block(kernel, sizes, kernel.table.shape[1], lanes)
@@ -126,8 +126,36 @@ def call_text(
     return processor + Template(TEXT).substitute(values)
 
 
-def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
+def _step_block(kernel: Kernel, lanes: int) -> str:
     """Write the function that takes a block of robots through all steps."""
+    arrays = range(len(kernel.argument_shapes) + len(kernel.results()))
+    values = {
+        "addresses": "\n  ".join(map(address, arrays)),
+        "arrays": ", ".join(f"ptr %a{i}" for i in arrays),
+        "lanes": lanes,
+    }
+    declared = "\n".join(declarations(lanes)) + "\n"
+    block = _template("xla_block.ll").substitute(values)
+    return declared + step_text(kernel, lanes) + block
+
+
+def step_text(kernel: Kernel, lanes: int) -> str:
+    """Write a function that takes robots through all steps of a kernel.
+
+    It is called `robots`, and takes the addresses of the arguments and results, arrays of all
+    robots, the first robot, and how many robots there are; it steps as many as there are lanes.
+
+    Args:
+      kernel: the kernel, without a table.
+      lanes: the number of robots that make a step side by side.
+
+    Returns:
+      The text of the function and of those that it calls, without `llvm_codegen.declarations`.
+
+    Raises:
+      UnsupportedError: the program has an operation that has no LLVM instruction.
+    """
+    sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     results = [math.prod(result.shape) for result in kernel.results()]
     # The tile begins with the rows of the step, or its results; the arguments follow, if what comes
     # before or after the step reads them too.
@@ -141,11 +169,11 @@ def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
     if kernel.after is not None:
         functions["after"] = kernel.after, [*rows, *stepped]
     values = {
-        "addresses": "\n  ".join(address(i) for i in range(len(sizes) + len(results))),
         "after": "" if kernel.after is None else "call void @after(ptr %tile)",
         "alignment": 4 * lanes,
         "before": "" if kernel.before is None else "call void @before(ptr %tile)",
         "lanes": lanes,
+        "pointers": ", ".join(f"ptr %a{i}" for i in range(len(sizes) + len(results))),
         "reads": _copies("%r{i} = mul i64 %robot, {size}", _READ, sizes, lanes, row=start),
         "rows": max(1, rows.stop, sum(results), len(stepped)),
         "step": STEP,
@@ -156,8 +184,7 @@ def _step_block(kernel: Kernel, sizes: Sequence[int], lanes: int) -> str:
         tile_text(program, lanes=lanes, name=name, rows=rows)
         for name, (program, rows) in functions.items()
     ]
-    declared = "\n".join(declarations(lanes)) + "\n"
-    return declared + "".join(texts) + _template("xla_step.ll").substitute(values)
+    return "".join(texts) + _template("xla_step.ll").substitute(values)
 
 
 def _map_block(kernel: Kernel, sizes: Sequence[int], items: int, lanes: int) -> str:

@@ -273,7 +273,8 @@ def runs_correctly(
     # Run the probe at once, because the caller may be tracing another function.
     with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
-            (result,) = jax.jit(lambda x: launch(probe, [x]))(jnp.asarray(values))
+            # An array of JAX would be another program to compile.
+            (result,) = jax.jit(lambda x: launch(probe, [x]))(values)
         except jax.errors.JaxRuntimeError:
             return False
         return bool((np.asarray(result) == 4 * values + 3).all())

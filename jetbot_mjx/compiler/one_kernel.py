@@ -4,7 +4,7 @@ Motivation: around physics, a step of a training computes observation, reward, t
 episode, and the first state of the next one. XLA compiles that to forty small kernels, in which a
 GPU mostly waits for the next launch, and of which a CPU compiles each for 16 ms.
 
-Protocol: `as_one_kernel` traces the function. Where it calls one kernel that steps
+Protocol: `OneKernel` traces the function. Where it calls one kernel that steps
 (`kernel.as_step`), the equations divide into those that the arguments of that kernel need and those
 that the results need. Both are lowered to scalars, and run in the kernel before its first step and
 after its last. What both need is computed twice, so that no register holds it during the steps. A
@@ -12,6 +12,7 @@ function that calls no kernel becomes a kernel as it is. A function that cannot 
 several kernels, stays as it is.
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -19,7 +20,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.core import Tracer
+from jax.core import ShapedArray, Tracer
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array
 
@@ -32,65 +33,119 @@ _SETTINGS = ("jax_threefry_partitionable", "jax_enable_x64", "jax_default_matmul
 """JAX's settings on which the kernel of a function depends."""
 
 
-def as_one_kernel(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Return a function of one robot that is one kernel if it can be, and as it is otherwise.
+class OneKernel:
+    """A `OneKernel` is a function of one robot as one kernel if it can be, and as it is otherwise.
 
-    Args:
-      function: a function of pytrees of arrays. It is traced once for all arguments of the same
-        shapes.
-
-    Returns:
-      The same function. It cannot be differentiated where it is a kernel; `jax.vmap` batches it.
+    It cannot be differentiated where it is a kernel; `jax.vmap` batches it.
     """
-    known: dict[Any, tuple[Callable[..., list[Array]], Any]] = {}
 
-    @functools.wraps(function)
-    def run(*arguments: Any) -> Any:
-        if jax.config.values["jax_disable_jit"]:
-            # The user wants to see every operation.
-            return function(*arguments)
+    def __init__(
+        self, function: Callable[..., Any], may_be_kernel: Callable[[], bool] = lambda: True
+    ) -> None:
+        """Wrap a function.
+
+        Args:
+          function: a function of pytrees of arrays. It is traced once for all arguments of the same
+            shapes.
+          may_be_kernel: returns whether there may be a kernel. It is asked when the function is
+            called: to try a back end takes a GPU 0.3 s, which a program from the cache saves.
+        """
+        functools.update_wrapper(self, function)
+        self._function, self._may_be_kernel = function, may_be_kernel
+        self._known: dict[Any, _Lowered] = {}
+
+    def __call__(self, *arguments: Any) -> Any:
+        """Compute the function."""
+        if not self._is_allowed():
+            return self._function(*arguments)
         leaves, structure = jax.tree.flatten(arguments)
         arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
+        lowered = self._find(structure, [x.aval for x in arrays], arguments)
+        return jax.tree.unflatten(lowered.structure, lowered.launch(*leaves))
+
+    def kernel_for(self, *arguments: Any) -> kernel.Kernel | None:
+        """Return the kernel that a call launches, without compiling it.
+
+        Args:
+          arguments: the shapes and dtypes of the arguments.
+
+        Returns:
+          The kernel, whose arguments are the leaves of the function's and whose results are those
+          of the first one again; None: a call does something else, takes or returns other numbers
+          than float32, or returns another structure or other shapes than its first argument has.
+        """
+        if not self._is_allowed():
+            return None
+        leaves, structure = jax.tree.flatten(arguments)
+        avals = [ShapedArray(x.shape, x.dtype) for x in leaves]
+        lowered = self._find(structure, avals, arguments)
+        jaxpr = lowered.traced.jaxpr
+        if lowered.places or any(x != np.float32 for x in _dtypes([*jaxpr.invars, *jaxpr.outvars])):
+            return None
+        carried, tree = jax.tree.flatten(arguments[0])
+        results = [x.aval.shape for x in jaxpr.outvars]
+        if lowered.structure != tree or results != [x.shape for x in carried]:
+            return None
+        return lowered.one
+
+    def _is_allowed(self) -> bool:
+        # With `jax_disable_jit` the user wants to see every operation.
+        return not jax.config.values["jax_disable_jit"] and self._may_be_kernel()
+
+    def _find(self, structure: Any, avals: Sequence[Any], arguments: Sequence[Any]) -> "_Lowered":
+        """Return the function for arguments like these, traced and lowered if it is not yet."""
         settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
-        key = (structure, settings, *((x.shape, x.dtype, x.aval.weak_type) for x in arrays))
-        if key not in known:
-            traced, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
-            compiled = _compiled(traced), jax.tree.structure(shapes)
-            if any(isinstance(x, Tracer) for x in traced.consts):
-                # It depends on what another function traces, and holds only inside of it.
-                return jax.tree.unflatten(compiled[1], compiled[0](*leaves))
-            known[key] = compiled
-        flat, tree = known[key]
-        return jax.tree.unflatten(tree, flat(*leaves))
-
-    return run
-
-
-def _compiled(traced: ClosedJaxpr) -> Callable[..., list[Array]]:
-    """Return a traced function of flat arguments as one kernel, if it can be."""
-    # What another function traces is an argument of the kernel too.
-    places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
-    try:
-        one = _lowered(traced, places)
-    except UnsupportedError:
-        return jaxpr_as_fun(traced)
-    backend = default_backend(one.impl)
-    if backend is not None:
-        backend.prepare(one)
-    launch = kernel.as_function(one)
-    constants = [traced.consts[i] for i in places]
-    arguments = _dtypes(_arguments(traced, places))
-    results = _dtypes(traced.jaxpr.outvars)
-
-    def run(*leaves: Array) -> list[Array]:
-        pairs = zip((*constants, *leaves), arguments, strict=True)
-        words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
-        return _from_words(launch(words), results)
-
-    return run
+        key = (structure, settings, *((x.shape, x.dtype, x.weak_type) for x in avals))
+        if key in self._known:
+            return self._known[key]
+        traced, shapes = jax.make_jaxpr(self._function, return_shape=True)(*arguments)
+        # What another function traces is an argument of the kernel too.
+        places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
+        try:
+            one = _lower(traced, places)
+        except UnsupportedError:
+            one = None
+        lowered = _Lowered(traced, jax.tree.structure(shapes), places, one)
+        # What depends on what another function traces holds only inside of it.
+        if not places:
+            self._known[key] = lowered
+        return lowered
 
 
-def _lowered(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
+@dataclasses.dataclass
+class _Lowered:
+    """A `_Lowered` is a function for arguments of some shapes, traced and lowered."""
+
+    traced: ClosedJaxpr
+    structure: Any
+    """Structure of the results."""
+    places: list[int]
+    """Places of the constants that the kernel takes as arguments, before the others."""
+    one: kernel.Kernel | None
+    """The kernel; None: an operation of the function is none of a kernel."""
+
+    @functools.cached_property
+    def launch(self) -> Callable[..., list[Array]]:
+        """Return the function of flat arguments, whose kernel begins to be compiled."""
+        if self.one is None:
+            return jaxpr_as_fun(self.traced)
+        backend = default_backend(self.one.impl)
+        if backend is not None:
+            backend.prepare(self.one)
+        launch = kernel.as_function(self.one)
+        constants = [self.traced.consts[i] for i in self.places]
+        arguments = _dtypes(_arguments(self.traced, self.places))
+        results = _dtypes(self.traced.jaxpr.outvars)
+
+        def run(*leaves: Array) -> list[Array]:
+            pairs = zip((*constants, *leaves), arguments, strict=True)
+            words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
+            return _from_words(launch(words), results)
+
+        return run
+
+
+def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> kernel.Kernel:
     """Lower a traced function to a kernel.
 
     Args:

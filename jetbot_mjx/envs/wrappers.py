@@ -17,7 +17,8 @@ import jax.numpy as jnp
 from brax.envs import Env, Wrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
-from jetbot_mjx.compiler.one_kernel import as_one_kernel
+from jetbot_mjx.compiler.kernel import Kernel
+from jetbot_mjx.compiler.one_kernel import OneKernel
 from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.camera.wrapper import with_camera
@@ -256,7 +257,11 @@ class NewEpisodeWrapper(Wrapper):
 
 
 class KernelWrapper(Wrapper):
-    """A wrapper that compiles a step as one kernel, and a reset as another, if physics is one."""
+    """A wrapper that compiles a step as one kernel, and a reset as another, if physics is one.
+
+    Beside the methods of an environment it has `step_packed`, from a packed state and an action to
+    the next packed state.
+    """
 
     def __init__(self, env: Any) -> None:
         """Wrap one environment, which observes numbers only.
@@ -265,20 +270,16 @@ class KernelWrapper(Wrapper):
           env: the environment, in all wrappers of a single robot but that of the camera.
         """
         super().__init__(env)
-        if not env.unwrapped.physics.may_be_kernel:
-            return
-        self.reset = as_one_kernel(env.reset)
-        self.step = as_one_kernel(env.step)
-        self.step_packed = as_one_kernel(functools.partial(_step_packed, env))
+        physics = env.unwrapped.physics
 
-    def step_packed(self, packed: Packed, action: Float[Array, "2"]) -> Packed:
-        """Make one step of a packed state, with one array in and one array out.
+        # Pyright would want the names of the methods' arguments.
+        def compiled(function: Callable[..., Any]) -> Any:
+            return OneKernel(function, lambda: physics.may_be_kernel)
 
-        Args:
-          packed: the state before the step.
-          action: the action, in [-1, 1]².
-        """
-        return _step_packed(self.env, packed, action)
+        self.reset = compiled(env.reset)
+        self.step = compiled(env.step)
+        # A step of a packed state has one array in and one array out.
+        self.step_packed = compiled(functools.partial(_step_packed, env))
 
 
 def _step_packed(env: Any, packed: Packed, action: Float[Array, "2"]) -> Packed:
@@ -315,6 +316,23 @@ class BatchWrapper(Wrapper):
           action: one action per environment, in [-1, 1]².
         """
         return jax.vmap(self.env.step_packed)(packed, action)
+
+    def packed_kernel(self, packed: Packed) -> Kernel | None:
+        """Return the kernel that `step_packed` launches, without compiling it.
+
+        Args:
+          packed: a batch of states.
+
+        Returns:
+          The kernel of one environment, from the words of its state and an action to the words of
+          the next state; None: a step is more than one kernel, or the next state is laid out
+          differently.
+        """
+        step = getattr(self.env, "step_packed", None)
+        if packed.others or not isinstance(step, OneKernel):
+            return None
+        one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), packed)
+        return step.kernel_for(one, jax.ShapeDtypeStruct((self.action_size,), jnp.float32))
 
 
 class RandomizedBatchWrapper(BatchWrapper):

@@ -9,7 +9,7 @@ from scipy import special
 from test_kernel import launches
 
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
-from jetbot_mjx.compiler.one_kernel import as_one_kernel
+from jetbot_mjx.compiler.one_kernel import OneKernel
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 
 KEY = jax.ShapeDtypeStruct((2,), jnp.uint32)
@@ -83,7 +83,7 @@ def test_they_are_those_of_jax_to_the_bit(name):
 
 def both(draw):
     """What a function of a key draws in NumPy and as a kernel."""
-    compiled = jax.vmap(as_one_kernel(draw))
+    compiled = jax.vmap(OneKernel(draw))
     assert launches(compiled, KEYS) == 1
     return evaluate(scalarize(draw, KEY), [KEYS]), jax.tree.leaves(jax.jit(compiled)(KEYS))
 
@@ -92,7 +92,7 @@ def test_none_are_drawn_where_none_are_wanted():
     def draw(key):
         return jax.random.bits(key, (0, 3)), jax.random.split(key, 0), jax.random.uniform(key)
 
-    compiled = jax.vmap(as_one_kernel(draw))
+    compiled = jax.vmap(OneKernel(draw))
     assert launches(compiled, KEYS) == 1
     bits, keys, number = compiled(KEYS)
     assert (bits.shape, bits.dtype) == ((len(KEYS), 0, 3), np.uint32)
@@ -145,7 +145,7 @@ OTHERS = {
 
 
 def check_as_it_is(draw, keys):
-    run = jax.vmap(as_one_kernel(draw))
+    run = jax.vmap(OneKernel(draw))
     assert launches(run, keys) == 0
     theirs = jax.vmap(draw)(keys)
     for one, other in zip(jax.tree.leaves(run(keys)), jax.tree.leaves(theirs), strict=True):

@@ -6,8 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jetbot_mjx.compiler.packed import pack
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs import mjx
+from jetbot_mjx.envs import mjx, physics
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState, State
@@ -224,6 +225,7 @@ def test_each_environment_can_have_a_physics_model_of_its_own():
 
     batch = wrap_for_training(env, 256, randomization_fn=randomize)
     state = batch.reset(jnp.zeros((2, 2), jnp.uint32))
+    assert batch.packed_kernel(pack(state, batch_axes=1)) is None
     step = jax.jit(batch.step)
     for _ in range(3):
         state = step(state, jnp.array([[-0.9, 0.0]] * 2))
@@ -232,3 +234,18 @@ def test_each_environment_can_have_a_physics_model_of_its_own():
     # And none of them is the environment's own, which stays as it was.
     fresh = mjx.put_model(make_mj_model(env.robot, env.config.physics, visual=False))
     np.testing.assert_array_equal(env.mjx_model.actuator_gainprm, fresh.actuator_gainprm)
+
+
+def test_no_back_end_is_tried_before_a_step_is_traced(monkeypatch):
+    # A program from the cache needs none, and a GPU's takes 0.3 s.
+    asked = []
+
+    def none_yet(impl):
+        asked.append(impl)
+        return []
+
+    monkeypatch.setattr(physics, "available_backends", none_yet)
+    batch = wrap_for_training(make_env(parse_config({})), 256)
+    assert not asked
+    batch.reset(jnp.zeros((2, 2), jnp.uint32))
+    assert asked

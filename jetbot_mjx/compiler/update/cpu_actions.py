@@ -2,6 +2,7 @@
 
 import dataclasses
 import functools
+from collections.abc import Iterator, Mapping
 
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.update import sample_loss
@@ -56,8 +57,13 @@ class ActionDivision(Division):
         return {"sample": self.reads * lanes, "drawn": sum(self.shape.drawn) * lanes}
 
 
-_ARGUMENTS = ("params", "mean", "scale", "observations", "noise")
-_RESULTS = ("action", "raw_action", "log_prob", "distribution_params")
+PARAMETERS = ("params", "mean", "scale")
+"""The arrays of `launch.actions` that all environments share."""
+
+DRAWN = ("action", "raw_action", "log_prob", "distribution_params")
+"""The arrays of `launch.Actions`."""
+
+_ARGUMENTS = (*PARAMETERS, "observations", "noise")
 
 
 def action_call(division: ActionDivision) -> Call:
@@ -68,17 +74,17 @@ def action_call(division: ActionDivision) -> Call:
     """
     shape = division.shape
     sizes = {"observations": shape.observations, "noise": shape.actions}
-    sizes |= zip(_RESULTS, shape.drawn, strict=True)
+    sizes |= zip(DRAWN, shape.drawn, strict=True)
     sizes = {name: division.environments * size for name, size in sizes.items()}
     sizes |= {"params": shape.size, "mean": shape.observations, "scale": shape.observations}
-    return Call(_ARGUMENTS, _RESULTS, sizes, [_ActionStage(division)])
+    return Call(_ARGUMENTS, DRAWN, sizes, [ActionStage(division)])
 
 
-class _ActionStage(NetworkStage):
-    """Runs the policy network and draws an action from each distribution."""
+class ActionStage(NetworkStage):
+    """An `ActionStage` runs the policy network and draws an action from each distribution."""
 
     name = "actions"
-    arrays_of = (*_ARGUMENTS, *_RESULTS)
+    arrays_of = (*_ARGUMENTS, *DRAWN)
 
     def functions(self) -> list[str]:
         """Return the activation and the sample."""
@@ -96,24 +102,48 @@ class _ActionStage(NetworkStage):
 
     def tile(self, first: str, count: str) -> None:
         """Draw the actions of some environments."""
-        code, size = self.code, self.shape.observations
+        self.act(first, count, self.arrays, self.shape.observations)
+
+    def act(self, first: str, count: str, arrays: Mapping[str, str], stride: int) -> None:
+        """Draw the actions of some environments.
+
+        Args:
+          first: the first environment.
+          count: their number.
+          arrays: the addresses of the observations, the noise and the results of all environments.
+          stride: numbers from one observation to the next.
+        """
+        code = self.code
         with code.loop(count) as row:
-            place = code.mul(code.add(first, row), size)
-            self.load_observation(code.at(self.arrays["observations"], place), row)
+            place = code.mul(code.add(first, row), stride)
+            self.load_observation(code.at(arrays["observations"], place), row)
         self.forward(self.stored_rows(count))
+        for start in self.groups(count):
+            there = code.smaller(code.sub(count, start), code.lanes)
+            self._draw(code.add(first, start), start, there, arrays)
+
+    def groups(self, count: str) -> Iterator[str]:
+        """Repeat what is appended for as many environments at once as a vector has lanes.
+
+        Args:
+          count: the number of environments.
+
+        Yields:
+          The first one of the group.
+        """
+        code = self.code
         groups = code.let(f"udiv i64 {code.add(count, code.lanes - 1)}, {code.lanes}")
         with code.loop(groups) as group:
-            start = code.mul(group, code.lanes)
-            there = code.smaller(code.sub(count, start), code.lanes)
-            self._draw(code.add(first, start), start, there)
+            yield code.mul(group, code.lanes)
 
-    def _draw(self, first: str, start: str, there: str) -> None:
-        """Draw the actions of as many environments at once as a vector has lanes.
+    def _draw(self, first: str, start: str, there: str, arrays: Mapping[str, str]) -> None:
+        """Draw the actions of a group of environments.
 
         Args:
           first: the first environment.
           start: its row.
           there: the number of environments.
+          arrays: those of `act`.
         """
         code, shape, places = self.code, self.shape, self.places
         lanes, actions = code.lanes, shape.actions
@@ -126,7 +156,7 @@ class _ActionStage(NetworkStage):
             sources = [
                 (outputs, self.division.outputs),
                 (deviations if shape.deviations else outputs, actions),
-                (code.at(self.arrays["noise"], noise), actions),
+                (code.at(arrays["noise"], noise), actions),
             ]
             target = code.at(places["sample"], lane)
             numbers = [(source, i) for source, count in sources for i in range(count)]
@@ -135,9 +165,9 @@ class _ActionStage(NetworkStage):
         code.call("draw", f"ptr {places['sample']}", f"ptr {places['drawn']}")
         with code.loop(there) as lane:
             place = 0
-            for name, size in zip(_RESULTS, self.shape.drawn, strict=True):
+            for name, size in zip(DRAWN, shape.drawn, strict=True):
                 row = code.mul(code.add(first, lane), size)
                 for i in range(size):
                     source = code.at(places["drawn"], place * lanes, lane)
-                    code.copy(source, code.at(self.arrays[name], row, i))
+                    code.copy(source, code.at(arrays[name], row, i))
                     place += 1

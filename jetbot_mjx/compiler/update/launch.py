@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from jetbot_mjx.compiler.kernel import Backend
 from jetbot_mjx.compiler.update import launch_cpu, launch_gpu
 from jetbot_mjx.compiler.update.adam import ALIASES, SIZES, AdamRule
+from jetbot_mjx.compiler.update.cpu_unroll import Unroll
 from jetbot_mjx.compiler.update.shapes import LossTerms, Minibatch, UpdateShape
 
 _LAUNCHERS: dict[str, Any] = {"gpu": launch_gpu, "cpu": launch_cpu}
@@ -61,6 +62,22 @@ def prepare(
     launcher.prepare(rule, batch, environments, policies, at_once=at_once)
 
 
+def unrolls_at_once() -> bool:
+    """Return whether one kernel computes an unroll on JAX's default device: `unroll`."""
+    return hasattr(_LAUNCHERS.get(jax.default_backend()), "launch_unroll")
+
+
+def prepare_unroll(spec: Unroll, environments: int, time: int) -> None:
+    """Begin to compile the kernel of `unroll`.
+
+    Args:
+      spec: the networks and the environment.
+      environments: the number of environments.
+      time: the number of steps.
+    """
+    _LAUNCHERS[jax.default_backend()].prepare_unroll(spec, environments, time)
+
+
 class Actions(NamedTuple):
     """An `Actions` holds actions and how likely they were, under Brax's names."""
 
@@ -92,6 +109,32 @@ def actions(
       noise: standard normal noise, from which the actions follow.
     """
     return Actions(*_actions_p.bind(params, mean, scale, observations, noise, spec=shape))
+
+
+def unroll(
+    spec: Unroll,
+    params: Float[Array, " size"],
+    mean: Float[Array, " obs"],
+    scale: Float[Array, " obs"],
+    start: Float[Array, "environments state"],
+    noise: Float[Array, "time environments action"],
+) -> tuple[Float[Array, "environments state"], Float[Array, "time environments kept"], Actions]:
+    """Draw actions and step the environments with them, again and again.
+
+    Args:
+      spec: the networks and the environment.
+      params: the parameters of both networks, in the order of `UpdateShape`.
+      mean: what is subtracted from the observations.
+      scale: what they are then multiplied by.
+      start: the states before the first step.
+      noise: standard normal noise, from which the actions follow.
+
+    Returns:
+      The states after the last step; what is kept of the states after each step; and the actions
+      of all steps.
+    """
+    end, kept, *drawn = _unroll_p.bind(params, mean, scale, start, noise, spec=spec)
+    return end, kept, Actions(*drawn)
 
 
 def gradient(
@@ -288,6 +331,17 @@ def _actions_sizes(shape: UpdateShape, *given: _Size) -> list[_Size]:
     return shape.drawn_shapes(environments)
 
 
+def _unroll_sizes(unroll: Unroll, *given: _Size) -> list[_Size]:
+    shape, state = unroll.shape, (unroll.state,)
+    statistics, (time, environments) = (shape.observations,), given[4][:2]
+    noise = time, environments, shape.actions
+    wanted = (shape.size,), statistics, statistics, (environments, *state), noise
+    _check("unroll", given, wanted)
+    _check("unroll", tuple(x.shape for x in unroll.kernel.results()), (state,))
+    each = [(environments, len(unroll.kept)), *shape.drawn_shapes(environments)]
+    return [(environments, *state), *((time, *sizes) for sizes in each)]
+
+
 def _adam_sizes(rule: AdamRule, *given: _Size) -> list[_Size]:
     size, terms = (rule.shape.size,), (SIZES["adam_terms"],)
     progress = rule.steps + 1, SIZES["progress"]
@@ -315,5 +369,6 @@ def _check(name: str, given: tuple[_Size, ...], wanted: tuple[_Size, ...]) -> No
 
 _gradient_p = _primitive("gradient", _gradient_sizes, (5, 7))
 _actions_p = _primitive("actions", _actions_sizes)
+_unroll_p = _primitive("unroll", _unroll_sizes)
 _adam_p = _primitive("adam", _adam_sizes, (5,), ALIASES)
 _update_p = _primitive("update", _update_sizes, (4,), launch_cpu.ALIASES)

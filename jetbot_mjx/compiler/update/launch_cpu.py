@@ -18,6 +18,7 @@ from jetbot_mjx.compiler.update.cpu_adam import adam_call
 from jetbot_mjx.compiler.update.cpu_gradient import divisions, gradient_call
 from jetbot_mjx.compiler.update.cpu_network import HEAD
 from jetbot_mjx.compiler.update.cpu_stages import Call
+from jetbot_mjx.compiler.update.cpu_unroll import Unroll, unroll_call
 from jetbot_mjx.compiler.update.cpu_update import ALIASES, update_call
 from jetbot_mjx.compiler.update.shapes import Minibatch, UpdateShape
 
@@ -49,9 +50,8 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return None
 
 
-@functools.cache
-def _text(host: llvm_backend.Host, write: Callable[..., Call], *given: Any) -> str:
-    """Return the LLVM module of a call.
+def _write(host: llvm_backend.Host, write: Callable[..., Call], *given: Any) -> str:
+    """Write the LLVM module of a call.
 
     Args:
       host: the processor.
@@ -63,6 +63,16 @@ def _text(host: llvm_backend.Host, write: Callable[..., Call], *given: Any) -> s
     )
 
 
+_text = functools.cache(_write)
+
+
+def _unroll_text(host: llvm_backend.Host, write: Callable[..., Call], *given: Any) -> str:
+    """Return the LLVM module of an unroll, which is kept with the kernel of its environment."""
+    unroll, *sizes = given
+    name = repr((*unroll._replace(kernel=None), *sizes, host))
+    return unroll.kernel.text(name, lambda: _write(host, write, *given))
+
+
 def _action_call(shape: UpdateShape, environments: int, lanes: int) -> Call:
     return action_call(ActionDivision(shape, environments, lanes))
 
@@ -71,14 +81,18 @@ def prepare(
     rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
 ) -> None:
     """Begin to compile all kernels, which serve any number of policies, as `launch.prepare`."""
-    calls: list[tuple[Any, ...]] = [(_action_call, rule.shape, environments)]
+    calls: list[tuple[Any, ...]] = [(gradient_call, rule.shape, batch), (adam_call, rule)]
     if at_once:
-        calls.append((update_call, rule, batch))
-    else:
-        calls += [(gradient_call, rule.shape, batch), (adam_call, rule)]
+        calls = [(update_call, rule, batch)]
     host = llvm_backend.host_processor()
     for call in calls:
         in_background(lambda call=call: llvm_backend.registered(_text(host, *call)))
+
+
+def prepare_unroll(unroll: Unroll, environments: int, time: int) -> None:
+    """Begin to compile an unroll, as `launch.prepare_unroll`."""
+    host, given = llvm_backend.host_processor(), (unroll, environments, time)
+    in_background(lambda: llvm_backend.registered(_unroll_text(host, unroll_call, *given)))
 
 
 def _launch(
@@ -87,6 +101,7 @@ def _launch(
     write: Callable[..., Call],
     *given: Any,
     aliases: Mapping[int, int] | None = None,
+    text: Callable[..., str] = _text,
 ) -> list[Array]:
     """Call a function, while JAX lowers a program for CPUs.
 
@@ -96,6 +111,7 @@ def _launch(
       write: a function that returns the call.
       *given: its arguments before the number of lanes.
       aliases: which arguments it changes, and as which results it returns them.
+      text: a function of the processor, `write` and what it is given that returns the LLVM module.
 
     Returns:
       Its results, of shape (policies, numbers) unless they are arguments.
@@ -106,7 +122,7 @@ def _launch(
     for argument, result in (aliases or {}).items():
         shapes[result] = arguments[argument].shape
     like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
-    return llvm_backend.launch_text(_text(host, write, *given), arguments, like, aliases)
+    return llvm_backend.launch_text(text(host, write, *given), arguments, like, aliases)
 
 
 def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:
@@ -123,6 +139,26 @@ def launch_actions(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array
     drawn = _launch(arguments, policies, _action_call, shape, environments)
     shapes = shape.drawn_shapes(environments)
     return [x.reshape(policies, *sizes) for x, sizes in zip(drawn, shapes, strict=True)]
+
+
+def launch_unroll(unroll: Unroll, arguments: Sequence[Array]) -> list[Array]:
+    """Take all environments through an unroll, while JAX lowers a program for CPUs.
+
+    Args:
+      unroll: the networks and the environment.
+      arguments: those of `launch.unroll`, with the policies as their first axis.
+
+    Returns:
+      The last states, what is kept of all states, and the arrays of `launch.Actions`.
+    """
+    policies, time, environments, _ = arguments[4].shape
+    given = unroll_call, unroll, environments, time
+    end, *steps = _launch(arguments, policies, *given, text=_unroll_text)
+    shapes = [(environments, len(unroll.kept)), *unroll.shape.drawn_shapes(environments)]
+    return [
+        end.reshape(policies, environments, unroll.state),
+        *(x.reshape(policies, time, *each) for x, each in zip(steps, shapes, strict=True)),
+    ]
 
 
 def launch_gradient(shape: UpdateShape, arguments: Sequence[Array]) -> list[Array]:

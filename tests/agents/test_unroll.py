@@ -1,0 +1,179 @@
+"""An unroll as one kernel on CPUs: its numbers are those of single steps, to the bit."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from brax.envs import Wrapper
+
+from jetbot_mjx.compiler import llvm_backend
+from jetbot_mjx.compiler.packed import pack
+from jetbot_mjx.compiler.update import launch
+from jetbot_mjx.compiler.update.cpu_unroll import Unroll
+from jetbot_mjx.config import load_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.training.ppo_trainer import build_ppo
+
+pytestmark = pytest.mark.cpu
+
+LENGTH = 12
+
+
+def built(root, name="jetbot", *overrides, envs=40):
+    """PPO with small networks."""
+    sizes = [f"ppo.num_envs={envs}", f"ppo.batch_size={envs}", "ppo.num_minibatches=1"]
+    sizes += [f"ppo.unroll_length={LENGTH}", "task.episode_length=7"]
+    hidden = [f"ppo.network.{x}_hidden_layer_sizes=[32, 32]" for x in ("policy", "value")]
+    settings = load_config(root / "configs" / f"{name}.yaml", [*sizes, *hidden, *overrides])
+    return build_ppo(settings, make_env(settings))
+
+
+def collected(ppo, monkeypatch, states, keys, *, at_once):
+    """What PPO collects, for each of several policies."""
+    monkeypatch.setattr(launch, "unrolls_at_once", lambda: at_once)
+    run = jax.jit(jax.vmap(ppo.collect))
+    traced = run.trace(states, keys)
+    assert ("ppo_unroll" in str(traced.jaxpr)) == at_once
+    assert ("ppo_actions" in str(traced.jaxpr)) != at_once
+    return jax.device_get(traced.lower().compile()(states, keys))
+
+
+def states_of(ppo, policies):
+    """Packed states, in which some environments and one policy are about to break."""
+
+    def one(seed):
+        state = ppo.init(jax.random.PRNGKey(seed))
+        return state.replace(
+            normalizer=state.normalizer.replace(
+                mean=0.1 * seed + jnp.arange(state.normalizer.mean.size, dtype=jnp.float32)
+            )
+        )
+
+    states = jax.vmap(one)(jnp.arange(policies))
+    env = states.env_state
+    qvel = env.pipeline_state.qvel.at[0, 3].set(jnp.nan).at[-1, 0].set(jnp.inf)
+    env = env.replace(pipeline_state=env.pipeline_state.replace(qvel=qvel))
+    return jax.vmap(ppo.packed)(states.replace(env_state=env))
+
+
+CASES = {
+    "jetbot": ("jetbot", 40, 1, ()),
+    "one environment": ("jetbot", 1, 1, ()),
+    "more than a part": ("jetbot", 67, 2, ()),
+    "parts of odd sizes": ("jetbot", 2113, 1, ()),
+    "egocentric": ("jetbot_egocentric", 17, 3, ()),
+    "smoke": ("smoke", 33, 1, ()),
+    "drawn robots": ("real_jetbot", 21, 2, ()),
+    "several unrolls": ("jetbot", 16, 2, ("ppo.num_minibatches=3",)),
+    "normal": ("jetbot", 24, 2, ("ppo.network.distribution_type=normal",)),
+    "not normalised": ("jetbot", 24, 1, ("ppo.normalize_observations=false",)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_an_unroll_is_its_steps_one_by_one(root, monkeypatch, case):
+    name, envs, policies, overrides = CASES[case]
+    ppo = built(root, name, *overrides, envs=envs)
+    states = states_of(ppo, policies)
+    keys = jax.vmap(jax.random.PRNGKey)(jnp.arange(policies) + 5)
+    ours, theirs = (
+        collected(ppo, monkeypatch, states, keys, at_once=at_once) for at_once in (True, False)
+    )
+    jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+    # Episodes end in every way, and every policy drives differently.
+    _, data, dump = ours
+    ended = data.extras["state_extras"]["episode_done"]
+    assert ended.any()
+    assert np.isfinite(data.observation).all()
+    if envs > 4:
+        assert dump.found[0]
+    assert len(np.unique(data.action[:, 0, 0, 0])) == policies
+
+
+def test_where_a_step_is_no_kernel_actions_and_steps_take_turns(root):
+    ppo = built(root)
+    state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
+    assert ppo._env.packed_kernel(state.env_state) is not None
+    with jax.disable_jit():
+        assert ppo._env.packed_kernel(state.env_state) is None
+    many = built(root, "jetbot", "physics.impl=xla")
+    assert many.is_fused
+    assert many._env.packed_kernel(state.env_state) is None
+    assert "ppo_actions" in str(jax.make_jaxpr(many.collect)(state, jax.random.PRNGKey(0)))
+
+
+def test_an_observation_of_other_numbers_is_not_read_as_floats(root):
+    ppo = built(root)
+    state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
+    given = state.params, state.normalizer, lambda state: state.obs
+    assert ppo._fused.unroll(ppo._env, state.env_state, *given)
+
+    def with_whole_numbers():
+        unpacked = ppo.unpacked(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state))
+        env = unpacked.env_state
+        return pack(env.replace(obs=env.obs.astype(jnp.int32)), batch_axes=1)
+
+    assert ppo._fused.unroll(ppo._env, jax.eval_shape(with_whole_numbers), *given) is None
+
+
+@pytest.mark.parametrize("change", ["dtype", "size"])
+def test_a_state_that_a_step_lays_out_differently_is_refused(root, monkeypatch, change):
+    """The kernel would read other numbers, or write beyond the end of its arrays."""
+    ppo = built(root)
+    env = ppo._env.env.env
+    step = env.step
+
+    def changed(state, action):
+        state = step(state, action)
+        goal = state.goal.view(jnp.int32) if change == "dtype" else jnp.tile(state.goal, 100)
+        return state.replace(goal=goal)
+
+    monkeypatch.setattr(env, "step", changed)
+    ppo._env.env.__init__(env)
+    state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
+    assert ppo._env.packed_kernel(state.env_state) is None
+    with pytest.raises(TypeError, match="carry"):
+        jax.eval_shape(ppo.collect, state, jax.random.PRNGKey(0))
+
+
+def test_a_wrapper_with_a_step_of_its_own_is_stepped(root, monkeypatch):
+    ppo = built(root)
+    state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
+
+    class Backwards(Wrapper):
+        def step_packed(self, packed, action):
+            return self.env.step_packed(packed, -action)
+
+    monkeypatch.setattr(ppo, "_env", Backwards(ppo._env))
+    text = str(jax.make_jaxpr(ppo.collect)(state, jax.random.PRNGKey(0)))
+    assert "ppo_actions" in text
+    assert "ppo_unroll" not in text
+
+
+def test_asking_for_the_kernel_compiles_nothing(root, monkeypatch):
+    begun = []
+    monkeypatch.setattr(llvm_backend, "prepare", begun.append)
+    ppo = built(root)
+    state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
+    before = len(begun)
+    assert ppo._env.packed_kernel(state.env_state) is not None
+    assert len(begun) == before
+
+
+@pytest.mark.parametrize("wrong", range(5))
+def test_an_unroll_of_other_shapes_is_refused(root, wrong):
+    ppo = built(root)
+    state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
+    shape, words = ppo._fused._shape, state.env_state.words.shape
+    spec = Unroll(shape, ppo._env.packed_kernel(state.env_state), 0, (3, 4, 1))
+    sizes = [(shape.size,), (16,), (16,), words, (LENGTH, words[0], 2)]
+    arrays = [jax.ShapeDtypeStruct(size, np.float32) for size in sizes]
+    jax.eval_shape(lambda *x: launch.unroll(spec, *x), *arrays)
+    for size, dtype in (
+        ((*sizes[wrong][:-1], sizes[wrong][-1] - 1), np.float32),
+        ((1, *sizes[wrong]), np.float32),
+        (sizes[wrong], np.int32),
+    ):
+        arrays[wrong] = jax.ShapeDtypeStruct(size, dtype)
+        with pytest.raises((TypeError, ValueError)):
+            jax.eval_shape(lambda *x: launch.unroll(spec, *x), *arrays)
