@@ -102,18 +102,24 @@ def test_where_a_step_is_no_kernel_actions_and_steps_take_turns(root):
     assert "ppo_actions" in str(jax.make_jaxpr(many.collect)(state, jax.random.PRNGKey(0)))
 
 
-def test_an_observation_of_other_numbers_is_not_read_as_floats(root):
+def test_an_observation_of_other_numbers_is_not_read_as_floats(root, monkeypatch):
     ppo = built(root)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
     given = state.params, state.normalizer, lambda state: state.obs
     assert ppo._fused.unroll(ppo._env, state.env_state, *given)
+    env = ppo._env.env.env
+    step = env.step
 
-    def with_whole_numbers():
-        unpacked = ppo.unpacked(jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), state))
-        env = unpacked.env_state
-        return pack(env.replace(obs=env.obs.astype(jnp.int32)), batch_axes=1)
+    def in_whole_numbers(state):
+        return state.replace(obs=state.obs.astype(jnp.int32))
 
-    assert ppo._fused.unroll(ppo._env, jax.eval_shape(with_whole_numbers), *given) is None
+    monkeypatch.setattr(env, "step", lambda *given: in_whole_numbers(step(*given)))
+    ppo._env.env.__init__(env)
+    packed = jax.eval_shape(
+        lambda x: pack(in_whole_numbers(x.unpack()), batch_axes=1), state.env_state
+    )
+    assert ppo._env.packed_kernel(packed) is not None
+    assert ppo._fused.unroll(ppo._env, packed, *given) is None
 
 
 @pytest.mark.parametrize("change", ["dtype", "size"])
