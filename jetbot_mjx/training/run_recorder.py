@@ -346,7 +346,10 @@ class SeedRecorder:
             "metrics": dict(evaluation),
             "progress": self.standing.to_json(),
         }
-        self._store.save(progress.env_steps, trees, about, evaluation.get("success_rate"))
+        success = evaluation.get("success_rate")
+        # Other programs may read the policy, array by array, but not the rest.
+        joined = trees.keys() - {POLICY}
+        self._store.save(progress.env_steps, trees, about, success, joined)
 
     def render(self, video: "EvaluationVideo", progress: Progress) -> None:
         """Render a video of the policy into the run folder, and log it."""

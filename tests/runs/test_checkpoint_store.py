@@ -40,12 +40,12 @@ def run_dir(tmp_path):
     return folder
 
 
-def save(run_dir, *steps, keep=50, tree=TREE):
+def save(run_dir, *steps, keep=50, tree=TREE, joined=()):
     """Checkpoints at some steps, each a number or a pair of steps and success rate."""
     with CheckpointStore(run_dir, keep) as store:
         for one in steps:
             env_steps, success_rate = one if isinstance(one, tuple) else (one, None)
-            store.save(env_steps, {"tree": tree}, {"explained": True}, success_rate)
+            store.save(env_steps, {"tree": tree}, {"explained": True}, success_rate, joined)
 
 
 def read(run_dir, env_steps, template=TREE):
@@ -59,8 +59,12 @@ def refused(use, *arguments):
     return str(caught.value)
 
 
-def test_what_is_read_is_what_was_written(run_dir):
-    save(run_dir, 3)
+joined_or_not = pytest.mark.parametrize("joined", [(), ("tree",)], ids=["arrays", "joined"])
+
+
+@joined_or_not
+def test_what_is_read_is_what_was_written(run_dir, joined):
+    save(run_dir, 3, joined=joined)
     again = read(run_dir, 3, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), TREE))
     assert jax.tree.structure(again) == jax.tree.structure(TREE)
     for one, other in zip(jax.tree.leaves(again), jax.tree.leaves(TREE), strict=True):
@@ -109,10 +113,24 @@ OTHER_TEMPLATES = {
 }
 
 
+def test_a_joined_tree_is_one_array_on_disk_and_refused_if_it_is_shorter(run_dir):
+    save(run_dir, 1, joined=("tree",))
+    save(run_dir, 2, joined=("tree",), tree={"weights": np.zeros(2)})
+    paths = [checkpoint_path(run_dir, step) / "tree" for step in (1, 2)]
+    with ocp.StandardCheckpointer() as reader:
+        stored = reader.restore(paths[0])
+    size = sum(np.asarray(x).nbytes for x in jax.tree.leaves(TREE))
+    assert {name: (x.dtype, x.shape) for name, x in stored.items()} == {"bytes": ("uint8", (size,))}
+    shutil.rmtree(paths[0])
+    shutil.copytree(paths[1], paths[0])
+    assert f"bytes is uint8[16], and should be uint8[{size}]" in refused(read, run_dir, 1)
+
+
+@joined_or_not
 @pytest.mark.parametrize("kind", OTHER_TEMPLATES)
-def test_other_arrays_than_those_that_are_wanted_are_refused_by_name(run_dir, kind):
+def test_other_arrays_than_those_that_are_wanted_are_refused_by_name(run_dir, kind, joined):
     change, said = OTHER_TEMPLATES[kind]
-    save(run_dir, 1)
+    save(run_dir, 1, joined=joined)
     template = dict(TREE)
     change(template)
     assert said in refused(read, run_dir, 1, template)
