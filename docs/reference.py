@@ -8,9 +8,12 @@ Nothing on these pages is written by hand.
 """
 
 import ast
+import inspect
+import itertools
 import json
 import math
 import re
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -115,7 +118,7 @@ def _walk(
     shared: Mapping[str, Any],
     defaults: Mapping[str, Any],
 ) -> Iterator[Section]:
-    settings, below = [], []
+    settings, below, meanings = [], [], _meanings(model)
     for key, value in schema["properties"].items():
         path = f"{name}.{key}".lstrip(".")
         field = model.model_fields[key]
@@ -123,12 +126,24 @@ def _walk(
             inner = shared[value["$ref"].rpartition("/")[2]]
             below.append((path, field.annotation, inner, shared, defaults[key]))
         else:
-            meaning = " ".join(value["description"].split())
+            meaning = meanings[key]
             kind = _range(value) or _kind(value, list(dict.fromkeys(_bounds(field))))
             settings.append(Setting(path, kind, defaults[key], meaning))
     yield Section(name, " ".join(schema["description"].split()), settings)
     for arguments in below:
         yield from _walk(*arguments)
+
+
+def _meanings(model: type[BaseModel]) -> dict[str, str]:
+    """Return the docstrings of a section's settings, which pydantic would read at every start."""
+    (tree,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
+    assert isinstance(tree, ast.ClassDef)
+    return {
+        field.target.id: " ".join(text.value.value.split())
+        for field, text in itertools.pairwise(tree.body)
+        if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
+        if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
+    }
 
 
 def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:

@@ -103,9 +103,7 @@ _MAX_SUBSTEPS = 10_000
 class _Section(BaseModel):
     """Base class of all sections: immutable, with strict types and without unknown keys."""
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, use_attribute_docstrings=True
-    )
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
 
 class RobotConfig(_Section):

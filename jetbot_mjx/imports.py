@@ -2,8 +2,10 @@
 
 MuJoCo loads GLFW before a window is requested. MJX loads trimesh and SciPy's geometry for meshes,
 which no robot here has, and prints two lines if its optional Warp part is absent. Brax loads JAXopt
-for an engine that is not used here, and tensorboardX loads a logging service that is not used. On a
-slow machine these imports take almost two seconds at every start of a command. A training also
+for an engine that is not used here, and tensorboardX loads a logging service that is not used. JAX
+loads Pallas, and a library for locks that watches every later import. Flax loads its networks and
+Orbax its second interface, although a training that finds its programs compiled needs neither. On a
+slow machine these imports take more than two seconds at every start of a command. A training also
 needs no OpenGL, so that a command must be able to import MuJoCo even if the backend that
 `MUJOCO_GL` names is unavailable. The versions of all libraries are told here, too.
 """
@@ -28,6 +30,7 @@ LIBRARIES = ("brax", "flax", "jax", "jaxlib", "llvmlite", "mujoco", "mujoco-mjx"
 """Libraries of whose releases the results of a training depend."""
 
 
+@functools.cache
 def installed_version(library: str) -> str | None:
     """Return the version of a library, or None if it is not installed."""
     # Commands that store no versions start without it.
@@ -148,9 +151,13 @@ def without_warp_lines() -> Iterator[None]:
 
 _COMET = types.ModuleType("tensorboardX.comet_utils")
 _COMET.CometLogger = None  # pyright: ignore[reportAttributeAccessIssue]
+_ORBAX_V1 = "orbax.checkpoint.experimental.v1"
 _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "brax.io.image": lambda: standing_in("PIL.Image", LazyModule("PIL.Image")),
+    "flax": lambda: standing_in("flax.linen", LazyModule("flax.linen")),
+    "jax._src.lru_cache": lambda: standing_in("filelock", LazyModule("filelock")),
+    "jax.extend": lambda: standing_in("jax.extend.pallas", LazyModule("jax.extend.pallas")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
     # MuJoCo then has no OpenGL, as with `MUJOCO_GL=disabled`, and `opengl.find_backend` reports
@@ -158,6 +165,7 @@ _AROUND: Mapping[str, _Around] = {
     "mujoco.rendering.classic.gl_context": lambda: contextlib.suppress(
         ImportError, AttributeError, OSError, RuntimeError
     ),
+    "orbax.checkpoint": lambda: standing_in(_ORBAX_V1, LazyModule(_ORBAX_V1)),
     # Stand in for a logging service of tensorboardX's own writer, which is not used.
     "tensorboardX.writer": lambda: standing_in("tensorboardX.comet_utils", _COMET),
 }

@@ -66,6 +66,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{name}: --resume continues that run, in its folder")
     if not (options.resume or options.config):
         parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
+    cli.wake_driver()
     config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
     with cli.exit_on_interrupt():
@@ -85,12 +86,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.training import session
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
-        print(
-            session.summary(result)
-            if result.finished
-            else f"stopped; to resume: python -m jetbot_mjx.train --resume {run_dir}",
-            flush=True,
-        )
+        how = f"stopped; to resume: python -m jetbot_mjx.train --resume {run_dir}"
+        print(session.summary(result) if result.finished else how, flush=True)
     distributed.leave()
     return 0 if result.finished else preemption.STOPPED
 

@@ -9,7 +9,7 @@ from jaxtyping import UInt8
 from jetbot_mjx.adapters.arguments import Source, resolve
 from jetbot_mjx.adapters.batched_env import BatchedEnv, unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
-from jetbot_mjx.agents.vision import is_image
+from jetbot_mjx.agents.cnn_sizes import is_image
 from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv

@@ -16,10 +16,10 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.agents.ppo import losses
 from brax.training.types import Transition
 from jaxtyping import Array, Float, Int, PyTree, UInt32
 
+from jetbot_mjx.agents.networks import NetworkParams
 from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.compiler.update import adam, launch
 from jetbot_mjx.compiler.update.adam import AdamRule, AdamTerms, Progress
@@ -32,9 +32,6 @@ from jetbot_mjx.compiler.update.shapes import (
     UpdateShape,
 )
 from jetbot_mjx.config import PPOConfig
-
-NetworkParams: Any = losses.PPONetworkParams
-"""Parameters of both networks, in the fields `policy` and `value`."""
 
 
 class _Place(NamedTuple):
@@ -147,7 +144,7 @@ class FusedUpdate:
         launch.prepare(self._rule, self.batch, self._environments, policies, at_once=self._at_once)
 
     def pack(self, tree: PyTree) -> PyTree:
-        """Return a tree with a vector in place of every `PPONetworkParams`, on host or device."""
+        """Return a tree with a vector in place of every `NetworkParams`, on host or device."""
 
         def vector(node: Any) -> Any:
             if not isinstance(node, NetworkParams):
@@ -165,13 +162,13 @@ class FusedUpdate:
         return jax.tree.map(vector, tree, is_leaf=lambda x: isinstance(x, NetworkParams))
 
     def unpack(self, tree: PyTree) -> PyTree:
-        """Return a tree with `PPONetworkParams` in place of every vector of that length."""
+        """Return a tree with `NetworkParams` in place of every vector of that length."""
         return jax.tree.map(
             lambda x: self.network_params(x) if x.shape == (self._shape.size,) else x, tree
         )
 
     def network_params(self, vector: Float[Array, " size"]) -> Any:
-        """Return the `PPONetworkParams` that a vector holds."""
+        """Return the `NetworkParams` that a vector holds."""
         networks: dict[str, Any] = {"policy": {}, "value": {}}
         for place in self._places:
             inner = networks[place.network]

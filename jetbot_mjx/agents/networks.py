@@ -1,29 +1,32 @@
-"""Build Brax's policy and value networks, name their parameters, and run inference."""
+"""Build Brax's policy and value networks, name their parameters, and run inference.
+
+A training whose programs are found compiled needs no networks, only their parameters. Flax and
+Brax's networks take a quarter of a second to import, and are imported where networks are built.
+"""
 
 import dataclasses
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from brax.training.acme import running_statistics, specs
-from brax.training.agents.ppo import networks as ppo_networks
 from brax.training.types import identity_observation_preprocessor
+from flax import struct
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.agents.vision import VisionNetworks, is_image, make_vision_networks
+from jetbot_mjx.agents.cnn_sizes import check_size, is_image
 from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import NetworkConfig, PPOConfig
 from jetbot_mjx.errors import InvalidError
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {
-    "tanh": nn.tanh,
-    "relu": nn.relu,
-    "elu": nn.elu,
-    "swish": nn.swish,
+    "tanh": jax.nn.tanh,
+    "relu": jax.nn.relu,
+    "elu": jax.nn.elu,
+    "swish": jax.nn.swish,
 }
 
 
@@ -31,8 +34,25 @@ Observation = Float[Array | np.ndarray, "*batch obs"] | Mapping[str, Array | np.
 """One observation or any batch of them: a vector of numbers, or a dictionary with images."""
 
 
-Networks = ppo_networks.PPONetworks | VisionNetworks
-"""Policy and value networks: Brax's, or those that see."""
+class Networks:
+    """A `Networks` has the attributes of Brax's `PPONetworks`, or of `VisionNetworks`.
+
+    The networks are built when one of them is asked for.
+    """
+
+    def __init__(self, build: Callable[[], Any]) -> None:
+        """Keep the function that builds the networks."""
+        self._built = functools.cache(build)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._built(), name)
+
+
+class NetworkParams(struct.PyTreeNode):
+    """A `NetworkParams` holds the weights of both networks, as Brax's `PPONetworkParams` does."""
+
+    policy: Any
+    value: Any
 
 
 class PolicyParams(NamedTuple):
@@ -57,7 +77,7 @@ class Policy(Protocol):
         ...
 
 
-def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetworks]:
+def network_factory(config: NetworkConfig) -> Callable[..., Any]:
     """Return Brax's `network_factory` argument for a network configuration.
 
     Args:
@@ -65,8 +85,11 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
 
     Returns:
       A function of (observation_size, action_size, preprocess_observations_fn=...) and of further
-      arguments of `brax.training.agents.ppo.networks.make_ppo_networks`.
+      arguments of `brax.training.agents.ppo.networks.make_ppo_networks`, which returns a
+      `PPONetworks`.
     """
+    from brax.training.agents.ppo import networks as ppo_networks
+
     make = functools.partial(
         ppo_networks.make_ppo_networks,
         policy_hidden_layer_sizes=config.policy_hidden_layer_sizes,
@@ -79,11 +102,6 @@ def network_factory(config: NetworkConfig) -> Callable[..., ppo_networks.PPONetw
     action = config.initial_action
 
     def make_biased(observation_size: Any, action_size: int, **arguments: Any) -> Any:
-        if len(action) != action_size:
-            raise InvalidError(
-                f"ppo.network.initial_action = {list(action)} is wrong: an action has"
-                f" {action_size} numbers"
-            )
         networks: Any = make(observation_size, action_size, **arguments)
         # A mean of the normal distribution is bounded by its tanh, or by nothing.
         is_bounded = config.distribution_type == "tanh_normal"
@@ -124,22 +142,40 @@ def make_networks(
       action_size: the length of the action.
 
     Returns:
-      Brax's `PPONetworks`, or `VisionNetworks`.
+      The networks.
+
+    Raises:
+      InvalidError: `initial_action` is not an action, or the images are too small for the
+        convolutions.
     """
+    network, shapes = config.network, {}
+    if network.initial_action is not None and len(network.initial_action) != action_size:
+        raise InvalidError(
+            f"ppo.network.initial_action = {list(network.initial_action)} is wrong: an action has"
+            f" {action_size} numbers"
+        )
+    if not isinstance(observation_size, int):
+        shapes = {name: tuple(shape) for name, shape in observation_size.items()}
+        check_size(network.cnn, shapes)
     preprocess = (
         running_statistics.normalize
         if config.normalize_observations
         else identity_observation_preprocessor
     )
-    # Brax's networks hold an observation of zeros, which need not be on the GPU.
-    with jax.ensure_compile_time_eval(), default_device_cpu():
-        make_heads = network_factory(config.network)
-        if isinstance(observation_size, int):
-            return make_heads(observation_size, action_size, preprocess_observations_fn=preprocess)
-        shapes = {name: tuple(shape) for name, shape in observation_size.items()}
-        return make_vision_networks(
-            config.network, shapes, action_size, make_heads=make_heads, normalize=preprocess
-        )
+
+    def build() -> Any:
+        # Brax's networks hold an observation of zeros, which need not be on the GPU.
+        with jax.ensure_compile_time_eval(), default_device_cpu():
+            make = network_factory(network)
+            if isinstance(observation_size, int):
+                return make(observation_size, action_size, preprocess_observations_fn=preprocess)
+            from jetbot_mjx.agents.vision import make_vision_networks
+
+            return make_vision_networks(
+                network, shapes, action_size, make_heads=make, normalize=preprocess
+            )
+
+    return Networks(build)
 
 
 def init_normalizer(observation_size: int | Mapping[str, Sequence[int]]) -> Any:
@@ -185,6 +221,8 @@ def make_policy(networks: Networks, params: PolicyParams) -> Policy:
     Returns:
       The policy, which takes one observation or any batch of observations.
     """
+    from brax.training.agents.ppo import networks as ppo_networks
+
     # Brax takes whatever has the attributes of its `PPONetworks`.
     any_networks: Any = networks
     inference = ppo_networks.make_inference_fn(any_networks)

@@ -55,22 +55,25 @@ import jax.numpy as jnp
 import optax
 from brax.envs import Env
 from brax.training.acme import running_statistics
-from brax.training.agents.ppo import losses, optimizer
-from brax.training.agents.ppo import networks as ppo_networks
+from brax.training.agents.ppo import optimizer
 from brax.training.types import Transition, UInt64
 from flax import struct
 from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.agents import fused_update, gae, update_probe
-from jetbot_mjx.agents.networks import Networks, PolicyParams, init_normalizer, update_normalizer
-from jetbot_mjx.agents.vision import VisionNetworks
+from jetbot_mjx.agents import fused_update, update_probe
+from jetbot_mjx.agents.networks import (
+    NetworkParams,
+    Networks,
+    PolicyParams,
+    init_normalizer,
+    update_normalizer,
+)
 from jetbot_mjx.compiler.packed import Condensed, Packed, condense, pack
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.errors import UserError
 
 # Pyright does not follow flax's dataclasses.
-_NetworkParams: Any = losses.PPONetworkParams
 _UInt64: Any = UInt64
 
 _EXTRA_FIELDS = ("truncation", "episode_metrics", "episode_done")
@@ -175,9 +178,6 @@ class PPO:
             if config.normalize_observations and config.normalizer == "physical"
             else None
         )
-        # Brax takes whatever has the attributes of its `PPONetworks`.
-        any_networks: Any = networks
-        self._make_policy = ppo_networks.make_inference_fn(any_networks)
         self._optimizer: Any = make_optimizer(config)
         loss: Any = self._loss
         value_and_gradient = jax.value_and_grad(loss, has_aux=True)
@@ -282,7 +282,7 @@ class PPO:
         policy_key, value_key = jax.random.split(global_key)
         epoch_key, _ = jax.random.split(local_key)
         # Initialise networks, optimizer, normaliser and environments.
-        params = _NetworkParams(
+        params = NetworkParams(
             policy=self.networks.policy_network.init(policy_key),
             value=self.networks.value_network.init(value_key),
         )
@@ -431,7 +431,11 @@ class PPO:
             given = state.env_state, state.params, state.normalizer, _kept
             at_once = fused.unroll(self._env, *given)
         else:
-            policy = self._make_policy(tuple(state.policy_params))
+            from brax.training.agents.ppo.networks import make_inference_fn
+
+            # Brax takes whatever has the attributes of its `PPONetworks`.
+            any_networks: Any = self.networks
+            policy = make_inference_fn(any_networks)(tuple(state.policy_params))
 
         def transition(obs: Any, action: Array, extras: Any, kept: dict[str, Any]) -> Transition:
             # The loss needs the next observation only at the end of an unroll, where it is in the
@@ -623,8 +627,13 @@ class PPO:
         key: UInt32[Array, "2"],
     ) -> tuple[Array, Mapping[str, Array]]:
         """Compute Brax's PPO loss L = L_policy + L_value + L_entropy, as the module states it."""
-        networks = self.networks
-        if isinstance(networks, VisionNetworks):
+        # Late: a training whose programs are found compiled needs no loss.
+        from brax.training.agents.ppo import losses
+
+        from jetbot_mjx.agents import gae
+
+        networks: Any = self.networks
+        if not isinstance(self._env.observation_size, int):
             batch = _encoded(networks, normalizer, params, batch)
             networks = networks.heads
         with gae.unrolled():
@@ -698,9 +707,7 @@ def _action_keys(key: UInt32[Array, "2"], time: int) -> UInt32[Array, "time 2"]:
     return jax.lax.scan(split, key, length=time)[1]
 
 
-def _encoded(
-    networks: VisionNetworks, normalizer: Any, params: PyTree, batch: Transition
-) -> Transition:
+def _encoded(networks: Networks, normalizer: Any, params: PyTree, batch: Transition) -> Transition:
     """Replace the observations of a minibatch, of shape (unrolls, time, ...), by their features."""
     # Encode the last next observations along with the others: one product is faster than two.
     joined = jax.tree.map(

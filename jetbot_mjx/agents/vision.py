@@ -27,40 +27,13 @@ from brax.training import networks as brax_networks
 from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt8
 
+from jetbot_mjx.agents.cnn_sizes import CNNS, Shapes, compute_dtype, is_image
 from jetbot_mjx.config import NetworkConfig
-from jetbot_mjx.errors import InvalidError
-
-Shapes = Mapping[str, tuple[int, ...]]
-"""Shapes of the parts of an observation, by name."""
 
 _POLICY, _VALUE = "policy", "value"
 
 ENCODER, HEAD = "encoder", "head"
 """Keys of the parts of a network's parameters."""
-
-
-class _Layers(NamedTuple):
-    """A `_Layers` holds the sizes of an encoder."""
-
-    convolutions: tuple[tuple[int, int, int], ...]
-    """Channels, side of the kernel and stride of each convolution [pixels]."""
-    features: int
-
-    @property
-    def smallest(self) -> int:
-        """Return the side of the smallest image [pixels], which leaves one row of outputs."""
-        size = 1
-        for _, side, stride in reversed(self.convolutions):
-            size = (size - 1) * stride + side
-        return size
-
-
-CNNS = {
-    "nature": _Layers(((32, 8, 4), (64, 4, 2), (64, 3, 1)), 512),
-    "small": _Layers(((16, 4, 2), (32, 4, 2), (32, 3, 1)), 128),
-    "tiny": _Layers(((16, 4, 4), (32, 4, 2)), 64),
-}
-"""Encoders by the name that `ppo.network.cnn` takes."""
 
 
 class VisionNetworks(NamedTuple):
@@ -104,11 +77,6 @@ class _ObservationEncoder(NamedTuple):
         return jnp.concatenate([features, *(values[name] for name in numbers)], axis=-1)
 
 
-def is_image(name: str) -> bool:
-    """Return whether a part of an observation holds images, as Brax's networks decide it."""
-    return name.startswith("pixels/")
-
-
 def make_vision_networks(
     config: NetworkConfig,
     shapes: Shapes,
@@ -128,12 +96,8 @@ def make_vision_networks(
 
     Returns:
       The networks.
-
-    Raises:
-      InvalidError: the images are too small for the convolutions.
     """
     layers = CNNS[config.cnn]
-    _check_size(config.cnn, shapes)
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
     encode_one = _ObservationEncoder(encoder, shapes, normalize)
     brax_heads = make_heads(encode_one.features, action_size)
@@ -190,37 +154,6 @@ def _on_features(
     )
 
 
-def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
-    """Return the memory of what the encoders compute from one observation [bytes].
-
-    Args:
-      config: the layers, and whether policy and value function share them.
-      shapes: the shapes of the observation's parts.
-    """
-    layers = CNNS[config.cnn]
-    images = [shape for name, shape in shapes.items() if is_image(name)]
-    height, width, _ = images[0]
-    channels = sum(shape[2] for shape in images)
-    count = layers.features
-    for c_out, side, stride in layers.convolutions:
-        height, width = ((size - side) // stride + 1 for size in (height, width))
-        count += height * width * (side * side * channels + c_out)
-        channels = c_out
-    encoders = 1 if config.shared_cnn else 2
-    return encoders * count * jnp.dtype(_dtype(config.cnn_dtype)).itemsize
-
-
-def _check_size(cnn: str, shapes: Shapes) -> None:
-    """Raise an error if an image is too small for convolutions."""
-    for height, width, _ in (shape for name, shape in shapes.items() if is_image(name)):
-        if min(height, width) < CNNS[cnn].smallest:
-            sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in CNNS.items())
-            raise InvalidError(
-                f"camera.width = {width} and camera.height = {height} are too small for"
-                f" ppo.network.cnn = {cnn!r}: make both at least that of the network ({sizes})"
-            )
-
-
 def _joined(images: Mapping[str, UInt8[Array, "*batch h w c"]]) -> UInt8[Array, "*batch h w c"]:
     """Return several images of one size as the channels of one."""
     return jnp.concatenate(list(images.values()), axis=-1)
@@ -238,7 +171,7 @@ class Encoder(nn.Module):
     @nn.compact
     def __call__(self, pixels: UInt8[Array, "*batch h w c"]) -> Float[Array, "*batch features"]:
         """Return the features of images, at any number of batch axes."""
-        dtype = _dtype(self.dtype)
+        dtype = compute_dtype(self.dtype)
         batch = pixels.shape[:-3]
         x = pixels.reshape(-1, *pixels.shape[-3:])
         for i, (channels, side, stride) in enumerate(self.convolutions):
@@ -252,12 +185,6 @@ class Encoder(nn.Module):
         x = x.reshape(x.shape[0], -1)
         x = nn.relu(nn.Dense(self.features, dtype=dtype, name="dense")(x))
         return x.astype(jnp.float32).reshape(*batch, self.features)
-
-
-def _dtype(name: str) -> Any:
-    if name == "auto":
-        return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16
-    return jnp.dtype(name)
 
 
 def convolve(

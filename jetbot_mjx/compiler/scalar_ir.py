@@ -12,7 +12,7 @@ that may be infinite or NaN goes without them, and reduces angles of any size.
 import dataclasses
 import functools
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -423,17 +423,27 @@ _FINE = np.float64((np.float32(np.pi / 2 - _COARSE).view(np.uint32) & 0xFFFFE000
 _QUARTER_TURN = [np.float32(part) for part in (_COARSE, _FINE, np.pi / 2 - _COARSE - _FINE)]
 
 
-def _polynomial(
-    function: Callable[[np.ndarray], np.ndarray], degree: int, low: float, high: float
-) -> list[np.float32]:
-    """Return polynomial coefficients of a function, lowest first, for numbers in an interval."""
-    fit = np.polynomial.Chebyshev.interpolate(function, degree, domain=[low, high])
+class _Polynomial(NamedTuple):
+    """A `_Polynomial` interpolates a function in an interval, once a program needs it."""
+
+    function: Callable[[np.ndarray], np.ndarray]
+    degree: int
+    low: float
+    high: float
+
+
+@functools.cache
+def _coefficients(polynomial: _Polynomial) -> list[np.float32]:
+    """Return the coefficients of a polynomial, lowest first."""
+    function, degree, *domain = polynomial
+    fit = np.polynomial.Chebyshev.interpolate(function, degree, domain=domain)
     power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1], window=[-1, 1])
     return [np.float32(c) for c in power.coef]
 
 
-def _horner(graph: ExprGraph, coefficients: Sequence[np.float32], x: Scalar) -> Scalar:
+def _horner(graph: ExprGraph, polynomial: _Polynomial, x: Scalar) -> Scalar:
     """Return the value of a polynomial."""
+    coefficients = _coefficients(polynomial)
     total: Scalar = coefficients[-1]
     for coefficient in reversed(coefficients[:-1]):
         total = graph.apply("add", graph.apply("mul", total, x), coefficient)
@@ -441,8 +451,8 @@ def _horner(graph: ExprGraph, coefficients: Sequence[np.float32], x: Scalar) -> 
 
 
 # The polynomials of sine and cosine are in s = r², for |r| up to π/4.
-_SINE = _polynomial(lambda s: np.sinc(np.sqrt(s) / np.pi), 4, 0.0, (np.pi / 4) ** 2)  # sin(r)/r
-_COSINE = _polynomial(lambda s: np.cos(np.sqrt(s)), 5, 0.0, (np.pi / 4) ** 2)
+_SINE = _Polynomial(lambda s: np.sinc(np.sqrt(s) / np.pi), 4, 0.0, (np.pi / 4) ** 2)  # sin(r)/r
+_COSINE = _Polynomial(lambda s: np.cos(np.sqrt(s)), 5, 0.0, (np.pi / 4) ** 2)
 
 
 def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0) -> Scalar:
@@ -480,19 +490,19 @@ _LN2 = float(np.log(2.0))
 # ln 2 as a sum of two parts, of which the products of the first with an exponent are exact.
 _LN2_COARSE = np.float32(round(_LN2 * 2**14) / 2**14)
 _LN2_FINE = np.float32(_LN2 - float(_LN2_COARSE))
-_EXP = _polynomial(np.exp, 6, -_LN2 / 2, _LN2 / 2)
+_EXP = _Polynomial(np.exp, 6, -_LN2 / 2, _LN2 / 2)
 _ROOT = float(np.sqrt(2.0))
 _LOG_END = ((_ROOT - 1.0) / (_ROOT + 1.0)) ** 2
 # atanh(t)/t in s = t², and tanh(x)/x in s = x².
-_ARTANH = _polynomial(lambda s: np.arctanh(np.sqrt(s)) / np.sqrt(s), 3, 1e-12 * _LOG_END, _LOG_END)
+_ARTANH = _Polynomial(lambda s: np.arctanh(np.sqrt(s)) / np.sqrt(s), 3, 1e-12 * _LOG_END, _LOG_END)
 # expm1(x)/x
 _EXPM1_END = 0.5
-_EXPM1 = _polynomial(lambda x: np.expm1(x) / x, 7, -_EXPM1_END, _EXPM1_END + 1e-9)
+_EXPM1 = _Polynomial(lambda x: np.expm1(x) / x, 7, -_EXPM1_END, _EXPM1_END + 1e-9)
 _TANH_END = 0.6
-_TANH = _polynomial(lambda s: np.tanh(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _TANH_END**2)
+_TANH = _Polynomial(lambda s: np.tanh(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _TANH_END**2)
 # atan(t)/t in s = t², for t up to tan(π/8).
 _ATAN_END = float(np.tan(np.pi / 8))
-_ATAN = _polynomial(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _ATAN_END**2)
+_ATAN = _Polynomial(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _ATAN_END**2)
 # For w = -log(1 - x²), erf⁻¹(x)/x is a polynomial in w up to the first end, then in √w; float32 has
 # no x between 1 and that of the last end.
 _ERF_INV_NEAR = 5.0
@@ -615,7 +625,7 @@ def _simplify_erf_inv(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
 
 
 @functools.cache
-def _inverse_error_polynomials() -> tuple[list[np.float32], list[np.float32]]:
+def _inverse_error_polynomials() -> tuple[_Polynomial, _Polynomial]:
     """Return polynomials of erf⁻¹(x)/x in w and in √w, around the centres of their intervals."""
     # Imported late, because few programs draw normal numbers.
     from scipy import special
@@ -625,11 +635,11 @@ def _inverse_error_polynomials() -> tuple[list[np.float32], list[np.float32]]:
         x = np.sqrt(-np.expm1(-w))
         return special.erfcinv(np.exp(-w) / (1 + x)) / x
 
-    near = _polynomial(
+    near = _Polynomial(
         lambda d: factor(d + _ERF_INV_NEAR / 2), 8, 1e-9 - _ERF_INV_NEAR / 2, _ERF_INV_NEAR / 2
     )
     half = (np.sqrt(_ERF_INV_FAR) - np.sqrt(_ERF_INV_NEAR)) / 2
-    far = _polynomial(lambda d: factor((d + _ERF_INV_CENTRE) ** 2), 8, -half, half)
+    far = _Polynomial(lambda d: factor((d + _ERF_INV_CENTRE) ** 2), 8, -half, half)
     return near, far
 
 

@@ -14,8 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from jetbot_mjx.agents.cnn_sizes import CNNS
 from jetbot_mjx.agents.networks import make_networks, make_policy
-from jetbot_mjx.agents.vision import CNNS, ENCODER, HEAD
+from jetbot_mjx.agents.vision import ENCODER, HEAD
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot, Observation

@@ -13,7 +13,6 @@ import sys
 import threading
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any, TextIO
 
 from rich.console import Console, Group
@@ -24,7 +23,7 @@ from rich.table import Table
 from rich.text import Text
 
 from jetbot_mjx.runs.metrics import History, MetricValues, process_seconds
-from jetbot_mjx.runs.progress import in_foreground, is_watched
+from jetbot_mjx.runs.progress import in_foreground
 from jetbot_mjx.training.console import Phase, Terminal
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
@@ -35,30 +34,6 @@ _PATIENCE_SECONDS = 1.0
 """How long a caller waits for the terminal at most, at a flush and at the end [s]."""
 _SPEED_SECONDS = 3600.0
 """Time over which the speed for the remaining time is averaged [s]."""
-
-
-def open_terminal(
-    run_dirs: Sequence[Path], total_steps: int, histories: Sequence[Sequence[History]]
-) -> Terminal:
-    """Return a dashboard if standard output is a terminal in the foreground, else plain lines.
-
-    As rich does, `TERM=dumb` and `TTY_INTERACTIVE=0` select plain lines, `NO_COLOR` no colours.
-
-    Args:
-      run_dirs: the folder of each seed.
-      total_steps: environment steps of the whole training.
-      histories: the metrics that each seed has logged before.
-
-    Returns:
-      The terminal.
-    """
-    # With its own file: `sys.stdout` is replaced while the dashboard is drawn.
-    console = Console(file=sys.stdout, highlight=False)
-    if not is_watched(console):
-        return Terminal(total_steps)
-    seeds = [folder.name.removeprefix("seed-") for folder in run_dirs]
-    title = (run_dirs[0] if len(run_dirs) == 1 else run_dirs[0].parent).name
-    return Dashboard(title, total_steps, seeds, histories, console)
 
 
 def sparkline(rates: Sequence[float], width: int) -> str:

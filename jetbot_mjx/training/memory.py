@@ -16,8 +16,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from jetbot_mjx.agents.cnn_sizes import activation_bytes
 from jetbot_mjx.agents.ppo import PPO
-from jetbot_mjx.agents.vision import activation_bytes
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.jetbot_env import JetBotEnv

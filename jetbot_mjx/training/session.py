@@ -50,7 +50,6 @@ from jetbot_mjx.runs.task_code import (
 from jetbot_mjx.runs.wandb_sink import check_tracking
 from jetbot_mjx.training import distributed, ppo_trainer
 from jetbot_mjx.training.callbacks import TrainerCallback
-from jetbot_mjx.training.dashboard import open_terminal
 from jetbot_mjx.training.memory import advice, device_memory, sizes
 from jetbot_mjx.training.preemption import Preemption
 from jetbot_mjx.training.run_recorder import (
@@ -59,6 +58,7 @@ from jetbot_mjx.training.run_recorder import (
     Standing,
     open_sinks,
 )
+from jetbot_mjx.training.terminal import open_terminal
 from jetbot_mjx.training.warm_start import WarmStart, make_warm_start
 
 _COMPLETE, _BEGINS, _RESUMES = range(3)

@@ -57,6 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0.
     """
     options = _parser().parse_args(arguments)
+    cli.wake_driver()
     config = cli.config_of(options)
     cli.divide_cpu(config.cpu_devices)
     cli.wake_device()

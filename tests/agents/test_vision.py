@@ -9,7 +9,7 @@ from brax.envs import Wrapper
 from brax.training.agents.ppo import losses, networks_vision
 from brax.training.types import Transition
 
-from jetbot_mjx.agents import vision
+from jetbot_mjx.agents import cnn_sizes
 from jetbot_mjx.agents.networks import init_normalizer, make_networks, update_normalizer
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.agents.vision import Encoder, convolve
@@ -17,7 +17,7 @@ from jetbot_mjx.config import NetworkConfig, PPOConfig, parse_config
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.errors import InvalidError
 
-LAYERS = sorted({layer for layers in vision.CNNS.values() for layer in layers.convolutions})
+LAYERS = sorted({layer for layers in cnn_sizes.CNNS.values() for layer in layers.convolutions})
 SMALLEST = {"nature": 36, "small": 18, "tiny": 16}
 
 
@@ -151,7 +151,7 @@ def init(ppo):
 def as_brax(params):
     """Rename the parameters of an encoder and a head to those of Brax's one network."""
     encoder, head = params["encoder"]["params"], params["head"]["params"]
-    layers = len(vision.CNNS["small"].convolutions)
+    layers = len(cnn_sizes.CNNS["small"].convolutions)
     convolutions = {
         f"Conv_{i}": {"kernel": encoder[f"conv_{i}_kernel"], "bias": encoder[f"conv_{i}_bias"]}
         for i in range(layers)
@@ -187,7 +187,7 @@ def separate():
 
 def test_the_loss_of_separate_encoders_is_that_of_brax_s_networks(separate):
     params, batch, ((loss, metrics), gradient) = separate
-    layers = vision.CNNS["small"]
+    layers = cnn_sizes.CNNS["small"]
     channels, sides, strides = zip(*layers.convolutions, strict=True)
     theirs = networks_vision.make_ppo_networks_vision(
         {PIXELS: SHAPE},
@@ -338,6 +338,6 @@ def test_the_memory_of_activations_is_what_a_gradient_keeps(cnn, shared):
         return sum(x.size * x.dtype.itemsize for x in jax.tree.leaves(kept))
 
     network = NetworkConfig(cnn=cnn, shared_cnn=shared, cnn_dtype="float32")
-    counted = vision.activation_bytes(network, shapes)
+    counted = cnn_sizes.activation_bytes(network, shapes)
     # It keeps the signs of relu and the parts of patches besides.
     assert 0.9 * counted <= kept(9) - kept(8) <= 1.5 * counted

@@ -60,9 +60,20 @@ from jetbot_mjx.imports import install_lazy_imports
 install_lazy_imports()
 {then}
 import jetbot_mjx.training.session
-heavy = ["PIL.Image", "glfw", "jaxopt", "scipy.optimize", "scipy.spatial",
+from jetbot_mjx.config import Config
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.runs import checkpoint_manager
+from jetbot_mjx.training.ppo_trainer import build_ppo
+ppo = build_ppo(Config(), make_env(Config()))
+heavy = ["PIL.Image", "filelock", "flax.linen", "glfw", "jax.extend.pallas", "jaxopt",
+    "orbax.checkpoint.experimental.v1", "scipy.optimize", "scipy.spatial",
     "tensorboardX.comet_utils", "torch", "trimesh"]
 print(*[name for name in heavy if name in sys.modules])
+print(type(ppo.networks.policy_network).__name__)
+import flax, jax.extend, jax._src.lru_cache, orbax.checkpoint
+print(flax.linen.Dense(3).features, jax.extend.pallas.__name__)
+print(jax._src.lru_cache.filelock.Timeout.__name__)
+print(orbax.checkpoint.v1.__name__, callable(orbax.checkpoint.v1.save_pytree))
 from brax.generalized import constraint
 print(constraint.jaxopt.ProjectedGradient.__name__)
 import inspect
@@ -80,7 +91,15 @@ def test_a_training_loads_nothing_heavy_and_all_of_it_is_there_when_asked_for(th
         text=True,
     )
     assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.splitlines() == ["", "ProjectedGradient", "ConvexHull True"]
+    assert done.stdout.splitlines() == [
+        "",
+        "FeedForwardNetwork",
+        "3 jax.extend.pallas",
+        "Timeout",
+        "orbax.checkpoint.experimental.v1 True",
+        "ProjectedGradient",
+        "ConvexHull True",
+    ]
 
 
 @pytest.mark.skipif(find_spec("glfw") is None, reason="MuJoCo was installed without GLFW")

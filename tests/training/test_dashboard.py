@@ -17,7 +17,8 @@ from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.training import dashboard as dashboard_module
 from jetbot_mjx.training.console import Terminal
-from jetbot_mjx.training.dashboard import Dashboard, open_terminal, sparkline
+from jetbot_mjx.training.dashboard import Dashboard, sparkline
+from jetbot_mjx.training.terminal import open_terminal
 
 PATIENCE = 60
 
@@ -274,7 +275,7 @@ def test_in_the_background_it_does_not_draw(screen, opened, monkeypatch):
 STOPPED_UNDER_A_DASHBOARD = """\
 import sys
 from pathlib import Path
-from jetbot_mjx.training.dashboard import open_terminal
+from jetbot_mjx.training.terminal import open_terminal
 terminal = open_terminal([Path("mine")], 100, [[]])
 terminal.begin()
 terminal.update(42, {}, 1.0)
