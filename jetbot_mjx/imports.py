@@ -3,7 +3,8 @@
 MuJoCo loads GLFW before a window is requested. MJX loads trimesh and SciPy's geometry for meshes,
 which no robot here has, and prints two lines if its optional Warp part is absent. Brax loads JAXopt
 for an engine that is not used here, and tensorboardX loads a logging service that is not used. JAX
-loads Pallas, and a library for locks that watches every later import. Flax loads its networks and
+loads Pallas, and a library for locks that watches every later import, and reads the metadata of all
+packages. Flax loads its networks and
 Orbax its second interface, although a training that finds its programs compiled needs neither. On a
 slow machine these imports take more than two seconds at every start of a command. A training also
 needs no OpenGL, so that a command must be able to import MuJoCo even if the backend that
@@ -13,6 +14,7 @@ needs no OpenGL, so that a command must be able to import MuJoCo even if the bac
 import ast
 import contextlib
 import functools
+import glob
 import importlib
 import importlib.abc
 import importlib.machinery
@@ -138,6 +140,19 @@ def _mjx() -> Iterator[None]:
 
 
 @contextlib.contextmanager
+def _without_rocm() -> Iterator[None]:
+    """Keep JAX from reading the metadata of all installed packages, if none is for AMD's GPUs."""
+    metadata = importlib.import_module("importlib.metadata")
+    distributions = metadata.distributions
+    if not any(glob.glob("jax[-_]rocm*", root_dir=folder) for folder in sys.path):
+        metadata.distributions = lambda: ()
+    try:
+        yield
+    finally:
+        metadata.distributions = distributions
+
+
+@contextlib.contextmanager
 def without_warp_lines() -> Iterator[None]:
     """Print what is printed inside the context, except for MJX's lines about its part Warp."""
     printed = io.StringIO()
@@ -156,6 +171,7 @@ _AROUND: Mapping[str, _Around] = {
     "brax.generalized.constraint": lambda: standing_in("jaxopt", LazyModule("jaxopt")),
     "brax.io.image": lambda: standing_in("PIL.Image", LazyModule("PIL.Image")),
     "flax": lambda: standing_in("flax.linen", LazyModule("flax.linen")),
+    "jax._src.numpy.array_constructors": _without_rocm,
     "jax._src.lru_cache": lambda: standing_in("filelock", LazyModule("filelock")),
     "jax.extend": lambda: standing_in("jax.extend.pallas", LazyModule("jax.extend.pallas")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),

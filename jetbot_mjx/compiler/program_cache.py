@@ -24,7 +24,7 @@ from jax.experimental import serialize_executable
 from jetbot_mjx.compiler import llvm_backend, random_bits
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once, write_private
-from jetbot_mjx.compiler.xla_options import Options, untuned_options
+from jetbot_mjx.compiler.xla_options import Options, unseen_options, untuned_options
 
 _UNUSED_DAYS = 30
 # Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
@@ -156,11 +156,10 @@ class ProgramCache:
         """
         options = self._options if tune else {**self._options, **untuned_options()}
         began = time.perf_counter()
-        # Tracing may have found small programs in JAX's cache, which do not count.
-        with _CacheHits() as hits:
-            program = lowered.compile(compiler_options=options)
-        # On a CPU, XLA cannot serialize a program that it loaded: functions would be missing.
-        loaded = hits.count and jax.default_backend() == "cpu"
+        program, loaded = _compiled(lowered, options)
+        if self._folder and loaded and (unseen := unseen_options()):
+            # Compile it once, instead of at every start: JAX finds nothing under other options.
+            program, loaded = _compiled(lowered, {**options, **unseen})
         if self._folder and not loaded and usable():
             seconds += time.perf_counter() - began
             # Only programs for CPUs call kernels by name, and their text takes a while to write.
@@ -239,6 +238,17 @@ class _CacheHits:
 
     def _listen(self, event: str, **kwargs: str | int) -> None:
         self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
+
+
+def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages.Compiled, bool]:
+    """Compile a program; return also whether XLA loaded it and cannot serialize it.
+
+    On a CPU, functions of a program that JAX found in its own cache would be missing.
+    """
+    # Tracing may have found small programs in JAX's cache, which do not count.
+    with _CacheHits() as hits:
+        program = lowered.compile(compiler_options=options)
+    return program, hits.count > 0 and jax.default_backend() == "cpu"
 
 
 def _load(path: Path) -> jax.stages.Compiled | None:

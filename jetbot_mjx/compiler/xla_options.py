@@ -12,6 +12,7 @@ cores. Without it, the bits of a fused training do not depend on the machine's c
 import contextlib
 import functools
 import os
+import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -52,6 +53,11 @@ def compiler_options(config: Config) -> Options:
 def untuned_options() -> Options:
     """Return options with which XLA times no kernels on a GPU, which takes it a second."""
     return _possible(_UNTUNED) if jax.default_backend() == "gpu" else {}
+
+
+def unseen_options() -> Options:
+    """Return an option that changes nothing on CPUs, with a value that JAX's cache has not seen."""
+    return _possible({"xla_gpu_nccl_termination_timeout_seconds": time.time_ns() % 1_000_000_000})
 
 
 def _possible(options: Options) -> Options:

@@ -156,8 +156,10 @@ class CompiledTrainer:
         if jax.process_count() > 1:
             # A process cannot read the devices of another: replicate everything first.
             state = jax.jit(lambda state: state, out_shardings=self._replicated)(state)
-        host = jax.device_get(state)
-        each = [jax.tree.map(lambda x, i=index: x[i], host) for index in range(len(self._seeds))]
+        leaves, structure = jax.tree.flatten(state)
+        # As leaves, because Brax's counters are JAX arrays even on the host: to index one compiles.
+        host = jax.device_get(leaves)
+        each = [structure.unflatten([x[i] for x in host]) for i in range(len(self._seeds))]
         return [self.ppo.unpacked(state) for state in each]
 
     def compile(self) -> Advance:

@@ -195,20 +195,42 @@ def test_without_a_folder_nothing_is_kept(folder):
     assert ProgramCache({}).find("double") is None
 
 
-@pytest.mark.parametrize(("platform", "written"), [("cpu", 0), ("gpu", 1)])
-def test_what_a_cpu_found_in_jax_s_cache_is_not_written_again(
-    folder, monkeypatch, platform, written
-):
-    hits = program_cache._CacheHits.__exit__
+@pytest.fixture
+def jax_cache(folder, tmp_path_factory):
+    """JAX's own cache, which takes every program."""
+    path = tmp_path_factory.mktemp("jax")
+    settings = {
+        "jax_compilation_cache_dir": str(path),
+        "jax_persistent_cache_min_compile_time_secs": 0.0,
+        "jax_enable_compilation_cache": True,
+    }
+    before = {name: jax.config.values[name] for name in settings}
+    for name, value in settings.items():
+        jax.config.update(name, value)
+    compilation_cache.reset_cache()
+    yield path
+    for name, value in before.items():
+        jax.config.update(name, value)
 
-    def found(self, *exception):
-        jax.monitoring.record_event(program_cache._CACHE_HIT)
-        hits(self, *exception)
 
-    monkeypatch.setattr(program_cache._CacheHits, "__exit__", found)
-    monkeypatch.setattr(jax, "default_backend", lambda: platform)
-    ProgramCache({}, folder, KEY).compile("double", double)
-    assert len(list(folder.iterdir())) == written
+def test_what_a_cpu_finds_in_jax_s_cache_is_compiled_once_more_and_written(jax_cache, folder):
+    for name in ("one", "another", "third"):
+        jax.clear_caches()
+        ProgramCache({}, folder, name).compile("double", double)
+    assert [path for path in jax_cache.iterdir() if "jit__lambda" in path.name]
+    assert len(list(folder.glob("program-*"))) == 3
+    for name in ("one", "another", "third"):
+        found = ProgramCache({}, folder, name).find("double")
+        assert found is not None
+        assert twice(found) == [0, 2, 4]
+
+
+def test_what_a_cpu_still_finds_there_is_not_written(jax_cache, folder, monkeypatch):
+    monkeypatch.setattr(program_cache, "unseen_options", dict)
+    for name in ("one", "another"):
+        jax.clear_caches()
+        ProgramCache({}, folder, name).compile("double", double)
+    assert len(list(folder.glob("program-*"))) == 1
 
 
 def test_what_nobody_used_for_long_makes_room(kept):
