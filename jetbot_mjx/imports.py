@@ -142,7 +142,7 @@ def _mjx() -> Iterator[None]:
 @contextlib.contextmanager
 def _without_rocm() -> Iterator[None]:
     """Keep JAX from reading the metadata of all installed packages, if none is for AMD's GPUs."""
-    metadata = importlib.import_module("importlib.metadata")
+    metadata: Any = importlib.import_module("importlib.metadata")
     distributions = metadata.distributions
     if not any(glob.glob("jax[-_]rocm*", root_dir=folder) for folder in sys.path):
         metadata.distributions = lambda: ()

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from brax.envs import Wrapper
 from brax.training.acme import running_statistics
+from brax.training.agents.ppo.networks import PPONetworks
 from brax.training.types import Transition
 from gpu_model import Gpu
 
@@ -549,7 +550,7 @@ def rounding(settings, networks):
 
     policy = dataclasses.replace(networks.policy_network, apply=apply)
     value = dataclasses.replace(networks.value_network, apply=lambda *x: apply(*x)[..., 0])
-    return dataclasses.replace(networks, policy_network=policy, value_network=value)
+    return PPONetworks(policy, value, networks.parametric_action_distribution)
 
 
 def drawn_for(fused, order, key):

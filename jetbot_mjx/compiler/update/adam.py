@@ -41,12 +41,6 @@ class AdamRule(NamedTuple):
     """Number of steps of a training step."""
 
     @property
-    def ranges(self) -> list[tuple[int, int]]:
-        """Return the ranges of the vector that hold parameters; metrics are behind each."""
-        policy, size = self.shape.policy_size, self.shape.size
-        return [(0, policy - len(POLICY_METRICS)), (policy, size - len(VALUE_METRICS))]
-
-    @property
     def sizes(self) -> dict[str, int]:
         """Return the number of elements of each of the `ARRAYS` for one policy."""
         sizes = dict.fromkeys(ARRAYS, self.shape.size) | SIZES

@@ -28,7 +28,7 @@ def adam_stages(rule: AdamRule, lanes: int) -> list[Stage]:
       rule: what the vectors hold.
       lanes: the number of float32 values in a vector register.
     """
-    return [SquareStage(lanes, rule.ranges), _AdamStage(rule, lanes)]
+    return [SquareStage(lanes, rule.shape.ranges), _AdamStage(rule, lanes)]
 
 
 class _AdamStage(VectorStage):
@@ -93,7 +93,7 @@ class _AdamStage(VectorStage):
         is_first = code.let("icmp eq i64 %part, 0")
         with code.loop(code.select(is_first, "i64", SIZES["progress"], 0)) as i:
             code.copy(code.at(progress, i), code.at(after, i))
-        for start, stop in rule.ranges:
+        for start, stop in rule.shape.ranges:
             first, count = self.chunk(code, start, stop)
             whole = code.let(f"udiv i64 {count}, {lanes}")
             done = code.mul(whole, lanes)

@@ -110,10 +110,10 @@ def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> list[St
       lanes: the number of float32 values in a vector register.
     """
     values, policy = divisions(shape, batch, lanes)
-    end = shape.policy_size
+    (begin, end), (values_begin, values_end) = shape.ranges
     ranges = {
-        "policy_vectors": (policy.parts, 0, end),
-        "values_vectors": (values.parts, end, shape.size),
+        "policy_vectors": (policy.parts, (begin, end, values_begin)),
+        "values_vectors": (values.parts, (values_begin, values_end, shape.size)),
     }
     return [_ValueStage(values), _PolicyStage(policy), SumStage(lanes, ranges)]
 

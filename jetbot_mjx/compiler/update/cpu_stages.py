@@ -10,6 +10,7 @@ threads.
 
 import abc
 import dataclasses
+import itertools
 from collections.abc import Mapping, Sequence
 
 from jetbot_mjx.compiler import ffi_wrapper
@@ -164,13 +165,13 @@ class VectorStage(Stage):
 class SumStage(VectorStage):
     """A `SumStage` adds up the gradients of all parts, in their order."""
 
-    def __init__(self, lanes: int, ranges: Mapping[str, tuple[int, int, int]]) -> None:
+    def __init__(self, lanes: int, ranges: Mapping[str, tuple[int, Sequence[int]]]) -> None:
         """Prepare.
 
         Args:
           lanes: the number of float32 values in a vector register.
-          ranges: of each array of vectors their number, and where in the gradient they begin and
-            end.
+          ranges: of each array of vectors their number, and where in the gradient they begin, where
+            their parameters end, and where they end.
         """
         super().__init__()
         self.name, self._lanes, self._ranges = "total", lanes, ranges
@@ -179,15 +180,16 @@ class SumStage(VectorStage):
         """Return the text of the function."""
         code = VectorCode(self._lanes)
         gradient = call.array(code, "gradient")
-        for name, (count, begin, end) in self._ranges.items():
-            vectors = call.array(code, name)
-            for place, kind in code.each(*self.chunk(code, 0, end - begin)):
-                source = code.at(vectors, place)
-                total = code.load(source, kind)
-                for i in range(1, count):
-                    other = code.load(code.at(source, i * (end - begin)), kind)
-                    total = code.arithmetic("fadd", total, other, kind)
-                code.store(total, code.at(gradient, begin, place), kind)
+        for name, (count, places) in self._ranges.items():
+            vectors, begin, size = call.array(code, name), places[0], places[-1] - places[0]
+            for start, stop in itertools.pairwise(places):
+                for place, kind in code.each(*self.chunk(code, start - begin, stop - begin)):
+                    source = code.at(vectors, place)
+                    total = code.load(source, kind)
+                    for i in range(1, count):
+                        other = code.load(code.at(source, i * size), kind)
+                        total = code.arithmetic("fadd", total, other, kind)
+                    code.store(total, code.at(gradient, begin, place), kind)
         return [self.function(code)]
 
 
@@ -219,6 +221,30 @@ class SquareStage(VectorStage):
         code.store(number(0.0), target)
         code.accumulate("%scratch", self._lanes, target)
         return [self.function(code)]
+
+
+class JoinedStage(Stage):
+    """A `JoinedStage` is two stages: a part of the second reads what that of the first wrote.
+
+    No thread waits between them, and a part's numbers are still in its cache.
+    """
+
+    def __init__(self, first: Stage, second: Stage) -> None:
+        """Prepare, for two stages of the same number of parts."""
+        super().__init__()
+        assert first.parts == second.parts
+        self._stages = first, second
+        self.name, self.parts = f"{first.name}_and_{second.name}", first.parts
+        self.scratch = max(first.scratch, second.scratch)
+
+    def texts(self, call: Call) -> list[str]:
+        """Return the texts of both functions, and of one that calls them."""
+        code = VectorCode(1)
+        texts = [text for stage in self._stages for text in stage.texts(call)]
+        for stage in self._stages:
+            code.call(stage.name, *_PARAMETERS)
+            self.programs += stage.programs
+        return [*texts, self.function(code)]
 
 
 SQUARES = _CHUNKS

@@ -1,12 +1,13 @@
 """Write all minibatches of a training step on CPUs as one call.
 
-Each minibatch has the stages of its gradient, and then those of Adam.
+Each minibatch has the stages of its gradient, and then those of Adam, whose first one is joined
+with the sum of the gradients: it squares what that has just written.
 """
 
 from jetbot_mjx.compiler.update.adam import UPDATED, AdamRule
 from jetbot_mjx.compiler.update.cpu_adam import adam_stages
 from jetbot_mjx.compiler.update.cpu_gradient import BETWEEN, gradient_sizes, gradient_stages
-from jetbot_mjx.compiler.update.cpu_stages import SQUARES, Call
+from jetbot_mjx.compiler.update.cpu_stages import SQUARES, Call, JoinedStage
 from jetbot_mjx.compiler.update.shapes import Minibatch
 
 ARGUMENTS = (
@@ -33,6 +34,8 @@ def update_call(rule: AdamRule, batch: Minibatch, lanes: int) -> Call:
         **gradient_sizes(rule.shape, batch, lanes),
         "squares": SQUARES,
     }
-    stages = [*gradient_stages(rule.shape, batch, lanes), *adam_stages(rule, lanes)]
+    *parts, total = gradient_stages(rule.shape, batch, lanes)
+    squares, *rest = adam_stages(rule, lanes)
+    stages = [*parts, JoinedStage(total, squares), *rest]
     results = *UPDATED, "gradient", "squares", *BETWEEN
     return Call(ARGUMENTS, results, sizes, stages, minibatches=batch.count)

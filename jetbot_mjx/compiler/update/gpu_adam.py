@@ -97,7 +97,7 @@ class _AdamKernel:
 
     def _is_parameter(self, place: Value) -> Value:
         """Return whether an element is a parameter: metrics are behind those of each network."""
-        ir, ((start, stop), (first, end)) = self.ir, self.rule.ranges
+        ir, ((start, stop), (first, end)) = self.ir, self.rule.shape.ranges
         assert start == 0
         middle = ir.select(place < stop, ir.constant(first, "i32"), place)
         return ir.select(middle < first, ir.constant(end, "i32"), middle) < end
@@ -109,7 +109,7 @@ class _AdamKernel:
         for i, start in enumerate(range(0, size, THREADS)):
             place, stop = self.thread + start, start + THREADS
             value = ir.fetch(gradient, ir.minimum(place, size - 1) if stop > size else place)
-            if not any(first <= start and stop <= last for first, last in self.rule.ranges):
+            if not any(first <= start and stop <= last for first, last in self.rule.shape.ranges):
                 value = ir.select(self._is_parameter(place), value, 0.0)
             sums[i % _SUMS] += value * value
         return sums

@@ -81,6 +81,12 @@ class UpdateShape(NamedTuple):
         return self.policy_size + self.hidden + self.width + 1 + len(VALUE_METRICS)
 
     @property
+    def ranges(self) -> list[tuple[int, int]]:
+        """Return the ranges of the vector that hold parameters; metrics are behind each."""
+        policy = self.policy_size
+        return [(0, policy - len(POLICY_METRICS)), (policy, self.size - len(VALUE_METRICS))]
+
+    @property
     def shares(self) -> list["Shares"]:
         """Return how the warps share each hidden layer's gradient."""
         tiles = self.width // TILE
