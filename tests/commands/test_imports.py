@@ -2,11 +2,13 @@
 
 import subprocess
 import sys
+import threading
 import types
 from importlib.util import find_spec
 
 import pytest
 
+from jetbot_mjx import cli
 from jetbot_mjx.imports import LazyModule, standing_in
 
 
@@ -126,3 +128,64 @@ except SystemExit as error:
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.stdout == "2 []\n", done.stderr[-2000:]
+
+
+ROCM = """
+import importlib.metadata, sys
+from jetbot_mjx.imports import install_lazy_imports
+install_lazy_imports()
+before = importlib.metadata.distributions
+read = []
+importlib.metadata.distributions = lambda: read.append("all") or []
+import jax
+print(read)
+"""
+
+
+@pytest.mark.parametrize("package", ["", "jax_rocm7_plugin", "jax-rocm7-plugin.dist-info"])
+def test_jax_looks_through_all_packages_only_if_one_may_be_for_amds_gpus(tmp_path, package):
+    if package:
+        (tmp_path / package).mkdir()
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys; sys.path.append({str(tmp_path)!r}){ROCM}"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.stdout == ("['all']\n" if package else "[]\n"), done.stderr[-2000:]
+
+
+@pytest.mark.parametrize(
+    ("platforms", "opened"),
+    [(None, True), ("cuda", True), ("gpu,cpu", True), ("cpu", False), ("tpu,cpu", False)],
+)
+def test_the_driver_is_opened_where_jax_may_use_it(monkeypatch, platforms, opened):
+    calls, threads = [], []
+
+    class Driver:
+        def __init__(self, name):
+            calls.append(name)
+
+        def cuInit(self, flags):
+            calls.append(flags)
+
+    class Thread(threading.Thread):
+        def start(self):
+            super().start()
+            threads.append(self)
+
+    monkeypatch.setattr(cli.ctypes, "CDLL", Driver)
+    monkeypatch.setattr(cli.threading, "Thread", Thread)
+    monkeypatch.setenv("JAX_PLATFORMS", platforms or "")
+    cli.wake_driver()
+    for thread in threads:
+        thread.join()
+    assert calls == (["libcuda.so.1", 0] if opened else [])
+
+
+def test_a_machine_without_a_driver_says_nothing(monkeypatch, capfd):
+    monkeypatch.delenv("JAX_PLATFORMS", raising=False)
+    before = set(threading.enumerate())
+    cli.wake_driver()
+    for thread in set(threading.enumerate()) - before:
+        thread.join()
+    assert capfd.readouterr() == ("", "")
