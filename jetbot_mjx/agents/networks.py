@@ -45,6 +45,9 @@ class Networks:
         self._built = functools.cache(build)
 
     def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            # What copies an object asks for such names before it has any.
+            raise AttributeError(name)
         return getattr(self._built(), name)
 
 
@@ -102,6 +105,7 @@ def network_factory(config: NetworkConfig) -> Callable[..., Any]:
     action = config.initial_action
 
     def make_biased(observation_size: Any, action_size: int, **arguments: Any) -> Any:
+        _check_action(action, action_size)
         networks: Any = make(observation_size, action_size, **arguments)
         # A mean of the normal distribution is bounded by its tanh, or by nothing.
         is_bounded = config.distribution_type == "tanh_normal"
@@ -114,6 +118,14 @@ def network_factory(config: NetworkConfig) -> Callable[..., Any]:
         )
 
     return make_biased
+
+
+def _check_action(action: Sequence[float] | None, action_size: int) -> None:
+    if action is not None and len(action) != action_size:
+        raise InvalidError(
+            f"ppo.network.initial_action = {list(action)} is wrong: an action has {action_size}"
+            " numbers"
+        )
 
 
 def _with_mean(params: Any, mean: np.ndarray) -> Any:
@@ -149,11 +161,7 @@ def make_networks(
         convolutions.
     """
     network, shapes = config.network, {}
-    if network.initial_action is not None and len(network.initial_action) != action_size:
-        raise InvalidError(
-            f"ppo.network.initial_action = {list(network.initial_action)} is wrong: an action has"
-            f" {action_size} numbers"
-        )
+    _check_action(network.initial_action, action_size)
     if not isinstance(observation_size, int):
         shapes = {name: tuple(shape) for name, shape in observation_size.items()}
         check_size(network.cnn, shapes)

@@ -301,8 +301,8 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
     if name not in about[_DIGESTS]:
         raise CheckpointError(f"checkpoint {path} holds no {name}")
     wanted, folder = flatten(template), path / name
-    table = about.get(_JOINED, {}).get(name)
     try:
+        table = about.get(_JOINED, {}).get(name)
         if table is None:
             flat = _read_arrays(folder, wanted)
         else:

@@ -1,11 +1,19 @@
 """The action around which an untrained policy acts."""
 
+import copy
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks, make_policy
+from jetbot_mjx.agents.networks import (
+    PolicyParams,
+    init_normalizer,
+    make_networks,
+    make_policy,
+    network_factory,
+)
 from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.envs.camera.wrapper import PIXELS
 from jetbot_mjx.errors import InvalidError
@@ -42,12 +50,22 @@ def test_all_other_weights_are_those_without_it():
     assert not same["params"]["hidden_11"]["bias"]
 
 
-def test_it_needs_a_number_for_each_action():
+@pytest.mark.parametrize("by_factory", [False, True])
+def test_it_needs_a_number_for_each_action(by_factory):
+    ppo = config(initial_action=[0.5])
     with pytest.raises(InvalidError) as caught:
-        make_networks(config(initial_action=[0.5]), 5, 2)
+        network_factory(ppo.network)(5, 2) if by_factory else make_networks(ppo, 5, 2)
     assert str(caught.value) == (
         "ppo.network.initial_action = [0.5] is wrong: an action has 2 numbers"
     )
+
+
+@pytest.mark.parametrize("copied", [copy.copy, copy.deepcopy])
+def test_networks_can_be_copied(copied):
+    networks = make_networks(config(), 5, 2)
+    key = jax.random.PRNGKey(0)
+    both = [one.value_network.init(key) for one in (networks, copied(networks))]
+    assert jax.tree.all(jax.tree.map(lambda x, y: bool(jnp.array_equal(x, y)), *both))
 
 
 @pytest.mark.parametrize("action", [[0.0, 1.0], [-1, 0], [], [float("nan"), 0.0]])

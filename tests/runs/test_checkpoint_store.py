@@ -12,6 +12,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 
+from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
@@ -124,6 +125,18 @@ def test_a_joined_tree_is_one_array_on_disk_and_refused_if_it_is_shorter(run_dir
     shutil.rmtree(paths[0])
     shutil.copytree(paths[1], paths[0])
     assert f"bytes is uint8[16], and should be uint8[{size}]" in refused(read, run_dir, 1)
+
+
+def test_a_table_that_is_none_is_refused(run_dir):
+    with CheckpointStore(run_dir, 50) as store:
+        store.save(1, {"tree": TREE}, {}, None)
+    file = checkpoint_path(run_dir, 1) / "about" / "metadata"
+    about = json.loads(file.read_text())
+    about["joined"] = [1]
+    del about["sha256"]["about"]
+    about["sha256"]["about"] = checkpoint_store._digest_json(about)
+    file.write_text(json.dumps(about))
+    assert "cannot be read" in refused(read, run_dir, 1)
 
 
 @joined_or_not
