@@ -226,6 +226,7 @@ def test_what_a_cpu_finds_in_jax_s_cache_is_compiled_once_more_and_written(jax_c
 
 
 def test_what_a_cpu_still_finds_there_is_not_written(jax_cache, folder, monkeypatch):
+    monkeypatch.setattr(jax, "default_backend", lambda: "cpu")
     monkeypatch.setattr(program_cache, "unseen_options", dict)
     for name in ("one", "another"):
         jax.clear_caches()
