@@ -4,11 +4,11 @@ MuJoCo loads GLFW before a window is requested. MJX loads trimesh and SciPy's ge
 which no robot here has, and prints two lines if its optional Warp part is absent. Brax loads JAXopt
 for an engine that is not used here, and tensorboardX loads a logging service that is not used. JAX
 loads Pallas, and a library for locks that watches every later import, and reads the metadata of all
-packages. Flax loads its networks and
-Orbax its second interface, although a training that finds its programs compiled needs neither. On a
-slow machine these imports take more than two seconds at every start of a command. A training also
-needs no OpenGL, so that a command must be able to import MuJoCo even if the backend that
-`MUJOCO_GL` names is unavailable. The versions of all libraries are told here, too.
+packages. Flax loads its networks and Orbax its second interface, although a training that finds its
+programs compiled needs neither. On a slow machine these imports take more than two seconds at every
+start of a command. A training also needs no OpenGL, so that a command must be able to import MuJoCo
+even if the backend that `MUJOCO_GL` names is unavailable. The versions of all libraries are told
+here, too.
 """
 
 import ast
@@ -18,6 +18,7 @@ import glob
 import importlib
 import importlib.abc
 import importlib.machinery
+import importlib.util
 import io
 import sys
 import types
@@ -139,6 +140,13 @@ def _mjx() -> Iterator[None]:
         yield
 
 
+def _lru_cache() -> contextlib.AbstractContextManager[None]:
+    # JAX does without the library where it is not installed.
+    if importlib.util.find_spec("filelock") is None:
+        return contextlib.nullcontext()
+    return standing_in("filelock", LazyModule("filelock"))
+
+
 @contextlib.contextmanager
 def _without_rocm() -> Iterator[None]:
     """Keep JAX from reading the metadata of all installed packages, if none is for AMD's GPUs."""
@@ -172,7 +180,7 @@ _AROUND: Mapping[str, _Around] = {
     "brax.io.image": lambda: standing_in("PIL.Image", LazyModule("PIL.Image")),
     "flax": lambda: standing_in("flax.linen", LazyModule("flax.linen")),
     "jax._src.numpy.array_constructors": _without_rocm,
-    "jax._src.lru_cache": lambda: standing_in("filelock", LazyModule("filelock")),
+    "jax._src.lru_cache": _lru_cache,
     "jax.extend": lambda: standing_in("jax.extend.pallas", LazyModule("jax.extend.pallas")),
     "mujoco.glfw": lambda: standing_in("glfw", LazyModule("glfw")),
     "mujoco.mjx": _mjx,
