@@ -299,6 +299,14 @@ def edit(change):
     return harm
 
 
+def test_other_programs_can_read_the_policy_and_the_rest_is_one_array(smoke_run):
+    path = checkpoint_path(smoke_run, LAST)
+    with ocp.StandardCheckpointer() as reader:
+        policy, rest = (reader.restore(path / name) for name in (POLICY, TRAINING))
+    assert policy[KERNEL].ndim == 2
+    assert list(rest) == ["bytes"]
+
+
 def replace(name):
     """Takes a part of the checkpoint before."""
 
