@@ -38,7 +38,7 @@ INTERRUPTED = 130
 _GARBAGE_THRESHOLDS = 1_000_000, 50, 100
 """Thresholds of Python's garbage collector during the start of a command. With its own, which begin
 at 700 objects, it takes a third of the time that imports and JAX's tracing take, and finds nothing.
-Those of a warm start stay below the first of these.
+A start that finds its programs compiled makes fewer objects than the first of these.
 """
 
 _START_SECONDS = 60
@@ -111,7 +111,7 @@ def run_command(
     timer.start()
     # JAX computes. NumPy would start a thread for every core, which takes longer than its import.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Nor does a configuration need what other packages add to pydantic, which looks for it in all.
+    # Pydantic would look for plugins in all installed packages.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     for stream in (sys.stdout, sys.stderr):
         # A character that the terminal cannot show must not fail a command that has finished.
@@ -208,7 +208,7 @@ def divide_cpu(devices: int | None) -> None:
 def wake_driver() -> None:
     """Start to open NVIDIA's driver in a thread, if there is one, while the host imports JAX.
 
-    JAX opens it later, and no other thread runs meanwhile: on an H200 for a fifth of a second.
+    JAX opens it later, and holds Python's lock meanwhile: on an H200 for a fifth of a second.
     """
 
     def open_driver() -> None:
