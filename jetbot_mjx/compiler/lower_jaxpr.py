@@ -218,10 +218,21 @@ class _JaxprLowering:
         rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
         if rule is None and name in RANDOM_RULES:
             rule = functools.partial(RANDOM_RULES[name], self._graph)
+        if rule is None and _is_expandable(equation):
+            rule = self._expand
         if rule is None:
             raise UnsupportedError(f"the operation {name}")
         result = rule(equation, *operands)
         return result if isinstance(result, list) else [result]
+
+    def _expand(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        """Lower an operation that JAX itself computes by others (see `_is_expandable`)."""
+
+        def expanded(*arrays: Any) -> Any:
+            with equation.ctx.manager:
+                return equation.primitive.to_lojax(*arrays, **equation.params)
+
+        return self.lower(jax.make_jaxpr(expanded)(*(x.aval for x in equation.invars)), operands)
 
     def _elementwise(self, op: str, *operands: ScalarArray) -> ScalarArray:
         arrays = np.broadcast_arrays(*operands)
@@ -726,6 +737,16 @@ def _constants(array: Any) -> ScalarArray:
     if isinstance(array, Tracer) or jnp.issubdtype(dtype, jax.dtypes.extended):
         raise UnsupportedError(f"a constant {array}")
     return constant_array(array)
+
+
+def _is_expandable(equation: Any) -> bool:
+    """Return whether JAX has an expansion of an operation, as of `jnp.nonzero` since JAX 0.12.
+
+    JAX calls these primitives high: it traces them to one equation, and replaces that by their
+    expansion before it compiles.
+    """
+    is_high = getattr(equation.primitive, "is_high", None)
+    return bool(is_high and is_high(*(x.aval for x in equation.invars), **equation.params))
 
 
 def _at(array: ScalarArray, i: int) -> ScalarArray:

@@ -124,6 +124,7 @@ FUNCTIONS = {
     ),
     "joins": lambda x: (jnp.concatenate([x, x], 1), jnp.stack([x, x], 1), jnp.split(x, 2, 1)),
     "sorted constants": lambda x: x[:, jnp.argsort(jnp.array([3, 1, 2, 0]))],
+    "places of constants": lambda x: x[:, jnp.nonzero(jnp.array([0, 1, 0, 1]), size=2)[0]],
     "selection": lambda x: (jnp.where(x > 0, x, -x), jnp.clip(x, -0.5, 0.5), jnp.sign(x)),
     "a place that depends": lambda x: jax.lax.dynamic_slice(
         x, (jnp.argmax(x[:, 0]), jnp.int32(1)), (1, 2)
@@ -167,6 +168,31 @@ def test_a_program_does_what_the_function_does(name):
     for one, other in zip(ours, theirs, strict=True):
         assert one.shape == other.shape
         np.testing.assert_allclose(one, other, rtol=2e-5, atol=2e-6)
+
+
+def test_an_operation_that_jax_expands_is_lowered_as_its_expansion():
+    hijax = pytest.importorskip("jax.experimental.hijax")
+    if not hasattr(hijax, "HiPrim"):
+        pytest.skip("JAX 0.12 and later let a user define such operations")
+
+    class TwiceAndCounted(hijax.HiPrim):
+        def __init__(self, like):
+            self.in_avals, self.out_aval, self.params = (like,), (like, like), {}
+            super().__init__()
+
+        def expand(self, x):
+            return x + x, jnp.ones_like(x).at[jnp.nonzero(np.ones(4), size=4)].add(1)
+
+    def function(x):
+        def body(carry, _):
+            twice, two = TwiceAndCounted(jax.typeof(carry))(carry)
+            return twice * two, None
+
+        return jax.lax.scan(body, x, length=3)[0]
+
+    x = np.float32(np.random.default_rng(3).normal(size=(20, *VECTOR.shape)))
+    (ours,) = evaluate(lower_jaxpr.scalarize(function, VECTOR), [x])
+    np.testing.assert_array_equal(ours, x * 4**3)
 
 
 def test_a_product_of_two_dtypes_is_one_of_the_results():
