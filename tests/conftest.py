@@ -46,6 +46,7 @@ import jax
 import pytest
 from unpainted import unpainted
 
+from jetbot_mjx import fallbacks
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs import opengl, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
@@ -72,6 +73,12 @@ def pytest_collection_modifyitems(items):
     """Begins with the files that take longest, so that no worker is left alone with one."""
     rank = {name: index for index, name in enumerate(_LONGEST)}
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONGEST)))
+
+
+@pytest.fixture(autouse=True)
+def fallbacks_printed_anew(monkeypatch):
+    """Each test is a process of its own in this: what an earlier one printed is printed again."""
+    monkeypatch.setattr(fallbacks, "_printed", set())
 
 
 def pytest_runtest_setup(item):

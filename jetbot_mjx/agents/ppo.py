@@ -45,7 +45,6 @@ Source: J. Schulman et al., Proximal Policy Optimization Algorithms, arXiv:1707.
 google/brax v0.14.2, brax/training/agents/ppo.
 """
 
-import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -72,6 +71,7 @@ from jetbot_mjx.compiler.packed import Condensed, Packed, condense, pack
 from jetbot_mjx.compiler.update import launch
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.fallbacks import Fallback, report
 
 # Pyright does not follow flax's dataclasses.
 _UInt64: Any = UInt64
@@ -193,8 +193,8 @@ class PPO:
             return value, unravel(jax.lax.pmean(vector, axis_name))
 
         self._loss_and_gradient = mean_gradient
-        self.notice: str | None = None
-        """One line that says why the kernels of the update do not run, or None."""
+        self._fallback: Fallback | None = None
+        """Why the kernels of the update do not run, although they may."""
         self._fused: fused_update.FusedUpdate | None = None
         # The layout of states between calls stays, even if XLA takes over the update.
         self._layout: fused_update.FusedUpdate | None = None
@@ -219,7 +219,8 @@ class PPO:
         self._fused = None
         if self.config.update == "fused":
             raise UserError(f"ppo.update = fused: {reason}: choose auto or xla")
-        self.notice = f"ppo.update = xla: {reason}"
+        self._fallback = Fallback("ppo.update", reason)
+        report(self._fallback)
 
     @property
     def is_fused(self) -> bool:
@@ -246,9 +247,8 @@ class PPO:
         Raises:
           UserError: `ppo.update` requests the kernels.
         """
-        if self._fused is not None and not launch.backend().is_available():
-            self._refuse_fused(f"it needs {launch.backend().NEEDS}")
-            print(self.notice, file=sys.stderr)
+        if self._fused is not None and (obstacle := launch.backend().obstacle()):
+            self._refuse_fused(obstacle)
 
     def check(self) -> bool:
         """Return whether `advance`, as it was traced, computes correctly on this machine.
@@ -262,8 +262,7 @@ class PPO:
         on_gpu = jax.default_backend() == "gpu"
         if self._fused is None or not on_gpu or update_probe.runs_correctly():
             return True
-        self._refuse_fused("the fused update failed its check on this machine")
-        print(self.notice, file=sys.stderr)
+        self._refuse_fused("its kernels failed their check on this machine")
         return False
 
     def init(self, key: UInt32[Array, "2"]) -> TrainState:
@@ -529,6 +528,8 @@ class PPO:
         self, params: PyTree, optimizer_state: PyTree, normalizer: Any, data: Transition, key: Array
     ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
         """Update the networks; return the sums of the metrics and the number of updates, too."""
+        if self._fallback:
+            report(self._fallback)
 
         def step(carry: Condensed, batch: Any) -> tuple[Condensed, None]:
             params, optimizer_state, totals = carry.restore()

@@ -23,14 +23,27 @@ def default_backend(impl: str) -> kernel.Backend | None:
     Args:
       impl: the name of the back end that must run them, or `auto`.
     """
+    backend = _platform_backend()
+    return backend if backend in available_backends(impl) else None
+
+
+def obstacle(impl: str) -> str | None:
+    """Return why JAX's default device runs no kernels, although its platform may; None otherwise.
+
+    Args:
+      impl: the setting's value: the name of a back end, `auto` or `xla`.
+    """
+    backend = _platform_backend()
+    return backend.obstacle() if impl == "auto" and backend else None
+
+
+def _platform_backend() -> kernel.Backend | None:
+    """Return the back end for the platform of JAX's default device, if there is one."""
     settings: Any = jax.config
     device = settings.jax_default_device or jax.local_devices()[0]
     platform = device if isinstance(device, str) else device.platform
     platform = _PLATFORMS.get(platform, platform)
-    for backend in available_backends(impl):
-        if platform == backend.PLATFORM:
-            return backend
-    return None
+    return next((x for x in BACKENDS if platform == x.PLATFORM), None)
 
 
 def available_backends(impl: str) -> list[kernel.Backend]:
@@ -39,7 +52,7 @@ def available_backends(impl: str) -> list[kernel.Backend]:
     Args:
       impl: the setting's value: the name of a back end, `auto` or `xla`.
     """
-    return [x for x in BACKENDS if impl in ("auto", x.IMPL) and x.is_available()]
+    return [x for x in BACKENDS if impl in ("auto", x.IMPL) and not x.obstacle()]
 
 
 def require_backend(impl: str, setting: str) -> None:
@@ -53,8 +66,5 @@ def require_backend(impl: str, setting: str) -> None:
       UserError: the requested back end is not available.
     """
     for backend in BACKENDS:
-        if impl == backend.IMPL and not backend.is_available():
-            raise UserError(
-                f"{setting} = {impl} needs {backend.NEEDS}; this is"
-                f" {jax.default_backend()}: choose xla or auto"
-            )
+        if impl == backend.IMPL and (obstacle := backend.obstacle()):
+            raise UserError(f"{setting} = {impl}: {obstacle}; or choose xla or auto")

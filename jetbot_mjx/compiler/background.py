@@ -1,5 +1,6 @@
 """Compute in a thread of its own what the process need not wait for."""
 
+import contextvars
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -9,7 +10,10 @@ _Result = TypeVar("_Result")
 
 
 def in_background(function: Callable[[], _Result]) -> Future[_Result]:
-    """Compute a function's result in a thread, for which the process does not wait at its end."""
+    """Compute a function's result in a thread, for which the process does not wait at its end.
+
+    The thread has the caller's context variables.
+    """
     future: Future[_Result] = Future()
 
     def run() -> None:
@@ -18,5 +22,5 @@ def in_background(function: Callable[[], _Result]) -> Future[_Result]:
         except BaseException as error:  # `result` raises it in the caller's thread.
             future.set_exception(error)
 
-    threading.Thread(target=run, daemon=True).start()
+    threading.Thread(target=contextvars.copy_context().run, args=(run,), daemon=True).start()
     return future

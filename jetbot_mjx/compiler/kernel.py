@@ -42,6 +42,7 @@ from jaxtyping import Array, Float, PyTree, UInt8
 from jetbot_mjx.compiler.lower_jaxpr import ScalarProgram, scalarize
 from jetbot_mjx.compiler.trusted_files import read_trusted, write_private
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.fallbacks import Fallback, report
 
 Step = Callable[[PyTree, PyTree], PyTree]
 """A function of (carry, consts) that returns the carry some steps later."""
@@ -111,11 +112,9 @@ class Backend(Protocol):
     """The back end's name in `physics.impl`."""
     PLATFORM: str
     """The JAX platform that the back end serves."""
-    NEEDS: str
-    """One line that names the hardware and packages that the back end needs."""
 
-    def is_available(self) -> bool:
-        """Return whether JAX has the platform and every requirement of the back end is met."""
+    def obstacle(self) -> str | None:
+        """Return why kernels cannot run in this process, with the remedy, or None if they can."""
         ...
 
     def prepare(self, kernel: Kernel) -> None:
@@ -253,17 +252,17 @@ def _differentiate(primals: Any, tangents: Any, *, kernel: Kernel) -> Any:
 ad.primitive_jvps[_kernel_p] = _differentiate
 
 
-def runs_correctly(
+def probe(
     launch: Callable[[Kernel, Sequence[Array]], list[Array]], device: Any, robots: int
-) -> bool:
-    """Return whether a back end runs a small kernel correctly.
+) -> str | None:
+    """Run a small kernel, and return why it failed, or None if its result is correct.
 
     Args:
       launch: the back end's function.
       device: the device to run on.
       robots: the number of robots.
     """
-    probe = Kernel(
+    kernel = Kernel(
         scalarize(lambda x: 2.0 * x + 1.0, jax.ShapeDtypeStruct((2,), jnp.float32)),
         carried=1,
         steps=2,
@@ -274,10 +273,11 @@ def runs_correctly(
     with jax.ensure_compile_time_eval(), jax.default_device(device):
         try:
             # An array of JAX would be another program to compile.
-            (result,) = jax.jit(lambda x: launch(probe, [x]))(values)
-        except jax.errors.JaxRuntimeError:
-            return False
-        return bool((np.asarray(result) == 4 * values + 3).all())
+            (result,) = jax.jit(lambda x: launch(kernel, [x]))(values)
+        except jax.errors.JaxRuntimeError as error:
+            return f"a small kernel failed: {str(error).partition(chr(10))[0]}"
+        correct = (np.asarray(result) == 4 * values + 3).all()
+        return None if correct else "a small kernel returned wrong numbers"
 
 
 def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
@@ -290,10 +290,12 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             x.reshape(robots, *shape)
             for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
         ]
-        if backend and kernel.impl in ("auto", backend.IMPL) and backend.is_available():
+        if backend and kernel.impl in ("auto", backend.IMPL) and not backend.obstacle():
             table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
             results = backend.launch(kernel, [*flat, *table])
         elif kernel.impl == "auto":
+            if backend and (obstacle := backend.obstacle()):
+                report(Fallback(kernel.setting, obstacle))
             results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
         else:
             raise UserError(

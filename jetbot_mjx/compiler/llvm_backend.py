@@ -1,7 +1,7 @@
 """Compile and launch kernels on CPUs; this module is a `jetbot_mjx.compiler.kernel.Backend`.
 
 `llvmlite` compiles a kernel for the present processor, and XLA calls it through its foreign
-function interface; `is_available` tries both with a small kernel. The name of a kernel is a hash of
+function interface; `obstacle` tries both with a small kernel. The name of a kernel is a hash of
 its content, so a cached program always finds the kernel that it was compiled with.
 """
 
@@ -19,11 +19,10 @@ from jaxtyping import Array
 
 from jetbot_mjx.compiler import ffi_wrapper
 from jetbot_mjx.compiler.background import in_background
-from jetbot_mjx.compiler.kernel import Kernel, cached_bytes, runs_correctly
+from jetbot_mjx.compiler.kernel import Kernel, cached_bytes, probe
 
 IMPL: str = "llvm"
 PLATFORM: str = "cpu"
-NEEDS: str = "a CPU, llvmlite (pip install llvmlite) and an XLA that calls what it compiles"
 
 NAME = "kernel"
 """Name of a kernel's function."""
@@ -55,17 +54,19 @@ class Host(NamedTuple):
 
 
 @functools.cache
-def is_available() -> bool:
-    """Return whether llvmlite is installed and XLA can call a kernel compiled by it on CPUs."""
+def obstacle() -> str | None:
+    """Return why XLA cannot call kernels compiled by llvmlite on CPUs, or None if it can."""
     try:
         device = jax.local_devices(backend=PLATFORM)[0]
         host = host_processor()
-    except (ImportError, OSError, RuntimeError, AttributeError, TypeError):
+    except (ImportError, OSError, RuntimeError, AttributeError, TypeError) as error:
         # llvmlite is missing or does not know this processor, the C library lacks a function, or
         # JAX_PLATFORMS leaves out the CPU.
-        return False
-    known = host.machine in ffi_wrapper.MACHINES
-    return known and runs_correctly(launch, device, robots=2 * host.lanes + 1)
+        return f"llvmlite cannot be used ({error}): pip install llvmlite"
+    if host.machine not in ffi_wrapper.MACHINES:
+        known = " and ".join(ffi_wrapper.MACHINES)
+        return f"there are kernels for {known} processors, not for {host.machine}"
+    return probe(launch, device, robots=2 * host.lanes + 1)
 
 
 def kernel_text(kernel: Kernel) -> str:

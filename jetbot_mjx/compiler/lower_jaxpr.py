@@ -37,6 +37,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, Literal
 
 from jetbot_mjx.compiler.indexing import (
@@ -212,6 +213,14 @@ class _JaxprLowering:
         return [read(atom) for atom in results]
 
     def _lower_eqn(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
+        try:
+            return self._apply_rule(equation, operands)
+        except UnsupportedError as error:
+            # The innermost equation is the one that the user wrote.
+            error.place = error.place or source_info_util.summarize(equation.source_info)
+            raise
+
+    def _apply_rule(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
         name = equation.primitive.name
         if name in EVALUATE and not hasattr(self, f"_{name}"):
             return [self._elementwise(name, *operands)]

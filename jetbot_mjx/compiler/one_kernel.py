@@ -40,7 +40,10 @@ class OneKernel:
     """
 
     def __init__(
-        self, function: Callable[..., Any], may_be_kernel: Callable[[], bool] = lambda: True
+        self,
+        function: Callable[..., Any],
+        may_be_kernel: Callable[[], bool] = lambda: True,
+        on_unsupported: Callable[[UnsupportedError], None] = lambda error: None,
     ) -> None:
         """Wrap a function.
 
@@ -49,9 +52,12 @@ class OneKernel:
             shapes.
           may_be_kernel: returns whether there may be a kernel. It is asked when the function is
             called: to try a back end takes a GPU 0.3 s, which a program from the cache saves.
+          on_unsupported: is called with the reason in every call for which there is no kernel
+            because the function cannot be lowered.
         """
         functools.update_wrapper(self, function)
         self._function, self._may_be_kernel = function, may_be_kernel
+        self._on_unsupported = on_unsupported
         self._known: dict[Any, _Lowered] = {}
 
     def __call__(self, *arguments: Any) -> Any:
@@ -61,6 +67,8 @@ class OneKernel:
         leaves, structure = jax.tree.flatten(arguments)
         arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
         lowered = self._find(structure, [x.aval for x in arrays], arguments)
+        if isinstance(lowered.one, UnsupportedError):
+            self._on_unsupported(lowered.one)
         return jax.tree.unflatten(lowered.structure, lowered.launch(*leaves))
 
     def kernel_for(self, *arguments: Any) -> kernel.Kernel | None:
@@ -86,7 +94,7 @@ class OneKernel:
         results = [x.aval.shape for x in jaxpr.outvars]
         if lowered.structure != tree or results != [x.shape for x in carried]:
             return None
-        return lowered.one
+        return lowered.one if isinstance(lowered.one, kernel.Kernel) else None
 
     def _is_allowed(self) -> bool:
         # With `jax_disable_jit` the user wants to see every operation.
@@ -103,8 +111,8 @@ class OneKernel:
         places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
         try:
             one = _lower(traced, places)
-        except UnsupportedError:
-            one = None
+        except UnsupportedError as error:
+            one = error
         lowered = _Lowered(traced, jax.tree.structure(shapes), places, one)
         # What depends on what another function traces holds only inside of it.
         if not places:
@@ -121,13 +129,13 @@ class _Lowered:
     """Structure of the results."""
     places: list[int]
     """Places of the constants that the kernel takes as arguments, before the others."""
-    one: kernel.Kernel | None
-    """The kernel; None: an operation of the function is none of a kernel."""
+    one: kernel.Kernel | UnsupportedError
+    """The kernel, or why there is none."""
 
     @functools.cached_property
     def launch(self) -> Callable[..., list[Array]]:
         """Return the function of flat arguments, whose kernel begins to be compiled."""
-        if self.one is None:
+        if isinstance(self.one, UnsupportedError):
             return jaxpr_as_fun(self.traced)
         backend = default_backend(self.one.impl)
         if backend is not None:

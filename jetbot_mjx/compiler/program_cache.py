@@ -10,27 +10,45 @@ import hashlib
 import os
 import pickle
 import platform
-import sys
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import jax
 from jax.experimental import serialize_executable
 
 from jetbot_mjx.compiler import llvm_backend, random_bits
 from jetbot_mjx.compiler.background import in_background
-from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, tell_once, write_private
+from jetbot_mjx.compiler.trusted_files import distrust, read_trusted, write_private
 from jetbot_mjx.compiler.xla_options import Options, unseen_options, untuned_options
+from jetbot_mjx.fallbacks import Fallback, collect, report
 
 _UNUSED_DAYS = 30
 # Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
 _tracing = threading.Lock()
 
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
+
+
+class _Lowered(NamedTuple):
+    """A `_Lowered` holds a program before it is compiled."""
+
+    program: jax.stages.Lowered
+    seconds: float
+    """Time that it took to trace and lower it [s]."""
+    fallbacks: list[Fallback]
+    """What of it runs slower than it could."""
+
+
+class _Stored(NamedTuple):
+    """A `_Stored` holds a compiled program as a file does."""
+
+    program: jax.stages.Compiled
+    fallbacks: list[Fallback]
+    """What of it runs slower than it could."""
 
 
 class ProgramCache:
@@ -47,7 +65,7 @@ class ProgramCache:
         self._options = options
         self._folder = folder
         self._key = f"{key} {sorted(options.items())}"
-        self._prefetched: dict[str, Future[jax.stages.Compiled | None]] = {}
+        self._prefetched: dict[str, Future[_Stored | None]] = {}
         self.loads = False
         """Whether programs are being loaded, and not one of them must be compiled."""
 
@@ -73,7 +91,12 @@ class ProgramCache:
         if self._folder is None:
             return None
         prefetched = self._prefetched.pop(name, None)
-        return prefetched.result() if prefetched else _load(self._path(name))
+        stored = prefetched.result() if prefetched else _load(self._path(name))
+        if stored is None:
+            return None
+        for fallback in stored.fallbacks:
+            report(fallback)
+        return stored.program
 
     def compile(
         self,
@@ -102,7 +125,7 @@ class ProgramCache:
         lowered = self._lower(trace)
         usable = in_background(check).result
         try:
-            program = self._compile(name, *lowered, usable, tune=tune)
+            program = self._compile(name, lowered, usable, tune=tune)
         except jax.errors.JaxRuntimeError:
             # What fails its check may also fail to compile.
             if usable():
@@ -110,7 +133,7 @@ class ProgramCache:
             program = None
         if program is not None and usable():
             return program
-        return self._compile(name, *self._lower(trace), tune=tune)
+        return self._compile(name, self._lower(trace), tune=tune)
 
     def compile_later(
         self, name: str, trace: Callable[[], jax.stages.Traced]
@@ -128,19 +151,17 @@ class ProgramCache:
         if program is not None:
             return lambda: program
         lowered = self._lower(trace)
-        return in_background(lambda: self._compile(name, *lowered)).result
+        return in_background(lambda: self._compile(name, lowered)).result
 
-    def _lower(self, trace: Callable[[], jax.stages.Traced]) -> tuple[jax.stages.Lowered, float]:
-        """Return a lowered program, and the seconds that this took."""
-        with _tracing, random_bits.by_one_kernel():
+    def _lower(self, trace: Callable[[], jax.stages.Traced]) -> "_Lowered":
+        with _tracing, random_bits.by_one_kernel(), collect() as fallbacks:
             began = time.perf_counter()
-            return trace().lower(), time.perf_counter() - began
+            return _Lowered(trace().lower(), time.perf_counter() - began, fallbacks)
 
     def _compile(
         self,
         name: str,
-        lowered: jax.stages.Lowered,
-        seconds: float,
+        lowered: "_Lowered",
         usable: Callable[[], bool] = lambda: True,
         *,
         tune: bool = False,
@@ -150,21 +171,21 @@ class ProgramCache:
         Args:
           name: name of the program.
           lowered: the program.
-          seconds: time that it took to trace and lower it [s].
           usable: a function that returns whether to write it.
           tune: whether XLA may time kernels.
         """
         options = self._options if tune else {**self._options, **untuned_options()}
         began = time.perf_counter()
-        program, loaded = _compiled(lowered, options)
+        program, loaded = _compiled(lowered.program, options)
         if self._folder and loaded and (unseen := unseen_options()):
             # Compile it once, instead of at every start: JAX finds nothing under other options.
-            program, loaded = _compiled(lowered, {**options, **unseen})
+            program, loaded = _compiled(lowered.program, {**options, **unseen})
         if self._folder and not loaded and usable():
-            seconds += time.perf_counter() - began
+            seconds = lowered.seconds + time.perf_counter() - began
             # Only programs for CPUs call kernels by name, and their text takes a while to write.
-            text = lowered.as_text() if jax.default_backend() == "cpu" else ""
-            _save(self._path(name), program, llvm_backend.kernels_in(text), seconds)
+            text = lowered.program.as_text() if jax.default_backend() == "cpu" else ""
+            kernels = llvm_backend.kernels_in(text)
+            _save(self._path(name), _Stored(program, lowered.fallbacks), kernels, seconds)
         return program
 
     def _path(self, name: str) -> Path:
@@ -213,13 +234,13 @@ def _cache_folder(given: str | None) -> Path | None:
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
         reason = distrust(folder, folder.stat())
     except OSError as error:
-        print(f"no compilation cache: {error.filename}: {error.strerror}", file=sys.stderr)
+        report(Fallback("compilation cache", f"{error.filename}: {error.strerror}"))
         return None
     except RuntimeError:
-        print("no compilation cache: no home folder: set HOME or XDG_CACHE_HOME", file=sys.stderr)
+        report(Fallback("compilation cache", "no home folder: set HOME or XDG_CACHE_HOME"))
         return None
     if reason is not None:
-        tell_once(folder, reason)
+        report(Fallback("compilation cache", reason))
         return None
     return folder
 
@@ -251,13 +272,13 @@ def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages
     return program, hits.count > 0 and jax.default_backend() == "cpu"
 
 
-def _load(path: Path) -> jax.stages.Compiled | None:
+def _load(path: Path) -> _Stored | None:
     """Load the program in a file; return None if it is missing, damaged, untrusted or unusable."""
     began = time.perf_counter()
     content = read_trusted(path)
     if content is None:
         return None
-    seconds, kernels, ids, serialized = pickle.loads(content)
+    seconds, kernels, fallbacks, ids, serialized = pickle.loads(content)
     llvm_backend.register(kernels)
     devices = {device.id: device for device in jax.devices()}
     try:
@@ -279,24 +300,22 @@ def _load(path: Path) -> jax.stages.Compiled | None:
         "/jax/compilation_cache/compile_time_saved_sec", max(0.0, seconds - loaded)
     )
     monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", loaded)
-    return program
+    return _Stored(program, fallbacks)
 
 
-def _save(
-    path: Path, program: jax.stages.Compiled, kernels: dict[str, bytes], seconds: float
-) -> None:
+def _save(path: Path, stored: _Stored, kernels: dict[str, bytes], seconds: float) -> None:
     """Write a program, the kernels that it calls and its compile time to a file.
 
     An error while writing is ignored, because a missing file only costs time.
     """
     try:
-        serialized = serialize_executable.serialize(program)
-        loaded: Any = program.runtime_executable()
+        serialized = serialize_executable.serialize(stored.program)
+        loaded: Any = stored.program.runtime_executable()
         ids = [device.id for device in loaded.local_devices()]
     except (NotImplementedError, ValueError):
         # Devices of this kind cannot serialize programs.
         return
-    content = pickle.dumps((seconds, kernels, ids, serialized))
+    content = pickle.dumps((seconds, kernels, stored.fallbacks, ids, serialized))
     with contextlib.suppress(OSError):
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:

@@ -1,7 +1,7 @@
 """Compile and launch kernels on NVIDIA GPUs; this module is a `jetbot_mjx.compiler.kernel.Backend`.
 
 LLVM compiles a kernel to PTX, NVIDIA's portable assembly, and XLA passes the PTX to the driver
-through its custom call for PTX kernels. That call is internal to XLA, so `is_available` tries
+through its custom call for PTX kernels. That call is internal to XLA, so `obstacle` tries
 whether the installed version has it. Each thread runs the whole program for one robot, with all
 intermediate values in registers.
 """
@@ -21,12 +21,11 @@ import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.compiler.background import in_background
-from jetbot_mjx.compiler.kernel import Kernel, runs_correctly
+from jetbot_mjx.compiler.kernel import Kernel, probe
 from jetbot_mjx.compiler.llvm_codegen import LlvmEmitter
 
 IMPL: str = "ptx"
 PLATFORM: str = "cuda"
-NEEDS: str = "an NVIDIA GPU, llvmlite (pip install llvmlite) and an XLA that launches PTX"
 
 _MAX_THREADS = 256
 """Largest number of robots in a block: with 255 registers each, it fills a multiprocessor."""
@@ -69,14 +68,17 @@ _ARCHITECTURES = (70, 80, 90)
 
 
 @functools.cache
-def is_available() -> bool:
-    """Return whether JAX has an NVIDIA GPU and XLA can launch a kernel that LLVM compiled."""
+def obstacle() -> str | None:
+    """Return why XLA cannot launch kernels that LLVM compiled for an NVIDIA GPU, or None."""
     try:
         device = jax.local_devices(backend=PLATFORM)[0]
+    except (RuntimeError, IndexError):
+        return "there is no NVIDIA GPU that JAX can use: pip install 'jax[cuda13]'"
+    try:
         _binding()
-    except (ImportError, OSError, RuntimeError, IndexError):
-        return False
-    return runs_correctly(launch, device, robots=2)
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"llvmlite cannot be used ({error}): pip install llvmlite"
+    return probe(launch, device, robots=2)
 
 
 def prepare(kernel: Kernel) -> None:

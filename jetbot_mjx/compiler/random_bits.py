@@ -34,7 +34,7 @@ def by_one_kernel() -> Iterator[None]:
     are. Other threads that lower programs meanwhile get the kernel too. One thread at a time.
     """
     rules, defaults = _rules()
-    if threefry2x32_p not in rules or not llvm_backend.is_available():
+    if threefry2x32_p not in rules or llvm_backend.obstacle():
         yield
         return
     ours = {threefry2x32_p: mlir.lower_fun(_threefry, multiple_results=True)}

@@ -18,7 +18,14 @@ import numpy as np
 
 
 class UnsupportedError(Exception):
-    """Raised when a JAX function cannot be written as arithmetic on scalars."""
+    """Raised when an operation cannot be lowered; its message says which."""
+
+    place: str | None = None
+    """The user's line that made the operation, if it is known."""
+
+    def __str__(self) -> str:
+        """Return the operation and its place."""
+        return super().__str__() + (f" ({self.place})" if self.place else "")
 
 
 Scalar = Any

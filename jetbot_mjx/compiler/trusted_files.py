@@ -9,15 +9,12 @@ file begins with the digest of its content, by which a damaged one is recognised
 import hashlib
 import os
 import stat
-import sys
 import tempfile
-import threading
 from pathlib import Path
 
+from jetbot_mjx.fallbacks import Fallback, report
+
 _DIGEST_BYTES = hashlib.sha256().digest_size
-_lock = threading.Lock()
-_warned: set[Path] = set()
-"""Folders that the user has been warned about."""
 
 
 def read_trusted(path: Path) -> bytes | None:
@@ -40,7 +37,7 @@ def read_trusted(path: Path) -> bytes | None:
                     return content if digest == hashlib.sha256(content).digest() else None
     except OSError:
         return None
-    tell_once(path.parent, reason)
+    report(Fallback("compilation cache", reason))
     return None
 
 
@@ -80,17 +77,3 @@ def distrust(path: Path, status: os.stat_result) -> str | None:
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return f"others may write to {path}: chmod go-w {path}"
     return None
-
-
-def tell_once(folder: Path, reason: str) -> None:
-    """Warn on stderr that a folder or a file in it is not trusted, once per folder.
-
-    Args:
-      folder: the folder.
-      reason: the result of `distrust`.
-    """
-    with _lock:
-        if folder in _warned:
-            return
-        _warned.add(folder)
-    print(f"compiled programs are not read, but made anew: {reason}", file=sys.stderr)

@@ -16,13 +16,19 @@ from jax.core import Tracer
 from jaxtyping import Array, Float
 
 from jetbot_mjx.compiler import kernel, llvm_codegen
-from jetbot_mjx.compiler.backends import available_backends, default_backend, require_backend
+from jetbot_mjx.compiler.backends import (
+    available_backends,
+    default_backend,
+    obstacle,
+    require_backend,
+)
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.envs import cholesky, mjx
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.fallbacks import Fallback, report
 
 
 class Physics:
@@ -80,9 +86,9 @@ class Physics:
         return "xla" if backend is None or self._kernel_step() is None else backend.IMPL
 
     @property
-    def may_be_kernel(self) -> bool:
-        """Whether a step can be one kernel, unless it has what no kernel can do."""
-        return bool(available_backends(self._config.impl))
+    def is_kernel(self) -> bool:
+        """Return whether a step is one kernel, on some platform that this process has."""
+        return self._kernel_step() is not None
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
@@ -166,7 +172,9 @@ class Physics:
 
     def _kernel_step(self) -> kernel.Step | None:
         """Return an environment step as one kernel; None: XLA compiles it on all platforms."""
-        if not self.may_be_kernel:
+        if not available_backends(self._config.impl):
+            if reason := obstacle(self._config.impl):
+                report(Fallback("physics.impl", reason))
             return None
         # Programs are traced in several threads; only one of them lowers the kernel.
         with self._lock:
@@ -177,11 +185,10 @@ class Physics:
                     self._kernel = error
         if not isinstance(self._kernel, UnsupportedError):
             return self._kernel
+        reason = f"one kernel cannot do {self._kernel}"
         if self._config.impl != "auto":
-            raise UserError(
-                f"physics.impl = {self._config.impl}: one kernel cannot do {self._kernel};"
-                " choose xla or auto"
-            )
+            raise UserError(f"physics.impl = {self._config.impl}: {reason}; choose xla or auto")
+        report(Fallback("physics.impl", f"{reason}: try the versions in constraints.txt"))
         return None
 
     def _lower(self) -> kernel.Kernel:

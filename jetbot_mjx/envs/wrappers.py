@@ -20,11 +20,13 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt32
 from jetbot_mjx.compiler.kernel import Kernel
 from jetbot_mjx.compiler.one_kernel import OneKernel
 from jetbot_mjx.compiler.packed import Packed, pack
+from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
+from jetbot_mjx.fallbacks import Fallback, report
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 """A function from one model to (batch of models, their `in_axes` for `jax.vmap`), as in Brax."""
@@ -274,12 +276,17 @@ class KernelWrapper(Wrapper):
 
         # Pyright would want the names of the methods' arguments.
         def compiled(function: Callable[..., Any]) -> Any:
-            return OneKernel(function, lambda: physics.may_be_kernel)
+            return OneKernel(function, lambda: physics.is_kernel, _report_unsupported)
 
         self.reset = compiled(env.reset)
         self.step = compiled(env.step)
         # A step of a packed state has one array in and one array out.
         self.step_packed = compiled(functools.partial(_step_packed, env))
+
+
+def _report_unsupported(error: UnsupportedError) -> None:
+    reason = f"one kernel cannot do {error}"
+    report(Fallback("environment step", f"{reason}: docs/own-task.md says what to avoid"))
 
 
 def _step_packed(env: Any, packed: Packed, action: Float[Array, "2"]) -> Packed:

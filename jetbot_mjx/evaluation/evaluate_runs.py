@@ -344,6 +344,7 @@ class _Reporter:
             learning_curve=learning_curve((one.env_steps, one.metrics) for one in history),
             episodes=finished,
             versions=self._versions,
+            fallbacks=checkpoint.about.get("fallbacks", ()),
             ranges=ranges if ranges.drawn else None,
             ranges_file=None if self._ranges_file is None else Path(self._ranges_file),
             best_known=best_known,

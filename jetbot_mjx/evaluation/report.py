@@ -144,6 +144,8 @@ class Report(NamedTuple):
     episodes: Episodes
     """The policy's episodes, with arrays on the host."""
     versions: Mapping[str, Any]
+    fallbacks: Sequence[tuple[str, str]] = ()
+    """What of the training ran slower than it could, each with the reason."""
     robustness: tuple[SweepResult, ...] = ()
     """Results on robots that differ from the preset; empty if they were not requested."""
     randomized: Summary | None = None

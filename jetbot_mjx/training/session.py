@@ -28,6 +28,7 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.program_key import TRUSTED
 from jetbot_mjx.errors import UserError, ran_out
 from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, training_keys
+from jetbot_mjx.fallbacks import Fallback, collect
 from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
 from jetbot_mjx.runs.metrics import METRICS, CompileClock, read_history, restart_clock
@@ -109,6 +110,8 @@ class Training(NamedTuple):
     """The parameters to begin with; None: those of the seed, or the run is resumed."""
     versions: Mapping[str, Any]
     """The versions that the folders of all seeds store."""
+    fallbacks: Sequence[Fallback]
+    """What runs slower than it could: those that are known yet, to which others are added."""
     task_code: TaskCode | None = None
     """The source of the task that the run stores; None: it has none, or it is stored already."""
 
@@ -160,12 +163,19 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
         config.check_cpu_devices(jax.local_device_count())
     config.check_devices(jax.device_count())
     check_tracking(config)
-    # Build every object once.
+    with collect() as fallbacks:
+        return _compose(config, run_dir, programs, fallbacks)
+
+
+def _compose(
+    config: Config, run_dir: Path, programs: ProgramCache, fallbacks: Sequence[Fallback]
+) -> Result:
+    """Build every object of a training once, and train."""
     run_dirs = seed_dirs(run_dir, config)
     env, task_code = _make_env(config, run_dirs)
     ppo = ppo_trainer.build_ppo(config, env)
     warm_start = _warm_start(config, env, run_dirs)
-    objects = env, ppo, programs, warm_start, versions()
+    objects = env, ppo, programs, warm_start, versions(), fallbacks
     training = Training(config, run_dir, run_dirs, *objects, task_code)
     try:
         return _train_with_brax(training) if config.trainer == "brax" else _train(training)
@@ -260,8 +270,6 @@ def _train(training: Training) -> Result:
                 return _COMPLETE
             if training.warm_start:
                 messages.append(training.warm_start.describe())
-            if training.ppo.notice:
-                messages.append(training.ppo.notice)
             recorder.begin("\n".join([*messages, _headline(config, training.run_dir)]))
             return _RESUMES if resumption else _BEGINS
 
@@ -326,7 +334,11 @@ def open_recorder(
     for index, seed_config in enumerate(config.of_each_seed()):
         folder, history = run_dirs[index], histories[index]
         sinks = open_sinks(seed_config, folder, history, terminal.say, len(run_dirs))
-        about = {**about_policy(seed_config, env), "versions": training.versions}
+        about = {
+            **about_policy(seed_config, env),
+            "versions": training.versions,
+            "fallbacks": training.fallbacks,
+        }
         standing = Standing.from_json(resumed.progress[index])
         fingerprint = digest(resumed.states[index].policy_params) if resumption else ""
         seeds.append(SeedRecorder(seed_config, folder, sinks, about, standing, fingerprint))

@@ -31,9 +31,10 @@ from jetbot_mjx.compiler.update import (
 from jetbot_mjx.compiler.update.shapes import Minibatch, Tiling
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.fallbacks import collect
 from jetbot_mjx.training import session
 
-on_a_gpu = pytest.mark.skipif(not ptx_backend.is_available(), reason="there is no NVIDIA GPU")
+on_a_gpu = pytest.mark.skipif(ptx_backend.obstacle() is not None, reason="there is no NVIDIA GPU")
 
 OBSERVATIONS, ACTIONS = 5, 2
 
@@ -87,28 +88,32 @@ def test_it_says_which_networks_a_gpu_cannot_compute(changes, sizes, reason):
 
 
 @pytest.mark.cpu
-def test_a_cpu_takes_the_kernels_where_it_can():
-    assert make_ppo(config())._fused is not None
-    assert make_ppo(config()).notice is None
-    other = make_ppo(config(hidden=[40]))
-    assert other._fused is None
-    assert other.notice == "ppo.update = xla: it takes layers of 16, 32, 48, ... units, not 40"
+def test_a_cpu_takes_the_kernels_where_it_can_and_says_where_it_cannot(capsys):
+    with collect() as found:
+        assert make_ppo(config())._fused is not None
+    assert (found, capsys.readouterr().err) == ([], "")
+    with collect() as found:
+        assert make_ppo(config(hidden=[40]))._fused is None
+    reason = "it takes layers of 16, 32, 48, ... units, not 40"
+    assert found == [("ppo.update", reason)]
+    line = f"slow: ppo.update: training is 2 to 4 times slower: {reason}\n"
+    assert capsys.readouterr().err == line
 
 
 @pytest.mark.cpu
-def test_without_llvmlite_a_cpu_takes_xla_and_says_so(monkeypatch):
-    llvm_backend.is_available.cache_clear()
+def test_without_llvmlite_a_cpu_takes_xla_and_says_so(monkeypatch, capsys):
+    llvm_backend.obstacle.cache_clear()
     monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
     monkeypatch.setattr(llvm_backend, "_binding", llvm_backend._binding.__wrapped__)
     monkeypatch.setattr(llvm_backend, "host_processor", llvm_backend.host_processor.__wrapped__)
     try:
         ppo = make_ppo(config())
         assert ppo._fused is None
-        assert ppo.notice.startswith("ppo.update = xla: it needs a CPU, llvmlite")
-        with pytest.raises(UserError, match=r"ppo\.update = fused: it needs a CPU, llvmlite"):
+        assert "ppo.update: training is 2 to 4 times slower: llvmlite" in capsys.readouterr().err
+        with pytest.raises(UserError, match=r"ppo\.update = fused: llvmlite cannot be used"):
             make_ppo(config(update="fused"))
     finally:
-        llvm_backend.is_available.cache_clear()
+        llvm_backend.obstacle.cache_clear()
 
 
 @pytest.mark.cpu
@@ -460,9 +465,7 @@ def test_kernels_that_fail_their_check_are_left_to_xla(monkeypatch, capsys):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert not ppo.check()
     assert ppo._fused is None
-    assert capsys.readouterr().err == (
-        "ppo.update = xla: the fused update failed its check on this machine\n"
-    )
+    assert capsys.readouterr().err.endswith(": its kernels failed their check on this machine\n")
     ppo.config, ppo._fused = config(update="fused").ppo, object()
     with pytest.raises(UserError, match=r"ppo\.update = fused: .* choose auto or xla"):
         ppo.check()
@@ -470,14 +473,14 @@ def test_kernels_that_fail_their_check_are_left_to_xla(monkeypatch, capsys):
 
 @pytest.mark.cpu
 def test_without_a_back_end_xla_computes_the_update(monkeypatch, capsys):
-    monkeypatch.setattr(ptx_backend, "is_available", lambda: False)
+    monkeypatch.setattr(ptx_backend, "obstacle", lambda: "there is none")
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     ppo = make_ppo(config(update="xla"))
     ppo.config, ppo._fused = config(update="auto").ppo, object()
     ppo.prepare(1)
     assert ppo._fused is None
     assert ppo.check()
-    assert capsys.readouterr().err.startswith("ppo.update = xla: it needs an NVIDIA GPU, llvmlite")
+    assert capsys.readouterr().err.endswith(": there is none\n")
 
 
 def test_the_probe_agrees():

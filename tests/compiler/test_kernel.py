@@ -11,7 +11,7 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 
-if not any(backend.is_available() for backend in (llvm_backend, ptx_backend)):
+if all(backend.obstacle() for backend in (llvm_backend, ptx_backend)):
     pytest.skip("there is no kernel here", allow_module_level=True)
 
 
@@ -121,12 +121,12 @@ def test_a_programs_platform_decides(step, monkeypatch):
     states = {"x": jnp.ones((5, 3)), "n": jnp.zeros(5)}
     arguments = jax.vmap(step), states, jnp.ones(5)
     assert launches(*arguments, platforms=("tpu",)) == 0
-    if llvm_backend.is_available():
+    if not llvm_backend.obstacle():
         assert launches(*arguments, platforms=("cpu",)) == 1
-    monkeypatch.setattr(ptx_backend, "is_available", lambda: True)
+    monkeypatch.setattr(ptx_backend, "obstacle", lambda: None)
     monkeypatch.setattr(ptx_backend, "target_architecture", lambda: 90)
     assert launches(*arguments, platforms=("cuda",)) == 1
-    monkeypatch.setattr(ptx_backend, "is_available", lambda: False)
+    monkeypatch.setattr(ptx_backend, "obstacle", lambda: "there is none")
     assert launches(*arguments, platforms=("cuda",)) == 0
 
 
@@ -146,11 +146,15 @@ def test_a_step_casts_what_it_is_given():
         np.testing.assert_array_equal(cast.qpos, plain.qpos)
 
 
-@pytest.mark.skipif(ptx_backend.is_available(), reason="there is a GPU")
+@pytest.mark.skipif(ptx_backend.obstacle() is None, reason="there is a GPU")
 def test_without_an_nvidia_gpu_there_is_none():
-    with pytest.raises(UserError, match=r"physics\.impl = ptx needs an NVIDIA GPU.* cpu"):
+    with pytest.raises(
+        UserError, match=r"physics\.impl = ptx: there is no NVIDIA GPU.* xla or auto"
+    ):
         make_env(parse_config({"physics": {"impl": "ptx"}}))
-    with pytest.raises(UserError, match=r"camera\.impl = ptx needs an NVIDIA GPU.* cpu"):
+    with pytest.raises(
+        UserError, match=r"camera\.impl = ptx: there is no NVIDIA GPU.* xla or auto"
+    ):
         make_env(parse_config({"task": {"observation": "camera"}, "camera": {"impl": "ptx"}}))
 
 
@@ -165,7 +169,7 @@ def test_a_run_with_a_kernel_of_one_device_can_be_used_on_any():
 @pytest.mark.parametrize("impl", ["auto", "llvm"])
 def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(impl):
     # The library's Cholesky factor is a call, not arithmetic.
-    if impl == "llvm" and not llvm_backend.is_available():
+    if impl == "llvm" and llvm_backend.obstacle() is not None:
         pytest.skip("there is no such kernel here")
     env = make_env(parse_config({"physics": {"impl": impl, "cholesky": "library"}}))
     if impl == "auto":

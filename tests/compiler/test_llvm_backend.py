@@ -28,7 +28,7 @@ pytestmark = pytest.mark.cpu
 DEVICES = 8
 
 needs_it = pytest.mark.skipif(
-    not llvm_backend.is_available(), reason="llvmlite compiles nothing for XLA"
+    llvm_backend.obstacle() is not None, reason="llvmlite compiles nothing for XLA"
 )
 
 
@@ -284,11 +284,11 @@ def test_a_kept_program_brings_its_kernels_into_the_next_process(cache, fresh, m
 
 @pytest.fixture
 def asked_anew():
-    llvm_backend.is_available.cache_clear()
+    llvm_backend.obstacle.cache_clear()
     llvm_backend.host_processor.cache_clear()
     llvm_backend._binding.cache_clear()
     yield
-    llvm_backend.is_available.cache_clear()
+    llvm_backend.obstacle.cache_clear()
     llvm_backend.host_processor.cache_clear()
     llvm_backend._binding.cache_clear()
 
@@ -318,10 +318,17 @@ def on_another_processor(monkeypatch):
         on_another_processor,
     ],
 )
-def test_where_it_cannot_be_had_xla_makes_the_step(asked_anew, where, monkeypatch):
+def test_where_it_cannot_be_had_xla_makes_the_step_and_one_line_says_so(
+    asked_anew, where, monkeypatch, capsys
+):
     where(monkeypatch)
-    assert make_env(parse_config({})).physics.impl == "xla"
-    with pytest.raises(UserError, match=r"physics\.impl = llvm needs .*llvmlite.*: choose xla"):
+    env = make_env(parse_config({}))
+    for _ in range(2):
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(2)), jax.random.PRNGKey(0))
+    assert env.physics.impl == "xla"
+    line = f"slow: physics.impl: training is about 5 times slower: {llvm_backend.obstacle()}\n"
+    assert capsys.readouterr().err == line
+    with pytest.raises(UserError, match=r"physics\.impl = llvm: .+; or choose xla or auto"):
         make_env(parse_config({"physics": {"impl": "llvm"}}))
 
 

@@ -18,7 +18,7 @@ from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 
 pytest.importorskip("llvmlite")
-if not llvm_backend.is_available():
+if llvm_backend.obstacle():
     pytest.skip("there is no CPU that it is written for", allow_module_level=True)
 
 LANES = llvm_backend.host_processor().lanes

@@ -530,7 +530,7 @@ def test_a_platform_without_a_back_end_runs_the_function_itself(case, monkeypatc
     one, function, given = prepared(case)
     assert launches(jax.vmap(one), *given, platforms=("tpu",)) == 0
     for backend in (llvm_backend, ptx_backend):
-        monkeypatch.setattr(backend, "is_available", lambda: False)
+        monkeypatch.setattr(backend, "obstacle", lambda: "there is none")
     theirs = jax.vmap(function)(*given)
     for known in (one, prepared(case)[0]):
         agree(jax.jit(jax.vmap(known))(*given), theirs)
@@ -539,12 +539,12 @@ def test_a_platform_without_a_back_end_runs_the_function_itself(case, monkeypatc
 
 def test_a_programs_platform_decides(drive, monkeypatch):
     arguments = jax.vmap(drive), *situations(5)
-    if llvm_backend.is_available():
+    if not llvm_backend.obstacle():
         assert is_one_kernel(*arguments, platforms=("cpu",))
-    monkeypatch.setattr(ptx_backend, "is_available", lambda: True)
+    monkeypatch.setattr(ptx_backend, "obstacle", lambda: None)
     monkeypatch.setattr(ptx_backend, "target_architecture", lambda: 90)
     assert is_one_kernel(*arguments, platforms=("cuda",))
-    monkeypatch.setattr(ptx_backend, "is_available", lambda: False)
+    monkeypatch.setattr(ptx_backend, "obstacle", lambda: "there is none")
     assert launches(*arguments, platforms=("cuda",)) == 0
 
 

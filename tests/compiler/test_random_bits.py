@@ -12,7 +12,7 @@ from jetbot_mjx.compiler.program_cache import ProgramCache
 
 pytestmark = [
     pytest.mark.cpu,
-    pytest.mark.skipif(not llvm_backend.is_available(), reason="there is no such back end"),
+    pytest.mark.skipif(llvm_backend.obstacle() is not None, reason="there is no such back end"),
 ]
 
 
@@ -82,7 +82,7 @@ def test_two_caches_that_lower_at_once_leave_jax_as_it_was():
 
 
 def test_where_there_is_no_back_end_jax_draws(monkeypatch):
-    monkeypatch.setattr(llvm_backend, "is_available", lambda: False)
+    monkeypatch.setattr(llvm_backend, "obstacle", lambda: "there is none")
     key = jax.random.PRNGKey(0)
     with random_bits.by_one_kernel():
         assert kernels(lowered(key)) == 0

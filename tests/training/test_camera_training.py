@@ -86,6 +86,11 @@ def test_an_interrupted_training_ends_with_the_same_bits(run, config_file):
     assert sums(run) != sums(run, STEP)
 
 
+def test_a_checkpoint_tells_what_of_the_training_was_slow(run):
+    told = read_about(checkpoint_path(run, 3 * STEP))["fallbacks"]
+    assert told == [["ppo.update", "it takes observations without images"]]
+
+
 def test_a_policy_takes_what_it_was_trained_on_and_nothing_else(run):
     policy = load_policy(run)
     images = np.random.default_rng(0).integers(0, 256, (5, 16, 16, 2), np.uint8)

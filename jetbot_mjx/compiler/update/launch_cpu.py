@@ -37,8 +37,8 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
       shape: the networks.
       batch: the minibatch.
     """
-    if not llvm_backend.is_available():
-        return f"it needs {llvm_backend.NEEDS}"
+    if obstacle := llvm_backend.obstacle():
+        return obstacle
     outputs = max(shape.outputs)
     if outputs > HEAD:
         return f"it takes at most {HEAD} outputs, not {outputs}"

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
 from jetbot_mjx.compiler import llvm_codegen
-from jetbot_mjx.compiler.backends import require_backend
+from jetbot_mjx.compiler.backends import obstacle, require_backend
 from jetbot_mjx.compiler.kernel import Kernel, as_map
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
@@ -50,6 +50,7 @@ from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, with_clutter
 from jetbot_mjx.envs.look_params import LookParams
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.fallbacks import Fallback, report
 
 GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 
@@ -93,7 +94,7 @@ class Camera:
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
         self._mount_rotation = axes.astype(np.float32)
         self._mount_position = np.asarray(config.position, np.float32)
-        self._kernels: dict[Any, Kernel | None] = {}
+        self._kernels: dict[Any, Kernel | UnsupportedError] = {}
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -156,25 +157,34 @@ class Camera:
         Args:
           structure: the tree structure of the `Frame`, which says what differs between episodes.
         """
-        if structure not in self._kernels:
-            self._kernels[structure] = self._make_kernel(structure)
-        return self._kernels[structure]
-
-    def _make_kernel(self, structure: Any) -> Kernel | None:
         if self.config.impl == "xla":
             return None
+        if reason := obstacle(self.config.impl):
+            report(Fallback("camera.impl", reason))
+        if structure not in self._kernels:
+            try:
+                self._kernels[structure] = self._make_kernel(structure)
+            except UnsupportedError as error:
+                self._kernels[structure] = error
+        found = self._kernels[structure]
+        if isinstance(found, Kernel):
+            return found
+        reason = f"one kernel cannot do {found}"
+        if self.config.impl != "auto":
+            raise UserError(f"camera.impl = {self.config.impl}: {reason}; choose xla or auto")
+        report(Fallback("camera.impl", f"{reason}: try the versions in constraints.txt"))
+        return None
+
+    def _make_kernel(self, structure: Any) -> Kernel:
+        """Lower an image to a kernel.
+
+        Raises:
+          UnsupportedError: an operation cannot be lowered.
+        """
         sizes = structure.num_leaves, len(self._table)
         arguments = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in sizes]
-        try:
-            program = scalarize(functools.partial(self._pixel, structure), *arguments)
-            llvm_codegen.require(program)
-        except UnsupportedError as error:
-            if self.config.impl != "auto":
-                raise UserError(
-                    f"camera.impl = {self.config.impl}: one kernel cannot do {error};"
-                    " choose xla or auto"
-                ) from None
-            return None
+        program = scalarize(functools.partial(self._pixel, structure), *arguments)
+        llvm_codegen.require(program)
         return Kernel(
             program,
             carried=0,
