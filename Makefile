@@ -31,10 +31,10 @@ $(SB3_STAMP): $(STAMP)
 # without OpenGL still gets its policy and its metrics: render then says what to install.
 train: RUN := $(RUN)
 train: setup
-	$(BIN)/python -m jetbot_mjx.train --config $(CONFIG) --run-dir $(RUN)
-	$(BIN)/python -m jetbot_mjx.evaluate $(RUN)
-	-$(BIN)/python -m jetbot_mjx.render $(RUN) --episodes 8
-	@echo "everything lies in $(RUN)"
+	$(BIN)/jetbot-mjx train $(CONFIG) --run-dir $(RUN)
+	$(BIN)/jetbot-mjx evaluate $(RUN)
+	-$(BIN)/jetbot-mjx render $(RUN) --episodes 8
+	@echo "everything is in $(RUN); to use the commands in this shell: source $(BIN)/activate"
 
 test: setup
 	$(BIN)/python -m pytest -m 'not slow' --numprocesses logical --maxprocesses 8 --dist loadfile \

@@ -5,7 +5,7 @@ Six rates for each number of environments, each of a program of its own:
   switched  `physics` under commands of ±1 that each robot holds for 1 to 24 steps
   env       the training environment: observation, reward, episode statistics, resets to new goals
   rollout   `env` under the exploring policy, with the transitions that PPO stores
-  training  PPO by the trainer of `python -m jetbot_mjx.train`: rollouts and updates
+  training  PPO by the trainer of `jetbot-mjx train`: rollouts and updates
   brax      PPO by Brax's own `ppo.train` with the same hyperparameters
 benchmarks/README.md explains how each is measured and how to read the table.
 """

@@ -1,7 +1,7 @@
 """Drive a JetBot to a goal: `python3 drive.py POLICY --goal X Y`, or `--camera`.
 
 It runs on the robot with Python 3.6 or newer, NumPy and NVIDIA's `jetbot`. POLICY is the folder
-that `python -m jetbot_mjx.export` wrote. X and Y are metres: ahead and to the left of the robot at
+that `jetbot-mjx export` wrote. X and Y are metres: ahead and to the left of the robot at
 the start, or in the frame of a tracker (`--tracker PORT`, see poses.py). A tracker on another
 machine needs `--tracker-host 0.0.0.0`, and a key that it shares with the robot.
 

@@ -41,7 +41,7 @@ On this page you look up every setting: its type and bounds, its default, and it
 file names only what differs from the defaults below, and `--set` changes one setting:
 
 ```sh
-python -m jetbot_mjx.train --config configs/jetbot.yaml --set ppo.learning_rate=3e-4 --seed 7
+jetbot-mjx train jetbot --set ppo.learning_rate=3e-4 --seed 7
 ```
 
 The value after `--set` is read as YAML, and the last one wins. All settings are checked before

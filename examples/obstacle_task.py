@@ -2,7 +2,7 @@
 
 Put the folder of this file on `PYTHONPATH` and name the class in a YAML file:
 
-    PYTHONPATH=examples python -m jetbot_mjx.train --config examples/obstacle.yaml
+    PYTHONPATH=examples jetbot-mjx train examples/obstacle.yaml
 
 A subclass of `GoalTask` overrides only what differs: what is drawn for an episode, the
 observation, the reward, and when the episode ends. Environment, trainer, evaluation and rendering

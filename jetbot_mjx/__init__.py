@@ -14,7 +14,7 @@ The subpackages, each of which imports only from those before it:
 - `adapters`: Gymnasium and Stable-Baselines3, for other people's programs
 
 The root holds the modules that all subpackages use (`config`, `errors`) and the commands, which
-share only the run folder: `python -m jetbot_mjx` lists them. A public name is imported at its first
+share only the run folder: `jetbot-mjx` lists them. A public name is imported at its first
 use, so that a mistyped command fails at once and a GPU initialises while the rest is imported.
 """
 

@@ -1,4 +1,4 @@
-"""Check a task before it is trained: `python -m jetbot_mjx.check_env my_task:MyTask`.
+"""Check a task before it is trained: `jetbot-mjx check_env my_task:MyTask`.
 
 Every mistake is reported in one line that says how to correct it. A built-in task is named by its
 class alone, such as `GoalTask`. `--config my_task.yaml` checks a task with the settings of a run.

@@ -536,7 +536,7 @@ class PPOConfig(_Section):
 
 
 class EvaluationConfig(_Section):
-    """The evaluations during training; `python -m jetbot_mjx.evaluate` has its own arguments."""
+    """The evaluations during training; `jetbot-mjx evaluate` has its own arguments."""
 
     episodes: Count = 256
     """Deterministic episodes per evaluation, on other goals than those of the report."""

@@ -1,4 +1,4 @@
-"""Evaluate policies on fixed goals: `python -m jetbot_mjx.evaluate RUN [RUN ...]`.
+"""Evaluate policies on fixed goals: `jetbot-mjx evaluate RUN [RUN ...]`.
 
 One policy gets a report. Several seeds, or several runs, are compared as well.
 """

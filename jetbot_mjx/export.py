@@ -1,4 +1,4 @@
-"""Export a policy to files that run without this package: `python -m jetbot_mjx.export RUN`.
+"""Export a policy to files that run without this package: `jetbot-mjx export RUN`.
 
 `--format numpy` writes one file of Python for a robot that has only NumPy, `onnx` and `stablehlo`
 write files for runtimes, and `all` writes all of them. The folder also holds `policy.json`, which

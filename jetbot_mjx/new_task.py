@@ -1,4 +1,4 @@
-"""Write a task to start from: `python -m jetbot_mjx.new_task my_task.py`.
+"""Write a task to start from: `jetbot-mjx new_task my_task.py`.
 
 It is the example `examples/obstacle_task.py` under your name, with its settings as YAML in the same
 folder. Both pass `check_env` and can be trained unchanged. No file is overwritten.
@@ -25,8 +25,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     files = write_task_template(parser.parse_args(arguments).module)
     folder = files.config.parent
     print(f"wrote {files.module} and {files.config}")
-    print(f"next: PYTHONPATH={folder} python -m jetbot_mjx.check_env --config {files.config}")
-    print(f"      PYTHONPATH={folder} python -m jetbot_mjx.train --config {files.config}")
+    print(f"next: PYTHONPATH={folder} jetbot-mjx check_env --config {files.config}")
+    print(f"      PYTHONPATH={folder} jetbot-mjx train {files.config}")
     return 0
 
 

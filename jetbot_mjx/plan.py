@@ -1,4 +1,4 @@
-"""Predict the memory that a training needs: `python -m jetbot_mjx.plan --config configs/gpu.yaml`.
+"""Predict the memory that a training needs: `jetbot-mjx plan gpu`.
 
 The table shows the memory of each device for more and for fewer environments. It is computed from
 shapes alone: nothing is compiled and nothing is trained.

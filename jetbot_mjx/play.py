@@ -1,4 +1,4 @@
-"""Watch a policy live and interact with it: `python -m jetbot_mjx.play RUN` serves a page.
+"""Watch a policy live and interact with it: `jetbot-mjx play RUN` serves a page.
 
 Without RUN, a policy that comes with the package drives.
 """

@@ -1,4 +1,4 @@
-"""Copy the trained policies that come with the package: `python -m jetbot_mjx.pretrained`.
+"""Copy the trained policies that come with the package: `jetbot-mjx pretrained`.
 
 There is one run for each of four configurations. The copies are run folders like any other:
 evaluate them, render them, compare them with your own runs, or train them further.
@@ -33,9 +33,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for path in runs:
         print(f"run folder: {path}")
     print(
-        f"next: python -m jetbot_mjx.evaluate {runs[0]}\n"
-        f"      python -m jetbot_mjx.render {runs[0]}\n"
-        f"      python -m jetbot_mjx.play {runs[0]}"
+        f"next: jetbot-mjx evaluate {runs[0]}\n"
+        f"      jetbot-mjx render {runs[0]}\n"
+        f"      jetbot-mjx play {runs[0]}"
     )
     return 0
 

@@ -1,4 +1,4 @@
-"""Render a policy that drives: `python -m jetbot_mjx.render RUN` writes an mp4, a gif and a plot.
+"""Render a policy that drives: `jetbot-mjx render RUN` writes an mp4, a gif and a plot.
 
 By default the best checkpoint drives to the first of the report's fixed goals. `--goals 3,17`
 chooses other goals. `--gallery` renders the first, the middle and the last checkpoint side by side,

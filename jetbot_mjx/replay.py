@@ -1,4 +1,4 @@
-"""Replay the steps before a non-finite state: `python -m jetbot_mjx.replay RUN/nan_dumps/FILE`."""
+"""Replay the steps before a non-finite state: `jetbot-mjx replay RUN/nan_dumps/FILE`."""
 
 from collections.abc import Sequence
 from pathlib import Path

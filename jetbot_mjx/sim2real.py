@@ -1,4 +1,4 @@
-"""Compare a real drive with the simulator: `python -m jetbot_mjx.sim2real LOG`.
+"""Compare a real drive with the simulator: `jetbot-mjx sim2real LOG`.
 
 LOG is a file that `deploy/drive.py --log` wrote on the robot. A simulated robot gets the same motor
 values at the same times, from the first logged pose on. An image and a JSON file in the folder of

@@ -1,4 +1,4 @@
-"""Train a policy into a run folder: `python -m jetbot_mjx.train --config configs/jetbot.yaml`.
+"""Train a policy into a run folder: `jetbot-mjx train jetbot`.
 
 The same command with the same `--run-dir`, or `--resume RUN`, continues a run that was stopped.
 SIGTERM and Ctrl-C stop a training: it saves everything and exits with code 75. With
@@ -86,7 +86,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.training import session
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
-        how = f"stopped; to resume: python -m jetbot_mjx.train --resume {run_dir}"
+        how = f"stopped; to resume: jetbot-mjx train --resume {run_dir}"
         print(session.summary(result) if result.finished else how, flush=True)
     distributed.leave()
     return 0 if result.finished else preemption.STOPPED

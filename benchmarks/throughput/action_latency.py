@@ -2,7 +2,7 @@
 
     python benchmarks/throughput/action_latency.py runs/mine/policy
 
-`python -m jetbot_mjx.export RUN --format all` writes the folder. Every call takes one observation,
+`jetbot-mjx export RUN --format all` writes the folder. Every call takes one observation,
 which is one image if the policy sees, as on a robot, and includes the conversion from and to NumPy.
 StableHLO is compiled by `jax.jit`.
 """

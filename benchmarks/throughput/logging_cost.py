@@ -3,7 +3,7 @@
     python benchmarks/throughput/logging_cost.py --config configs/jetbot_egocentric.yaml
 
 The same compiled training runs repeatedly and in turn in three modes: without a recorder; with the
-logs of `python -m jetbot_mjx.train` (metrics.jsonl, TensorBoard, the terminal and its dashboard);
+logs of `jetbot-mjx train` (metrics.jsonl, TensorBoard, the terminal and its dashboard);
 and with logs and checkpoints, which are saved in the background. No mode runs evaluations.
 """
 

@@ -106,7 +106,7 @@ class JetBotEnv(brax.envs.Env):
                 reason = f"MJX does not support {reason}"
             raise UserError(
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
-                f" (python -m jetbot_mjx.check_env {config.task.name} says more)"
+                f" (jetbot-mjx check_env {config.task.name} says more)"
             ) from None
 
     def blind(self) -> "JetBotEnv":

@@ -173,7 +173,7 @@ class Report(NamedTuple):
     def evaluate_command(self) -> str:
         """Return the command line that creates this report."""
         return (
-            f"python -m jetbot_mjx.evaluate {shlex.quote(str(self.run))}"
+            f"jetbot-mjx evaluate {shlex.quote(str(self.run))}"
             f" --checkpoint {self.env_steps} --episodes {self.policy.episodes}"
             f"{' --robustness' if self.robustness else ''}"
             f"{' --simulator mujoco' if self._asks_for_mujoco else ''}"
@@ -336,10 +336,7 @@ def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | Non
     which = ",".join(str(goal) for goal in goals if goal < REPORT_GOALS)
     if not which:
         return None
-    return (
-        f"python -m jetbot_mjx.render {shlex.quote(str(run))}"
-        f" --checkpoint {env_steps} --goals {which}"
-    )
+    return f"jetbot-mjx render {shlex.quote(str(run))} --checkpoint {env_steps} --goals {which}"
 
 
 def learning_curve(history: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[CurvePoint, ...]:

@@ -270,7 +270,7 @@ def advice(config: Config, each: Sizes, device_count: int, limit: int | None) ->
         return f"{problem}choose smaller networks, ppo.unroll_length or evaluation.episodes"
     return (
         f"{problem}--set ppo.num_envs={fits.num_envs} --set ppo.batch_size={fits.batch_size} takes"
-        f" {fits.total / GIB:.2f} GiB; python -m jetbot_mjx.plan lists other sizes"
+        f" {fits.total / GIB:.2f} GiB; jetbot-mjx plan lists other sizes"
     )
 
 

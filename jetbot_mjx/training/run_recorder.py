@@ -223,7 +223,7 @@ class RunRecorder(TrainerCallback):
         if path is not None:
             self.terminal.say(
                 f"a state became non-finite before step {env_steps:,}, and its environment was"
-                f" reset: python -m jetbot_mjx.replay {path}"
+                f" reset: jetbot-mjx replay {path}"
             )
 
     def on_compiled(self) -> None:

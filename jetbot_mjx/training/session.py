@@ -472,9 +472,9 @@ def summary(result: Result) -> str:
         )
     lines += [
         f"{result.wall_seconds:.1f} s in all",
-        f"next: python -m jetbot_mjx.evaluate {result.run_dir}",
-        f"      python -m jetbot_mjx.render {result.run_dirs[0]}",
-        f"      python -m jetbot_mjx.play {result.run_dirs[0]}",
+        f"next: jetbot-mjx evaluate {result.run_dir}",
+        f"      jetbot-mjx render {result.run_dirs[0]}",
+        f"      jetbot-mjx play {result.run_dirs[0]}",
     ]
     if importlib.util.find_spec("tensorboard") is not None:
         # TensorBoard names runs by their folder below this one.

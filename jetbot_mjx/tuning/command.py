@@ -80,7 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     _say(
         f"\ntrained anew with {CONFIRM_SEEDS} new seeds, evaluated on the report's goals:\n\n"
         f"{results.entrants_table(entrants)}\n\n{process_seconds():.1f} s in all\n"
-        f"results: {folder}\nnext: python -m jetbot_mjx.train --config {path}"
+        f"results: {folder}\nnext: jetbot-mjx train {path}"
     )
     return 0
 

@@ -44,7 +44,7 @@ def test_what_is_written_passes_the_checks_and_trains(folder, capsys):
     assert result.finished
     written = (folder / "park_here.py").read_text("utf-8") + config.read_text("utf-8")
     assert "class ParkHere(GoalTask)" in written
-    assert "PYTHONPATH=. python -m jetbot_mjx.train --config park_here.yaml" in written
+    assert "PYTHONPATH=. jetbot-mjx train park_here.yaml" in written
     for name in ("examples", "obstacle_task", "ObstacleTask", "obstacle.yaml"):
         assert name not in written
 

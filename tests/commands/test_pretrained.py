@@ -88,7 +88,7 @@ def test_it_tells_where_the_runs_are(tmp_path, capsys):
     printed = capsys.readouterr().out
     for name in NAMES:
         assert f"run folder: {tmp_path / 'here' / name}\n" in printed
-    assert f"python -m jetbot_mjx.play {tmp_path / 'here' / NAMES[0]}\n" in printed
+    assert f"jetbot-mjx play {tmp_path / 'here' / NAMES[0]}\n" in printed
 
 
 def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):

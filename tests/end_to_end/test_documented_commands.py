@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
-from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, own_files
+from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, in_full, own_files
 
 from jetbot_mjx import plan
 from jetbot_mjx.agents.ppo import NanDump
@@ -51,19 +51,10 @@ NUMBERS = {"--seeds": "2", "--episodes": "3", "--checkpoint": "256"}
 """What stands in for the number behind an argument."""
 
 TRAININGS = (
-    "--config configs/jetbot.yaml --run-dir runs/mine",
-    "--config configs/jetbot.yaml --seeds 5 --run-dir runs/five",
+    "jetbot --run-dir runs/mine",
+    "jetbot --seeds 5 --run-dir runs/five",
 )
 """Of which the others speak."""
-
-
-def in_full(words):
-    """`jetbot-mjx train` as the `python -m jetbot_mjx.train` that it is short for."""
-    return (
-        ["python", "-m", f"jetbot_mjx.{words[1]}", *words[2:]]
-        if words[0] == "jetbot-mjx"
-        else words
-    )
 
 
 DOCUMENTED = {
@@ -108,7 +99,7 @@ def checkout(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         for arguments in TRAININGS:
-            assert f"python -m jetbot_mjx.train {arguments}" in DOCUMENTED
+            assert f"jetbot-mjx train {arguments}" in DOCUMENTED
             assert run("train", arguments.split()) == 0
         shutil.copytree("runs/mine", "runs/other")
         assert run("pretrained", []) == 0
@@ -186,9 +177,7 @@ def test_a_documented_training_trains(page, words, reader, monkeypatch, capsys):
 def pillar(reader, monkeypatch):
     """The run of the page about tasks, unless it is there."""
     if not Path("runs/pillar").exists():
-        arguments = "--config my_task.yaml --run-dir runs/pillar"
-        text = f"PYTHONPATH=. python -m jetbot_mjx.train {arguments}"
-        page, words = DOCUMENTED[text]
+        page, words = DOCUMENTED["PYTHONPATH=. jetbot-mjx train my_task.yaml --run-dir runs/pillar"]
         assert execute(page, words, reader, monkeypatch) == 0
 
 

@@ -140,8 +140,8 @@ def test_a_replay_command_survives_the_shell():
     episodes = make_episodes([[1, 0], [0, 1]], [1, 0])
     (failure,) = find_failures(episodes, Path("my runs/it's"), 2048)
     words = shlex.split(failure.replay)
-    assert words[:3] == ["python", "-m", "jetbot_mjx.render"]
-    assert words[3:] == ["my runs/it's", "--checkpoint", "2048", "--goals", "1"]
+    assert words[:2] == ["jetbot-mjx", "render"]
+    assert words[2:] == ["my runs/it's", "--checkpoint", "2048", "--goals", "1"]
 
 
 def test_goals_that_cannot_be_filmed_have_no_command(monkeypatch):

@@ -409,6 +409,15 @@ def commands(block):
                 words.append(word)
 
 
+def in_full(words):
+    """A command with `jetbot-mjx train` written as `python -m jetbot_mjx.train`."""
+    if "jetbot-mjx" not in words:
+        return words
+    at = words.index("jetbot-mjx")
+    name, rest = words[at + 1 : at + 2], words[at + 2 :]
+    return [*words[:at], "python", "-m", ".".join(["jetbot_mjx", *name]), *rest]
+
+
 SHELL = [
     pytest.param(page, words, id=f"{page}-{' '.join(words)[:60]}")
     for page, text in PAGES.items()
@@ -462,6 +471,8 @@ def test_shell_blocks_are_shell(page):
 @pytest.mark.parametrize(("page", "words"), SHELL)
 def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
     reader(page)
+    # There is no run here that could be the latest.
+    words = [word.replace("latest", "runs/mine") for word in in_full(words)]
     while re.fullmatch(r"\w+=.*", words[0]):
         name, _, value = words[0].partition("=")
         assert name in VARIABLES
@@ -471,9 +482,6 @@ def test_a_command_of_the_pages_is_one(page, words, reader, monkeypatch):
         words = words[1:]
     if words[0] == "srun":
         words = words[words.index("python") :]
-    if words[0] == "jetbot-mjx":
-        # There is no run here that could be the latest.
-        words = ["python", "-m", *(word.replace("latest", "runs/mine") for word in words[1:])]
     match words:
         case ["python", "-m", "pytest", *arguments]:
             assert all(Path(one).is_file() for one in arguments if one[0] != "-")
@@ -540,8 +548,11 @@ def check_install(arguments):
 @pytest.mark.parametrize(
     ("page", "block"),
     [
+        ("a.md", "jetbot-mjx train jetbot --sed 1"),
+        ("a.md", "jetbot-mjx train jetbot --set ppo.num_env=1"),
+        ("a.md", "jetbot-mjx train nothing"),
+        ("a.md", "jetbot-mjx dance runs/mine"),
         ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --sed 1"),
-        ("a.md", "python -m jetbot_mjx.train --config configs/jetbot.yaml --set ppo.num_env=1"),
         ("a.md", "python -m jetbot_mjx.train --config configs/nothing.yaml"),
         ("a.md", "python -m jetbot_mjx.dance runs/mine"),
         ("a.md", "python3 deploy/drive.py policy --gaol 1 0"),

@@ -307,7 +307,7 @@ def test_a_training_on_a_terminal_has_the_dashboard(screen, watch, root, tmp_pat
         arguments += ["--set", setting]
     assert train.main(arguments) == 0
     assert sys.stdout is screen.stream
-    screen.until("python -m jetbot_mjx.play")
+    screen.until("jetbot-mjx play")
     text = screen.text
     for part in ("training jetbot_mjx:GoalTask", "run folder: ", "first training step done"):
         assert part in text

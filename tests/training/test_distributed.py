@@ -163,7 +163,7 @@ def test_a_signal_to_one_stops_all_at_the_same_step(stopped):
     (first, second), _, saved = stopped
     assert [first.code, second.code] == [STOPPED, STOPPED], first.err + second.err
     assert saved == [0, SIZE]
-    assert "stopped; to resume: python -m jetbot_mjx.train --resume" in first.said
+    assert "stopped; to resume: jetbot-mjx train --resume" in first.said
     assert "SIGTERM: finishing this step" in second.complained
 
 

@@ -91,7 +91,7 @@ def assert_saved_and_gone(process, code, number=signal.SIGTERM):
         f"\n{number.name}: finishing this step and saving (once more to leave without saving)\n"
     )
     last = process.stdout.splitlines()[-1]
-    assert last == f"stopped; to resume: python -m jetbot_mjx.train --resume {process.run_dir}"
+    assert last == f"stopped; to resume: jetbot-mjx train --resume {process.run_dir}"
     assert process.unfinished == set()
 
 

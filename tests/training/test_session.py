@@ -20,8 +20,8 @@ def test_the_end_names_the_next_commands_and_tensorboard_where_it_is_installed(
     result = session.Result(mine, [mine], [standing], ["abc"], finished=True, wall_seconds=1.0)
     lines = session.summary(result).splitlines()
     assert lines[2:5] == [
-        "next: python -m jetbot_mjx.evaluate runs/mine",
-        "      python -m jetbot_mjx.render runs/mine",
-        "      python -m jetbot_mjx.play runs/mine",
+        "next: jetbot-mjx evaluate runs/mine",
+        "      jetbot-mjx render runs/mine",
+        "      jetbot-mjx play runs/mine",
     ]
     assert lines[5:] == (["      tensorboard --logdir runs"] if installed else [])
