@@ -14,7 +14,7 @@ SB3_STAMP := $(VENV)/.installed-sb3
 setup: $(STAMP)
 
 $(STAMP): pyproject.toml constraints.txt
-	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14) and "error: jetbot_mjx needs Python 3.11, 3.12 or 3.13, not %d.%d; say make PYTHON=python3.11" % sys.version_info[:2])'
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: jetbot_mjx needs Python 3.11 or later, not %d.%d; say make PYTHON=python3.11" % sys.version_info[:2])'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
 	@touch $@
@@ -72,16 +72,28 @@ $(DOCS_STAMP): $(STAMP)
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
 	@touch $@
 
-# Builds the wheel, and uses it where there is no checkout: in a new environment and an empty folder.
+# Builds the wheel, and uses it as its users do: in an empty folder, under the newest Python there is, with the newest of
+# everything. Then the tests of what new versions break first: are the kernels on, does the page of `play` load.
+NEWEST ?= $(shell ls -d $${PYENV_ROOT:-$$HOME/.pyenv}/versions/3.*/bin/python 2>/dev/null | sort -V | tail -n 1)
+WHEEL_PYTHON := $(or $(NEWEST),$(PYTHON))
+USE := cd .cache/wheel/elsewhere && ../venv/bin/jetbot-mjx
+
 wheel: $(STAMP)
 	rm -rf .cache/wheel && mkdir -p .cache/wheel/elsewhere
 	$(BIN)/python -m hatchling build -t wheel -d .cache/wheel
-	$(PYTHON) -m venv .cache/wheel/venv
-	.cache/wheel/venv/bin/python -m pip install --quiet --constraint constraints.txt .cache/wheel/*.whl
-	cd .cache/wheel/elsewhere && ../venv/bin/jetbot-mjx configs && ../venv/bin/jetbot-mjx train smoke \
-		&& ../venv/bin/jetbot-mjx evaluate latest --episodes 64 \
-		&& ../venv/bin/jetbot-mjx evaluate pretrained:jetbot_egocentric --episodes 64 --output report \
-		&& ../venv/bin/jetbot-mjx runs && ../venv/bin/jetbot-mjx new_task my_task.py
+	@$(WHEEL_PYTHON) -c 'import sys; print("the wheel runs under Python", sys.version.split()[0])'
+	$(WHEEL_PYTHON) -m venv .cache/wheel/venv
+	.cache/wheel/venv/bin/python -m pip install --quiet pytest pytest-xdist beartype \
+		"$$(echo .cache/wheel/*.whl)[export,play]"
+	$(USE) configs
+	$(USE) train smoke
+	$(USE) evaluate latest --episodes 64
+	$(USE) evaluate pretrained:jetbot_egocentric --episodes 64 --output report
+	$(USE) export latest --format all
+	$(USE) runs
+	$(USE) new_task my_task.py
+	.cache/wheel/venv/bin/python -m pytest -p no:cacheprovider --numprocesses 2 --dist loadfile \
+		tests/end_to_end/test_kernels_are_on.py tests/compiler/test_lower_jaxpr.py tests/viewers/test_viser_server.py
 
 clean:
 	rm -rf $(VENV) .cache site

@@ -1,0 +1,40 @@
+"""With what is installed, kernels compute whatever kernels can: on new versions before all."""
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from jetbot_mjx.compiler import llvm_backend, ptx_backend
+from jetbot_mjx.config import load_config, shipped_configs
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.fallbacks import collect
+from jetbot_mjx.training.ppo_trainer import build_ppo
+
+IMAGES = "it takes observations without images"
+WITHOUT_FUSED_UPDATE = {
+    "camera_gpu": IMAGES,
+    "camera_real": IMAGES,
+    "jetbot_camera": IMAGES,
+    "isaac_sb3": "it takes two networks of the same hidden layers of one width",
+}
+BACKENDS = {"cpu": llvm_backend, "gpu": ptx_backend}
+
+
+def test_the_back_end_of_this_device_can_be_used():
+    assert BACKENDS[jax.default_backend()].obstacle() is None
+
+
+@pytest.mark.parametrize("name", sorted(shipped_configs()))
+def test_no_shipped_configuration_falls_back(name, capsys):
+    config = load_config(name)
+    with collect() as found:
+        env = make_env(config)
+        ppo = build_ppo(config, env)
+        wrapped = wrap_for_training(env, 100)
+        keys = jax.random.split(jax.random.PRNGKey(0), 2)
+        jax.eval_shape(lambda keys: wrapped.step(wrapped.reset(keys), jnp.zeros((2, 2))), keys)
+    assert env.physics.impl == BACKENDS[jax.default_backend()].IMPL
+    reason = WITHOUT_FUSED_UPDATE.get(name)
+    assert found == ([("ppo.update", reason)] if reason else [])
+    assert ppo.is_fused == (reason is None)
