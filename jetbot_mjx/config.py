@@ -546,6 +546,12 @@ class EvaluationConfig(_Section):
     Without OpenGL a line says so, and the training continues."""
 
 
+BRAX_DEFAULTS: Mapping[str, Any] = {
+    "ppo": {"normalizer": "brax", "network": {"shared_cnn": False}},
+}
+"""Defaults of settings under `trainer: brax` that differ from the others."""
+
+
 class Config(_Section):
     """All settings of a run."""
 
@@ -555,7 +561,8 @@ class Config(_Section):
     """Number of policies to train at once in one program, with consecutive seeds from `seed` on."""
     trainer: Literal["resumable", "brax"] = "resumable"
     """`resumable`: this project's training loop with Brax's PPO; `brax`: Brax's own
-    `brax.training.agents.ppo.train.train`, which cannot resume."""
+    `brax.training.agents.ppo.train.train`, which cannot resume; the defaults of `ppo.normalizer`
+    and `ppo.network.shared_cnn` are then `brax` and false."""
     deterministic: bool = False
     """Whether a GPU computes bit-identical results for a seed, more slowly; a CPU always does."""
     cpu_devices: Count | None = None
@@ -584,6 +591,14 @@ class Config(_Section):
     randomization: RandomizationConfig = RandomizationConfig()
     ppo: PPOConfig = PPOConfig()
     evaluation: EvaluationConfig = EvaluationConfig()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _defaults_for_brax(cls, values: Any) -> Any:
+        """Default to what Brax's own trainer knows, where it is to train."""
+        if isinstance(values, Mapping) and values.get("trainer") == "brax":
+            return _with_defaults(values, BRAX_DEFAULTS)
+        return values
 
     @model_validator(mode="after")
     def _settings_fit(self) -> Self:
@@ -619,13 +634,12 @@ class Config(_Section):
 
     @model_validator(mode="after")
     def _trainer_can(self) -> Self:
-        linear = self.ppo.learning_rate_schedule == "LINEAR"
+        shared = self.task.sees and self.ppo.network.shared_cnn
         physical = self.ppo.normalizer == "physical"
         for is_set, setting, other_remedy in (
-            (linear, "ppo.learning_rate_schedule = 'LINEAR'", ", or NONE or ADAPTIVE_KL"),
             (physical, "ppo.normalizer = 'physical'", ", or ppo.normalizer = 'brax'"),
             (self.ppo.update == "fused", "ppo.update = 'fused'", ", or ppo.update = 'auto'"),
-            (self.task.sees, f"task.observation = {self.task.observation!r}", ""),
+            (shared, "ppo.network.shared_cnn = true", ", or ppo.network.shared_cnn = false"),
             (self.deterministic, "deterministic = true", ""),
             (self.init_from is not None, "init_from", ""),
             (self.seeds > 1, f"seeds = {self.seeds}", ""),
@@ -734,6 +748,15 @@ CHANGEABLE_ON_RESUME = (
     "evaluation.video",
 )
 """Settings that may change on resume: the length of the training, and what it writes."""
+
+
+def _with_defaults(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+    """Return nested settings with those that are missing taken from others."""
+    merged = {**defaults, **values}
+    for key, default in defaults.items():
+        if isinstance(default, Mapping) and isinstance(values.get(key), Mapping):
+            merged[key] = _with_defaults(values[key], default)
+    return merged
 
 
 def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -26,7 +26,7 @@ class Fallback(NamedTuple):
     """A `Fallback` holds what runs slower than it could, and why."""
 
     what: str
-    """The setting that chooses the implementation, such as `physics.impl`, or `environment step`."""
+    """The setting that chooses the implementation, or `environment step`."""
     reason: str
     """Why there is no kernel, and what the user can do."""
 

@@ -42,7 +42,7 @@ class VisionNetworks(NamedTuple):
     policy_network: brax_networks.FeedForwardNetwork
     """The policy: parameters and observation to the parameters of the action distribution."""
     value_network: brax_networks.FeedForwardNetwork
-    """The value function; it takes encoded observations."""
+    """The value function; it takes encoded observations if its encoder is the policy's."""
     parametric_action_distribution: Any
     heads: ppo_networks.PPONetworks
     """The networks behind the encoder, which take encoded observations."""
@@ -121,11 +121,17 @@ def make_vision_networks(
         encoded = {_POLICY: encode_one(normalizer, params, obs)}
         return heads.policy_network.apply(None, params, encoded)
 
+    def apply_value(normalizer: Any, params: Any, obs: Any) -> Array:
+        encoded = {_VALUE: encode_one(normalizer, params, obs)}
+        return heads.value_network.apply(None, params, encoded)
+
     return VisionNetworks(
         policy_network=brax_networks.FeedForwardNetwork(
             init=heads.policy_network.init, apply=apply_policy
         ),
-        value_network=heads.value_network,
+        value_network=heads.value_network
+        if config.shared_cnn
+        else brax_networks.FeedForwardNetwork(init=heads.value_network.init, apply=apply_value),
         parametric_action_distribution=heads.parametric_action_distribution,
         heads=heads,
         encode=encode,

@@ -8,17 +8,18 @@ resumed, because Brax keeps its state in local variables.
 import contextlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from typing import Any, Self
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from brax.training.agents.ppo import train as brax_train
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from jetbot_mjx.agents.networks import PolicyParams, network_factory
+from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.agents.ppo import LOSSES
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, PPOConfig
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
@@ -26,6 +27,33 @@ from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 
 class _StopTraining(Exception):
     """Raised to leave Brax's training loop, which has no other way to stop early."""
+
+
+class _LinearRate(float):
+    """A step size that falls to zero: a number for Brax, and a schedule for optax.
+
+    Brax has no such schedule, but it passes its step size to optax, which calls what is callable.
+    """
+
+    _schedule: optax.Schedule
+    _gradient_steps_per_step: float
+
+    def __new__(cls, initial: float, config: PPOConfig) -> Self:
+        rate = super().__new__(cls, initial)
+        rate._schedule = optax.linear_schedule(initial, 0.0, config.gradient_steps)
+        rate._gradient_steps_per_step = config.gradient_steps / (
+            config.training_steps * config.steps_per_training_step
+        )
+        return rate
+
+    def __call__(self, count: Any) -> Any:
+        """Return the step size after a number of gradient steps."""
+        return self._schedule(count)
+
+    def at(self, env_steps: int) -> float:
+        """Return the step size after a number of environment steps."""
+        rate: Any = self._schedule(env_steps * self._gradient_steps_per_step)
+        return float(rate)
 
 
 def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
@@ -37,6 +65,10 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
       recorder: the callback, which is invoked before the first step and after every interval.
     """
     ppo = config.ppo.model_dump(exclude={"network", "normalizer", "update"})
+    rate = None
+    if config.ppo.learning_rate_schedule == "LINEAR":
+        rate = ppo["learning_rate"] = _LinearRate(config.ppo.learning_rate, config.ppo)
+        ppo["learning_rate_schedule"] = "NONE"
     num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
     latest: dict[str, Any] = {}
     # Brax annotates it as a function of the environment alone, but passes four arguments.
@@ -56,9 +88,19 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
         nonlocal clock
         params = jax.device_get(latest["params"])
         named = rename_metrics(metrics, config.ppo.entropy_cost)
+        if rate is not None and metrics:
+            named["policy/learning_rate"] = rate.at(env_steps)
         if not recorder.on_interval([Progress(env_steps, params, named, seconds)]):
             raise _StopTraining
         clock = time.perf_counter()
+
+    def networks(observation_size: Any, action_size: int, **_: Any) -> Any:
+        # Brax gives the shape of a vector, or the shapes of the parts of an observation.
+        size = observation_size if isinstance(observation_size, Mapping) else observation_size[0]
+        return make_networks(config.ppo, size, action_size)
+
+    # Brax annotates more than it calls.
+    any_networks: Any = networks
 
     # Run Brax's trainer without its own evaluations.
     with device_put_replicated(), contextlib.suppress(_StopTraining):
@@ -66,7 +108,7 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
             environment=env,
             episode_length=config.task.episode_length,
             wrap_env_fn=wrap_env_fn,
-            network_factory=network_factory(config.ppo.network),
+            network_factory=any_networks,
             seed=config.seed,
             # Report at the beginning and after every interval; the recorder evaluates.
             num_evals=num_intervals + 1,

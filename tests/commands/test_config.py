@@ -8,7 +8,7 @@ import pytest
 from pydantic import ValidationError
 from ruamel.yaml import YAML
 
-from jetbot_mjx.config import Config, ConfigError, load_config, parse_config
+from jetbot_mjx.config import Config, ConfigError, load_config, parse_config, shipped_configs
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 
@@ -487,3 +487,13 @@ def test_a_task_that_is_none_is_refused(name, said):
     assert len(message.splitlines()) == 1
     assert message.startswith(f"task.name = {name!r}")
     assert said in message
+
+
+@pytest.mark.parametrize("name", sorted(shipped_configs()))
+def test_brax_s_trainer_takes_every_configuration_of_the_package(name):
+    config = load_config(name, ["trainer=brax"])
+    assert (config.ppo.normalizer, config.ppo.network.shared_cnn) == ("brax", False)
+    # What is given stays: a default is none.
+    with pytest.raises(ConfigError, match=r"ppo\.normalizer = 'physical' is not known to"):
+        load_config(name, ["trainer=brax", "ppo.normalizer=physical"])
+    assert load_config(name).ppo.normalizer == "physical"

@@ -32,13 +32,13 @@ ROOMS = (
 )
 """A room imports only itself and those before it, and no command; adapters are imported by none."""
 
-COMMON = ("config", "errors", "imports", "interrupts")
+COMMON = ("config", "errors", "fallbacks", "imports", "interrupts")
 """Modules of the root that every room may import."""
 
 COMMANDS = ("__main__", *(module for module, _ in command_line.COMMANDS.values()))
 """A command imports whatever it likes but adapters and other commands; it may be in a room."""
 
-MOST_AT_THE_ROOT = 18
+MOST_AT_THE_ROOT = 19
 
 MAY_PRINT_AND_PARSE = ("cli", *COMMANDS)
 

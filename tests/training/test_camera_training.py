@@ -164,8 +164,8 @@ def test_a_task_whose_policy_sees_passes_its_checks(config_file, capsys):
     [
         ({"init_from": "pretrained:jetbot_egocentric"}, "cannot begin with another's"),
         (
-            {"trainer": "brax", "ppo": {"learning_rate_schedule": "NONE", "normalizer": "brax"}},
-            "task.observation = 'camera' is not known to trainer = 'brax'",
+            {"trainer": "brax", "ppo": {"network": {"shared_cnn": True}}},
+            "ppo.network.shared_cnn = true is not known to trainer = 'brax'",
         ),
     ],
 )

@@ -34,7 +34,7 @@ SETTINGS = [
     "--set",
     "evaluation.episodes=8",
 ]
-STOCK = ["--set", "trainer=brax", "--set", "ppo.normalizer=brax"]
+STOCK = ["--set", "trainer=brax"]
 VARIABLES = ("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID")
 
 

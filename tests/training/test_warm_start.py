@@ -152,7 +152,6 @@ def test_brax_s_trainer_cannot():
         config_of(
             init_from=SOURCE,
             trainer="brax",
-            ppo={"normalizer": "brax", "learning_rate_schedule": "NONE"},
         )
 
 
