@@ -220,8 +220,8 @@ class PhysicsConfig(_Section):
     is below the resolution of float32."""
     iterations: Count = 20
     """Largest number of Newton iterations per physics step; usually one or two are needed."""
-    ls_iterations: Count = 4
-    """Largest number of line-search steps per Newton iteration."""
+    ls_iterations: Count = 8
+    """Largest number of line-search steps per Newton iteration; a slippery floor needs most."""
     cholesky: Literal["unrolled", "library"] = "unrolled"
     """How MJX factorises its matrices. `unrolled`: as scalar arithmetic; `library`: by a call of
     LAPACK or cuSOLVER, which prevents a step from running as one kernel or CUDA graph."""

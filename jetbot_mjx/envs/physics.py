@@ -25,7 +25,7 @@ from jetbot_mjx.compiler.backends import (
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import PhysicsConfig
-from jetbot_mjx.envs import cholesky, mjx
+from jetbot_mjx.envs import cholesky, line_search, mjx
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.fallbacks import Fallback, report
@@ -166,7 +166,11 @@ class Physics:
         )
         # By default GPUs multiply float32 matrices in TF32, with which the contact solver diverges.
         # Only physics requires full precision; networks choose their own.
-        with jax.default_matmul_precision("highest"), factorise():
+        with (
+            jax.default_matmul_precision("highest"),
+            line_search.relative_costs(),
+            factorise(),
+        ):
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
