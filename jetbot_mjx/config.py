@@ -14,7 +14,7 @@ import functools
 import io
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -34,6 +34,10 @@ from ruamel.yaml import YAML
 from ruamel.yaml.error import YAMLError
 
 from jetbot_mjx.errors import InvalidError, NotFoundError
+
+Overrides = Mapping[str, Any] | Sequence[str]
+"""Settings that replace those of a configuration: `{"ppo.num_envs": 256}`, or a list of
+`section.key=value` as after `--set`."""
 
 
 class ConfigError(InvalidError):
@@ -104,6 +108,12 @@ class _Section(BaseModel):
     """Base class of all sections: immutable, with strict types and without unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+    def __repr_args__(self) -> Iterator[tuple[str | None, Any]]:
+        """Yield the settings that differ from the defaults, which are few of them."""
+        for name, field in type(self).model_fields.items():
+            if (value := getattr(self, name)) != field.get_default(call_default_factory=True):
+                yield name, value
 
 
 class RobotConfig(_Section):
@@ -812,13 +822,14 @@ def find_config(name: str | Path) -> Path:
     raise ConfigNotFoundError(f"config {name} does not exist: {hint}")
 
 
-def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Config:
-    """Read a YAML file, apply overrides, and check the result.
+def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:
+    """Read a configuration, apply overrides, and check the result.
 
     Args:
-      path: the YAML file with the settings that differ from the defaults, or the name of a
-        configuration that comes with the package. None: only defaults.
-      overrides: `section.key=value`, the value read as YAML; the last one wins.
+      config: the name of a configuration that comes with the package; a YAML file with the settings
+        that differ from the defaults; or a `Config`. None: only defaults.
+      overrides: the settings to change, such as `{"ppo.num_envs": 256}`; or a list of
+        `section.key=value`, as after `--set`, the value read as YAML, of which the last one wins.
 
     Returns:
       The resolved configuration.
@@ -827,12 +838,30 @@ def load_config(path: str | Path | None, overrides: Sequence[str] = ()) -> Confi
       ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
         type, out of bounds or at odds with another.
     """
-    values = {} if path is None else read_yaml(find_config(path))
-    for override in overrides:
-        _apply_override(values, override)
-    return parse_config(
-        values, source=" ".join([str(path or "config"), *(f"--set {o}" for o in overrides)])
-    )
+    if isinstance(config, Config):
+        if not overrides:
+            return config
+        values, name = config.model_dump(mode="json"), "config"
+    elif config is None:
+        values, name = {}, "config"
+    elif isinstance(config, str | Path):
+        values, name = read_yaml(find_config(config)), str(config)
+    else:
+        raise ConfigError(f"config = {config!r} is wrong: give a name, a YAML file or a Config")
+    if isinstance(overrides, str):
+        raise ConfigError(
+            f"overrides = {overrides!r} is wrong: give settings and values, as in"
+            " {'ppo.num_envs': 256}"
+        )
+    if isinstance(overrides, Mapping):
+        name += f" with {dict(overrides)}" if overrides else ""
+        for key, value in overrides.items():
+            _set(values, str(key), value, f"{key} = {value!r}")
+    else:
+        for override in overrides:
+            name += f" --set {override}"
+            _apply_override(values, override, f"--set {override}")
+    return parse_config(values, source=name)
 
 
 def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
@@ -907,24 +936,37 @@ def _parse_yaml(text: str, source: str) -> object:
         raise ConfigError(f"{source} is not valid YAML: {error}") from None
 
 
-def _apply_override(values: dict[str, Any], override: str) -> None:
+def _apply_override(values: dict[str, Any], override: str, source: str) -> None:
     key, separator, text = override.partition("=")
-    parts = key.strip().split(".")
-    if not separator or not all(parts):
-        raise ConfigError(f"--set {override}: write section.key=value, as in ppo.num_envs=256")
+    if not separator or not all(key.strip().split(".")):
+        raise ConfigError(f"{source}: write section.key=value, as in ppo.num_envs=256")
+    value = _parse_yaml(text, source)
+    _set(values, key.strip(), value, source, "--set {}={}")
+
+
+def _set(
+    values: dict[str, Any], key: str, value: object, source: str, form: str = "'{}': {!r}"
+) -> None:
+    """Set one key of nested values.
+
+    Args:
+      values: the nested values, which are changed.
+      key: the key with its sections, such as `ppo.num_envs`.
+      value: its new value.
+      source: the override as it was written, for error messages.
+      form: how an override is written, for error messages.
+    """
+    *sections, last = key.split(".")
     section = values
-    for part in parts[:-1]:
+    for part in sections:
         section = section.setdefault(part, {})
         if not isinstance(section, dict):
-            raise ConfigError(f"--set {override}: {part} is a value, not a section")
-    value = _parse_yaml(text, f"--set {override}")
-    if isinstance(value, dict):
+            raise ConfigError(f"{source}: {part} is a value, not a section")
+    if isinstance(value, Mapping):
         # A whole section would silently discard the file's values of its other keys.
-        inner = next(iter(value.items()), ("key", "value"))
-        raise ConfigError(
-            f"--set {override}: set single keys, as in --set {key.strip()}.{inner[0]}={inner[1]}"
-        )
-    section[parts[-1]] = value
+        inner, one = next(iter(value.items()), ("key", "value"))
+        raise ConfigError(f"{source}: set single keys, as in {form.format(f'{key}.{inner}', one)}")
+    section[last] = value
 
 
 def _explain(error: ErrorDetails) -> str:

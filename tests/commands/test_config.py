@@ -393,6 +393,60 @@ def test_a_bad_override_is_refused(refusal, override, said):
     assert said in refusal("seed: 1\nppo: {gae_lambda: 0.5}", override)
 
 
+def test_overrides_may_be_a_mapping_and_the_configuration_an_object():
+    given = ["seed=7", "ppo.network.policy_hidden_layer_sizes=[8]", "task.options.depth=2"]
+    values = {
+        "seed": 7,
+        "ppo.network.policy_hidden_layer_sizes": [8],
+        "task.options.depth": 2,
+    }
+    kept = copy.deepcopy(values)
+    base = load_config("smoke")
+    assert load_config("smoke", values) == load_config("smoke", given) == load_config(base, values)
+    assert load_config(base, given) == load_config("smoke", given)
+    assert load_config(base) is base
+    assert values == kept
+    assert base == load_config("smoke")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        ({"ppo": {"num_envs": 8}}, "ppo = {'num_envs': 8}: set single keys, as in 'ppo.num_envs'"),
+        (
+            {"ppo.num_env": 8},
+            "smoke with {'ppo.num_env': 8}: ppo.num_env = 8 is unknown: did you mean",
+        ),
+        ({"ppo.num_envs": "many"}, "ppo.num_envs = 'many' is wrong: it should be a whole number"),
+        (
+            {"seed": 1, "ppo.num_envs.x": 1},
+            "ppo.num_envs.x = 1: num_envs is a value, not a section",
+        ),
+        ({3: 4}, "3 = 4 is unknown"),
+        ("seed=1", "overrides = 'seed=1' is wrong: give settings and values, as in {'ppo.num_en"),
+    ],
+)
+def test_a_bad_override_in_python_is_refused_in_its_own_terms(overrides, said):
+    with pytest.raises(ConfigError) as caught:
+        load_config("smoke", overrides)
+    assert said in str(caught.value)
+    assert "--set" not in str(caught.value)
+
+
+def test_what_is_no_configuration_is_refused():
+    with pytest.raises(ConfigError, match="config = 5 is wrong: give a name, a YAML file or a Con"):
+        load_config(5)
+
+
+def test_a_configuration_shows_what_differs_from_the_defaults():
+    config = load_config("jetbot_egocentric", {"seed": 3})
+    assert repr(config) == (
+        "Config(seed=3, checkpoint_interval=65536, task=TaskConfig(observation='egocentric'),"
+        " ppo=PPOConfig(num_timesteps=524288, num_envs=256, batch_size=64))"
+    )
+    assert repr(Config()) == "Config()"
+
+
 # The remedies that name a number: does it work?
 
 
