@@ -1,6 +1,8 @@
 """Define exceptions for errors that the user can correct, each with a message of one line."""
 
 import contextlib
+import math
+import numbers
 from collections.abc import Iterator
 
 
@@ -22,6 +24,18 @@ class NotFoundError(UserError, FileNotFoundError):
 
 class MissingPackageError(UserError, ImportError):
     """Raised when an optional package is missing; callers may also catch an `ImportError`."""
+
+
+def check_count(name: str, value: object, most: float = math.inf) -> None:
+    """Check that an argument is a whole number from 1 to `most`.
+
+    Raises:
+      InvalidError: It is not; the message begins with `name`.
+    """
+    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
+        raise InvalidError(f"{name} = {value!r} is wrong: it should be a whole number from 1 on")
+    if int(value) > most:
+        raise InvalidError(f"{name} = {value} is wrong: it should be at most {most}")
 
 
 @contextlib.contextmanager

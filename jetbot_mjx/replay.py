@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         f" up to there:\n{nan_dump.HEADER}"
     )
     nonfinite: list[str] = []
-    env = make_env(stored.config.for_any_device(), stored.task_class)
+    env = make_env(stored.config.for_any_device(), task_class=stored.task_class)
     for index, step in enumerate(nan_dump.replay_nan_dump(stored, env)):
         print(nan_dump.format_step(index, step))
         nonfinite = step.nonfinite

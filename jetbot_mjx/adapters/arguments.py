@@ -11,7 +11,7 @@ from jaxtyping import Float, UInt32
 
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.config import Config, load_config, parse_config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, check_count
 
 Seed = int | Sequence[int | None] | None
 Source = Config | Mapping[str, Any] | str | Path | None
@@ -70,18 +70,6 @@ def _read(config: Source) -> Config:
         case None | str() | Path():
             return load_config(config)
     raise UserError(f"config = {config!r} is wrong: give a YAML file, a mapping or a Config")
-
-
-def check_count(name: str, value: Any, most: float = math.inf) -> None:
-    """Check that an argument is a whole number from 1 to `most`.
-
-    Raises:
-      UserError: It is not; the message begins with `name`.
-    """
-    if not isinstance(value, numbers.Integral) or isinstance(value, bool) or value < 1:
-        raise UserError(f"{name} = {value!r} is wrong: it should be a whole number from 1 on")
-    if int(value) > most:
-        raise UserError(f"{name} = {value} is wrong: it should be at most {most}")
 
 
 def _check_seconds(name: str, value: Any) -> None:

@@ -8,13 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
 
-from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions, check_count
+from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions
 from jetbot_mjx.adapters.renderer import Pose
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.errors import check_count
 
 Observations = Float[np.ndarray, "n obs"] | UInt8[np.ndarray, "n h w c"] | dict[str, np.ndarray]
 """Numbers, images, or both by name."""

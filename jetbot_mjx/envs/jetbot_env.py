@@ -8,6 +8,7 @@ rebuilt inside `step`.
 import copy
 import functools
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import brax.envs
@@ -17,7 +18,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.envs import kinematics, mjx
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, numbers_of, observation_shapes, see
@@ -39,7 +40,7 @@ from jetbot_mjx.envs.task import (
     make_task,
     min_std,
 )
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, UserError
 
 
 class TaskStep(NamedTuple):
@@ -109,6 +110,15 @@ class JetBotEnv(brax.envs.Env):
                 f" (jetbot-mjx check_env {config.task.name} says more)"
             ) from None
 
+    def __repr__(self) -> str:
+        """Return the task, the robot and the sizes in one line."""
+        task = self.config.task
+        return (
+            f"{type(self).__name__}(task={task.name!r}, robot={self.config.robot.preset!r},"
+            f" observation={task.observation!r}, observation_size={self.observation_size},"
+            f" action_size={self.action_size})"
+        )
+
     def blind(self) -> "JetBotEnv":
         """Return a copy of this environment that observes numbers only.
 
@@ -159,7 +169,12 @@ class JetBotEnv(brax.envs.Env):
 
         Returns:
           The first state.
+
+        Raises:
+          InvalidError: `rng` has another shape, for example that of several keys.
         """
+        typed = isinstance(rng, jax.Array) and jnp.issubdtype(rng.dtype, jax.dtypes.prng_key)
+        _check_one("rng", rng, () if typed else (2,), "reset")
         key, goal_key = jax.random.split(rng)
         goal = self.task.sample(goal_key)
         physics = PhysicsState(
@@ -193,7 +208,12 @@ class JetBotEnv(brax.envs.Env):
 
         Returns:
           The next state, with the same tree structure, shapes and dtypes.
+
+        Raises:
+          InvalidError: the action has another shape, or the state is a batch of states.
         """
+        _check_one("action", action, (self.action_size,), "step")
+        _check_one("state.done", state.done, (), "step")
         targets = self.wheel_targets(action)
         if self.camera is None:
             return self.step_with_ctrl(state, action, targets)
@@ -356,17 +376,42 @@ class JetBotEnv(brax.envs.Env):
         return self.config.physics.ctrl_dt
 
 
-def make_env(config: Config, task_class: type[Any] | None = None) -> JetBotEnv:
+def _check_one(name: str, array: Any, shape: tuple[int, ...], method: str) -> None:
+    """Check that an argument of a method is that of one robot.
+
+    Raises:
+      InvalidError: it has another shape.
+    """
+    given = getattr(array, "shape", None)
+    if given == shape:
+        return
+    if given is not None and given[1:] == shape:
+        raise InvalidError(
+            f"{name}: got {given[0]} of them, and an environment is of one robot: batch it, as in"
+            f" jax.vmap(env.{method})"
+        )
+    got = type(array).__name__ if given is None else f"shape {list(given)}"
+    raise InvalidError(f"{name}: expected an array of shape {list(shape)}; got {got}")
+
+
+def make_env(
+    config: str | Path | Config,
+    overrides: Overrides = (),
+    *,
+    task_class: type[Any] | None = None,
+) -> JetBotEnv:
     """Build the environment that a configuration describes.
 
     Args:
-      config: the configuration; the sections robot, task and physics are used.
+      config: the configuration, its name or its file, as for `load_config`; the sections robot,
+        task and physics are used.
+      overrides: the settings to change, as for `load_config`.
       task_class: the class of the task; None: the one that `task.name` imports.
 
     Returns:
       The environment, unbatched and unwrapped.
 
     Raises:
-      UserError: the task or its scene cannot be built.
+      UserError: the configuration is invalid, or the task or its scene cannot be built.
     """
-    return JetBotEnv(config, task_class)
+    return JetBotEnv(load_config(config, overrides), task_class)

@@ -184,7 +184,7 @@ def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
       task_class: as for `MujocoJetBot`.
     """
     config = Config.model_validate_json(settings)
-    env = make_env(config, task_class)
+    env = make_env(config, task_class=task_class)
     # Leave non-finite states to `MujocoJetBot`, which counts them.
     model = copy.copy(env.physics.mj_model)
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET

@@ -29,6 +29,7 @@ from jetbot_mjx.evaluation.bootstrap import (
 )
 from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary, json_values
 from jetbot_mjx.evaluation.report import CurvePoint, Report
+from jetbot_mjx.runs.run_dir import shortened
 
 
 class Aggregate(NamedTuple):
@@ -103,6 +104,11 @@ class Comparison(NamedTuple):
     """Values of each run, by key, for the settings in which runs differ besides the seed."""
     baselines: Mapping[str, Summary]
     versions: Mapping[str, Any]
+
+    def __repr__(self) -> str:
+        """Return the mean success rate of each run and the folder in one line."""
+        rates = {run.name: f"{run.success_rate.mean.value:.1%}" for run in self.runs}
+        return f"Comparison(success={rates}, folder={str(shortened(self.folder))!r})"
 
     def to_json(self) -> dict[str, Any]:
         """Return everything except the episodes as JSON values."""

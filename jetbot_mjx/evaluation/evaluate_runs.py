@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 
@@ -12,7 +12,7 @@ from jetbot_mjx.config import RandomizationConfig, load_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
 from jetbot_mjx.evaluation.evaluator import (
     BASELINES,
@@ -248,6 +248,8 @@ class _Reporter:
         simulator: Simulator | None,
     ) -> None:
         """Take the options of `evaluate_run`."""
+        if simulator not in (None, *get_args(Simulator)):
+            raise InvalidError(f"simulator = {simulator!r} is unknown: give 'mujoco' or None")
         self._keys, self._versions = report_keys(episodes), versions()
         self._robustness, self._in_mujoco = robustness, robustness or simulator is not None
         self._pictures = simulator is not None

@@ -20,6 +20,7 @@ from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State, robot_state
+from jetbot_mjx.errors import check_count
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 from jetbot_mjx.runs.progress import stage
 
@@ -37,7 +38,12 @@ _TRAINING_SEED = 20_252
 
 
 def report_keys(episodes: int) -> UInt32[Array, "n 2"]:
-    """Return the reset keys of the report's fixed goal set."""
+    """Return the reset keys of the report's fixed goal set.
+
+    Raises:
+      InvalidError: `episodes` is not a number from 1 to `MOST_GOALS`.
+    """
+    check_count("episodes", episodes, MOST_GOALS)
     return _fixed_keys(_REPORT_SEED, episodes)
 
 

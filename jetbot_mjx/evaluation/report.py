@@ -26,6 +26,7 @@ from jetbot_mjx.evaluation.evaluator import (
 from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs.run_dir import shortened
 
 TIME_LIMIT = "time limit"
 ENDED_BY_TASK = "ended by the task"
@@ -162,6 +163,14 @@ class Report(NamedTuple):
     """Why there are no best-known times."""
     seen: tuple[SeenEpisode, ...] = ()
     """What the policy saw in some episodes; empty if it does not see."""
+
+    def __repr__(self) -> str:
+        """Return the headline and the folder in one line."""
+        return (
+            f"Report(run={str(self.run)!r}, env_steps={self.env_steps},"
+            f" success={self.policy.successes}/{self.policy.episodes},"
+            f" folder={str(shortened(self.folder))!r})"
+        )
 
     @property
     def name(self) -> str:

@@ -59,6 +59,10 @@ class Checkpoint(NamedTuple):
     networks: Any
     about: Mapping[str, Any]
 
+    def __repr__(self) -> str:
+        """Return the folder and the configuration's repr, without the arrays."""
+        return f"Checkpoint(path={str(self.path)!r}, config={self.config!r})"
+
     @property
     def results_dir(self) -> Path:
         """Return the folder for results: of a run of the package, one in the current folder."""
@@ -77,7 +81,7 @@ class Checkpoint(NamedTuple):
           CheckpointError: its observation differs from the one that the policy was trained on.
         """
         task_class = stored_task_class(self.run_dir, self.config.task.name)
-        env = make_env(self.config.for_any_device(), task_class)
+        env = make_env(self.config.for_any_device(), task_class=task_class)
         layout = layout_data(env.task.layout)
         if layout != self.about["layout"]:
             raise CheckpointError(

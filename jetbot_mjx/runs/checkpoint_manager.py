@@ -1,6 +1,5 @@
 """Write checkpoints with Orbax, which takes a third of a second to import."""
 
-import logging
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -8,10 +7,6 @@ from typing import Any
 import jax
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers
-
-# Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
-# tracebacks from each of its threads for errors that it raises as well.
-logging.getLogger("absl").setLevel(logging.CRITICAL)
 
 
 def open_manager(

@@ -30,6 +30,7 @@ import contextlib
 import hashlib
 import itertools
 import json
+import logging
 import math
 import os
 import re
@@ -90,6 +91,7 @@ class CheckpointStore:
         }
         self._keep = keep
         self._opened: Any = None
+        self._log = contextlib.ExitStack()
         self._folder = (run_dir / FOLDER).absolute()
         self._clear_deleted()
         with self._writing():
@@ -106,6 +108,7 @@ class CheckpointStore:
     def _manager(self) -> Any:
         """Orbax's manager, opened with the first checkpoint."""
         if self._opened is None:
+            self._log.enter_context(_without_log())
             self._opened = self._orbax.open_manager(
                 self._folder,
                 self._keep,
@@ -152,7 +155,8 @@ class CheckpointStore:
         # Hand over to Orbax, which writes in the background.
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
-            if not self._orbax.start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
+            manager = self._manager
+            if not self._orbax.start_save(manager, env_steps, arrays, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
 
     def wait(self) -> None:
@@ -172,7 +176,7 @@ class CheckpointStore:
     def __exit__(self, *exception: object) -> None:
         """Wait until all checkpoints are on disk, and close the store."""
         if self._opened is not None:
-            with self._writing():
+            with self._log, self._writing():
                 self._manager.close()
         shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
 
@@ -203,6 +207,33 @@ class CheckpointStore:
                 f"{self._folder}: a checkpoint could not be written: {_reason(error)}; the earlier"
                 " ones are unchanged"
             ) from error
+
+
+@contextlib.contextmanager
+def _without_log() -> Iterator[None]:
+    """Keep Orbax from logging inside the context; what others log remains.
+
+    Orbax logs every step of its work at INFO, and recommendations at WARNING. At ERROR it logs
+    tracebacks from each of its threads for errors that it raises as well.
+    """
+    orbax, root = logging.getLogger("absl"), logging.getLogger()
+    quiet, none = _NotOfOrbax(), logging.NullHandler()
+    orbax.addFilter(quiet)
+    # As long as there is no handler, its logger adds one that writes to standard error.
+    root.addHandler(none)
+    try:
+        yield
+    finally:
+        root.removeHandler(none)
+        orbax.removeFilter(quiet)
+
+
+class _NotOfOrbax(logging.Filter):
+    """A filter of log records that drops those of Orbax."""
+
+    def filter(self, record: logging.LogRecord) -> bool:
+        """Return whether to log the record."""
+        return "orbax" not in Path(record.pathname).parts
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:

@@ -84,6 +84,13 @@ class Terminal:
         self._last_line = time.monotonic()
 
 
+class SilentTerminal(Terminal):
+    """A `SilentTerminal` shows nothing, for a program that has not asked for the progress."""
+
+    def _print(self, *parts: str) -> None:
+        """Do nothing."""
+
+
 def _formatted(metrics: MetricValues, name: str, form: str) -> str:
     value = metrics.get(name)
     return form.format(value) if value is not None else ""

@@ -38,7 +38,7 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.training import distributed
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
-from jetbot_mjx.training.preemption import Preemption
+from jetbot_mjx.training.preemption import StopRequest
 
 _AXIS = "devices"
 _MAX_CALL_SECONDS = 1.0
@@ -245,7 +245,7 @@ def _load_blas() -> None:
 def train(
     trainer: CompiledTrainer,
     recorder: TrainerCallback,
-    preemption: Preemption,
+    stop: StopRequest,
     checkpoint_interval: int,
     states: Sequence[TrainState] | None = None,
     *,
@@ -256,7 +256,7 @@ def train(
     Args:
       trainer: the compiled trainer of the run.
       recorder: the callback that receives every report.
-      preemption: the signal listener, which is checked while compiling and before every call.
+      stop: the request to stop, which is checked while compiling and before every call.
       checkpoint_interval: environment steps from one report to the next, at least.
       states: the state of each seed to start from, on the host; None: that of its seed.
       resumes: whether these states were reported before.
@@ -272,21 +272,21 @@ def train(
     # Wait until every process has compiled; leave if one of them was asked to stop.
     running = True
     while running:
-        stopped = preemption.wait(_POLL_SECONDS)
+        stopped = stop.wait(_POLL_SECONDS)
         gathered = distributed.all_gather_ints(stopped, not compiling.done())
         if gathered[:, 0].any():
             return
         running = gathered[:, 1].any()
     advance = compiling.result()
     recorder.on_compiled()
-    _train_loop(trainer, advance, recorder, preemption, checkpoint_interval, state, done)
+    _train_loop(trainer, advance, recorder, stop, checkpoint_interval, state, done)
 
 
 def _train_loop(
     trainer: CompiledTrainer,
     advance: Advance,
     recorder: TrainerCallback,
-    preemption: Preemption,
+    stop: StopRequest,
     checkpoint_interval: int,
     state: TrainState,
     done: int,
@@ -295,12 +295,12 @@ def _train_loop(
     config = trainer.ppo.config
     size = config.steps_per_training_step
     interval = -(-checkpoint_interval // size)
-    call_seconds = min(_MAX_CALL_SECONDS, preemption.notice / _CALLS_PER_NOTICE)
+    call_seconds = min(_MAX_CALL_SECONDS, stop.notice / _CALLS_PER_NOTICE)
     chunk, seconds, restart = 1, 0.0, False
     while done < config.training_steps:
         # Agree with the other processes on whether to go on, and on the length of the call.
         goal = min(config.training_steps, (done // interval + 1) * interval)
-        gathered = distributed.all_gather_ints(preemption.requested, min(chunk, goal - done))
+        gathered = distributed.all_gather_ints(stop.requested, min(chunk, goal - done))
         if gathered[:, 0].any():
             break
         count = int(gathered[0, 1])

@@ -1,8 +1,10 @@
 """Stop a training on request: on SIGTERM from a scheduler, and on Ctrl-C from the user.
 
-After the first signal the training finishes its current call, saves and ends. If that takes longer
-than the configured notice, or at a second signal, the process exits at once. The earlier
-checkpoints stay complete, because a checkpoint gets its name only when it is complete.
+After the first signal the training finishes its current call, saves and ends. In a command, which
+uses `Preemption`, the process exits at once if that takes longer than the configured notice, or at
+a second signal. The earlier checkpoints stay complete, because a checkpoint gets its name only when
+it is complete. A program that imports the package uses `DeferredSignals`: its process never exits
+here.
 """
 
 import os
@@ -23,7 +25,72 @@ _END = 0
 """Byte that ends the listener; no signal has this number."""
 
 
-class Preemption:
+class StopRequest:
+    """A `StopRequest` says whether a training was asked to stop; this base class is never asked."""
+
+    def __init__(self, notice: float) -> None:
+        """Prepare to be asked.
+
+        Args:
+          notice: time after the request at which the training should have ended [s].
+        """
+        self.notice = notice
+        self._requested = threading.Event()
+
+    @property
+    def requested(self) -> bool:
+        """Return whether the training was asked to stop."""
+        return self._requested.is_set()
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for a request for some seconds, and return whether there is one."""
+        return self._requested.wait(seconds)
+
+    def __enter__(self) -> Self:
+        """Return the object itself."""
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Do nothing."""
+
+
+class DeferredSignals(StopRequest):
+    """A `DeferredSignals` holds the first signal back until the training has saved.
+
+    At the first SIGINT or SIGTERM it asks the training to stop and restores the program's own
+    handlers, which receive every further signal. When the context ends they receive the first one,
+    too: Ctrl-C raises a KeyboardInterrupt, as in any other Python code.
+    """
+
+    def __enter__(self) -> Self:
+        """Begin to listen; do nothing outside the main thread, where Python allows no handlers."""
+        self._former, self._deferred = {}, None
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                # Leave an ignored signal ignored, and a handler that is not Python's in its place.
+                if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                    self._former[number] = signal.signal(number, self._defer)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        """Restore the handlers, and send the program the signal that was held back."""
+        self._restore()
+        # If a second Ctrl-C has ended the training, the program has learnt of it.
+        if self._deferred is not None and not isinstance(exception[1], KeyboardInterrupt):
+            signal.raise_signal(self._deferred)
+
+    def _defer(self, number: int, frame: FrameType | None) -> None:
+        self._deferred = number
+        self._restore()
+        self._requested.set()
+
+    def _restore(self) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+        self._former = {}
+
+
+class Preemption(StopRequest):
     """A `Preemption` listens for signals; as a context manager it restores the former handlers.
 
     Python runs a signal handler only between two of its own instructions, so not while a program
@@ -37,19 +104,9 @@ class Preemption:
         Args:
           notice: time after a signal at which the process must have ended [s].
         """
-        self.notice = notice
-        self._requested = threading.Event()
+        super().__init__(notice)
         self._timer: threading.Timer | None = None
         self._listener: threading.Thread | None = None
-
-    @property
-    def requested(self) -> bool:
-        """Return whether a signal has arrived."""
-        return self._requested.is_set()
-
-    def wait(self, seconds: float) -> bool:
-        """Wait for a signal for some seconds, and return whether one has arrived."""
-        return self._requested.wait(seconds)
 
     def __enter__(self) -> Self:
         """Begin to listen; do nothing outside the main thread, where Python allows no handlers."""

@@ -31,7 +31,7 @@ from jetbot_mjx.evaluation.evaluator import Evaluator, Summary, summarize, train
 from jetbot_mjx.fallbacks import Fallback, collect
 from jetbot_mjx.runs.checkpoint import about_policy, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
-from jetbot_mjx.runs.metrics import METRICS, CompileClock, read_history, restart_clock
+from jetbot_mjx.runs.metrics import METRICS, CompileClock, History, read_history, restart_clock
 from jetbot_mjx.runs.resume import Resumption, resume
 from jetbot_mjx.runs.run_dir import (
     changed_versions,
@@ -51,8 +51,9 @@ from jetbot_mjx.runs.task_code import (
 from jetbot_mjx.runs.wandb_sink import check_tracking
 from jetbot_mjx.training import distributed, ppo_trainer
 from jetbot_mjx.training.callbacks import TrainerCallback
+from jetbot_mjx.training.console import SilentTerminal
 from jetbot_mjx.training.memory import advice, device_memory, sizes
-from jetbot_mjx.training.preemption import Preemption
+from jetbot_mjx.training.preemption import DeferredSignals, Preemption, StopRequest
 from jetbot_mjx.training.run_recorder import (
     RunRecorder,
     SeedRecorder,
@@ -81,6 +82,19 @@ class Result(NamedTuple):
     """Whether the training came to its end; otherwise the same command resumes it."""
     wall_seconds: float
     """Time spent on the training, in all processes [s]."""
+
+    def __repr__(self) -> str:
+        """Return the folder and the best success rate of each seed in one line."""
+        rates = [f"{one.best.success_rate:.1%}" if one.best else "-" for one in self.standings]
+        return (
+            f"Result(run_dir={str(self.run_dir)!r}, success={' '.join(rates) or '-'},"
+            f" finished={self.finished})"
+        )
+
+    @property
+    def history(self) -> list[History]:
+        """Return the metrics of the first seed, one entry for each line of its `metrics.jsonl`."""
+        return read_history(self.run_dirs[0] / METRICS)
 
     @property
     def best(self) -> Summary:
@@ -114,17 +128,20 @@ class Training(NamedTuple):
     """What runs slower than it could: those that are known yet, to which others are added."""
     task_code: TaskCode | None = None
     """The source of the task that the run stores; None: it has none, or it is stored already."""
+    verbose: bool = True
+    """Whether to show the progress."""
 
 
-def run(config: Config, run_dir: Path) -> Result:
-    """Train a policy, from the beginning or from where the folder's run was stopped.
+def run(config: Config, run_dir: Path, *, verbose: bool = False) -> Result:
+    """Train a policy in a program that imports the package, which keeps its process to itself.
 
     The programs are compiled, or found in JAX's own cache; `train` takes a cache that is loaded
-    without tracing.
+    without tracing. SIGINT and SIGTERM stop the training as `DeferredSignals` describes.
 
     Args:
       config: the configuration of the run.
       run_dir: the run folder: a new one, or that of a run with this configuration.
+      verbose: whether to show the progress.
 
     Returns:
       The result.
@@ -133,10 +150,19 @@ def run(config: Config, run_dir: Path) -> Result:
       UserError: as for `train`.
     """
     restart_clock()
-    return train(config, run_dir, ProgramCache(compiler_options(config)))
+    programs = ProgramCache(compiler_options(config))
+    stop = DeferredSignals(config.preemption_notice)
+    return train(config, run_dir, programs, stop, verbose=verbose)
 
 
-def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
+def train(
+    config: Config,
+    run_dir: Path,
+    programs: ProgramCache,
+    stop: StopRequest | None = None,
+    *,
+    verbose: bool = True,
+) -> Result:
     """Train a policy with a given cache of compiled programs.
 
     Args:
@@ -144,6 +170,8 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
       run_dir: the run folder: a new one, or that of a run with this configuration.
       programs: the cache of compiled programs of this configuration. Programs that are loaded from
         disk do not contain what was replaced or patched in this package.
+      stop: a context manager that hears of requests to stop; None: a command's `Preemption`.
+      verbose: whether to show the progress.
 
     Returns:
       The result.
@@ -163,12 +191,19 @@ def train(config: Config, run_dir: Path, programs: ProgramCache) -> Result:
         config.check_cpu_devices(jax.local_device_count())
     config.check_devices(jax.device_count())
     check_tracking(config)
+    stop = stop or Preemption(config.preemption_notice)
     with collect() as fallbacks:
-        return _compose(config, run_dir, programs, fallbacks)
+        return _compose(config, run_dir, programs, fallbacks, stop, verbose=verbose)
 
 
 def _compose(
-    config: Config, run_dir: Path, programs: ProgramCache, fallbacks: Sequence[Fallback]
+    config: Config,
+    run_dir: Path,
+    programs: ProgramCache,
+    fallbacks: Sequence[Fallback],
+    stop: StopRequest,
+    *,
+    verbose: bool,
 ) -> Result:
     """Build every object of a training once, and train."""
     run_dirs = seed_dirs(run_dir, config)
@@ -176,9 +211,9 @@ def _compose(
     ppo = ppo_trainer.build_ppo(config, env)
     warm_start = _warm_start(config, env, run_dirs)
     objects = env, ppo, programs, warm_start, versions(), fallbacks
-    training = Training(config, run_dir, run_dirs, *objects, task_code)
+    training = Training(config, run_dir, run_dirs, *objects, task_code, verbose)
     try:
-        return _train_with_brax(training) if config.trainer == "brax" else _train(training)
+        return _train_with_brax(training) if config.trainer == "brax" else _train(training, stop)
     except jax.errors.JaxRuntimeError as error:
         if not ran_out(error):
             raise
@@ -213,7 +248,7 @@ def _make_env(config: Config, run_dirs: Sequence[Path]) -> tuple[JetBotEnv, Task
         with tempfile.TemporaryDirectory() as folder:
             write_task_code(Path(folder), pickle.loads(sent))
             task_class = stored_task_class(Path(folder), name, silent=True)
-    env = make_env(config, task_class)
+    env = make_env(config, task_class=task_class)
     if name not in TRUSTED:
         require_trainable(env.task, config)
     return env, None if task_class else collect_task_code(name)
@@ -251,12 +286,12 @@ def _train_with_brax(training: Training) -> Result:
     return _result(training, recorder, finished=True)
 
 
-def _train(training: Training) -> Result:
+def _train(training: Training, stop: StopRequest) -> Result:
     config = training.config
     opened: list[tuple[RunRecorder, list[TrainState]]] = []
     with contextlib.ExitStack() as stack:
         clock = stack.enter_context(CompileClock())
-        preemption = stack.enter_context(Preemption(config.preemption_notice))
+        stack.enter_context(stop)
         seeds = [one.seed for one in config.of_each_seed()]
         trainer = ppo_trainer.CompiledTrainer(training.ppo, seeds, training.programs)
 
@@ -286,7 +321,7 @@ def _train(training: Training) -> Result:
             ppo_trainer.train(
                 trainer,
                 callback,
-                preemption,
+                stop,
                 config.checkpoint_interval,
                 states,
                 resumes=found == _RESUMES,
@@ -329,7 +364,9 @@ def open_recorder(
         for folder in run_dirs
     ]
     total_steps = config.ppo.training_steps * config.ppo.steps_per_training_step
-    terminal = open_terminal(run_dirs, total_steps, histories)
+    terminal = SilentTerminal(total_steps)
+    if training.verbose:
+        terminal = open_terminal(run_dirs, total_steps, histories)
     seeds = []
     for index, seed_config in enumerate(config.of_each_seed()):
         folder, history = run_dirs[index], histories[index]

@@ -10,9 +10,6 @@ from pathlib import Path
 from jetbot_mjx import cli
 from jetbot_mjx.interrupts import exit_on_interrupt
 
-CONFIRM_SEEDS = 5
-"""How many new seeds the best trials are trained with."""
-
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx tune", description=__doc__)
@@ -38,8 +35,7 @@ def _parser() -> cli.Parser:
         type=cli.whole_number(0),
         default=3,
         metavar="N",
-        help=f"how many of the best trials to train anew with {CONFIRM_SEEDS} new seeds"
-        " (default: 3)",
+        help="how many of the best trials to train anew with new seeds (default: 3)",
     )
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="default: runs/tune-<config>-<date>-<time>"
@@ -64,23 +60,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with exit_on_interrupt():
         from jetbot_mjx.runs.metrics import process_seconds
         from jetbot_mjx.runs.run_dir import default_run_dir
-        from jetbot_mjx.tuning import results, search
+        from jetbot_mjx.tuning import results
         from jetbot_mjx.tuning.space import read_space
     space = read_space(options.space, config)
     cli.prepare_device()
     folder = options.output or default_run_dir(Path(f"tune-{options.config.stem}"))
-    # Search.
     with cli.show_progress():
-        study = search.Search(config, space, folder, storage=options.storage, say=_say)
-        study.run(options.trials, options.round)
-        _say(f"search done {process_seconds():.1f} s after the start")
-        # Train the best anew, and write the results.
-        entrants = study.confirm(options.confirm, CONFIRM_SEEDS)
-    path = results.write_results(folder, config, study.study, entrants)
+        found = results.run_search(
+            config,
+            space,
+            folder,
+            trials=options.trials,
+            round_size=options.round,
+            confirm=options.confirm,
+            storage=options.storage,
+            say=_say,
+        )
     _say(
-        f"\ntrained anew with {CONFIRM_SEEDS} new seeds, evaluated on the report's goals:\n\n"
-        f"{results.entrants_table(entrants)}\n\n{process_seconds():.1f} s in all\n"
-        f"results: {folder}\nnext: jetbot-mjx train {path}"
+        "\ntrained anew with new seeds, evaluated on the report's goals:\n\n"
+        f"{results.entrants_table(found.entrants)}\n\n{process_seconds():.1f} s in all\n"
+        f"results: {folder}\nnext: jetbot-mjx train {found.config_file}"
     )
     return 0
 

@@ -1,22 +1,88 @@
-"""Write what a search found: the best configuration, tables of all trials, and Optuna's plots."""
+"""Search, and write what was found: the best configuration, tables of all trials, and plots."""
 
 import csv
 import io
 import statistics
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
 import optuna
 
-from jetbot_mjx.config import Config
+from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.runs.metrics import process_seconds
 from jetbot_mjx.runs.run_dir import write_text, writing_to
-from jetbot_mjx.tuning.search import Entrant, completed_trials
-from jetbot_mjx.tuning.space import with_values
+from jetbot_mjx.tuning.search import CONFIRM_SEEDS, Entrant, Search, completed_trials
+from jetbot_mjx.tuning.space import Parameter, with_values
 
 _PLOTS = ("optimization_history", "param_importances", "slice", "parallel_coordinate")
+
+
+class TuningResult(NamedTuple):
+    """A `TuningResult` holds the result of a search."""
+
+    folder: Path
+    """The folder of the study and of all files."""
+    config_file: Path
+    """The file with the best configuration, `best.yaml`."""
+    config: Config
+    """The best configuration."""
+    entrants: tuple[Entrant, ...]
+    """The final trainings: of the given configuration, then of the best trials."""
+    study: optuna.Study
+    """Optuna's study, which holds all trials."""
+
+    def __repr__(self) -> str:
+        """Return the folder and the best values in one line."""
+        best = self.best
+        return (
+            f"TuningResult(folder={str(self.folder)!r}, best={best.name!r},"
+            f" success={statistics.fmean(best.success_rates):.1%}, values={dict(best.values)})"
+        )
+
+    @property
+    def best(self) -> Entrant:
+        """Return the entrant with the best configuration."""
+        return best_entrant(self.entrants)
+
+
+def run_search(
+    config: Config,
+    space: Sequence[Parameter],
+    folder: Path,
+    *,
+    trials: int,
+    round_size: int,
+    confirm: int,
+    storage: str | None = None,
+    say: Callable[[str], None] = lambda text: None,
+) -> TuningResult:
+    """Search, train the best trials anew, and write the results.
+
+    Args:
+      config: the configuration in which settings are changed.
+      space: the settings and their values.
+      folder: where the study and its results are stored.
+      trials: how many completed trials the study shall have.
+      round_size: how many trials to train at once.
+      confirm: how many of the best trials to train anew, with `CONFIRM_SEEDS` new seeds each.
+      storage: a database URL; None: SQLite in the folder.
+      say: called with one line about each round.
+
+    Returns:
+      The result.
+
+    Raises:
+      UserError: as for `Search`, its method `run` and `write_results`.
+    """
+    search = Search(config, space, folder, storage=storage, say=say)
+    search.run(trials, round_size)
+    say(f"search done {process_seconds():.1f} s after the start")
+    entrants = search.confirm(confirm, CONFIRM_SEEDS)
+    path = write_results(folder, config, search.study, entrants)
+    return TuningResult(folder, path, load_config(path), tuple(entrants), search.study)
 
 
 def best_entrant(entrants: Sequence[Entrant]) -> Entrant:
@@ -102,7 +168,8 @@ def _plot(folder: Path, study: optuna.Study) -> None:
     for name in _PLOTS:
         if len(completed_trials(study)) < 2:
             return
-        with warnings.catch_warnings(), plt.ioff():
+        # Optuna sets a style for all figures, and a notebook shows those that are left open.
+        with warnings.catch_warnings(), plt.ioff(), plt.rc_context():
             warnings.simplefilter("ignore")
             draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
             more: dict[str, Any] = {}
@@ -113,7 +180,7 @@ def _plot(folder: Path, study: optuna.Study) -> None:
             figure = (axes if hasattr(axes, "figure") else axes.flat[0]).figure
             figure.set_size_inches(11, 6)
             figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
-            plt.close("all")
+            plt.close(figure)
 
 
 def _short(value: Any) -> str:

@@ -40,6 +40,8 @@ _BEAT_SECONDS = 5
 _STALE_SECONDS = 30
 """After how long without a heartbeat a worker counts as dead [s]."""
 _POLL_SECONDS = 2.0
+CONFIRM_SEEDS = 5
+"""How many new seeds the best trials are trained with."""
 _CONFIRM_SEED = 1_000_000
 """The first seed of the final trainings, beyond those of the search."""
 
@@ -57,12 +59,23 @@ class Entrant(NamedTuple):
     """Mean duration of the report's episodes [s], for each seed; a failed one counts in full."""
 
 
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Keep Optuna from logging, and from warnings that do not matter here, inside the context."""
+    verbosity = optuna.logging.get_verbosity()
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
+            # Heartbeats are recorded here, for a whole round of trials.
+            warnings.filterwarnings("ignore", "Heartbeat of storage", UserWarning)
+            yield
+    finally:
+        optuna.logging.set_verbosity(verbosity)
+
+
 def _open_storage(url: str) -> optuna.storages.RDBStorage:
     """Open a study's database, which enqueues the trials of killed workers again."""
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-    # Heartbeats are recorded here, for a whole round of trials.
-    warnings.filterwarnings("ignore", "Heartbeat of storage", UserWarning)
     return optuna.storages.RDBStorage(
         url,
         heartbeat_interval=_BEAT_SECONDS,
@@ -74,6 +87,7 @@ def _open_storage(url: str) -> optuna.storages.RDBStorage:
 class Search:
     """A `Search` runs trials of one study."""
 
+    @_quiet()
     def __init__(
         self,
         config: Config,
@@ -128,6 +142,7 @@ class Search:
             raise UserError(f"--storage {url} cannot be used: {reason}") from None
         self._check_space()
 
+    @_quiet()
     def run(self, trials: int, round_size: int) -> None:
         """Run rounds of trials until the study has enough.
 

@@ -63,11 +63,11 @@ class Parameter(NamedTuple):
         return suggest(self.name, self.low, self.high, log=self.log)
 
 
-def read_space(path: str | Path, config: Config) -> list[Parameter]:
-    """Read the file that describes a search.
+def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Parameter]:
+    """Read what a search may change.
 
     Args:
-      path: the YAML file.
+      space: the YAML file, or its content.
       config: the configuration in which the settings are changed.
 
     Returns:
@@ -77,15 +77,17 @@ def read_space(path: str | Path, config: Config) -> list[Parameter]:
       ConfigError: the file cannot be read, an entry is malformed, or a setting does not accept an
         end of its range or one of its choices.
     """
-    values = read_yaml(Path(path), "--space")
+    name, values = "space", space
+    if not isinstance(values, Mapping):
+        name, values = str(space), read_yaml(Path(str(space)), "--space")
     if not values:
         raise ConfigError(
-            f"{path} is empty: write lines such as ppo.discounting: {{low: 0.9, high: 0.99}}"
+            f"{name} is empty: write lines such as ppo.discounting: {{low: 0.9, high: 0.99}}"
         )
-    return [_parameter(name, entry, path, config) for name, entry in values.items()]
+    return [_parameter(key, entry, name, config) for key, entry in values.items()]
 
 
-def _parameter(name: Any, entry: Any, path: str | Path, config: Config) -> Parameter:
+def _parameter(name: Any, entry: Any, path: str, config: Config) -> Parameter:
     where = f"{path}: {name}"
     if not isinstance(entry, Mapping):
         raise ConfigError(
@@ -99,7 +101,7 @@ def _parameter(name: Any, entry: Any, path: str | Path, config: Config) -> Param
     choices, low, high = entry.get("choices"), entry.get("low"), entry.get("high")
     log = entry.get("log", False)
     if choices is not None:
-        if not isinstance(choices, list) or not choices or len(entry) > 1:
+        if not isinstance(choices, list | tuple) or not choices or len(entry) > 1:
             raise ConfigError(f"{where} is wrong: choices should be a list, without other keys")
         found = Parameter(str(name), choices=tuple(choices))
     else:
@@ -110,7 +112,7 @@ def _parameter(name: Any, entry: Any, path: str | Path, config: Config) -> Param
         found = Parameter(str(name), low, high, log)
     # If both ends of a range are valid, so is what lies between them.
     for value in found.choices or (low, high):
-        with_values(config, {found.name: value}, source=str(path), alone=True)
+        with_values(config, {found.name: value}, source=path, alone=True)
     return found
 
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 from jetbot_mjx.imports import load_lazily
 
 if TYPE_CHECKING:
+    from jetbot_mjx.viewers.gallery import Rendered as Rendered
     from jetbot_mjx.viewers.gallery import render_gallery as render_gallery
     from jetbot_mjx.viewers.gallery import render_run as render_run
     from jetbot_mjx.viewers.live import play_live as play_live

@@ -1,6 +1,7 @@
 """Render a policy that drives to the fixed goals of the report: videos, and plots from above."""
 
 import io
+import numbers
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import groupby
@@ -14,7 +15,7 @@ from PIL import Image
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import InvalidError, UserError, check_count
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
 from jetbot_mjx.evaluation.plots import plot_trajectories
 from jetbot_mjx.evaluation.result_names import name_with_count
@@ -22,7 +23,7 @@ from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 from jetbot_mjx.runs.progress import Advance, stage
-from jetbot_mjx.runs.run_dir import make_folder, writing_to
+from jetbot_mjx.runs.run_dir import make_folder, shortened, writing_to
 from jetbot_mjx.viewers.video import (
     GIF_STRIDE,
     Frame,
@@ -49,6 +50,12 @@ class Rendered(NamedTuple):
     """Number of goals that each policy drove to."""
     files: Mapping[str, Path]
     """The files by what they are: `video`, `gif`, `plot`, `plots` or `image`."""
+
+    def __repr__(self) -> str:
+        """Return the goals reached by steps, and the files, in one line."""
+        reached = {step: f"{count}/{self.episodes}" for step, count in self.successes.items()}
+        files = {what: str(shortened(path)) for what, path in self.files.items()}
+        return f"Rendered(reached={reached}, files={files})"
 
     def describe(self) -> str:
         """Return what to print about it: a line for each checkpoint and for each file."""
@@ -89,6 +96,7 @@ def render_run(
     """
     # Choose the goals and the names of the files.
     if goals is None:
+        check_count("episodes", episodes, REPORT_GOALS)
         goals = range(episodes)
         names = [name_with_count(name, episodes, EPISODES) for name in ("episodes", "trajectories")]
     else:
@@ -128,6 +136,7 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     Raises:
       UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
     """
+    check_count("episodes", episodes, REPORT_GOALS)
     path = run_folder(run_dir, "--gallery")
     # Run all chosen checkpoints on the same goals.
     chosen = early_middle_final(checkpoint_steps(path))
@@ -259,6 +268,8 @@ def check_goals(goals: Sequence[int]) -> None:
     if not goals:
         raise UserError("goals = [] names none: give at least one index")
     for place, goal in enumerate(goals):
+        if not isinstance(goal, numbers.Integral):
+            raise InvalidError(f"goals: {goal!r} is wrong: give indices, as in [3, 17]")
         if not 0 <= goal < REPORT_GOALS:
             raise UserError(
                 f"goal {goal} is none of the {REPORT_GOALS:,} fixed goals: they are 0 to"

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, check_count
 from jetbot_mjx.runs.checkpoint import Which, explanation, load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
@@ -58,6 +58,7 @@ def render_many(
     Raises:
       UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
     """
+    check_count("robots", robots, MOST_ROBOTS)
     # Run the episodes.
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
@@ -93,6 +94,7 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     Raises:
       UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
     """
+    check_count("robots", robots, MOST_ROBOTS)
     # Choose the checkpoints and run them on the same goals.
     path = run_folder(run_dir, "--strip")
     rates = {

@@ -17,9 +17,9 @@ import pytest
 from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
 from brax.training.types import Transition
+from command_modules import evaluate
 from gliding import Gliding
 
-from jetbot_mjx import evaluate
 from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
@@ -700,6 +700,6 @@ def test_several_seeds_resume_to_the_bit(several, glide, tmp_path, capsys):
     config, result = several
     session.run(with_ppo(config, num_timesteps=SIZE), tmp_path / "run")
     capsys.readouterr()
-    resumed = session.run(config, tmp_path / "run")
+    resumed = session.run(config, tmp_path / "run", verbose=True)
     assert f"resuming after {SIZE:,} steps" in capsys.readouterr().out
     assert resumed.fingerprints == result.fingerprints

@@ -10,11 +10,12 @@ from pathlib import Path
 
 import jax
 import pytest
+from command_modules import evaluate, render, train
 from test_cli import COMMANDS, SMOKE, damage_about, damaged, here, refused, trained
 from test_config import refusal, write
 from test_metrics import read_events
 
-from jetbot_mjx import cli, evaluate, render, train
+from jetbot_mjx import cli
 from jetbot_mjx.compiler import program_cache
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env

@@ -13,9 +13,10 @@ import numpy as np
 import orbax.checkpoint as ocp
 import pytest
 from brax.training.acme import running_statistics, specs
+from command_modules import evaluate, render, train
 from test_report import make_episodes, make_report
 
-from jetbot_mjx import cli, evaluate, plan, render, replay, train
+from jetbot_mjx import cli, plan, replay
 from jetbot_mjx.agents.networks import PolicyParams, make_networks
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.task import WORLD, layout_data

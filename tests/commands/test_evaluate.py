@@ -10,10 +10,11 @@ from html.parser import HTMLParser
 import jax
 import numpy as np
 import pytest
+from command_modules import evaluate
 from PIL import Image
 from unpainted import unpainted
 
-from jetbot_mjx import cli, evaluate
+from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import (
     compare_runs,

@@ -121,7 +121,7 @@ def test_glfw_is_there_when_asked_for():
 def test_a_mistyped_command_says_so_before_anything_heavy_is_loaded():
     code = """
 import sys
-from jetbot_mjx import train
+from command_modules import train
 try:
     train.main(["--config", "nowhere.yaml", "--sed", "1"])
 except SystemExit as error:

@@ -16,7 +16,8 @@ WITHOUT = """
 import ctypes, os, signal, sys, time
 for name in ("fcntl", "termios", "pwd", "grp", "resource"):
     sys.modules[name] = None
-from jetbot_mjx import cli, train
+from command_modules import train
+from jetbot_mjx import cli
 from jetbot_mjx.training import session  # its libraries keep what they found
 
 for name in ("tcgetpgrp", "getpgrp", "sysconf", "geteuid", "sched_getaffinity"):

@@ -4,8 +4,9 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_modules import evaluate, train
 
-from jetbot_mjx import PRETRAINED, evaluate, load_policy, play, pretrained, train
+from jetbot_mjx import PRETRAINED, load_policy, play, pretrained
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import copy_pretrained

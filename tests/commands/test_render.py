@@ -9,8 +9,8 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 import pytest
+from command_modules import render
 
-from jetbot_mjx import render
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError

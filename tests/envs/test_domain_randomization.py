@@ -8,8 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_modules import train
 
-from jetbot_mjx import make_env, train
+from jetbot_mjx import make_env
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper, draw, maybe_randomize

@@ -7,8 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_modules import train
 
-from jetbot_mjx import cli, train
+from jetbot_mjx import cli
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state

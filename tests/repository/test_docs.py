@@ -15,21 +15,19 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
+from command_modules import evaluate, render, train
 from ruamel.yaml import YAML
 
 from jetbot_mjx import (
     check_env,
     cli,
-    evaluate,
     export,
     new_task,
     plan,
     play,
     pretrained,
-    render,
     replay,
     sim2real,
-    train,
 )
 from jetbot_mjx.agents.ppo import LOSSES
 from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config

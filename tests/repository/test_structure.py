@@ -125,7 +125,7 @@ def complaints(name, source):
 def test_the_root_is_small_and_every_folder_a_room():
     at_root = [path.stem for path in (ROOT / PACKAGE).glob("*.py")]
     commands = {name for name in COMMANDS if "." not in name}
-    assert set(at_root) == {"__init__", "cli", *COMMON, *commands}
+    assert set(at_root) == {"__init__", "cli", "library", *COMMON, *commands}
     assert len(at_root) <= MOST_AT_THE_ROOT
     folders = {path.parent.name for path in (ROOT / PACKAGE).glob("*/__init__.py")}
     assert folders == set(ROOMS)

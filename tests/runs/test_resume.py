@@ -18,10 +18,11 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+from command_modules import train
 from test_metrics import read_events
 from test_wandb_sink import FakeWandb
 
-from jetbot_mjx import load_config, make_env, train
+from jetbot_mjx import load_config, make_env
 from jetbot_mjx.agents.networks import make_networks
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
@@ -205,7 +206,7 @@ def stop_after(monkeypatch):
     """Makes the next trainings stop after so many training steps, each a call of its own."""
 
     def stop_after(training_steps):
-        monkeypatch.setattr(session, "Preemption", lambda notice: StopAfter(training_steps))
+        monkeypatch.setattr(session, "DeferredSignals", lambda notice: StopAfter(training_steps))
         monkeypatch.setattr(ppo_trainer, "next_chunk", lambda steps, seconds, wanted: 1)
 
     return stop_after
@@ -613,7 +614,7 @@ def test_training_after_damage_ends_where_it_would_have(
     DAMAGES[kind][0](checkpoint_path(run_copy, LAST), states[LAST])
     with (run_copy / "metrics.jsonl").open("a") as file:
         file.write('{"env_steps": 81920, "timestamp": 1.0}\n{"env_steps": 98304, "timest')
-    assert session.run(config, run_copy).finished
+    assert session.run(config, run_copy, verbose=True).finished
     same(run_copy)
     out, err = capfd.readouterr()
     assert f"skipped: checkpoint {checkpoint_path(run_copy, LAST)} " in out
@@ -637,11 +638,11 @@ def test_what_is_not_as_it_was_is_said(run_copy, config, capsys):
     found = json.loads(path.read_text())
     found["packages"]["brax"] = "0.0.1"
     path.write_text(json.dumps(found))
-    session.run(config, run_copy)
+    session.run(config, run_copy, verbose=True)
     assert (
         "versions changed, so the results may differ: brax 0.0.1, now " in capsys.readouterr().out
     )
-    session.run(config, run_copy)
+    session.run(config, run_copy, verbose=True)
     assert "the results may differ" not in capsys.readouterr().out
 
 

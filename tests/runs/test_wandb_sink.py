@@ -11,8 +11,9 @@ import types
 from pathlib import Path
 
 import pytest
+from command_modules import train
 
-from jetbot_mjx import load_config, train
+from jetbot_mjx import load_config
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.metrics import History

@@ -12,7 +12,9 @@ import pytest
 
 pytest.importorskip("gymnasium")
 
-from jetbot_mjx import check_env, evaluate, load_policy, make_env, train
+from command_modules import evaluate, train
+
+from jetbot_mjx import check_env, load_policy, make_env
 from jetbot_mjx.agents.ppo import NanDump
 from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS

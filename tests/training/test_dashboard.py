@@ -9,10 +9,10 @@ import threading
 import time
 
 import pytest
+from command_modules import train
 from rich.console import Console
 from test_preemption import LISTENER
 
-from jetbot_mjx import train
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.training import dashboard as dashboard_module

@@ -13,10 +13,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_modules import train
 from jax.sharding import Mesh, PartitionSpec
 from test_ppo import OBS, SIZE, TINY, beginning, furthest, lines, made_up, with_ppo
 
-from jetbot_mjx import train
 from jetbot_mjx.agents.ppo import PPO
 from jetbot_mjx.config import ConfigError, RandomizationConfig, load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env

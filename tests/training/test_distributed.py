@@ -13,8 +13,9 @@ import gliding
 import jax
 import numpy as np
 import pytest
+from command_modules import train
 
-from jetbot_mjx import cli, train
+from jetbot_mjx import cli
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest

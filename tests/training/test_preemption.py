@@ -55,7 +55,8 @@ def dwell_in_calls(seconds):
 {before_imports}
 {lazily}
 import gliding
-from jetbot_mjx import cli, train
+from command_modules import train
+from jetbot_mjx import cli
 from jetbot_mjx.training import session as training
 from jetbot_mjx.evaluation.evaluator import Evaluator
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer

@@ -161,7 +161,7 @@ def test_a_training_begins_with_it_and_resumes_without_it(tmp_path, capsys):
     shutil.copytree(load_checkpoint(SOURCE).run_dir, copied)
     run_dir = tmp_path / "run"
     config = config_of(init_from=str(copied))
-    first = session.run(config, run_dir)
+    first = session.run(config, run_dir, verbose=True)
     assert f"begins with the policy of {copied}" in capsys.readouterr().out
     start = load_checkpoint(run_dir, 0).params
     np.testing.assert_array_equal(

@@ -8,8 +8,8 @@ import jax
 import mujoco
 import numpy as np
 import pytest
+from command_modules import render
 
-from jetbot_mjx import render
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys

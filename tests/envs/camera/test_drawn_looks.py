@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from command_modules import train
 
-from jetbot_mjx import train
 from jetbot_mjx.config import ConfigError, load_config, parse_config
 from jetbot_mjx.envs.camera.looks import Appearance
 from jetbot_mjx.envs.camera.wrapper import PIXELS, with_camera

@@ -1,0 +1,299 @@
+"""Train, evaluate, render and tune from Python: what the commands of these names do, as functions.
+
+A program that imports the package keeps its process to itself. These functions print nothing unless
+asked, raise a `UserError` where a command exits, and leave signals, imports, log levels and JAX's
+settings as they are. They work in a notebook and in any thread.
+"""
+
+import contextlib
+import sys
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, overload
+
+from jetbot_mjx import evaluation, training, tuning, viewers
+from jetbot_mjx.cli import require_device
+from jetbot_mjx.config import Config, Overrides, load_config
+from jetbot_mjx.errors import InvalidError, UserError, check_count, ran_out
+from jetbot_mjx.runs import metrics, progress
+from jetbot_mjx.runs.find_run import find_run, find_run_config
+from jetbot_mjx.runs.run_dir import default_run_dir, seed_folders
+
+if TYPE_CHECKING:
+    from jetbot_mjx.runs.checkpoint import Which
+
+_FITTING = {
+    "strip": ("many",),
+    "gallery": ("episodes",),
+    "many": ("which",),
+    "goals": ("which",),
+    "episodes": ("which",),
+}
+"""The arguments of `render` that say what to render, with those that may be given beside them."""
+
+
+def train(
+    config: str | Path | Config | None = None,
+    overrides: Overrides = (),
+    *,
+    run_dir: str | Path | None = None,
+    resume: str | Path | None = None,
+    verbose: bool = False,
+) -> "training.Result":
+    """Train a policy, from the beginning or from where the run in the folder was stopped.
+
+    Ctrl-C, or *Interrupt the kernel* in a notebook, saves the training and then raises a
+    KeyboardInterrupt; the same call, or `resume`, continues it.
+
+    Args:
+      config: a configuration: its name, its file or the object.
+      overrides: the settings to change, such as `{"ppo.num_envs": 512}`.
+      run_dir: the run folder: a new one, or that of a run with this configuration. None: a new one,
+        `runs/<config>-<date>-<time>`.
+      resume: a run to continue with its own configuration, in place of `config` and `run_dir`.
+      verbose: whether to show the progress.
+
+    Returns:
+      The run folder, the metrics of its best checkpoint, and more.
+
+    Raises:
+      UserError: a setting or argument is wrong, the folder cannot be used, or a device has too
+        little memory.
+    """
+    if resume is not None:
+        if config is not None or run_dir is not None:
+            raise InvalidError(
+                f"resume = {str(resume)!r} continues a run with its configuration in its folder:"
+                " leave out config and run_dir"
+            )
+        run_dir = find_run(resume)
+        config = find_run_config(run_dir)
+    elif config is None:
+        raise InvalidError('give a configuration, as in train("jetbot"), or a run to resume')
+    if run_dir is None:
+        run_dir = default_run_dir(_name(config))
+    with _ready(verbose):
+        return training.run(load_config(config, overrides), Path(run_dir), verbose=verbose)
+
+
+@overload
+def evaluate(
+    runs: str | Path,
+    *,
+    which: "Which" = ...,
+    episodes: int = ...,
+    output: str | Path | None = ...,
+    robustness: bool = ...,
+    ranges: str | Path | None = ...,
+    simulator: "evaluation.Simulator | None" = ...,
+    verbose: bool = ...,
+) -> "evaluation.Report": ...
+@overload
+def evaluate(
+    runs: Sequence[str | Path],
+    *,
+    which: "Which" = ...,
+    episodes: int = ...,
+    output: str | Path | None = ...,
+    robustness: bool = ...,
+    ranges: str | Path | None = ...,
+    simulator: "evaluation.Simulator | None" = ...,
+    verbose: bool = ...,
+) -> "evaluation.Comparison": ...
+def evaluate(
+    runs: str | Path | Sequence[str | Path],
+    *,
+    which: "Which" = "best",
+    episodes: int = 1024,
+    output: str | Path | None = None,
+    robustness: bool = False,
+    ranges: str | Path | None = None,
+    simulator: "evaluation.Simulator | None" = None,
+    verbose: bool = False,
+) -> "evaluation.Report | evaluation.Comparison":
+    """Evaluate a policy on the fixed goals and write its report, or compare several runs.
+
+    Args:
+      runs: one run or checkpoint, which gets a report; or a list of runs, of one seed or several,
+        which are compared as well. A run is named by its folder or as for the commands: `latest`, a
+        folder in `runs/`, or `pretrained:NAME`.
+      which: the checkpoint of a run: `"best"`, `"last"` or a number of steps.
+      episodes: the number of fixed goals, from the first on.
+      output: the folder of the report or comparison; None: one in `evaluations/` of the run.
+      robustness: whether to evaluate also on robots that differ from the preset, and in C MuJoCo.
+      ranges: a configuration file with ranges below `randomization`: evaluate also on one robot
+        sampled from them for each goal. None: the ranges of the run, if any.
+      simulator: `"mujoco"` to evaluate also in C MuJoCo.
+      verbose: whether to show the progress.
+
+    Returns:
+      The report of one run, or the comparison of a list of runs. Both name the folder of their
+      files.
+
+    Raises:
+      UserError: a run or argument is wrong, the runs cannot be compared, or a folder cannot be
+        written.
+    """
+    options: dict[str, Any] = {
+        "which": which,
+        "episodes": episodes,
+        "output": output,
+        "robustness": robustness,
+        "ranges": ranges,
+        "simulator": simulator,
+    }
+    with _ready(verbose):
+        if not isinstance(runs, str | Path):
+            return evaluation.compare_runs([find_run(run) for run in runs], **options)
+        run = find_run(runs)
+        if seed_folders(run):
+            raise InvalidError(
+                f"{run} holds several seeds: name one of them, or compare all in a list, as in"
+                f" evaluate([{str(run)!r}])"
+            )
+        return evaluation.evaluate_run(run, **options)
+
+
+def render(
+    run: str | Path,
+    *,
+    which: "Which" = "best",
+    episodes: int | None = None,
+    goals: Sequence[int] | None = None,
+    many: int | None = None,
+    gallery: bool = False,
+    strip: bool = False,
+    verbose: bool = False,
+) -> "viewers.Rendered":
+    """Render a policy that drives to the fixed goals: a video, a GIF and a plot.
+
+    Args:
+      run: a run or checkpoint, named as for `evaluate`.
+      which: the checkpoint of a run: `"best"`, `"last"` or a number of steps.
+      episodes: the number of goals, from the first on (default: 20, of a gallery 4).
+      goals: these of the fixed goals, such as `[3, 17]`, in place of `episodes`.
+      many: that many robots in one scene, each with its own goal.
+      gallery: whether to render the first, the middle and the last checkpoint side by side.
+      strip: whether to render an image of an untrained, an early and a trained policy; `many` is
+        then the number of robots of each.
+      verbose: whether to show the progress.
+
+    Returns:
+      The files, and how many goals were reached.
+
+    Raises:
+      UserError: a run or argument is wrong, arguments exclude each other, there is no OpenGL, or a
+        folder cannot be written.
+    """
+    given = {
+        "strip": strip,
+        "gallery": gallery,
+        "many": many is not None,
+        "goals": goals is not None,
+        "episodes": episodes is not None,
+        "which": which != "best",
+    }
+    chosen = next((name for name in _FITTING if given[name]), "episodes")
+    for name in given:
+        if given[name] and name not in (chosen, *_FITTING[chosen]):
+            raise InvalidError(f"render: {chosen} and {name} exclude each other")
+    with _ready(verbose):
+        if strip:
+            return viewers.render_training_strip(find_run(run), robots=16 if many is None else many)
+        if gallery:
+            return viewers.render_gallery(
+                find_run(run), episodes=4 if episodes is None else episodes
+            )
+        if many is not None:
+            return viewers.render_many(find_run(run), robots=many, which=which)
+        count = 20 if episodes is None else episodes
+        return viewers.render_run(find_run(run), episodes=count, goals=goals, which=which)
+
+
+def tune(
+    config: str | Path | Config,
+    overrides: Overrides = (),
+    *,
+    space: str | Path | Mapping[str, Any],
+    trials: int = 64,
+    round_size: int = 16,
+    confirm: int = 3,
+    output: str | Path | None = None,
+    storage: str | None = None,
+    verbose: bool = False,
+) -> "tuning.TuningResult":
+    """Search for hyperparameters, many trials at once.
+
+    The same call with the same `output` continues a search that was stopped.
+
+    Args:
+      config: a configuration: its name, its file or the object.
+      overrides: the settings to change before the search, such as `{"ppo.num_envs": 512}`.
+      space: the settings to search and their values, such as `{"ppo.learning_rate": {"low": 1e-4,
+        "high": 1e-2, "log": True}}`, or the YAML file that holds them.
+      trials: the number of trials.
+      round_size: how many trials to train at once.
+      confirm: how many of the best trials to train anew, with five new seeds each.
+      output: the folder of the study and its results; None: a new one,
+        `runs/tune-<config>-<date>-<time>`.
+      storage: the database of the study; None: SQLite in the folder.
+      verbose: whether to show the progress.
+
+    Returns:
+      The best configuration, and all final trainings.
+
+    Raises:
+      UserError: a setting or argument is wrong, Optuna is not installed, or the folder or storage
+        cannot be used.
+    """
+    check_count("trials", trials)
+    check_count("round_size", round_size, 1024)
+    if confirm:
+        check_count("confirm", confirm)
+    base = load_config(config, overrides)
+    parameters = tuning.read_space(space, base)
+    folder = default_run_dir(Path(f"tune-{_name(config).stem}")) if output is None else Path(output)
+
+    def say(text: str) -> None:
+        if verbose:
+            print(text, file=sys.stdout, flush=True)
+
+    with _ready(verbose):
+        return tuning.run_search(
+            base,
+            parameters,
+            folder,
+            trials=trials,
+            round_size=round_size,
+            confirm=confirm,
+            storage=storage,
+            say=say,
+        )
+
+
+def _name(config: str | Path | Config) -> Path:
+    """Return the name of a configuration, as of its file."""
+    return Path("run") if isinstance(config, Config) else Path(config)
+
+
+@contextlib.contextmanager
+def _ready(verbose: bool) -> Iterator[None]:
+    """Check that there is a device, and show the progress inside the context if asked to.
+
+    Raises:
+      UserError: JAX has no usable device, or the device has too little memory.
+    """
+    require_device()
+    with contextlib.ExitStack() as stack:
+        if verbose:
+            metrics.restart_clock()
+            stack.enter_context(progress.show_progress(sys.stderr))
+        try:
+            yield
+        # JAX raises a subclass.
+        except RuntimeError as error:
+            if not ran_out(error):
+                raise
+            raise UserError(
+                "the device's memory does not suffice: choose fewer episodes, robots or trials"
+            ) from error
