@@ -32,8 +32,8 @@ SMALL = {
     "ppo.num_timesteps": 2 * STEP,
     "checkpoint_interval": STEP,
     "evaluation.episodes": 8,
-    "ppo.network.policy_hidden_layer_sizes": [8],
-    "ppo.network.value_hidden_layer_sizes": [8],
+    "ppo.network.policy_hidden_layer_sizes": [16],
+    "ppo.network.value_hidden_layer_sizes": [16],
     "tensorboard": False,
 }
 LONG = {**SMALL, "ppo.num_timesteps": 10_000 * STEP}
