@@ -89,7 +89,8 @@ def test_the_trials_of_a_dead_worker_are_run_again(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "_BEAT_SECONDS", 1)
     dead = search.Search(CONFIG, SPACE, tmp_path / "s")
     # It asks, beats once, and is gone.
-    trials = [dead.study.ask() for _ in range(2)]
+    with search._quiet():
+        trials = [dead.study.ask() for _ in range(2)]
     values = []
     for trial in trials:
         values.append({one.name: one.suggest(trial) for one in SPACE})
@@ -106,8 +107,8 @@ def test_the_trials_of_a_dead_worker_are_run_again(tmp_path, monkeypatch):
 def test_values_that_do_not_fit_together_fail_with_their_reason(tmp_path):
     space = [Parameter("ppo.batch_size", choices=(24,)), SPACE[0]]
     one = search.Search(CONFIG, space, tmp_path / "s")
-    trial = one.study.ask()
-    one._train([trial])
+    with search._quiet():
+        one._train([one.study.ask()])
     (stored,) = one.study.trials
     assert stored.state == FAIL
     assert "is not a multiple of num_envs" in stored.user_attrs["error"]
