@@ -8,27 +8,44 @@ is in order however the process ends, even by SIGKILL.
 
 import contextlib
 import io
+import os
 import statistics
 import sys
 import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any, TextIO
 
-from rich.console import Console, Group
+import jax
+from rich.columns import Columns
+from rich.console import Console, ConsoleOptions, Group, RenderResult
 from rich.live import Live
+from rich.measure import Measurement
 from rich.panel import Panel
-from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import Progress
+from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from jetbot_mjx.runs.metrics import History, MetricValues, process_seconds
+from jetbot_mjx.runs.metrics import History, MetricValues, mean_of, process_seconds
 from jetbot_mjx.runs.progress import in_foreground
 from jetbot_mjx.training.console import Phase, Terminal
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 _MAX_ROWS = 8
 _MAX_WIDTH = 100
+_MIN_CURVE, _MIN_BAR = 8, 8
+_DROPPED = ("return", "p95", "", "best", "exploring", "to goal")
+"""Columns of the table of seeds that a narrow terminal leaves out, the first of them first; the
+curve has no name."""
+_UPDATE = {
+    "loss": ("loss/total", "{:.3g}"),
+    "KL": ("policy/kl", "{:.2g}"),
+    "std": ("policy/std", "{:.2f}"),
+    "learning rate": ("policy/learning_rate", "{:.1e}"),
+}
+"""Metrics of the line on the last update, by their label."""
 _SECONDS_BETWEEN_DRAWINGS = 0.5
 _PATIENCE_SECONDS = 1.0
 """How long a caller waits for the terminal at most, at a flush and at the end [s]."""
@@ -67,26 +84,20 @@ class Dashboard(Terminal):
         super().__init__(total_steps)
         self._title, self._seeds, self._console = title, seeds, console
         self._rates: list[list[float]] = [[] for _ in seeds]
-        self._metrics: list[dict[str, float | None]] = [{} for _ in seeds]
+        self._metrics: Sequence[MetricValues] = [{} for _ in seeds]
+        self._mean: MetricValues = {}
         self._nonfinite = 0.0
-        self._speed = "-"
+        self._speed: float | None = None
         self._phase: Phase | None = None
         self._spent: dict[Phase, float] = {}
         self._phase_began = time.monotonic()
-        # Show the history before the progress bar begins to measure the speed.
+        # Show the history before the speed for the remaining time is measured.
         steps = 0
         for entries in zip(*histories, strict=False):
             steps = entries[0].env_steps
             self._add([entry.metrics for entry in entries])
         self._progress = Progress(
-            BarColumn(None),
-            TextColumn("{task.percentage:.0f}%  {task.completed:,} of {task.total:,} steps"),
-            TimeRemainingColumn(compact=True),
-            TextColumn("left"),
-            console=console,
-            expand=True,
-            speed_estimate_period=_SPEED_SECONDS,
-            get_time=time.monotonic,
+            console=console, speed_estimate_period=_SPEED_SECONDS, get_time=time.monotonic
         )
         self._task = self._progress.add_task("", total=total_steps, completed=steps)
         # Protects the data above and the lines, and is never held while the terminal is written.
@@ -128,10 +139,9 @@ class Dashboard(Terminal):
             self._advance(env_steps, metrics[0].get("time/env_steps_per_second"))
 
     def update(self, env_steps: int, metrics: MetricValues, env_steps_per_second: float) -> None:
-        """Show progress within an interval; the metrics are means, so only one seed shows them."""
+        """Show progress within an interval; the metrics are means over all seeds."""
         with self._lock:
-            if len(self._seeds) == 1:
-                self._metrics = [{**self._metrics[0], **metrics}]
+            self._mean = {**self._mean, **metrics}
             self._advance(env_steps, env_steps_per_second)
 
     def say(self, text: str) -> None:
@@ -210,7 +220,7 @@ class Dashboard(Terminal):
             return self.render()
 
     def _add(self, metrics: Sequence[MetricValues]) -> None:
-        self._metrics = [dict(one) for one in metrics]
+        self._metrics, self._mean = metrics, mean_of(metrics)
         for rates, one in zip(self._rates, metrics, strict=True):
             if (rate := one.get("eval/success_rate")) is not None:
                 rates.append(rate)
@@ -219,7 +229,7 @@ class Dashboard(Terminal):
 
     def _advance(self, env_steps: int, speed: float | None) -> None:
         self._progress.update(self._task, completed=env_steps)
-        self._speed = f"{speed:,.0f} environment steps/s" if speed else "-"
+        self._speed = speed
 
     def _seconds_in(self, phase: Phase) -> float:
         running = time.monotonic() - self._phase_began if phase == self._phase else 0.0
@@ -227,41 +237,97 @@ class Dashboard(Terminal):
 
     def render(self) -> Group:
         """Lay out the dashboard; the empty line at its end is for the cursor."""
-        phases = Text()
-        for name in self._spent:
-            style = "bold cyan" if name == self._phase else ""
-            phases.append(f"{name} {_clock(self._seconds_in(name))}", style).append("   ")
-        rows = [self._table(), "", self._progress, self._speed, phases]
+        rows = Table.grid(padding=(0, 2, 0, 0), expand=True, pad_edge=False)
+        rows.add_column(style="dim", no_wrap=True)
+        rows.add_column(ratio=1)
+        rows.add_row("steps", self._steps())
+        rows.add_row("speed", self._pace())
+        rows.add_row("time", self._phases())
+        rows.add_row("update", self._update())
         if self._nonfinite:
-            rows.append(Text(f"{self._nonfinite:,.0f} non-finite states or gradients", "bold red"))
-        elapsed = _clock(process_seconds())
-        title = Text(self._title, "bold")
+            count = f"{self._nonfinite:,.0f} states or gradients"
+            rows.add_row("non-finite", Text(count, "bold red"))
+        if memory := _memory_in_use():
+            rows.add_row("memory", memory)
         panel = Panel(
-            Group(*rows), title=title, title_align="left", subtitle=elapsed, width=_MAX_WIDTH
+            Group(self._table(), "", rows),
+            title=Text(self._title, "bold"),
+            title_align="left",
+            subtitle=_clock(process_seconds()),
+            subtitle_align="right",
+            width=_MAX_WIDTH,
         )
         return Group(panel, "")
 
-    def _table(self) -> Table:
-        table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
-        table.add_column("seed", no_wrap=True)
-        table.add_column("", ratio=1, no_wrap=True)
-        for name in ("success", "best", "exploring", "return", "to goal"):
-            table.add_column(name, justify="right", no_wrap=True)
-        width = min(self._console.width, _MAX_WIDTH) - 60
-        for name, rates, metrics in self._rows():
-            table.add_row(
-                name,
-                Text(sparkline(rates, max(8, width)), "green"),
-                Text(_formatted(metrics.get("eval/success_rate"), "{:.1%}"), "bold green"),
-                _formatted(max(rates, default=None), "{:.1%}"),
-                _formatted(metrics.get("rollout/success_rate"), "{:.1%}"),
-                _formatted(metrics.get("eval/episode_return"), "{:.2f}"),
-                _formatted(metrics.get("eval/time_to_goal_median"), "{:.2f} s"),
+    def _steps(self) -> "_FirstThatFits":
+        total = self._total
+        done = min(self._progress.tasks[0].completed, total)
+        text = Text(f"{done / total:.0%}  {done:,.0f} of {total:,}")
+        beside = Table.grid(padding=(0, 2, 0, 0), expand=True, pad_edge=False)
+        beside.add_column(ratio=1)
+        beside.add_column(no_wrap=True)
+        beside.add_row(_Bar(total, done), text)
+        return _FirstThatFits(beside, text)
+
+    def _pace(self) -> str:
+        if not self._speed:
+            return "-"
+        text = f"{self._speed:,.0f} environment steps/s"
+        left = self._progress.tasks[0].time_remaining
+        return f"{text}, {_clock(left)} left" if left else text
+
+    def _phases(self) -> Columns:
+        texts = [
+            Text(
+                f"{name} {_clock(self._seconds_in(name))}",
+                "bold cyan" if name == self._phase else "",
             )
-        return table
+            for name in self._spent
+        ]
+        return Columns(texts, padding=(0, 3))
+
+    def _update(self) -> Columns | str:
+        texts = [
+            f"{label} {form.format(value)}"
+            for label, (name, form) in _UPDATE.items()
+            if (value := self._mean.get(name)) is not None
+        ]
+        return Columns(texts, padding=(0, 3)) if texts else "-"
+
+    def _table(self) -> "_FirstThatFits":
+        cells = [
+            {
+                "seed": name,
+                "success": Text(
+                    _formatted(metrics.get("eval/success_rate"), "{:.1%}"), "bold green"
+                ),
+                "": _Curve(rates),
+                "best": _formatted(max(rates, default=None), "{:.1%}"),
+                "exploring": _formatted(metrics.get("rollout/success_rate"), "{:.1%}"),
+                "return": _formatted(metrics.get("eval/episode_return"), "{:.2f}"),
+                "to goal": _formatted(metrics.get("eval/time_to_goal_median"), "{:.2f} s"),
+                "p95": _formatted(metrics.get("eval/time_to_goal_p95"), "{:.2f} s"),
+            }
+            for name, rates, metrics in self._rows()
+        ]
+        names = [name for name in cells[0] if name != "seed" or len(self._seeds) > 1]
+        tables = []
+        for count in range(len(_DROPPED) + 1):
+            table = Table(box=None, expand=True, pad_edge=False, header_style="dim")
+            shown = [name for name in names if name not in _DROPPED[:count]]
+            for name in shown:
+                ratio = 1 if name == "" else None
+                justify = "left" if name in ("seed", "") else "right"
+                table.add_column(name, justify=justify, no_wrap=True, ratio=ratio)
+            for row in cells:
+                table.add_row(*(row[name] for name in shown))
+            tables.append(table)
+        return _FirstThatFits(*tables)
 
     def _rows(self) -> list[tuple[str, Sequence[float], MetricValues]]:
         """Return name, success rates and metrics of each seed, or of many seeds their range."""
+        if len(self._seeds) == 1:
+            return [("", self._rates[0], self._mean)]
         if len(self._seeds) <= _MAX_ROWS:
             return list(zip(self._seeds, self._rates, self._metrics, strict=True))
         rows = []
@@ -306,6 +372,53 @@ class _LineQueue(io.TextIOBase):
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._stream, name)
+
+
+class _FirstThatFits:
+    """A `_FirstThatFits` renders the first of several renderables that is narrow enough."""
+
+    def __init__(self, *choices: Table | Text) -> None:
+        self._choices = choices
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        unlimited = options.update(max_width=1_000)
+        for choice in self._choices:
+            if Measurement.get(console, unlimited, choice).maximum <= options.max_width:
+                break
+        yield choice
+
+
+class _Curve:
+    """A `_Curve` renders a `sparkline` that is as wide as its cell."""
+
+    def __init__(self, rates: Sequence[float]) -> None:
+        self._rates = rates
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        yield Text(sparkline(self._rates, options.max_width), "green")
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement(_MIN_CURVE, _MIN_CURVE)
+
+
+class _Bar(ProgressBar):
+    """A `_Bar` is a progress bar that is as wide as its cell."""
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement(_MIN_BAR, _MIN_BAR)
+
+
+def _memory_in_use() -> str:
+    """Return the memory in use, of the first device or of this process; empty if unknown."""
+    if stats := jax.local_devices()[0].memory_stats():
+        limit = stats.get("bytes_limit")
+        of = f" of {limit / 2**30:.1f}" if limit else ""
+        return f"{stats['bytes_in_use'] / 2**30:.2f}{of} GiB"
+    statm = Path("/proc/self/statm")
+    if not statm.is_file():  # on macOS and Windows
+        return ""
+    pages = int(statm.read_text().split()[1])
+    return f"{pages * os.sysconf('SC_PAGE_SIZE') / 2**30:.2f} GiB"
 
 
 def _clock(seconds: float) -> str:

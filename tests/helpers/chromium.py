@@ -40,6 +40,16 @@ class Page:
     def open(self, url):
         self._call("Page.navigate", url=url)
 
+    def resize(self, width, height):
+        """Make the page as wide and high as a small screen, which no window can be."""
+        self._call(
+            "Emulation.setDeviceMetricsOverride",
+            width=width,
+            height=height,
+            deviceScaleFactor=1,
+            mobile=True,
+        )
+
     def evaluate(self, source):
         done = self._call("Runtime.evaluate", expression=source, returnByValue=True)
         return done["result"].get("value")
@@ -121,6 +131,8 @@ def browse(folder):
         "--use-angle=swiftshader",
         "--enable-unsafe-swiftshader",
         "--disable-background-networking",
+        "--disable-component-update",
+        "--disable-sync",
         "--no-first-run",
     ]
     process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

@@ -26,9 +26,14 @@ REPORT = {
     "eval/success_rate": 0.625,
     "eval/episode_return": 0.81,
     "eval/time_to_goal_median": 1.25,
+    "eval/time_to_goal_p95": 2.5,
     "rollout/success_rate": 0.5,
     "train/nonfinite_envs": 0.0,
     "train/nonfinite_updates": 0.0,
+    "loss/total": 0.00212,
+    "policy/kl": 0.0123,
+    "policy/std": 0.456,
+    "policy/learning_rate": 1e-3,
     "time/env_steps_per_second": 41_234.5,
 }
 
@@ -348,7 +353,7 @@ def text_of(dashboard):
 
 
 def table(dashboard):
-    """The cells of the table of seeds, without the curves."""
+    """The cells of the table of seeds, without its header and the curves."""
     lines = text_of(dashboard)[2:]
     rows = lines[: next(number for number, line in enumerate(lines) if not line.strip("│ "))]
     return [re.sub("[▁▂▃▄▅▆▇█]+", "", line).strip("│ ").split() for line in rows]
@@ -361,22 +366,49 @@ def test_before_the_first_report_time_passes(now):
     text = "\n".join(text_of(empty))
     assert "compiling 1:01" in text
     assert " 1:01 ─" in text
-    assert "0%  0 of 10,000 steps" in text
-    assert table(empty) == [["0", *["-"] * 5]]
+    assert "0%  0 of 10,000" in text
+    assert re.search(r"update  - +│", text)
+    assert table(empty) == [["-"] * 6]
 
 
 def test_the_last_report_and_what_is_known_since(now):
     one = dashboard_of()
     one.write(2_500, [REPORT])
-    assert table(one) == [["0", "62.5%", "62.5%", "50.0%", "0.81", "1.25", "s"]]
-    assert "25%  2,500 of 10,000 steps" in "".join(text_of(one))
+    assert table(one) == [["62.5%", "62.5%", "50.0%", "0.81", "1.25", "s", "2.50", "s"]]
+    assert "25%  2,500 of 10,000" in "".join(text_of(one))
     assert "41,234 environment steps/s" in "".join(text_of(one))
     one.update(3_000, {"rollout/success_rate": 0.75}, 20_000.0)
-    assert table(one)[0][1:4] == ["62.5%", "62.5%", "75.0%"]
-    assert "30%  3,000 of 10,000 steps" in "".join(text_of(one))
+    assert table(one)[0][:3] == ["62.5%", "62.5%", "75.0%"]
+    assert "30%  3,000 of 10,000" in "".join(text_of(one))
     assert "20,000 environment steps/s" in "".join(text_of(one))
     one.write(5_000, [{**REPORT, "eval/success_rate": 0.25}])
-    assert table(one)[0][1:4] == ["25.0%", "62.5%", "50.0%"]
+    assert table(one)[0][:3] == ["25.0%", "62.5%", "50.0%"]
+
+
+def test_it_shows_what_the_guide_shows(root):
+    """The lines and columns of the guide's picture, and their labels, are those of the program."""
+    guide = (root / "docs" / "getting-started.md").read_text(encoding="utf-8")
+    picture = guide.split("```text\n╭")[1].split("```")[0]
+    one = dashboard_of(width=80)
+    one.write(2_500, [REPORT])
+    shown = "\n".join(text_of(one))
+
+    def words(text):
+        return set(re.findall(r"[a-zA-Z][a-zA-Z0-9]+", text))
+
+    phases = {"compiling", "training", "evaluating", "saving"}
+    assert words(picture) - words(shown) - phases == {"left"}
+    assert words(shown) - words(picture) == set()
+    assert "loss 0.00212   KL 0.012   std 0.46   learning rate 1.0e-03" in shown
+    assert re.search(r"memory  \d\.\d\d GiB", shown)
+
+
+def test_the_update_of_many_seeds_is_their_mean():
+    two = dashboard_of(seeds=2)
+    two.write(1, [REPORT, {**REPORT, "policy/std": 0.656}])
+    assert "std 0.56" in "".join(text_of(two))
+    two.update(2, {"policy/std": 0.25}, 1.0)
+    assert "std 0.25" in "".join(text_of(two))
 
 
 def test_the_time_left_counts_evaluating_and_saving_but_not_compiling(now):
@@ -385,7 +417,9 @@ def test_the_time_left_counts_evaluating_and_saving_but_not_compiling(now):
     one.update(1_000, {}, 99_999.0)
     now[0] = 110.0  # 2,000 steps took 10 s, whatever was done in them
     one.write(3_000, [REPORT])
-    assert re.search(r"00:35\s+left", "".join(text_of(one)))
+    assert ", 0:35 left" in "".join(text_of(one))
+    one.write(10_000, [REPORT])
+    assert "left" not in "".join(text_of(one))
 
 
 def test_each_phase_has_its_time(now):
@@ -401,10 +435,10 @@ def test_each_phase_has_its_time(now):
 def test_non_finite_states_are_counted_and_otherwise_not_mentioned():
     two = dashboard_of(seeds=2)
     two.write(1, [REPORT, REPORT])
-    assert "finite" not in "".join(text_of(two))
+    assert "non-finite" not in "".join(text_of(two))
     two.write(2, [{**REPORT, "train/nonfinite_envs": 2.0}, REPORT])
     two.write(3, [REPORT, {**REPORT, "train/nonfinite_updates": 1.0}])
-    assert "3 non-finite states or gradients" in "".join(text_of(two))
+    assert "non-finite  3 states or gradients" in "".join(text_of(two))
 
 
 def test_a_few_seeds_have_a_row_each_and_many_their_range():
@@ -412,6 +446,8 @@ def test_a_few_seeds_have_a_row_each_and_many_their_range():
     several, many = dashboard_of(seeds=3), dashboard_of(seeds=10)
     several.write(1, [{**REPORT, "eval/success_rate": rate} for rate in rates[:3]])
     assert [line[:2] for line in table(several)] == [["0", "0.0%"], ["1", "10.0%"], ["2", "20.0%"]]
+    assert "seed" in text_of(several)[1]
+    assert "seed" not in "".join(text_of(dashboard_of()))
     many.write(1, [{**REPORT, "eval/success_rate": rate} for rate in rates])
     many.write(2, [{**REPORT, "eval/success_rate": 0.5, "eval/time_to_goal_median": None}] * 10)
     assert [line[:3] for line in table(many)] == [
@@ -419,18 +455,18 @@ def test_a_few_seeds_have_a_row_each_and_many_their_range():
         ["lowest", "50.0%", "50.0%"],
         ["highest", "50.0%", "90.0%"],
     ]
-    assert table(many)[0][-1] == "-"
+    assert table(many)[0][-3:] == ["-", "2.50", "s"]
 
 
 def test_a_resumed_training_shows_what_was_logged_before():
     history = [History(0, 1.0, {"eval/success_rate": 0.0}), History(2_500, 2.0, REPORT)]
     again = dashboard_of(history=history)
-    assert table(again)[0][1:4] == ["62.5%", "62.5%", "50.0%"]
+    assert table(again)[0][:3] == ["62.5%", "62.5%", "50.0%"]
     assert "▁▆" in "".join(text_of(again))
-    assert "25%  2,500 of 10,000 steps" in "".join(text_of(again))
+    assert "25%  2,500 of 10,000" in "".join(text_of(again))
 
 
-@pytest.mark.parametrize("width", [1, 30, 50, 60, 80, 140])
+@pytest.mark.parametrize("width", [1, 30, 40, 50, 60, 80, 140])
 @pytest.mark.parametrize("seeds", [1, 3, 10])
 def test_a_dashboard_fits_into_the_terminal(seeds, width):
     full = dashboard_of(seeds, total=10**10, width=width)
@@ -440,9 +476,17 @@ def test_a_dashboard_fits_into_the_terminal(seeds, width):
     lines = text_of(full)
     assert max(map(len, lines)) <= width
     assert len(lines) < 30 or width < 30
-    if width >= 80:
+    if width >= 40:
         assert "…" not in "".join(lines)
-        assert lines[2].count("▆") >= min(width, 100) - 60
+        # A narrow terminal has fewer columns, and each of them whole.
+        names = lines[1].strip("│ ").replace("to goal", "to_goal").split()
+        assert {"success", "to_goal"} <= set(names)
+        values = " ".join(table(full)[0]).replace(" s", "_s").split()
+        assert len(values) == len(names)
+        assert set(values) <= {"0", "mean", "62.5%", "50.0%", "0.81", "1.25_s", "2.50_s"}
+    if width >= 80:
+        assert {"best", "exploring", "return", "p95"} <= set(names)
+        assert lines[2].count("▆") >= min(width, 100) - 70
 
 
 def test_a_curve_is_the_whole_history_in_so_many_blocks():
