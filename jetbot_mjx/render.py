@@ -51,12 +51,27 @@ def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
     chosen = options.checkpoint != "best"
     for wrong, message in (
-        (options.gallery and options.goals, "--goals: a gallery shows the first goals"),
-        (options.gallery and chosen, "--checkpoint: a gallery shows the first, middle and last"),
-        (options.gallery and options.many, "--many: a gallery shows one robot at a time"),
-        (options.strip and chosen, "--checkpoint: a strip chooses three by itself"),
-        (options.strip and options.gallery, "--strip: it is no gallery"),
-        (options.strip and (options.goals or options.episodes), "--strip: only --many fits it"),
+        (
+            options.gallery and options.goals,
+            "--goals: cannot be combined with --gallery, which shows the first goals",
+        ),
+        (
+            options.gallery and chosen,
+            "--checkpoint: cannot be combined with --gallery, which shows three",
+        ),
+        (
+            options.gallery and options.many,
+            "--many: cannot be combined with --gallery, which shows one robot at a time",
+        ),
+        (
+            options.strip and chosen,
+            "--checkpoint: cannot be combined with --strip, which chooses three itself",
+        ),
+        (options.strip and options.gallery, "--strip: cannot be combined with --gallery"),
+        (
+            options.strip and (options.goals or options.episodes),
+            "--strip: can be combined with --many only",
+        ),
     ):
         if wrong:
             parser.error(message)

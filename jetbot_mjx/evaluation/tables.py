@@ -14,7 +14,7 @@ from jetbot_mjx.runs.text_table import text_table
 def summarize_report(report: Report) -> str:
     """Return the results of one policy."""
     text = (
-        f"{report.policy.episodes} fixed goals (set {GOAL_SET_VERSION}), policy after"
+        f"{_count(report.policy.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}), policy after"
         f" {report.env_steps:,} steps\n{policies_table({'policy': report})}\n"
         f"{best_known_lines(report)}{robustness_table(report)}"
         f"report: {report.folder / 'report.html'}"
@@ -22,7 +22,7 @@ def summarize_report(report: Report) -> str:
     if fuller := fuller_report(report.folder, report.checkpoint.name):
         text += f" (the one in {fuller} stays as it is)"
     if report.policy.nonfinite_envs:
-        text += f"\n{report.policy.nonfinite_envs} episodes ended in a non-finite state"
+        text += f"\n{_count(report.policy.nonfinite_envs, 'episode')} ended in a non-finite state"
     return text
 
 
@@ -35,8 +35,8 @@ def summarize_comparison(comparison: Comparison) -> str:
         for seed, report in run.seeds.items()
     }
     text = (
-        f"{comparison.episodes} fixed goals (set {GOAL_SET_VERSION}), {len(policies)} policies\n"
-        f"{policies_table(policies)}\n\n{runs_table(comparison)}"
+        f"{_count(comparison.episodes, 'fixed goal')} (set {GOAL_SET_VERSION}),"
+        f" {len(policies)} policies\n{policies_table(policies)}\n\n{runs_table(comparison)}"
     )
     if comparison.pairs:
         text += f"\n\n{pairs_table(comparison)}"
@@ -107,15 +107,15 @@ def best_known_lines(report: Report) -> str:
     if best is None:
         return f"best known: not available, {report.best_known_missing}\n"
     if best.total.gap is None:
-        return "best known: the policy reached no goal to be compared on\n"
+        return "best known: no comparison, because the policy reached no goal\n"
     directions = ", ".join(
         f"{180 - (180 - (one.bearing_low + one.bearing_high) / 2) % 360:.0f}° {one.gap:+.1%}"
         for one in best.by_direction
         if one.gap is not None
     )
     return (
-        f"time to goal above the best known: {best.total.gap:+.2%} in the mean of"
-        f" {best.total.reached:,} goals reached ({best.total.policy_mean:.3f} s,"
+        f"{abs(best.total.gap):.2%} {'slower' if best.total.gap >= 0 else 'faster'} than best known"
+        f" (mean of {best.total.reached:,} goals: {best.total.policy_mean:.3f} s, best known"
         f" {best.total.best_mean:.3f} s)\n  by the goal's bearing: {directions}\n"
     )
 
@@ -169,6 +169,10 @@ def pairs_table(comparison: Comparison) -> str:
                 f" goals {result.wins} : {result.losses} (p {result.p:.2g})"
             )
     return "\n".join(lines)
+
+
+def _count(number: int, what: str) -> str:
+    return f"{number} {what}" if number == 1 else f"{number} {what}s"
 
 
 def _value(value: float | None, form: str) -> str:

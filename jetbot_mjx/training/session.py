@@ -508,7 +508,7 @@ def summary(result: Result) -> str:
             f" (95 % interval {over_seeds.low:.2%} .. {over_seeds.high:.2%})"
         )
     lines += [
-        f"{result.wall_seconds:.1f} s in all",
+        f"total {result.wall_seconds:.1f} s",
         f"next: jetbot-mjx evaluate {result.run_dir}",
         f"      jetbot-mjx render {result.run_dirs[0]}",
         f"      jetbot-mjx play {result.run_dirs[0]}",

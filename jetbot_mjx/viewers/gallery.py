@@ -17,7 +17,7 @@ from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.errors import InvalidError, UserError, check_count
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
-from jetbot_mjx.evaluation.plots import plot_trajectories
+from jetbot_mjx.evaluation.plots import plot_trajectories, theme, to_png
 from jetbot_mjx.evaluation.result_names import name_with_count
 from jetbot_mjx.evaluation.rollout import Episodes
 from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
@@ -50,6 +50,8 @@ class Rendered(NamedTuple):
     """Number of goals that each policy drove to."""
     files: Mapping[str, Path]
     """The files by what they are: `video`, `gif`, `plot`, `plots` or `image`."""
+    note: str = ""
+    """A line for the user; empty if there is nothing to say."""
 
     def __repr__(self) -> str:
         """Return the goals reached by steps, and the files, in one line."""
@@ -58,11 +60,12 @@ class Rendered(NamedTuple):
         return f"Rendered(reached={reached}, files={files})"
 
     def describe(self) -> str:
-        """Return what to print about it: a line for each checkpoint and for each file."""
+        """Return what to print about it: lines for each checkpoint, the note, and each file."""
         lines = [
             f"{step:>12,} steps  {count:,} of {self.episodes:,} goals reached"
             for step, count in self.successes.items()
         ]
+        lines += [self.note] if self.note else []
         return "\n".join([*lines, *(f"{f'{what}:':6} {path}" for what, path in self.files.items())])
 
 
@@ -184,11 +187,11 @@ def run_folder(run_dir: str | Path, option: str) -> Path:
     """Return the absolute path of a run folder.
 
     Raises:
-      UserError: `run_dir` is no run folder, or one of its checkpoints; `option` needs several.
+      UserError: `run_dir` is not a run folder but, for example, one checkpoint.
     """
     path = Path(run_dir).absolute()
     if find_checkpoint(path, "last") == path:
-        raise UserError(f"{option} {run_dir} is one checkpoint: give the run folder it lies in")
+        raise UserError(f"{option} {run_dir} is one checkpoint: give its run folder")
     return path
 
 
@@ -218,15 +221,16 @@ def _trajectory_plot(
     markers = jax.vmap(env.task.markers)(episodes.goal)
     others = [np.asarray(place) for name, place in markers.items() if name != "goal"]
     title = (
-        f"{int(episodes.success.sum())} of {len(goals)} goals reached,"
+        f"{int(episodes.success.sum()):,} of {len(goals):,} goals reached,"
         f" policy after {checkpoint.env_steps:,} steps"
     )
-    figure = plot_trajectories(episodes, title, others)
-    for number, goal_w in zip(goals, episodes.goal_w, strict=True):
-        figure.axes[0].annotate(str(number), goal_w[:2], ha="center", va="center", fontsize="small")
-    file = io.BytesIO()
-    figure.savefig(file, dpi=120)
-    return Image.open(file).convert("RGB")
+    with theme("light"):
+        figure = plot_trajectories(episodes, title, others)
+        for number, goal_w in zip(goals, episodes.goal_w, strict=True):
+            figure.axes[0].annotate(
+                str(number), goal_w[:2], ha="center", va="center", fontsize="small"
+            )
+        return Image.open(io.BytesIO(to_png(figure))).convert("RGB")
 
 
 def _write_videos(
@@ -266,17 +270,17 @@ def check_goals(goals: Sequence[int]) -> None:
       UserError: an index is invalid or occurs twice, or there is none.
     """
     if not goals:
-        raise UserError("goals = [] names none: give at least one index")
+        raise UserError("goals = [] is empty: give at least one index")
     for place, goal in enumerate(goals):
         if not isinstance(goal, numbers.Integral):
             raise InvalidError(f"goals: {goal!r} is wrong: give indices, as in [3, 17]")
         if not 0 <= goal < REPORT_GOALS:
             raise UserError(
-                f"goal {goal} is none of the {REPORT_GOALS:,} fixed goals: they are 0 to"
+                f"goal {goal} is not one of the {REPORT_GOALS:,} fixed goals: they are 0 to"
                 f" {REPORT_GOALS - 1}"
             )
         if goal in goals[:place]:
-            raise UserError(f"goal {goal} is named twice: once will do")
+            raise UserError(f"goal {goal} is given twice: give it once")
 
 
 def _ranges(goals: Sequence[int]) -> str:
@@ -297,16 +301,16 @@ def parse_goals(text: str) -> list[int]:
       The indices, in the order of the text.
 
     Raises:
-      UserError: the text is no such list, or `check_goals` rejects an index.
+      UserError: the text is not such a list, or `check_goals` rejects an index.
     """
     goals: list[int] = []
     for part in text.split(","):
         found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", part.strip(), re.ASCII)
         if found is None:
-            raise UserError(f"{part!r} is no goal: write indices and ranges, as in 3,17 or 0-7")
+            raise UserError(f"{part!r} is not a goal: write indices and ranges, as in 3,17 or 0-7")
         first, last = int(found[1]), int(found[2] or found[1])
         if last < first:
-            raise UserError(f"{part} runs backwards: write {last}-{first}")
+            raise UserError(f"{part} is a reversed range: write {last}-{first}")
         # Limit the length: an index beyond the last goal is rejected below anyway.
         goals += range(first, min(last, first + REPORT_GOALS) + 1)
     check_goals(goals)

@@ -16,7 +16,14 @@ from jaxtyping import Float
 
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.viewers.offscreen import add_lines, open_renderer, overview, reduce_image
+from jetbot_mjx.viewers.offscreen import (
+    add_lines,
+    goal_geoms,
+    open_renderer,
+    overview,
+    paint_reached,
+    reduce_image,
+)
 from jetbot_mjx.viewers.pose import set_pose
 from jetbot_mjx.viewers.robot_grid import WIDEST_CELL, RobotGrid
 from jetbot_mjx.viewers.video import Frame
@@ -30,7 +37,6 @@ _TRAIL_HEIGHT = 0.004  # [m]
 _HIDDEN_GROUP = 3  # group of the colliders, which are not drawn
 _FLOOR = (0.25, 0.29, 0.36, 1.0)
 _TRAIL = np.array((0.36, 0.66, 1.0, 1.0), np.float32)
-_REACHED = np.array((0.20, 0.85, 0.30, 1.0), np.float32)
 _START_DISTANCE, _START_AZIMUTH, _START_ELEVATION = 0.85, 25.0, -30.0  # of the camera [m, degrees]
 
 
@@ -82,7 +88,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
         volume = np.where(robot, model.geom_aabb[:, 3:].prod(axis=1), 0.0)
         is_far = mocap.copy()
         is_far[np.argsort(volume)[-_LARGEST_GEOMS:]] = True
-        self._goal_geoms = frozenset(np.flatnonzero(mocap & _of_body(model, "goal")).tolist())
+        self._goal_geoms = goal_geoms(model)
         self._length = _length(model, robot)
         # Pixels of a metre below which a geom is drawn enlarged.
         self._smallest = np.where(
@@ -157,9 +163,9 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
         everything = int(mujoco.mjtCatBit.mjCAT_ALL)
         perturbation = mujoco.MjvPerturb()
         mujoco.mjv_addGeoms(self._model, self._data, option, perturbation, everything, scene)
+        if reached:
+            paint_reached(scene, self._goal_geoms, first)
         for geom in (scene.geoms[index] for index in range(first, scene.ngeom)):
-            if reached and geom.objid in self._goal_geoms:
-                geom.rgba[:] = _REACHED
             if not detailed:
                 mocap_id = self._mocap_ids[geom.objid]
                 centre = robot_w if mocap_id < 0 else self._data.mocap_pos[mocap_id]
@@ -189,11 +195,6 @@ def _show_groups(groups: Sequence[int]) -> mujoco.MjvOption:
     option = mujoco.MjvOption()
     option.geomgroup[:] = np.isin(np.arange(len(option.geomgroup)), groups)
     return option
-
-
-def _of_body(model: mujoco.MjModel, name: str) -> np.ndarray:
-    """Return which geoms belong to a body; none if the model has no such body."""
-    return model.geom_bodyid == mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_BODY, name)
 
 
 def _length(model: mujoco.MjModel, geoms: np.ndarray) -> float:

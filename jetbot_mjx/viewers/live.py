@@ -63,7 +63,7 @@ def play_live(
     else:
         mujoco_window.require_window()
         run = mujoco_window.run
-    tell(f"loading {run_or_checkpoint} and compiling: some seconds")
+    tell(f"loading {run_or_checkpoint} and compiling: this takes a few seconds")
     player = Player(run_or_checkpoint, which=which, agent=agent, seed=seed, robots=robots)
     # Ctrl-C is the normal way to end the viewer.
     with contextlib.suppress(KeyboardInterrupt):

@@ -37,6 +37,7 @@ _STRIP_SIDE = 480  # [pixels]
 _STRIP_SPACING = (1.8, 1.8)  # [m] the same for all policies
 _STRIP_ROBOT, _STRIP_MARKER, _STRIP_TRAIL = 18.0, 13.0, 2.0  # [pixels]
 _EARLY_SUCCESS = 0.4  # the early policy is the one closest to this success rate
+_CLOSE = 0.15  # difference of success rates up to which the closest policy is close enough
 
 
 def render_many(
@@ -81,7 +82,8 @@ def render_many(
 def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     """Render the ends of the same episodes with an untrained, an early and a trained policy.
 
-    The early policy is the checkpoint whose success rate in its own evaluation is closest to 40 %.
+    The early policy is the checkpoint whose success rate in its own evaluation is closest to 40 %;
+    if none is close, the result says so.
     Goals that a robot reached are green, and goals that it missed are red.
 
     Args:
@@ -133,7 +135,7 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     successes = {
         step: int(grid.reached.sum()) for step, grid in zip(chosen.values(), grids, strict=True)
     }
-    return Rendered(successes, robots, {"image": png})
+    return Rendered(successes, robots, {"image": png}, note_on_early(rates[chosen["early"]]))
 
 
 def _video_frames(grid: RobotGrid, renderer: GridRenderer) -> Iterator[Frame]:
@@ -191,3 +193,17 @@ def untrained_early_trained(success_rates: Mapping[int, float]) -> dict[str, int
         )
     early = min(steps[1:-1], key=lambda step: abs(success_rates[step] - _EARLY_SUCCESS))
     return {"untrained": steps[0], "early": early, "trained": steps[-1]}
+
+
+def note_on_early(success_rate: float) -> str:
+    """Return a line for the user if the early policy of a strip is far from 40 %, else nothing.
+
+    Args:
+      success_rate: The success rate of the early policy in its own evaluation.
+    """
+    if abs(success_rate - _EARLY_SUCCESS) <= _CLOSE:
+        return ""
+    return (
+        f"no checkpoint is close to {_EARLY_SUCCESS:.0%} success, the early one has"
+        f" {success_rate:.0%}: train with a smaller checkpoint_interval or ppo.learning_rate"
+    )

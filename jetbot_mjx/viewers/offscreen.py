@@ -22,6 +22,10 @@ _OVERSAMPLING = 2
 """Rendered pixels per pixel of the image, along each axis. This is as smooth as OpenGL's four
 samples per pixel, and on a CPU it takes two thirds of the time (one third for small images)."""
 
+_SHADOW_SIZE = 4096
+"""Side of the shadow map [pixels]; on the floor one of them is 3 mm wide."""
+
+_REACHED = np.array((0.20, 0.85, 0.30, 1.0), np.float32)
 _TRAIL = np.array((0.10, 0.35, 0.85, 1.0), np.float32)
 _TRAIL_WIDTH = 0.01  # fraction of the image's width
 
@@ -46,6 +50,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         """
         self._model, self._renderer = open_renderer(mj_model, width, height)
         self._data = mujoco.MjData(self._model)
+        self._goal_geoms = goal_geoms(self._model)
 
     def frame(
         self,
@@ -54,6 +59,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         camera: str | mujoco.MjvCamera,
         *,
         shadows: bool = True,
+        reached: bool = False,
         trail_w: Float[np.ndarray, "n 3"] | None = None,
     ) -> UInt8[np.ndarray, "height width 3"]:
         """Render one pose.
@@ -63,6 +69,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
           markers: positions [m] of the mocap bodies, by name, as `Task.markers` returns them.
           camera: `chase`, `top` or `onboard`, or a camera object.
           shadows: whether to render shadows; without them, rendering takes less than half the time.
+          reached: whether the goal is green because the robot has reached it.
           trail_w: points [m], world frame, to connect by a line, such as the path so far.
 
         Returns:
@@ -72,6 +79,8 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
         mujoco.mj_camlight(self._model, self._data)
         self._renderer.update_scene(self._data, camera=camera)
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SHADOW] = shadows
+        if reached:
+            paint_reached(self._renderer.scene, self._goal_geoms)
         if trail_w is not None:
             width = _TRAIL_WIDTH * self._renderer.width
             add_lines(self._renderer.scene, np.asarray(trail_w, float), width, _TRAIL)
@@ -80,6 +89,19 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
     def __exit__(self, *exception: object) -> None:
         """Free the OpenGL context."""
         self._renderer.close()
+
+
+def goal_geoms(mj_model: mujoco.MjModel) -> frozenset[int]:
+    """Return the indices of the geoms of the goal; none if the model has no body `goal`."""
+    goal = mujoco.mj_name2id(mj_model, mujoco.mjtObj.mjOBJ_BODY, "goal")
+    return frozenset(np.flatnonzero(mj_model.geom_bodyid == goal).tolist())
+
+
+def paint_reached(scene: mujoco.MjvScene, geoms: frozenset[int], first: int = 0) -> None:
+    """Make the geoms of a goal that was reached green, in a scene from its element `first` on."""
+    for geom in (scene.geoms[index] for index in range(first, scene.ngeom)):
+        if geom.objtype == mujoco.mjtObj.mjOBJ_GEOM and geom.objid in geoms:
+            geom.rgba[:] = _REACHED
 
 
 def add_lines(
@@ -127,6 +149,7 @@ def open_renderer(
     width, height = _OVERSAMPLING * width, _OVERSAMPLING * height
     model.vis.map.znear = _NEAR / model.stat.extent
     model.vis.quality.offsamples = 0
+    model.vis.quality.shadowsize = _SHADOW_SIZE
     model.vis.global_.offwidth = width
     model.vis.global_.offheight = height
     # MuJoCo's renderer has no other way to set a back end after import.

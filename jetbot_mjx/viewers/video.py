@@ -1,7 +1,7 @@
 """Render episodes to video frames, and write videos and animations.
 
 Videos play in real time. Every frame shows the number of the report's fixed goal, the time, the
-remaining distance, and the outcome at the end.
+remaining distance, and the outcome at the end; a goal turns green when its robot reaches it.
 """
 
 import contextlib
@@ -76,6 +76,10 @@ class Trajectory(NamedTuple):
     def step_at(self, seconds: float) -> int:
         """Return the index of the state at a time [s]; after the end, the index of the last one."""
         return min(round(seconds / self.dt), self.steps)
+
+    def reached_at(self, step: int) -> bool:
+        """Return whether the goal is reached at a step."""
+        return self.reached and step == self.steps
 
     def trail_w(self, step: int) -> Float[np.ndarray, "n 3"]:
         """Return the points of the path up to a step [m], just above the floor."""
@@ -185,7 +189,12 @@ class VideoRenderer(contextlib.ExitStack):
             yield np.hstack([draw(step) for draw, step in zip(draws, steps, strict=True)])
 
     def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
-        chase = self._view.frame(trajectory.qpos[step], trajectory.markers, "chase")
+        chase = self._view.frame(
+            trajectory.qpos[step],
+            trajectory.markers,
+            "chase",
+            reached=trajectory.reached_at(step),
+        )
         top = self._frame_with_trail(trajectory, step, "top")
         inset = self._inset_image(trajectory, step, _SEEN)
         # In the lower corner the inset hides a goal only while the robot drives away from it.
@@ -202,8 +211,14 @@ class VideoRenderer(contextlib.ExitStack):
     def _frame_with_trail(
         self, trajectory: Trajectory, step: int, camera: str | mujoco.MjvCamera
     ) -> Frame:
-        qpos, trail_w = trajectory.qpos[step], trajectory.trail_w(step)
-        return self._view.frame(qpos, trajectory.markers, camera, shadows=False, trail_w=trail_w)
+        return self._view.frame(
+            trajectory.qpos[step],
+            trajectory.markers,
+            camera,
+            shadows=False,
+            reached=trajectory.reached_at(step),
+            trail_w=trajectory.trail_w(step),
+        )
 
     def _episode_view(
         self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
@@ -225,7 +240,8 @@ class VideoRenderer(contextlib.ExitStack):
         """
         qpos, markers = trajectory.qpos[step], trajectory.markers
         if self._policy_image is None:
-            image = self._inset.frame(qpos, markers, "onboard", shadows=False)
+            reached = trajectory.reached_at(step)
+            image = self._inset.frame(qpos, markers, "onboard", shadows=False, reached=reached)
         else:
             seen = np.asarray(self._policy_image(qpos, markers))
             image = resize_nearest(seen, round(share * self._side))

@@ -138,6 +138,9 @@ def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
         "goals-3,1.mp4",
         "goals-3,1.png",
     ]
+    # The plan view has the style of the report's plots, in which nothing is quite black.
+    plot = iio.imread(pictures.files["video"].with_suffix(".png"))
+    assert (plot.min(), plot.max()) == (0x1F, 255)
 
 
 @pytest.mark.parametrize(
@@ -158,17 +161,17 @@ def test_goals_are_written_as_indices_and_ranges(text, goals, name):
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        (["--goals", "1024"], "goal 1024 is none of the 1,024 fixed goals: they are 0 to 1023"),
-        (["--goals", "5-999999999"], "goal 1024 is none of the 1,024 fixed goals"),
-        (["--goals", "3,x"], "'x' is no goal: write indices and ranges, as in 3,17 or 0-7"),
-        (["--goals", "3,"], "'' is no goal"),
-        (["--goals=-3"], "'-3' is no goal"),
-        (["--goals", "²"], "'²' is no goal"),
-        (["--goals", "7-3"], "7-3 runs backwards: write 3-7"),
-        (["--goals", "3,1-4"], "goal 3 is named twice"),
+        (["--goals", "1024"], "goal 1024 is not one of the 1,024 fixed goals: they are 0 to 1023"),
+        (["--goals", "5-999999999"], "goal 1024 is not one of the 1,024 fixed goals"),
+        (["--goals", "3,x"], "'x' is not a goal: write indices and ranges, as in 3,17 or 0-7"),
+        (["--goals", "3,"], "'' is not a goal"),
+        (["--goals=-3"], "'-3' is not a goal"),
+        (["--goals", "²"], "'²' is not a goal"),
+        (["--goals", "7-3"], "7-3 is a reversed range: write 3-7"),
+        (["--goals", "3,1-4"], "goal 3 is given twice: give it once"),
         (["--goals", "3", "--episodes", "2"], "--episodes: not allowed with argument --goals"),
-        (["--gallery", "--goals", "3"], "--goals: a gallery shows the first goals"),
-        (["--gallery", "--checkpoint", "last"], "--checkpoint: a gallery shows the first"),
+        (["--gallery", "--goals", "3"], "--goals: cannot be combined with --gallery, which"),
+        (["--gallery", "--checkpoint", "last"], "--checkpoint: cannot be combined with --gallery"),
     ],
 )
 def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, said, capsys):
@@ -254,7 +257,7 @@ def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, co
 
 
 def test_one_checkpoint_makes_no_gallery(run_copy):
-    with pytest.raises(UserError, match="is one checkpoint: give the run folder it lies in"):
+    with pytest.raises(UserError, match="is one checkpoint: give its run folder"):
         render_gallery(run_copy / "checkpoints" / f"{65_536:012}")
     with pytest.raises(UserError, match="no such folder"):
         render_gallery(run_copy / "nothing")

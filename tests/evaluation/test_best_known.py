@@ -150,7 +150,7 @@ def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
         "-",
         "-",
     ]
-    assert "above the best known: +9.42% in the mean of 7 goals reached (1.162 s, 1.062 s)" in (
+    assert "9.42% slower than best known (mean of 7 goals: 1.162 s, best known 1.062 s)" in (
         best_known_lines(report)
     )
     assert "0° +10.0%, 45° +9.8%, 135° +9.5%, 180° +9.4%, -135° +9.2%" in best_known_lines(report)
@@ -159,7 +159,7 @@ def test_a_report_tells_it_in_all_its_forms(searched, tmp_path):
     assert values["best_known"]["total"]["gap"] == pytest.approx(found.total.gap)
     text = (tmp_path / "report" / "report.md").read_text()
     assert "| best known | - | - | 1.06 s | 1.11 s |" in text
-    assert "this policy takes 1.162 s on average, +9.42% above the best-known time" in text
+    assert "best-known mean time to the same goals is 1.062 s (gap +9.42%)" in text
     assert "| +68° to +112° | 0 | - | - | - |" in text
     page = (tmp_path / "report" / "report.html").read_text()
     assert 'data-json="best_known.total.gap">+9.42%</data>' in page

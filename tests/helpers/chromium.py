@@ -40,6 +40,13 @@ class Page:
     def open(self, url):
         self._call("Page.navigate", url=url)
 
+    def open_and_wait(self, url):
+        self.open(url)
+        deadline = time.monotonic() + 60
+        while self.evaluate("document.readyState + location.href") != f"complete{url}":
+            assert time.monotonic() < deadline, "the page does not load"
+            time.sleep(0.05)
+
     def resize(self, width, height):
         """Make the page as wide and high as a small screen, which no window can be."""
         self._call(

@@ -2,6 +2,7 @@
 
 import math
 import shutil
+from pathlib import Path
 
 import imageio.v3 as iio
 import jax
@@ -137,6 +138,10 @@ def test_a_strip_shows_the_first_one_that_fails_and_the_last():
     rates = {0: 0.0, 10: 0.05, 20: 0.45, 30: 0.9, 40: 0.4}
     chosen = many.untrained_early_trained(rates)
     assert chosen == {"untrained": 0, "early": 20, "trained": 40}
+    assert many.note_on_early(rates[20]) == ""
+    assert "close to 40% success, the early one has 56%" in many.note_on_early(0.56)
+    shown = many.Rendered({0: 0, 20: 9}, 16, {"image": Path("a.png")}, "a note").describe()
+    assert shown.splitlines()[2:] == ["a note", "image: a.png"]
     with pytest.raises(UserError, match="smaller checkpoint_interval"):
         many.untrained_early_trained({0: 0.0, 10: 1.0})
 
@@ -165,9 +170,9 @@ def test_many_robots_and_a_strip_are_rendered(
     [
         (["--many", "0"], "--many"),
         (["--many", "4", "--goals", "3"], "not allowed with argument"),
-        (["--many", "4", "--gallery"], "--many: a gallery shows one robot at a time"),
-        (["--strip", "--goals", "3"], "--strip: only --many fits it"),
-        (["--strip", "--checkpoint", "last"], "--checkpoint: a strip chooses"),
+        (["--many", "4", "--gallery"], "--many: cannot be combined with --gallery, which"),
+        (["--strip", "--goals", "3"], "--strip: can be combined with --many only"),
+        (["--strip", "--checkpoint", "last"], "--checkpoint: cannot be combined with --strip"),
     ],
 )
 def test_options_that_contradict_are_refused_in_one_line(arguments, said, capsys):

@@ -136,6 +136,25 @@ def test_whoever_has_finished_stands_while_the_others_drive(renderer, drive, wri
     assert written[last - 3 : last] == ["9 steps", "goal 7 0.90 s", "1.30 m to go"]
 
 
+@pytest.mark.parametrize("reached", [True, False])
+def test_a_goal_turns_green_when_it_is_reached(renderer, drive, reached):
+    def green(frame):
+        r, g, b = np.moveaxis(frame.astype(int), -1, 0)
+        return int(((g > 120) & (g > 2 * r) & (g > 2 * b)).sum())
+
+    one = drive((0.5, 0.0), (0.6, 0.0), reached=reached)
+    for frames in (renderer.render_episode(one), renderer.render_side_by_side([("", one)])):
+        first, *_, last = frames
+        assert (green(last) > green(first) + 10) == reached
+        assert abs(green(last) - green(first)) < 5 or reached
+
+
+def test_the_edges_of_shadows_are_fine(renderer):
+    model = renderer._view._model
+    width = 2 * model.vis.map.shadowclip * model.stat.extent
+    assert width / model.vis.quality.shadowsize < 0.004  # [m]; a pixel of the chase view is 3 mm
+
+
 def test_text_and_inset_stay_above_what_happens(renderer, drive):
     """Their pixels are those that differ from the bare view."""
     one = drive((1.5, 1.5), (-1.0, -0.5), number=1023, reached=False)
