@@ -50,31 +50,17 @@ def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
 def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
     chosen = options.checkpoint != "best"
-    for wrong, message in (
-        (
-            options.gallery and options.goals,
-            "--goals: cannot be combined with --gallery, which shows the first goals",
-        ),
-        (
-            options.gallery and chosen,
-            "--checkpoint: cannot be combined with --gallery, which shows three",
-        ),
-        (
-            options.gallery and options.many,
-            "--many: cannot be combined with --gallery, which shows one robot at a time",
-        ),
-        (
-            options.strip and chosen,
-            "--checkpoint: cannot be combined with --strip, which chooses three itself",
-        ),
-        (options.strip and options.gallery, "--strip: cannot be combined with --gallery"),
-        (
-            options.strip and (options.goals or options.episodes),
-            "--strip: can be combined with --many only",
-        ),
+    for both, option, other in (
+        (options.gallery and options.goals, "--goals", "--gallery"),
+        (options.gallery and chosen, "--checkpoint", "--gallery"),
+        (options.gallery and options.many, "--many", "--gallery"),
+        (options.strip and chosen, "--checkpoint", "--strip"),
+        (options.strip and options.gallery, "--strip", "--gallery"),
+        (options.strip and options.goals, "--goals", "--strip"),
+        (options.strip and options.episodes, "--episodes", "--strip"),
     ):
-        if wrong:
-            parser.error(message)
+        if both:
+            parser.error(f"{option}: cannot be combined with {other}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -170,8 +170,10 @@ def test_many_robots_and_a_strip_are_rendered(
     [
         (["--many", "0"], "--many"),
         (["--many", "4", "--goals", "3"], "not allowed with argument"),
-        (["--many", "4", "--gallery"], "--many: cannot be combined with --gallery, which"),
-        (["--strip", "--goals", "3"], "--strip: can be combined with --many only"),
+        (["--many", "4", "--gallery"], "--many: cannot be combined with --gallery"),
+        (["--strip", "--gallery"], "--strip: cannot be combined with --gallery"),
+        (["--strip", "--goals", "3"], "--goals: cannot be combined with --strip"),
+        (["--strip", "--episodes", "3"], "--episodes: cannot be combined with --strip"),
         (["--strip", "--checkpoint", "last"], "--checkpoint: cannot be combined with --strip"),
     ],
 )
