@@ -107,7 +107,7 @@ def test_every_table_scrolls_by_itself(pages, which):
         (0, "All 24 goals reached. Squares are goals"),
         (1, "The one goal not reached, and all 23 goals reached. Squares"),
         (12, "All 12 goals not reached, and all 12 goals reached. Squares"),
-        (1, "How the episode ended: time limit. This command renders it: python -m"),
+        (1, "How the episode ended: time limit. This command renders it: jetbot-mjx render"),
         (12, "How the episodes ended: time limit (12). This command renders the first 8 of them: "),
     ],
 )
