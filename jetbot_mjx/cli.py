@@ -22,7 +22,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
-from jetbot_mjx.errors import UserError, ran_out
+from jetbot_mjx.errors import UserError, printable, printable_lines, ran_out
 from jetbot_mjx.imports import install_lazy_imports
 from jetbot_mjx.interrupts import exit_on_interrupt, repeat_lost_interrupts
 
@@ -88,7 +88,7 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
-        message = " ".join(message.splitlines())
+        message = printable(" ".join(message.splitlines()))
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
@@ -150,6 +150,15 @@ def run_command(
     sys.exit(code)
 
 
+def tell(text: str) -> None:
+    """Print a result, which may name files: a terminal shows all of its characters and obeys none.
+
+    Args:
+      text: one line or several.
+    """
+    print(printable_lines(text), flush=True)
+
+
 def prepare_device() -> None:
     """Check that JAX has a usable device, and turn its compilation cache on.
 
@@ -180,8 +189,9 @@ def require_device() -> None:
     """
     import jax
 
-    if jax.config.values["jax_enable_x64"]:
-        raise UserError("all is computed in float32, and JAX_ENABLE_X64 is set: unset it")
+    from jetbot_mjx.compiler.backends import require_float32
+
+    require_float32()
     try:
         jax.devices()
     # JAX fails by an assertion where the plugin for a platform is not installed.

@@ -31,9 +31,11 @@ from pydantic import (
 )
 from pydantic_core import ErrorDetails, PydanticCustomError
 from ruamel.yaml import YAML
+from ruamel.yaml.constructor import SafeConstructor
 from ruamel.yaml.error import YAMLError
+from ruamel.yaml.nodes import Node
 
-from jetbot_mjx.errors import InvalidError, NotFoundError
+from jetbot_mjx.errors import InvalidError, NotFoundError, clipped, shown
 
 Overrides = Mapping[str, Any] | Sequence[str]
 """Settings that replace those of a configuration: `{"ppo.num_envs": 256}`, or a list of
@@ -59,7 +61,8 @@ def _wandb_project(name: str) -> str:
     """Reject a project name that Weights & Biases would reject after the training has started."""
     if not 0 < len(name) <= 128 or set(name) & set("/\\#?%:") or not name.isprintable():
         raise ValueError(
-            f"{name!r} is no project's name: it should have 1 to 128 characters, none of /\\#?%:"
+            f"{shown(name)} is no project's name: it should have 1 to 128 characters, none of"
+            " /\\#?%:"
         )
     return name
 
@@ -80,11 +83,12 @@ def _utf8(text: str) -> str:
 _LARGEST_FLOAT32 = 3.4e38
 
 Text = Annotated[str, AfterValidator(_utf8)]
-_Scalar = bool | int | Annotated[float, Field(allow_inf_nan=False)] | Text
+_WritableInt = Annotated[int, Field(gt=-(10**300), lt=10**300)]
+_Scalar = bool | _WritableInt | Annotated[float, Field(allow_inf_nan=False)] | Text
 
 Count = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**31)]
 Steps = Annotated[int, BeforeValidator(_integral), Field(ge=1, lt=2**53)]
-Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1)]
+Layers = Annotated[tuple[Count, ...], Field(strict=False, min_length=1, max_length=100)]
 InnerAction = Annotated[
     tuple[Annotated[float, Field(gt=-1, lt=1)], ...], Field(strict=False, min_length=1)
 ]
@@ -628,7 +632,7 @@ class Config(_Section):
             ),
             (
                 self.task.sees and self.init_from is not None,
-                f"init_from = {self.init_from!r}: a policy with task.observation ="
+                f"init_from = {shown(self.init_from)}: a policy with task.observation ="
                 f" {self.task.observation!r} cannot begin with another's: leave it out",
             ),
             (
@@ -699,8 +703,8 @@ class Config(_Section):
         for key in {**then, **now}:
             if then.get(key) != now.get(key) and key not in CHANGEABLE_ON_RESUME:
                 raise ConfigError(
-                    f"{key} = {now.get(key)!r} is not what the run began with,"
-                    f" {then.get(key)!r}: only {', '.join(CHANGEABLE_ON_RESUME)} may change"
+                    f"{clipped(key)} = {shown(now.get(key))} is not what the run began with,"
+                    f" {shown(then.get(key))}: only {', '.join(CHANGEABLE_ON_RESUME)} may change"
                 )
 
     def check_cpu_devices(self, local_device_count: int) -> None:
@@ -847,20 +851,23 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
     elif isinstance(config, str | Path):
         values, name = read_yaml(find_config(config)), str(config)
     else:
-        raise ConfigError(f"config = {config!r} is wrong: give a name, a YAML file or a Config")
+        raise ConfigError(
+            f"config = {shown(config)} is wrong: it should be a name, a file or Config"
+        )
     if isinstance(overrides, str):
         raise ConfigError(
-            f"overrides = {overrides!r} is wrong: give settings and values, as in"
+            f"overrides = {shown(overrides)} is wrong: give settings and values, as in"
             " {'ppo.num_envs': 256}"
         )
     if isinstance(overrides, Mapping):
-        name += f" with {dict(overrides)}" if overrides else ""
+        name += f" with {shown(dict(overrides))}" if overrides else ""
         for key, value in overrides.items():
-            _set(values, str(key), value, f"{key} = {value!r}")
+            _set(values, str(key), value, f"{clipped(str(key))} = {shown(value)}")
     else:
         for override in overrides:
-            name += f" --set {override}"
-            _apply_override(values, override, f"--set {override}")
+            given = f"--set {clipped(override)}"
+            name += f" {given}"
+            _apply_override(values, override, given)
     return parse_config(values, source=name)
 
 
@@ -894,7 +901,8 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, Any]:
       ConfigError: the file cannot be read, or does not hold `key: value` lines.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8") as file:
+            text = file.read(_MOST_YAML_CHARACTERS + 1)
     except FileNotFoundError:
         message = f"{what} {path} does not exist: give the path of a YAML file"
         raise ConfigNotFoundError(message) from None
@@ -905,11 +913,28 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, Any]:
             raise ConfigError(f"{what} {path} is a folder: {remedy}") from None
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError(f"{what} {path} cannot be read: {reason}") from None
-    values = _parse_yaml(text, f"{what} {path}")
+    return parse_yaml(text, f"{what} {path}")
+
+
+def parse_yaml(text: str, source: str) -> dict[str, Any]:
+    """Return the settings that a text in YAML holds; an empty text gives an empty dictionary.
+
+    Args:
+      text: the text.
+      source: description of its origin for error messages.
+
+    Raises:
+      ConfigError: the text is not valid YAML, or does not hold `key: value` lines.
+    """
+    if len(text) > _MOST_YAML_CHARACTERS:
+        raise ConfigError(
+            f"{source} has more than {_MOST_YAML_CHARACTERS:,} characters: that is no configuration"
+        )
+    values = _parse_yaml(text, source)
     if values is None:
         return {}
     if not isinstance(values, dict):
-        raise ConfigError(f"{what} {path} holds {values!r}: write `key: value` lines")
+        raise ConfigError(f"{source} holds {shown(values)}: write `key: value` lines")
     return values
 
 
@@ -921,19 +946,56 @@ _YAML_PROBLEMS = {
 }
 """What is meant by messages that speak of a parser's inner life."""
 
+_MOST_YAML_CHARACTERS = 100_000
+_MOST_YAML_VALUES = 100_000
+"""Largest size of a file of settings, as text and with all aliases replaced by what they stand for.
+"""
+
+
+class _BoundedConstructor(SafeConstructor):
+    """A `_BoundedConstructor` refuses text whose aliases stand for more values than it should."""
+
+    def construct_document(self, node: Node) -> Any:
+        """Construct the value of a document, unless it would be too large."""
+        if _count_values(node, {}) > _MOST_YAML_VALUES:
+            raise YAMLError(f"its aliases stand for more than {_MOST_YAML_VALUES:,} values")
+        return super().construct_document(node)
+
+
+def _count_values(node: Node, known: dict[int, float]) -> float:
+    """Return the number of nodes below a node with aliases replaced; infinite if it is recursive.
+
+    Args:
+      node: the node.
+      known: the numbers found so far, by the identity of the node.
+    """
+    if id(node) not in known:
+        known[id(node)] = math.inf
+        children = node.value if isinstance(node.value, list) else []
+        pairs = [child if isinstance(child, tuple) else (child,) for child in children]
+        known[id(node)] = 1 + sum(_count_values(one, known) for pair in pairs for one in pair)
+    return known[id(node)]
+
 
 def _parse_yaml(text: str, source: str) -> object:
+    yaml = YAML(typ="safe", pure=True)
+    yaml.Constructor = _BoundedConstructor
+    yaml.composer.warn_double_anchors = False
     try:
-        return YAML(typ="safe", pure=True).load(text)
+        return yaml.load(text)
     except YAMLError as error:
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         mark = getattr(error, "problem_mark", None)
         place = f", line {mark.line + 1}" if mark else ""
-        reason = _YAML_PROBLEMS.get(problem, problem)
+        reason = _YAML_PROBLEMS.get(problem, clipped(problem))
         raise ConfigError(f"{source}{place} is not valid YAML: {reason}") from None
-    # Errors that ruamel.yaml does not convert: `!!int x`, `!!bool x`, endless integers or nesting.
-    except (ValueError, LookupError, RecursionError) as error:
-        raise ConfigError(f"{source} is not valid YAML: {error}") from None
+    except RecursionError:
+        raise ConfigError(f"{source} is not valid YAML: it is nested too deeply") from None
+    # Errors that ruamel.yaml does not convert: `!!int x`, `!!bool x`, endless integers.
+    except (ValueError, LookupError) as error:
+        endless = "integer string conversion" in str(error)
+        reason = "a number has too many digits" if endless else clipped(str(error))
+        raise ConfigError(f"{source} is not valid YAML: {reason}") from None
 
 
 def _apply_override(values: dict[str, Any], override: str, source: str) -> None:
@@ -945,7 +1007,7 @@ def _apply_override(values: dict[str, Any], override: str, source: str) -> None:
 
 
 def _set(
-    values: dict[str, Any], key: str, value: object, source: str, form: str = "'{}': {!r}"
+    values: dict[str, Any], key: str, value: object, source: str, form: str = "'{}': {}"
 ) -> None:
     """Set one key of nested values.
 
@@ -965,38 +1027,44 @@ def _set(
     if isinstance(value, Mapping):
         # A whole section would silently discard the file's values of its other keys.
         inner, one = next(iter(value.items()), ("key", "value"))
-        raise ConfigError(f"{source}: set single keys, as in {form.format(f'{key}.{inner}', one)}")
+        inner, one = (x if isinstance(x, str) else shown(x) for x in (inner, one))
+        example = form.format(f"{key}.{clipped(inner)}", clipped(one))
+        raise ConfigError(f"{source}: set single keys, as in {example}")
     section[last] = value
 
 
 def _explain(error: ErrorDetails) -> str:
     """Return one line about pydantic's first error: the key, the value, and what is expected."""
     # Pydantic adds the name of a union's branch or the index in a tuple; keep only the keys.
-    location = [str(part) for part in error["loc"]]
+    location = [clipped(str(part), 100) for part in error["loc"]]
     key = ".".join(location)
-    value = error["input"]
+    value = shown(error["input"])
     if location[:2] == ["task", "options"] and len(location) > 2:
         key = ".".join(location[:3])
-        return f"{key} = {value!r} is wrong: it should be true, false, a finite number or text"
+        return f"{key} = {value} is wrong: it should be true, false, a finite number or text"
     match error["type"]:
         case "invalid_key":
-            return f"{key} = {value!r} is no key: keys should be strings"
+            return f"{key} = {value} is no key: keys should be strings"
         case "missing" if isinstance(error["input"], list | tuple):
-            return f"{'.'.join(location[:-1])} = {list(value)} is wrong: it lacks items"
+            value = shown(list(error["input"]))
+            return f"{'.'.join(location[:-1])} = {value} is wrong: it lacks items"
         case "tuple_type":
-            return f"{key} = {value!r} is wrong: it should be a list"
+            return f"{key} = {value} is wrong: it should be a list"
         case "too_short":
-            return f"{key} = {value!r} is wrong: it should have at least 1 item"
+            return f"{key} = {value} is wrong: it should have at least 1 item"
+        case "too_long":
+            most = error.get("ctx", {}).get("max_length")
+            return f"{key} = {value} is wrong: it should have at most {most} items"
         case "extra_forbidden":
-            return f"{key} = {value!r} is unknown: {_likely_key(location)}"
+            return f"{key} = {value} is unknown: {_likely_key(location)}"
         case "value_error":
             prefix = f"{key}: " if key else ""
             return prefix + str(error["ctx"]["error"]) if "ctx" in error else error["msg"]
         case "model_type" | "model_attributes_type":
-            return f"{key} = {value!r} is not a section: write its keys below it, indented"
+            return f"{key} = {value} is not a section: write its keys below it, indented"
         case _:
             wanted = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
-            return f"{key} = {value!r} is wrong: it should be {_KINDS.get(wanted, wanted)}"
+            return f"{key} = {value} is wrong: it should be {_KINDS.get(wanted, wanted)}"
 
 
 _KINDS = {

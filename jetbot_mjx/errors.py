@@ -1,8 +1,13 @@
-"""Define exceptions for errors that the user can correct, each with a message of one line."""
+"""Define exceptions for errors that the user can correct, each with a message of one line.
+
+Names of files and values that come from files are shown by the functions of this module, so that a
+message stays short and a terminal shows every character instead of obeying it.
+"""
 
 import contextlib
 import math
 import numbers
+import reprlib
 from collections.abc import Iterator
 
 
@@ -11,7 +16,7 @@ class UserError(Exception):
 
     def __init__(self, message: str) -> None:
         """Join the lines of a message that quotes a key, a path or another library's message."""
-        super().__init__(" ".join(message.splitlines()))
+        super().__init__(printable(" ".join(message.splitlines())))
 
 
 class InvalidError(UserError, ValueError):
@@ -56,6 +61,59 @@ def requires_extra(extra: str, what: str) -> Iterator[None]:
             f"{what} needs {error.name}, which is not installed: pip install"
             f" 'jetbot_mjx[{extra}]', from a checkout '.[{extra}]'"
         ) from None
+
+
+def printable(text: str) -> str:
+    """Return one line in which characters that a terminal would obey are written as escapes."""
+    if text.isprintable():
+        return text
+    return "".join(
+        one if one.isprintable() else one.encode("unicode_escape").decode() for one in text
+    )
+
+
+def printable_lines(text: str) -> str:
+    """Return text of several lines, each of them made `printable`."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def clipped(text: str, most: int = 300) -> str:
+    """Return text whose middle is left out if it is too long.
+
+    Args:
+      text: the text.
+      most: the number of characters of a text that is returned as it is.
+    """
+    return text if len(text) <= most else f"{text[: most // 2]} ... {text[-most // 2 :]}"
+
+
+def shown(value: object) -> str:
+    """Return a value as Python writes it, in a few hundred characters however large it is.
+
+    Of a collection only the first items are read, because YAML's aliases let a small file stand for
+    a collection with more items than fit into memory.
+    """
+    return clipped(_SHORT.repr(value))
+
+
+class _ShortRepr(reprlib.Repr):
+    """A `_ShortRepr` writes the first items of collections, and the size of long numbers."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.maxlevel = 3
+        self.maxdict = self.maxlist = self.maxtuple = self.maxset = 8
+        self.maxstring = self.maxother = 200
+
+    def repr_int(self, x: int, level: int) -> str:
+        # Python refuses to write integers of more than 4,300 digits.
+        digits = int(x.bit_length() * _DECIMAL_DIGITS_PER_BIT) + 1
+        return repr(x) if digits < _MOST_DIGITS else f"(a number of {digits:,} digits)"
+
+
+_DECIMAL_DIGITS_PER_BIT = 0.30103
+_MOST_DIGITS = 100
+_SHORT = _ShortRepr()
 
 
 def ran_out(error: Exception) -> bool:

@@ -83,9 +83,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             result = evaluate_runs.evaluate_run(options.run[0], **settings)
             text = tables.summarize_report(result)
-    print(text)
+    cli.tell(text)
     below = tables.below_target(result, options.min_success)
-    print("".join(f"{line}\n" for line in below), end="")
+    if below:
+        cli.tell("\n".join(below))
     return BELOW_TARGET if below else 0
 
 

@@ -26,12 +26,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.deployment.exporters import FORMATS
         from jetbot_mjx.deployment.policy_export import FOLDER, export_policy, summarize_export
 
-    def formats(text: str) -> tuple[str, ...]:
-        if text == "all":
-            return tuple(FORMATS)
-        if text in FORMATS:
-            return (text,)
-        raise argparse.ArgumentTypeError(f"{text!r} is none of {', '.join([*FORMATS, 'all'])}")
+    def formats(text: str) -> list[str]:
+        names = text.split(",")
+        for name in names:
+            if name not in (*FORMATS, "all"):
+                known = ", ".join([*FORMATS, "all"])
+                raise argparse.ArgumentTypeError(f"{name!r} is none of {known}")
+        return list(FORMATS) if "all" in names else names
 
     # Parse.
     parser = cli.Parser(prog="jetbot-mjx export", description=__doc__)
@@ -39,9 +40,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument(
         "--format",
         type=formats,
-        default=("numpy",),
+        action="extend",
         metavar="|".join([*FORMATS, "all"]),
-        help="what to write (default: numpy)",
+        help="what to write; several with commas between them (default: numpy)",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help=f"the folder (default: RUN/{FOLDER})"
@@ -51,9 +52,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     with cli.show_progress():
         exported = export_policy(
-            options.run, formats=options.format, which=options.checkpoint, output=options.out
+            options.run,
+            formats=tuple(dict.fromkeys(options.format or ("numpy",))),
+            which=options.checkpoint,
+            output=options.out,
         )
-    print(summarize_export(exported))
+    cli.tell(summarize_export(exported))
     return 0
 
 

@@ -24,9 +24,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("module", type=Path, metavar="MODULE.py", help="file to be written")
     files = write_task_template(parser.parse_args(arguments).module)
     folder = files.config.parent
-    print(f"wrote {files.module} and {files.config}")
-    print(f"next: PYTHONPATH={folder} jetbot-mjx check_env --config {files.config}")
-    print(f"      PYTHONPATH={folder} jetbot-mjx train {files.config}")
+    cli.tell(f"wrote {files.module} and {files.config}")
+    cli.tell(f"next: PYTHONPATH={folder} jetbot-mjx check_env --config {files.config}")
+    cli.tell(f"      PYTHONPATH={folder} jetbot-mjx train {files.config}")
     return 0
 
 

@@ -36,7 +36,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.divide_cpu(config.cpu_devices)
     cli.prepare_device()
     plan = plan_memory(config, options.memory)
-    print(memory_table(plan))
+    cli.tell(memory_table(plan))
     return 0 if plan.fits else TOO_LARGE
 
 

@@ -77,7 +77,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     cli.prepare_device()
     if options.run is None:
         name = f"{_DEFAULT_POLICY}.yaml"
-        print(f"no run is named: this policy comes with the package, trained by {name}")
+        cli.tell(f"no run is named: this policy comes with the package, trained by {name}")
     successes, episodes = live.play_live(
         PRETRAINED / _DEFAULT_POLICY if options.run is None else options.run,
         viewer=options.viewer,
@@ -88,9 +88,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         host=options.host,
         port=options.port,
         allow=options.allow_origin,
-        tell=lambda line: print(line, flush=True),
+        tell=cli.tell,
     )
-    print(f"{successes} of {episodes} goals reached")
+    cli.tell(f"{successes} of {episodes} goals reached")
     return 0
 
 

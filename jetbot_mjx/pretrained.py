@@ -31,8 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     runs = copy_pretrained(options.out)
     for path in runs:
-        print(f"run folder: {path}")
-    print(
+        cli.tell(f"run folder: {path}")
+    cli.tell(
         f"next: jetbot-mjx evaluate {runs[0]}\n"
         f"      jetbot-mjx render {runs[0]}\n"
         f"      jetbot-mjx play {runs[0]}"

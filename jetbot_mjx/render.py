@@ -90,7 +90,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         else:
             count = episodes or gallery.EPISODES
             rendered = gallery.render_run(run, episodes=count, goals=options.goals, which=which)
-    print(rendered.describe())
+    cli.tell(rendered.describe())
     return 0
 
 

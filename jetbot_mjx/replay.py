@@ -26,17 +26,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.runs import nan_dump
     cli.prepare_device()
     stored = nan_dump.load_nan_dump(options.file)
-    print(
+    cli.tell(
         f"the state became non-finite before step {stored.env_steps:,} of the training; the unroll"
         f" up to there:\n{nan_dump.HEADER}"
     )
     nonfinite: list[str] = []
     env = make_env(stored.config.for_any_device(), task_class=stored.task_class)
     for index, step in enumerate(nan_dump.replay_nan_dump(stored, env)):
-        print(nan_dump.format_step(index, step))
+        cli.tell(nan_dump.format_step(index, step))
         nonfinite = step.nonfinite
     if not nonfinite:
-        print("the state stayed finite here: other devices and versions round differently")
+        cli.tell("the state stayed finite here: other devices and versions round differently")
         return NOT_REPRODUCED
     return 0
 

@@ -40,7 +40,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         comparison = compare_drive(
             options.log, delay=options.delay, lag=options.lag, output=options.output
         )
-    print(summarize_drive(comparison))
+    cli.tell(summarize_drive(comparison))
     return 0
 
 

@@ -87,7 +87,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
         how = f"stopped; to resume: jetbot-mjx train --resume {run_dir}"
-        print(session.summary(result) if result.finished else how, flush=True)
+        cli.tell(session.summary(result) if result.finished else how)
     distributed.leave()
     return 0 if result.finished else preemption.STOPPED
 

@@ -55,6 +55,16 @@ def available_backends(impl: str) -> list[kernel.Backend]:
     return [x for x in BACKENDS if impl in ("auto", x.IMPL) and not x.obstacle()]
 
 
+def require_float32() -> None:
+    """Raise an error if JAX computes in 64 bits.
+
+    Raises:
+      UserError: it does.
+    """
+    if jax.config.values["jax_enable_x64"]:
+        raise UserError("all is computed in float32, and JAX_ENABLE_X64 is set: unset it")
+
+
 def require_backend(impl: str, setting: str) -> None:
     """Raise an error if a setting requests a back end that this process does not have.
 

@@ -13,7 +13,7 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.envs.task import GOAL_HEIGHT, Layout
 from jetbot_mjx.runs.checkpoint import Checkpoint
-from jetbot_mjx.runs.run_dir import versions
+from jetbot_mjx.runs.run_dir import read_text, versions
 
 FILE = "policy.json"
 
@@ -168,7 +168,7 @@ def _evaluation(checkpoint: Checkpoint) -> Mapping[str, Any] | None:
     """Return the summary of this checkpoint's report, if `evaluate` wrote one."""
     path = checkpoint.run_dir / "evaluations" / checkpoint.path.name / "report.json"
     try:
-        report = json.loads(path.read_text(encoding="utf-8"))
+        report = json.loads(read_text(path))
         return {"goal_set_version": report["goal_set_version"], **report["policy"]}
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None

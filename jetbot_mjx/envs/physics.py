@@ -21,6 +21,7 @@ from jetbot_mjx.compiler.backends import (
     default_backend,
     obstacle,
     require_backend,
+    require_float32,
 )
 from jetbot_mjx.compiler.lower_jaxpr import scalarize
 from jetbot_mjx.compiler.scalar_ir import UnsupportedError
@@ -44,8 +45,7 @@ class Physics:
         Raises:
           UserError: the requested kernel back end is not available, or JAX computes in 64 bits.
         """
-        if jax.config.values["jax_enable_x64"]:
-            raise UserError("physics is float32, and JAX_ENABLE_X64 is set: unset it")
+        require_float32()
         self.mj_model = mj_model
         self._config = config
         self._traced_leaves: tuple[int, ...] = ()

@@ -4,6 +4,7 @@ import json
 from pathlib import Path
 
 from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, REPORT_GOALS
+from jetbot_mjx.runs.run_dir import read_text
 
 PARTS = ("robustness", "randomized", "mujoco", "rendered")
 """Parts of a report that are written on request or if the run has ranges; keys of its JSON file,
@@ -73,12 +74,12 @@ def fuller_report(folder: Path, name: str) -> Path | None:
 def _goals_and_parts(folder: Path) -> tuple[int, frozenset[str]] | None:
     """Return the number of goals and the parts of the report in a folder; None without one."""
     try:
-        values = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        values = json.loads(read_text(folder / "report.json"))
         if values["goal_set_version"] != GOAL_SET_VERSION:
             return None
         found = {**values, "rendered": (values.get("mujoco") or {}).get("rendered")}
         parts = frozenset(part for part in PARTS if found.get(part) is not None)
         return int(values["policy"]["episodes"]), parts
-    except (OSError, ValueError, LookupError, TypeError, AttributeError):
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
         # Whatever cannot be read is not worth keeping.
         return None

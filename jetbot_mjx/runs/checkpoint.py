@@ -2,12 +2,13 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from jetbot_mjx.agents.networks import (
     Observation,
@@ -17,10 +18,11 @@ from jetbot_mjx.agents.networks import (
     make_networks,
     make_policy,
 )
-from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.compiler.backends import require_float32
+from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import layout_data
-from jetbot_mjx.errors import InvalidError
+from jetbot_mjx.errors import InvalidError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     CheckpointError,
@@ -44,7 +46,31 @@ POLICY = "policy"
 FORMAT = "jetbot_mjx/3"
 """Format of a checkpoint's content; checkpoints of other formats cannot be read."""
 
-_KEYS = ("format", "config", "layout", "observation_size", "action_size", "env_steps", "metrics")
+_Size = Annotated[int, Field(ge=1, lt=2**24)]
+
+
+class _LayoutField(BaseModel):
+    """One field of the observation, as `layout_data` returns it."""
+
+    model_config = ConfigDict(strict=True)
+
+    name: str
+    size: _Size
+    unit: str
+    frame: str
+
+
+class _About(BaseModel):
+    """The metadata that a policy needs; there may be more."""
+
+    model_config = ConfigDict(strict=True)
+
+    config: dict[str, Any]
+    layout: list[_LayoutField]
+    observation_size: _Size | dict[str, list[_Size]]
+    action_size: _Size
+    env_steps: Annotated[int, Field(ge=0)]
+    metrics: dict[str, float | None]
 
 
 class Checkpoint(NamedTuple):
@@ -121,12 +147,14 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
     Raises:
       CheckpointError: there is no checkpoint, it was not written by jetbot_mjx, or it changed
         after it was written.
+      UserError: JAX is set to 64 bits.
     """
+    require_float32()
     folder = find_checkpoint(path, which)
     about = explanation(folder)
+    size = about["observation_size"]
     try:
         config = parse_config(about["config"], source="stored config")
-        size = about["observation_size"]
         networks = make_networks(config.ppo, size, about["action_size"])
         template = jax.eval_shape(
             lambda key: PolicyParams(
@@ -136,8 +164,14 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
             ),
             jax.random.PRNGKey(0),
         )
-    except (KeyError, TypeError, ConfigError) as error:
+    except UserError as error:
         raise CheckpointError(f"checkpoint {folder} has unusable metadata: {error}") from None
+    # JAX and Flax report sizes that make no network by many kinds of exception.
+    except Exception:
+        raise CheckpointError(
+            f"checkpoint {folder} has unusable metadata: observation_size = {shown(size)} and"
+            f" action_size = {about['action_size']} do not fit its configuration"
+        ) from None
     return Checkpoint(
         path=folder,
         run_dir=folder.parent.parent,
@@ -161,12 +195,19 @@ def explanation(folder: Path) -> dict[str, Any]:
     Raises:
       CheckpointError: it was not written by jetbot_mjx, is incomplete, or has another format.
     """
-    about = read_about(folder, _KEYS)
+    about = read_about(folder, ("format", *_About.model_fields))
     if about["format"] != FORMAT:
         raise CheckpointError(
-            f"checkpoint {folder} has the format {about['format']!r}, and only {FORMAT!r} can be"
-            " read"
+            f"checkpoint {folder} has the format {shown(about['format'])}, and only {FORMAT!r} can"
+            " be read"
         )
+    try:
+        _About.model_validate(about)
+    except ValidationError as error:
+        key = str(error.errors()[0]["loc"][0])
+        raise CheckpointError(
+            f"checkpoint {folder} has unusable metadata: {key} = {shown(about[key])} is wrong"
+        ) from None
     return about
 
 

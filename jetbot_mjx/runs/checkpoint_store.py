@@ -35,6 +35,7 @@ import math
 import os
 import re
 import shutil
+import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
@@ -43,7 +44,8 @@ import jax
 import numpy as np
 import tensorstore as ts
 
-from jetbot_mjx.errors import NotFoundError, UserError
+from jetbot_mjx.errors import NotFoundError, UserError, clipped, shown
+from jetbot_mjx.runs.run_dir import read_text
 
 FOLDER = "checkpoints"
 """Name of the folder of checkpoints in a run folder."""
@@ -56,6 +58,11 @@ _SUCCESS = "success_rate"
 _STEP_DIGITS = 12
 _SPARE_BYTES = 1_000_000
 _DELETED = ".deleted"
+
+_UNSUSPECTED_BYTES = 1_000_000_000
+_MOST_COMPRESSED = 1_000
+"""Arrays of more bytes than the first of these are read only if their files hold at least this part
+of them. Metadata alone can ask for any amount of memory."""
 
 _SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
@@ -290,7 +297,7 @@ def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
     # Read the file and compare it with its own digest.
     file = path / _ABOUT / "metadata"
     try:
-        about = json.loads(file.read_text(encoding="utf-8"))
+        about = json.loads(read_text(file))
         stored_digest = about[_DIGESTS].pop(_ABOUT)
         is_intact = stored_digest == _digest_json(about)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
@@ -308,7 +315,8 @@ def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
             raise CheckpointError(f"checkpoint {path} has unusable metadata: no {key}")
     if path.name.isdecimal() and int(path.name) != about.get("env_steps"):
         raise CheckpointError(
-            f"checkpoint {path} was renamed: it was written after {about.get('env_steps')} steps"
+            f"checkpoint {path} was renamed: it was written after"
+            f" {shown(about.get('env_steps'))} steps"
         )
     return about
 
@@ -341,10 +349,15 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
             flat = _split(folder, table)
     except CheckpointError:
         raise
-    # TensorStore reports a damaged folder by many kinds of exception.
-    except Exception as error:
+    except OSError as error:
         raise CheckpointError(
-            f"checkpoint {path} cannot be read: another one may be intact; {_reason(error)}"
+            f"checkpoint {path} cannot be read: {name}: {error.strerror}"
+        ) from None
+    # TensorStore reports a damaged folder by many kinds of exception.
+    except Exception:
+        raise CheckpointError(
+            f"checkpoint {path} cannot be read: a file in {name} is damaged or missing; another"
+            " checkpoint may be intact"
         ) from None
     if digest(flat) != about[_DIGESTS][name]:
         raise CheckpointError(f"checkpoint {path} is damaged: {name} changed after it was written")
@@ -375,7 +388,7 @@ def stored_success_rate(run_dir: Path, env_steps: int) -> float:
         rate = read_about(checkpoint_path(run_dir, env_steps)).get(_SUCCESS)
     except CheckpointError:
         return -1.0
-    return -1.0 if rate is None else rate
+    return rate if isinstance(rate, int | float) and 0 <= rate <= 1 else -1.0
 
 
 def _digest_json(values: Mapping[str, Any]) -> str:
@@ -393,6 +406,7 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
         raise CheckpointError(
             f"checkpoint {folder.parent} cannot be read: {folder.name} is missing"
         )
+    stored_bytes = _count_bytes(folder)
     # TensorStore refuses a path with `..` in it.
     files = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
     keys = [key.decode() for key in ts.KvStore.open(files).result().list().result()]
@@ -402,7 +416,38 @@ def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarra
         place = {**files, "path": f"{name}/"}
         stored[name] = ts.open({"driver": "zarr", "kvstore": place}, read=True).result()
     _compare(folder, wanted, stored)
+    # A chunk is read as a whole, and one that no file holds is filled. A scalar has none.
+    needed = sum(
+        array.dtype.numpy_dtype.itemsize * max(math.prod(array.shape), math.prod(chunk))
+        for array in stored.values()
+        for chunk in [array.chunk_layout.read_chunk.shape or ()]
+    )
+    if needed > max(_UNSUSPECTED_BYTES, _MOST_COMPRESSED * stored_bytes):
+        raise CheckpointError(
+            f"checkpoint {folder.parent} cannot be read: {folder.name} asks for {needed:.1e} bytes"
+            f" of memory, and its files hold {stored_bytes:,}"
+        )
     return {name: array.read().result() for name, array in stored.items()}
+
+
+def _count_bytes(folder: Path) -> int:
+    """Return the size of all files below a folder, which must be regular ones [bytes].
+
+    TensorStore would wait for ever for a named pipe.
+    """
+    total = 0
+    for parent, _, names in os.walk(folder):
+        for file in (Path(parent, name) for name in names):
+            status = file.stat()
+            is_regular = stat.S_ISREG(status.st_mode)
+            if not is_regular or not os.access(file, os.R_OK):
+                reason = "permission denied" if is_regular else "it is not a regular file"
+                name = file.relative_to(folder.parent)
+                raise CheckpointError(
+                    f"checkpoint {folder.parent} cannot be read: {name}: {reason}"
+                )
+            total += status.st_size
+    return total
 
 
 def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
@@ -454,7 +499,7 @@ def _reason(error: Exception) -> str:
     text = _SOURCE_LOCATIONS.sub("", str(error))
     lines = text.strip().splitlines() or [type(error).__name__]
     # A message of TensorStore begins with the operation and ends with the cause: keep both ends.
-    return lines[0] if len(lines[0]) <= 300 else f"{lines[0][:150]} ... {lines[0][-150:]}"
+    return clipped(lines[0])
 
 
 def _describe(array: Any) -> str:

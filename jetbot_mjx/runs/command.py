@@ -27,11 +27,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     folder = options.folder or find_run.ROOT
     if options.folder and not folder.is_dir():
         parser.error(f"{folder} is no folder")
-    print(find_run.runs_table(find_run.list_runs(folder)))
+    cli.tell(find_run.runs_table(*find_run.scan_runs(folder)))
     if not options.folder:
-        print(
+        cli.tell(
             "\nwith the package, for every command that takes a run:\n"
-            f"{find_run.runs_table(find_run.list_runs(find_run.PRETRAINED))}"
+            f"{find_run.runs_table(*find_run.scan_runs(find_run.PRETRAINED))}"
         )
     return 0
 

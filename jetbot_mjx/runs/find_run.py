@@ -8,13 +8,19 @@ import difflib
 import os
 import shutil
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from jetbot_mjx.config import load_config
-from jetbot_mjx.errors import NotFoundError, UserError
+from jetbot_mjx.errors import NotFoundError, UserError, clipped, printable
 from jetbot_mjx.runs.metrics import METRICS, read_history
-from jetbot_mjx.runs.run_dir import CONFIG, atomic_folder, stored_config
+from jetbot_mjx.runs.run_dir import (
+    CONFIG,
+    DamagedRunError,
+    atomic_folder,
+    read_config,
+    stored_config,
+)
 from jetbot_mjx.runs.text_table import text_table
 
 ROOT = Path("runs")
@@ -45,9 +51,21 @@ class RunInfo(NamedTuple):
     @property
     def name(self) -> str:
         """Return the shortest name by which commands find the run."""
-        if self.path.parent == PRETRAINED:
-            return _PREFIX + self.path.name
-        return self.path.name if self.path.parent == ROOT else str(self.path)
+        return _shortest_name(self.path)
+
+
+class DamagedRun(NamedTuple):
+    """A `DamagedRun` holds what a list of runs says about a run that cannot be read."""
+
+    path: Path
+    reason: str
+    """What is wrong with which of its files."""
+
+
+def _shortest_name(path: Path) -> str:
+    if path.parent == PRETRAINED:
+        return _PREFIX + path.name
+    return path.name if path.parent == ROOT else str(path)
 
 
 def find_run(name: str | Path, root: Path = ROOT) -> Path:
@@ -66,7 +84,12 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
     if os.path.lexists(text):
         return Path(name)
     if text == _LATEST:
-        runs = list_runs(root)
+        runs, damaged = scan_runs(root)
+        if not runs and damaged:
+            raise NotFoundError(
+                f"{_LATEST}: every run in {root}/ is damaged, such as {damaged[0].path.name}:"
+                f" {damaged[0].reason}"
+            )
         if not runs:
             raise NotFoundError(f"{_LATEST}: there is no run in {root}/: train one first")
         return runs[0].path
@@ -89,7 +112,19 @@ def find_run_config(run_dir: Path) -> Path:
 
 
 def list_runs(root: Path = ROOT) -> list[RunInfo]:
-    """Return the runs in a folder and in its direct subfolders, the latest first.
+    """Return the runs in the subfolders of a folder, the latest first, without damaged ones.
+
+    Args:
+      root: the folder, which may be missing.
+
+    Raises:
+      UserError: the folder cannot be read.
+    """
+    return scan_runs(root)[0]
+
+
+def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRun]]:
+    """Return the runs in the subfolders of a folder, the latest first, and the damaged ones.
 
     Args:
       root: the folder, which may be missing.
@@ -98,37 +133,59 @@ def list_runs(root: Path = ROOT) -> list[RunInfo]:
       UserError: the folder cannot be read.
     """
     try:
-        found = [path.parent for path in root.glob(f"*/{CONFIG}")]
+        folders = sorted(root.iterdir())
+    except (FileNotFoundError, NotADirectoryError):
+        return [], []
     except OSError as error:
         raise UserError(f"{root} cannot be read: {error.strerror}") from None
-    runs = [info for path in found if (info := read_info(path)) is not None]
-    return sorted(runs, key=lambda run: -run.changed)
+    runs, damaged = [], []
+    for folder in folders:
+        if any(os.path.lexists(folder / name) for name in (CONFIG, METRICS)):
+            try:
+                runs.append(read_info(folder))
+            except DamagedRunError as error:
+                damaged.append(DamagedRun(folder, error.reason))
+    return sorted(runs, key=lambda run: -run.changed), damaged
 
 
-def read_info(run_dir: Path) -> RunInfo | None:
-    """Return what a list says about the run in a folder; None if it cannot be read."""
+def read_info(run_dir: Path) -> RunInfo:
+    """Return what a list says about the run in a folder.
+
+    Raises:
+      DamagedRunError: its configuration or its metrics cannot be read.
+    """
+    config = read_config(run_dir)
     try:
-        config = load_config(run_dir / CONFIG)
         # Of several seeds, show the first.
         seeds = sorted(run_dir.glob(f"seed-*/{METRICS}"))
         history = read_history(seeds[0] if seeds else run_dir / METRICS)
         changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
-    except (UserError, OSError):
-        return None
+    except (UserError, OSError) as error:
+        raise DamagedRunError(run_dir, str(error)) from None
     rates = [line.metrics.get("eval/success_rate") for line in history]
     task = config.task
     return RunInfo(
         path=run_dir,
-        task=f"{task.name} {config.robot.preset} {task.observation}",
+        task=f"{clipped(task.name, 60)} {config.robot.preset} {task.observation}",
         env_steps=history[-1].env_steps if history else 0,
         num_timesteps=config.ppo.num_timesteps,
-        success_rate=max((rate for rate in rates if rate is not None), default=None),
+        success_rate=max((x for x in rates if x is not None and 0 <= x <= 1), default=None),
         changed=changed,
     )
 
 
-def runs_table(runs: list[RunInfo]) -> str:
-    """Return a list of runs as text, one line each, or a line that says there are none."""
+def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRun] = ()) -> str:
+    """Return a list of runs as text, one line each, or a line that says there are none.
+
+    Args:
+      runs: the runs.
+      damaged: runs that cannot be read, which follow with the reason.
+    """
+    lines = [printable(f"damaged: {_shortest_name(one.path)}: {one.reason}") for one in damaged]
+    return "\n".join([_table(runs), *lines])
+
+
+def _table(runs: Sequence[RunInfo]) -> str:
     if not runs:
         return "no runs here: train one, or use one that comes with the package: pretrained:NAME"
     rows = [("run", "task", "steps", "success", "age")]

@@ -26,11 +26,11 @@ timestamp, and TensorBoard also shows the tags of Stable-Baselines3 (`sb3_tags.p
   time/wall_seconds         time of all processes that worked on the run, from their start
 """
 
-import contextlib
 import json
 import math
 import os
 import struct
+import sys
 import threading
 import time
 from collections.abc import Mapping, Sequence
@@ -42,7 +42,7 @@ import jax
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.imports import standing_in
-from jetbot_mjx.runs.run_dir import write_text
+from jetbot_mjx.runs.run_dir import read_bytes, write_text
 from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
 
 # Where PyTorch is installed, tensorboardX would load it to draw network graphs, which takes seconds
@@ -60,6 +60,9 @@ EVALUATION_VIDEO = "evaluation.mp4"
 
 VIDEO_TAG = "eval/video"
 """Name of the videos in TensorBoard and Weights & Biases."""
+
+_LATEST = 253_402_300_799
+"""Last second of the year 9999, after which no time can be shown [s since 1970]."""
 
 MetricValues = Mapping[str, float | None]
 
@@ -109,17 +112,35 @@ def read_history(path: Path, last: float = math.inf) -> list[History]:
       UserError: the file cannot be read.
     """
     try:
-        text = path.read_text(encoding="utf-8", errors="replace") if path.is_file() else ""
+        text = read_bytes(path).decode(errors="replace")
+    except FileNotFoundError:
+        return []
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from None
-    found = []
-    for line in text.splitlines():
-        with contextlib.suppress(ValueError, LookupError, TypeError, AttributeError):
-            values = json.loads(line)
-            env_steps, timestamp = values.pop("env_steps"), values.pop("timestamp")
-            if env_steps <= last:
-                found.append(History(env_steps, timestamp, values))
-    return found
+    entries = map(_parse_line, text.splitlines())
+    return [entry for entry in entries if entry is not None and entry.env_steps <= last]
+
+
+def _parse_line(line: str) -> History | None:
+    """Return what a line holds; None if it is incomplete or no training can have written it."""
+    try:
+        values = json.loads(line)
+        env_steps, timestamp = values.pop("env_steps"), values.pop("timestamp")
+    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return None
+    is_valid = (
+        isinstance(env_steps, int)
+        and 0 <= env_steps < 2**53
+        and _is_number(timestamp)
+        and 0 <= timestamp <= _LATEST
+        and all(value is None or _is_number(value) for value in values.values())
+    )
+    return History(env_steps, timestamp, values) if is_valid else None
+
+
+def _is_number(value: object) -> bool:
+    """Return whether a JSON value is a number that a float can hold."""
+    return isinstance(value, int | float) and abs(value) <= sys.float_info.max
 
 
 class JsonlSink:
@@ -218,10 +239,10 @@ class TensorBoardSink:
         for entry in history:
             self._add(*entry)
         written = {entry.env_steps: entry.timestamp for entry in history}
-        for path in sorted(folder.parent.glob(f"videos/*/{Path(EVALUATION_VIDEO).stem}.gif")):
-            env_steps = int(path.parent.name)
-            if env_steps in written:
-                self._add_video(env_steps, written[env_steps], path)
+        for env_steps, timestamp in written.items():
+            mp4 = folder.parent / "videos" / f"{env_steps:012d}" / EVALUATION_VIDEO
+            if mp4.with_suffix(".gif").is_file():
+                self._add_video(env_steps, timestamp, mp4)
         self._writer.flush()
 
     def write(self, env_steps: int, metrics: MetricValues) -> None:
@@ -261,7 +282,9 @@ class TensorBoardSink:
         self._writer.write_event(event)
 
     def _add_video(self, env_steps: int, timestamp: float, mp4: Path) -> None:
-        gif = mp4.with_suffix(".gif").read_bytes()
+        gif = read_bytes(mp4.with_suffix(".gif"))
+        if len(gif) < _GIF_SIZE_AT + 4:
+            return  # It was cut off since it was written.
         width, height = struct.unpack_from("<HH", gif, _GIF_SIZE_AT)
         shown = _SUMMARY.Image(width=width, height=height, colorspace=3, encoded_image_string=gif)
         summary = _SUMMARY(value=[_SUMMARY.Value(tag=VIDEO_TAG, image=shown)])

@@ -1,5 +1,6 @@
 """Save non-finite states of a training to files, load them again, and replay what led to them."""
 
+import io
 import json
 import math
 from collections.abc import Iterator
@@ -17,8 +18,9 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.kinematics import yaw
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.errors import InvalidError, NotFoundError, UserError
+from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
+from jetbot_mjx.runs.run_dir import read_bytes
 from jetbot_mjx.runs.task_code import stored_task_class
 
 FOLDER = "nan_dumps"
@@ -88,11 +90,11 @@ def load_nan_dump(path: Path) -> StoredNanDump:
       InvalidError: `save_nan_dump` did not write it.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with np.load(io.BytesIO(read_bytes(path)), allow_pickle=False) as stored:
             arrays = {name: stored[name] for name in stored.files}
         about = json.loads(str(arrays.pop("about")))
         if about["format"] != _FORMAT:
-            raise InvalidError(f"{path} has the format {about['format']!r}, not {_FORMAT!r}")
+            raise InvalidError(f"{path} has the format {shown(about['format'])}, not {_FORMAT!r}")
         config = parse_config(about["config"], source="stored config")
         run_dir = Path(path).absolute().parent.parent
         task_class = stored_task_class(run_dir, config.task.name)
@@ -101,10 +103,17 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         if wanted.keys() != arrays.keys():
             odd = sorted(wanted.keys() ^ arrays.keys())[0]
             raise InvalidError(f"{path} does not fit its task: {odd} is missing or unexpected")
+        for name, array in arrays.items():
+            shape = np.shape(wanted[name])
+            if array.shape != shape or array.dtype.kind not in "biuf":
+                raise InvalidError(
+                    f"{path} does not fit its task: {name} is {array.dtype}{list(array.shape)}, and"
+                    f" numbers of the shape {list(shape)} are expected"
+                )
         nan_dump = jax.tree.unflatten(
             jax.tree.structure(template), [arrays[name] for name in wanted]
         )
-        return StoredNanDump(config, about["env_steps"], nan_dump, task_class)
+        return StoredNanDump(config, int(about["env_steps"]), nan_dump, task_class)
     except FileNotFoundError:
         raise NotFoundError(f"{path} does not exist: give a file of a run's {FOLDER}/") from None
     except ConfigError as error:

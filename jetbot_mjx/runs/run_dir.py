@@ -13,6 +13,7 @@ import json
 import os
 import platform
 import shutil
+import stat
 import subprocess
 import sys
 from collections.abc import Iterator, Mapping
@@ -21,8 +22,8 @@ from typing import Any
 
 import jax
 
-from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.config import Config, ConfigError, parse_config, parse_yaml
+from jetbot_mjx.errors import UserError, clipped
 from jetbot_mjx.imports import LIBRARIES, installed_version
 
 try:
@@ -34,6 +35,27 @@ CONFIG = "config.yaml"
 """Name of the file in a run folder that holds the resolved configuration."""
 
 _VERSIONS = "versions.json"
+
+_MOST_BYTES = 100_000_000
+"""Largest size of a file that is read from a run, but for a checkpoint's arrays."""
+
+_LAST_SECTION = list(Config.model_fields)[-1]
+
+
+class DamagedRunError(UserError):
+    """Raised when a file of a run folder is damaged, and commands cannot tell what the run is."""
+
+    def __init__(self, run_dir: Path, reason: str) -> None:
+        """Compose the message.
+
+        Args:
+          run_dir: the run folder.
+          reason: what is wrong with which of its files.
+        """
+        super().__init__(
+            f"the run {run_dir} is damaged: {reason}: restore the file, or train into a new folder"
+        )
+        self.reason = reason
 
 
 def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
@@ -62,6 +84,37 @@ def seed_folders(run_dir: Path) -> list[Path]:
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
+def read_config(run_dir: Path) -> Config:
+    """Return the configuration that a run folder holds.
+
+    Args:
+      run_dir: the run folder.
+
+    Raises:
+      DamagedRunError: the file is missing, cannot be read or is not one that a training wrote
+        completely.
+    """
+    try:
+        text = read_text(run_dir / CONFIG)
+        if not text.strip():
+            raise ConfigError(f"{CONFIG} is empty")
+        # A training writes all settings. Those after a cut would be read as the defaults.
+        if not text.endswith("\n"):
+            raise ConfigError(f"{CONFIG} was cut off: its last line is not complete")
+        values = parse_yaml(text, CONFIG)
+        if _LAST_SECTION not in values:
+            raise ConfigError(f"{CONFIG} was cut off: it has no section {_LAST_SECTION}")
+        return parse_config(values, CONFIG)
+    except FileNotFoundError:
+        raise DamagedRunError(run_dir, f"{CONFIG} is missing") from None
+    except UnicodeDecodeError:
+        raise DamagedRunError(run_dir, f"{CONFIG} is not UTF-8 text") from None
+    except OSError as error:
+        raise DamagedRunError(run_dir, f"{CONFIG} cannot be read: {error.strerror}") from None
+    except ConfigError as error:
+        raise DamagedRunError(run_dir, str(error)) from None
+
+
 def stored_config(run_dir: Path) -> Config | None:
     """Return the configuration of the run in a folder.
 
@@ -72,11 +125,12 @@ def stored_config(run_dir: Path) -> Config | None:
       The resolved configuration; None if the folder does not exist yet or is empty.
 
     Raises:
+      DamagedRunError: as for `read_config`.
       UserError: the path holds something else, or cannot be read.
     """
     try:
-        if run_dir.is_dir() and (run_dir / CONFIG).is_file():
-            return load_config(run_dir / CONFIG)
+        if run_dir.is_dir() and os.path.lexists(run_dir / CONFIG):
+            return read_config(run_dir)
         if run_dir.is_dir() and all(path.name.startswith(".") for path in run_dir.iterdir()):
             return None
         in_use = run_dir.exists()
@@ -104,7 +158,8 @@ def occupied(run_dir: Path) -> Iterator[None]:
         run_dir.mkdir(parents=True, exist_ok=True)
         file = path.open("a+")
     except OSError as error:
-        raise UserError(f"--run-dir {run_dir} cannot be written: {error.strerror}") from None
+        reason = error.strerror or f"{path.name} is not a regular file"
+        raise UserError(f"--run-dir {run_dir} cannot be written: {reason}") from None
     with file:
         try:
             if fcntl is None:
@@ -116,13 +171,14 @@ def occupied(run_dir: Path) -> Iterator[None]:
             file.seek(0)
             raise UserError(
                 f"--run-dir {run_dir} is locked by another training (process"
-                f" {file.read().strip() or 'unknown'}): wait for it, or name another folder"
+                f" {file.read(20).strip() or 'unknown'}): wait for it, or name another folder"
             ) from None
         except OSError:
             # The file system has no locks: train without one.
             pass
-        file.truncate(0)
-        print(os.getpid(), file=file, flush=True)
+        with writing_to(path):
+            file.truncate(0)
+            print(os.getpid(), file=file, flush=True)
         yield
 
 
@@ -145,19 +201,19 @@ def write_run(run_dir: Path, config: Config, made_with: Mapping[str, Any]) -> No
 def changed_versions(run_dir: Path) -> list[str]:
     """Return the versions that changed since the last training, as `jax 0.10.2, now 0.11.2`."""
     try:
-        then = json.loads((run_dir / _VERSIONS).read_text(encoding="utf-8"))
+        then = json.loads(read_text(run_dir / _VERSIONS))
         packages = dict(then["packages"])
-    except (OSError, ValueError, LookupError, TypeError):
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return []
     now = versions()
     found = [
-        f"{name} {packages.get(name)}, now {version}"
+        f"{name} {clipped(str(packages.get(name)), 40)}, now {version}"
         for name, version in now["packages"].items()
         if packages.get(name) != version
     ]
     for key in ("device", "device_count"):
         if then.get(key) != now[key]:
-            found.append(f"{key} {then.get(key)}, now {now[key]}")
+            found.append(f"{key} {clipped(str(then.get(key)), 80)}, now {now[key]}")
     return found
 
 
@@ -242,6 +298,36 @@ def versions() -> dict[str, Any]:
         "device_count": len(devices),
         "git": _git_state(),
     }
+
+
+def read_bytes(path: Path) -> bytes:
+    """Read a file of a run, and never wait for one that only another process could fill.
+
+    Raises:
+      OSError: it cannot be read, is not a regular file, or is larger than any that a run has.
+    """
+    with open(path, "rb", opener=_open_at_once) as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "it is not a regular file")
+        content = file.read(_MOST_BYTES + 1)
+    if len(content) > _MOST_BYTES:
+        raise OSError(errno.EFBIG, f"it is larger than {_MOST_BYTES // 1_000_000} MB")
+    return content
+
+
+def read_text(path: Path) -> str:
+    """Read a text file of a run, as `read_bytes` does.
+
+    Raises:
+      OSError: as for `read_bytes`.
+      UnicodeDecodeError: it is not UTF-8.
+    """
+    return read_bytes(path).decode()
+
+
+def _open_at_once(path: str, flags: int) -> int:
+    """Open a file as `os.open` does, but a named pipe without waiting for its writer."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def write_json(path: Path, values: Any) -> None:

@@ -24,7 +24,14 @@ from types import ModuleType
 from typing import Any, NamedTuple
 
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.run_dir import shortened, write_bytes, write_json, writing_to
+from jetbot_mjx.runs.run_dir import (
+    read_bytes,
+    read_text,
+    shortened,
+    write_bytes,
+    write_json,
+    writing_to,
+)
 
 FOLDER = "task"
 """Name of the folder in a run folder that holds the source of the task."""
@@ -121,7 +128,7 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
     path = run_dir / FOLDER / HASHES
     remedy = f"restore it, or delete {run_dir / FOLDER} to run the module that can be imported"
     try:
-        stored = json.loads(path.read_text(encoding="utf-8"))
+        stored = json.loads(read_text(path))
         module, hashes = str(stored["module"]), dict(stored["sha256"])
         files = []
         for name, expected in hashes.items():
@@ -129,7 +136,7 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
             parts = PurePosixPath(name)
             if parts.is_absolute() or ".." in parts.parts:
                 raise ValueError
-            content = path.read_bytes()
+            content = read_bytes(path)
             if hashlib.sha256(content).hexdigest() != expected:
                 raise UserError(f"{path} is not the file that the training stored: {remedy}")
             files.append((name, content))
@@ -139,7 +146,7 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
         raise UserError(f"{path} is missing: {remedy}") from None
     except OSError as error:
         raise UserError(f"{path} cannot be read: {error.strerror}") from None
-    except (ValueError, LookupError, TypeError):
+    except (ValueError, LookupError, TypeError, RecursionError):
         raise UserError(f"{path} is damaged: {remedy}") from None
     return TaskCode(module, tuple(sorted(files)))
 

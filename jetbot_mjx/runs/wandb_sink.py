@@ -16,7 +16,7 @@ from typing import Any
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import MissingPackageError
 from jetbot_mjx.runs.metrics import VIDEO_TAG, History, MetricValues
-from jetbot_mjx.runs.run_dir import write_json
+from jetbot_mjx.runs.run_dir import read_text, write_json
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
 
 _FILE = "wandb.json"
@@ -145,8 +145,8 @@ class WandbSink:
 
 def _read(path: Path, project: str | None) -> dict[str, Any]:
     """Return the id and last step of this project's run, or those of a new run if there is none."""
-    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):
-        progress = json.loads(path.read_text(encoding="utf-8"))
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
+        progress = json.loads(read_text(path))
         if progress["project"] == project and isinstance(progress["id"], str):
             return {**progress, "env_steps": int(progress["env_steps"])}
     return {"project": project, "id": uuid.uuid4().hex[:8], "env_steps": -1}

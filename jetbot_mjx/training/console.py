@@ -6,6 +6,7 @@ import time
 from collections.abc import Sequence
 from typing import Literal, TextIO
 
+from jetbot_mjx.errors import printable_lines
 from jetbot_mjx.runs.metrics import MetricValues, mean_of, process_seconds
 
 Phase = Literal["compiling", "training", "evaluating", "saving", "rendering"]
@@ -70,8 +71,8 @@ class Terminal:
             )
 
     def say(self, text: str) -> None:
-        """Print a message."""
-        self._print(text)
+        """Print a message, which may name files."""
+        self._print(printable_lines(text))
 
     def close(self) -> None:
         """Leave the terminal in order, with the last metrics on it."""

@@ -28,6 +28,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from jetbot_mjx.errors import printable_lines
 from jetbot_mjx.runs.metrics import History, MetricValues, mean_of, process_seconds
 from jetbot_mjx.runs.progress import in_foreground
 from jetbot_mjx.training.console import Phase, Terminal
@@ -146,6 +147,7 @@ class Dashboard(Terminal):
 
     def say(self, text: str) -> None:
         """Print a message above the dashboard; do not fail if the terminal is gone."""
+        text = printable_lines(text)
         with self._lock:
             if self._drawing:
                 self._lines.append(text)
@@ -208,7 +210,7 @@ class Dashboard(Terminal):
             lines, self._lines = self._lines, []
         # Printing draws the dashboard below the lines.
         if lines:
-            self._console.print(Text.from_ansi("\n".join(lines)), soft_wrap=True)
+            self._console.print(Text("\n".join(lines)), soft_wrap=True)
         else:
             live.refresh()
         with self._lock:

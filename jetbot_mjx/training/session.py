@@ -405,7 +405,12 @@ def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
     return evaluate
 
 
-def _check_folder(config: Config, run_dir: Path) -> None:
+def _check_folder(config: Config, run_dir: Path) -> bool:
+    """Return whether the folder holds a run, which this training may continue.
+
+    Raises:
+      UserError: it holds another run or something else, or cannot be read.
+    """
     stored = stored_config(run_dir)
     if stored is not None:
         if "brax" in (stored.trainer, config.trainer):
@@ -422,6 +427,7 @@ def _check_folder(config: Config, run_dir: Path) -> None:
                 raise ConfigError(
                     f"{run_dir} holds another run: choose a new --run-dir, or --resume it: {error}"
                 ) from None
+    return stored is not None
 
 
 def _open_folders(
@@ -438,7 +444,7 @@ def _open_folders(
       The state to resume from, None if there is none, and the messages to print about it.
     """
     config, run_dir, run_dirs = training.config, training.run_dir, training.run_dirs
-    _check_folder(config, run_dir)
+    holds_run = _check_folder(config, run_dir)
     configs = config.of_each_seed()
     for folder in dict.fromkeys([run_dir, *run_dirs]):
         stack.enter_context(occupied(folder))
@@ -450,6 +456,8 @@ def _open_folders(
         if changes := changed_versions(run_dir):
             messages.append(f"versions changed, so the results may differ: {'; '.join(changes)}")
         messages.append(f"resuming after {resumption.env_steps:,} steps")
+    elif holds_run:
+        messages.append("the run has no checkpoint: starting from zero")
     _store_run(training)
     return resumption, messages
 

@@ -74,18 +74,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             round_size=options.round,
             confirm=options.confirm,
             storage=options.storage,
-            say=_say,
+            say=cli.tell,
         )
-    _say(
+    cli.tell(
         "\ntrained anew with new seeds, evaluated on the report's goals:\n\n"
         f"{results.entrants_table(found.entrants)}\n\n{process_seconds():.1f} s in all\n"
         f"results: {folder}\nnext: jetbot-mjx train {found.config_file}"
     )
     return 0
-
-
-def _say(text: str) -> None:
-    print(text, flush=True)
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
 from jetbot_mjx.config import Config, ConfigError, parse_config, read_yaml
+from jetbot_mjx.errors import clipped, shown
 
 TRACED = (
     "ppo.learning_rate",
@@ -88,16 +89,16 @@ def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Pa
 
 
 def _parameter(name: Any, entry: Any, path: str, config: Config) -> Parameter:
-    where = f"{path}: {name}"
+    where = f"{path}: {clipped(str(name))}"
     if not isinstance(entry, Mapping):
         raise ConfigError(
-            f"{where} = {entry!r} is wrong: write {{low: A, high: B}} or {{choices: [...]}}"
+            f"{where} = {shown(entry)} is wrong: write {{low: A, high: B}} or {{choices: [...]}}"
         )
     for key in entry:
         if key not in _KEYS:
             close = difflib.get_close_matches(str(key), _KEYS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(_KEYS)}"
-            raise ConfigError(f"{where}.{key} is unknown: {hint}")
+            raise ConfigError(f"{where}.{clipped(str(key))} is unknown: {hint}")
     choices, low, high = entry.get("choices"), entry.get("low"), entry.get("high")
     log = entry.get("log", False)
     if choices is not None:
@@ -108,7 +109,7 @@ def _parameter(name: Any, entry: Any, path: str, config: Config) -> Parameter:
         if not (_is_number(low) and _is_number(high) and low < high):
             raise ConfigError(f"{where} is wrong: low and high should be numbers, low the smaller")
         if not isinstance(log, bool) or (log and low <= 0):
-            raise ConfigError(f"{where}.log = {log!r} is wrong: true needs a low above 0")
+            raise ConfigError(f"{where}.log = {shown(log)} is wrong: true needs a low above 0")
         found = Parameter(str(name), low, high, log)
     # If both ends of a range are valid, so is what lies between them.
     for value in found.choices or (low, high):

@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from jetbot_mjx.errors import UserError, check_count
-from jetbot_mjx.runs.checkpoint import Which, explanation, load_checkpoint
-from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
+from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, stored_success_rate
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
 from jetbot_mjx.viewers.gallery import Rendered, run_episodes, run_folder, video_files
 from jetbot_mjx.viewers.grid_renderer import GridRenderer, camera_above, pull_back_camera
@@ -99,10 +99,7 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     check_count("robots", robots, MOST_ROBOTS)
     # Choose the checkpoints and run them on the same goals.
     path = run_folder(run_dir, "--strip")
-    rates = {
-        step: float(explanation(checkpoint_path(path, step))["metrics"].get("success_rate", -1))
-        for step in checkpoint_steps(path)
-    }
+    rates = {step: stored_success_rate(path, step) for step in checkpoint_steps(path)}
     chosen = untrained_early_trained(rates)
     checkpoints = [load_checkpoint(path, step) for step in chosen.values()]
     env = checkpoints[0].make_env()

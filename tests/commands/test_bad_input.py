@@ -24,6 +24,18 @@ from jetbot_mjx.runs.metrics import TensorBoardSink
 from jetbot_mjx.runs.run_dir import stored_config
 from jetbot_mjx.training import ppo_trainer
 
+HEX = "0x" + "f" * 5000
+"""A number that Python reads, and refuses to write."""
+
+
+def laughs(levels, alias=", &a{n} [{list}]", first="&a0 [x, x]"):
+    """Aliases of aliases: each level stands for nine times as many values as the one before."""
+    lists = (", ".join([f"*a{n - 1}"] * 9) for n in range(1, levels))
+    return first + "".join(alias.format(n=n, list=one) for n, one in enumerate(lists, start=1))
+
+
+MERGED = laughs(9, ", &a{n} {{<<: [{list}]}}", "&a0 {x: 1}")
+
 
 @pytest.mark.parametrize(
     ("text", "said"),
@@ -33,10 +45,26 @@ from jetbot_mjx.training import ppo_trainer
         ("physics: {sim_dt: 1e-9}", "sim_dt"),  # settling takes hours
         ("ppo: {num_envs: 1000000000000}", "ppo.num_envs = 1000000000000 is wrong"),
         ('ppo: {"a\\nb": 1}', "is unknown"),
-        (f"seed: {'9' * 5000}", "is not valid YAML"),  # ValueError
+        (f"seed: {'9' * 5000}", "a number has too many digits"),  # ValueError
+        (f"seed: {HEX}", "seed = (a number of 6,021 digits) is wrong"),  # ValueError
+        (f"randomization: {{mass: [1, {HEX}]}}", "mass = [1, (a number of 6,021 digits)] is wrong"),
+        (f"task: {{options: {{a: {HEX}}}}}", "task.options.a = (a number of 6,021 digits) is"),
+        (f"seed: {'x' * 50_000}", "seed = 'xxx"),
+        (f"{'x' * 1000}: 1", "is unknown: known are seed"),
+        (f"seed: !!bool {'x' * 50_000}", "is not valid YAML"),
+        (f"seed: [{laughs(4)}]", "seed = [['x', 'x'], [['x', 'x'], ['x', 'x'], ['x', 'x']"),
+        (
+            f"seed: [{laughs(12)}]",
+            "is not valid YAML: its aliases stand for more than 100,000",
+        ),
+        (f"seed: [{MERGED}]", "is not valid YAML: its aliases stand for more than 100,000"),
+        ("seed: [&a 1, &a 2]", "seed = [1, 2] is wrong"),
+        ("seed: &a [*a]", "is not valid YAML: its aliases stand for more than 100,000"),
+        (f"wandb: '{'/' * 50_000}'", "is no project's name"),
+        (f"ppo: {{network: {{policy_hidden_layer_sizes: {[8] * 101}}}}}", "at most 100 items"),
         ("seed: !!int x", "is not valid YAML"),  # ValueError
         ("seed: !!bool x", "is not valid YAML"),  # KeyError
-        (f"seed: {'[' * 3000}", "is not valid YAML"),  # RecursionError
+        (f"seed: {'[' * 3000}", "is nested too deeply"),  # RecursionError
         ("ppo: {network: {policy_hidden_layer_sizes: 32}}", "it should be a list"),
         ("ppo: {network: {policy_hidden_layer_sizes: []}}", "should have at least 1 item"),
         ("ppo: {1: 2}", "is no key: keys should be strings"),
@@ -45,7 +73,31 @@ from jetbot_mjx.training import ppo_trainer
     ],
 )
 def test_config(refusal, text, said):
-    assert said in refusal(text)
+    message = refusal(text)
+    assert said in message
+    assert len(message) < 1000
+
+
+@pytest.mark.parametrize("override", [f"seed={HEX}", f"ppo={{a: {HEX}}}", f"seed={'x' * 9000}"])
+def test_overrides(refusal, override):
+    assert len(refusal("", override)) < 1000
+
+
+def test_a_setting_of_a_resumed_run_is_shown_in_a_line():
+    then, now = (parse_config({"init_from": name * 50_000}) for name in "ab")
+    with pytest.raises(UserError) as caught:
+        then.check_resume(now)
+    assert len(str(caught.value)) < 1000
+
+
+def test_a_message_cannot_command_the_terminal():
+    said = str(UserError("run \x1b[31m\u202e\udcff\x07\nnext\tü 5 µm"))
+    assert said == r"run \x1b[31m\u202e\udcff\x07 next\tü 5 µm"
+
+
+def test_a_result_cannot_command_the_terminal(capsys):
+    cli.tell("one\x1b[31m\ntwo\r")
+    assert capsys.readouterr().out == "one\\x1b[31m\ntwo\\r\n"
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """The command line: a user's mistake costs one line and exit code 2, and leaves nothing behind."""
 
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -22,7 +23,7 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.task import WORLD, layout_data
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import evaluate_runs
-from jetbot_mjx.runs import checkpoint_store
+from jetbot_mjx.runs import checkpoint_store, nan_dump
 from jetbot_mjx.runs.checkpoint import FORMAT
 from jetbot_mjx.training import session
 
@@ -479,6 +480,24 @@ def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
         write(tmp_path / name)
         said = refused(replay, tmp_path / name)
         assert f"{name} is not a NaN dump of a training: give a file of a run's nan_dumps/" in said
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo], ids=["folder", "pipe"])
+def test_replay_refuses_what_is_no_file(refused, tmp_path, make):
+    make(tmp_path / "dump.npz")
+    assert "dump.npz is not a NaN dump of a training" in refused(replay, tmp_path / "dump.npz")
+
+
+@pytest.mark.parametrize("value", [np.zeros((10**4, 3)), np.array("x")], ids=["shape", "dtype"])
+def test_replay_refuses_arrays_of_another_kind(refused, tmp_path, value):
+    config = parse_config({})
+    arrays = nan_dump.flatten(nan_dump._template(config, None))
+    arrays = {name: np.zeros(np.shape(leaf), np.float32) for name, leaf in arrays.items()}
+    about = {"format": nan_dump._FORMAT, "config": config.model_dump(mode="json"), "env_steps": 1}
+    arrays |= {"actions": value, "about": np.array(json.dumps(about))}
+    np.savez(tmp_path / "dump.npz", **arrays)
+    line = refused(replay, tmp_path / "dump.npz")
+    assert "dump.npz does not fit its task: actions is " in line
 
 
 def test_train_names_its_run_folder_after_the_configuration(asked):

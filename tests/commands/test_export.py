@@ -536,9 +536,27 @@ def test_a_folder_that_cannot_be_is_told(run_dir, tmp_path):
     assert os.listdir(tmp_path) == []
 
 
+@pytest.mark.parametrize(
+    "arguments",
+    [["--format", "stablehlo", "--format", "numpy"], ["--format", "stablehlo,numpy"]],
+    ids=["twice", "a list"],
+)
+def test_several_formats_are_all_written(run_dir, tmp_path, shortly, arguments):
+    out = tmp_path / "policy"
+    assert export.main([str(run_dir), "--out", str(out), *arguments]) == 0
+    names = {path.name for path in out.iterdir()}
+    assert names == {"policy.stablehlo", "policy.py", "policy.json", "recording.npz"}
+
+
+def test_without_a_format_it_is_numpy(run_dir, tmp_path, shortly):
+    assert export.main([str(run_dir), "--out", str(tmp_path / "policy")]) == 0
+    files = json.loads((tmp_path / "policy" / "policy.json").read_text())["files"]
+    assert list(files) == ["numpy"]
+
+
 def test_an_unknown_format_is_told(run_dir, capsys):
     with pytest.raises(SystemExit) as left:
-        export.main([str(run_dir), "--format", "torch"])
+        export.main([str(run_dir), "--format", "numpy,torch"])
     assert left.value.code == 2
     assert "'torch' is none of numpy, onnx, stablehlo, all" in capsys.readouterr().err
 

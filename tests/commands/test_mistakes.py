@@ -61,6 +61,9 @@ def home(tmp_path_factory, smoke_run):
     (folder / "runs" / "other" / "thesis.tex").touch()
     for name in ("mine", "damaged"):
         shutil.copytree(smoke_run, folder / "runs" / name)
+    shutil.copytree(smoke_run, folder / "runs" / "cut")
+    cut = folder / "runs" / "cut" / "config.yaml"
+    cut.write_text(cut.read_text()[:500])
     for path in (folder / "runs" / "damaged" / "checkpoints").glob("*/policy/**/d/*"):
         path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return folder

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from command_modules import train
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, load_policy
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
@@ -201,6 +201,11 @@ def test_a_scene_that_cannot_be_simulated_is_refused_before_a_run_begins(name, r
 def test_64_bits_are_refused_by_commands_with_the_remedy():
     with jax.enable_x64(True), pytest.raises(UserError, match="JAX_ENABLE_X64 is set: unset it"):
         cli.require_device()
+
+
+def test_64_bits_are_refused_when_a_policy_is_loaded():
+    with jax.enable_x64(True), pytest.raises(UserError, match="JAX_ENABLE_X64 is set: unset it"):
+        load_policy("pretrained:jetbot_egocentric")
 
 
 def test_64_bits_are_refused_with_the_remedy():

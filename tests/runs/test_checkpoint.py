@@ -1,15 +1,20 @@
+import json
+import os
 import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
+import tensorstore as ts
 
 from jetbot_mjx import load_policy
 from jetbot_mjx.errors import InvalidError
+from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint import (
     FORMAT,
     POLICY,
@@ -245,6 +250,111 @@ def test_a_damaged_checkpoint_is_refused(run_copy, harm, capfd):
                 path.unlink()
     assert "cannot be read" in refused(folder)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("key", "values"),
+    [
+        ("observation_size", (-3, 0, 2**40, "7", None, [7], {"pixels/front": [-1, 2, 3]})),
+        ("action_size", (-1, 0, 10**12, "2", None, 2.5)),
+        ("layout", (None, 3, [3], [{}], [{"frame": "body", "name": "a", "size": -1, "unit": "m"}])),
+    ],
+)
+def test_metadata_that_no_training_wrote_is_refused_by_name(write, key, values):
+    for number, value in enumerate(values):
+        said = refused(write((number, 0.5), **{key: value}), number)
+        assert f"has unusable metadata: {key} = {value!r} is wrong" in said
+
+
+@pytest.mark.parametrize("size", [{}, {"pixels/front": [32, 32]}, {"x": [7]}])
+def test_sizes_that_make_no_network_are_refused(write, size):
+    said = refused(write((1, 0.5), observation_size=size), 1)
+    assert f"observation_size = {size!r} and action_size = 2 do not fit its configuration" in said
+
+
+def test_a_format_of_any_length_is_shown_in_a_line(write):
+    assert len(refused(write((1, 0.5), format="x" * 100_000))) < 1000
+
+
+_LARGE = 1_000_000
+
+
+def ask_for_memory(folder, shapes, chunks):
+    """Change the shapes and chunks that the files of a policy state."""
+    place = {"driver": "file", "path": f"{folder / POLICY}/"}
+    store = ts.KvStore.open({"driver": "ocdbt", "base": place}).result()
+    for key in store.list().result():
+        name = key.decode().removesuffix("/.zarray").removeprefix("policy.params.")
+        if key.endswith(b"/.zarray") and name in {*shapes, *chunks}:
+            about = json.loads(store[key])
+            about["shape"] = shapes.get(name, about["shape"])
+            about["chunks"] = chunks.get(name, about["shape"])
+            store[key] = json.dumps(about).encode()
+
+
+def test_metadata_alone_asks_for_no_memory(smoke_run, write):
+    config = load_checkpoint(smoke_run).about["config"]
+    config["ppo"]["network"]["policy_hidden_layer_sizes"] = [_LARGE, _LARGE]
+    folder = find_checkpoint(write((1, 0.5), config=config), 1)
+    shapes = {
+        "hidden_0.kernel": [7, _LARGE],
+        "hidden_0.bias": [_LARGE],
+        "hidden_1.kernel": [_LARGE, _LARGE],
+        "hidden_1.bias": [_LARGE],
+        "hidden_2.kernel": [_LARGE, 4],
+    }
+    ask_for_memory(folder, shapes, {})
+    assert "policy asks for 4.0e+12 bytes of memory, and its files hold" in refused(folder)
+
+
+def test_a_chunk_asks_for_no_more_memory_than_its_array(write):
+    folder = find_checkpoint(write((1, 0.5)), 1)
+    ask_for_memory(folder, {}, {"hidden_1.kernel": [_LARGE, _LARGE]})
+    assert "policy asks for 4.0e+12 bytes of memory, and its files hold" in refused(folder)
+
+
+def replaced_by(make):
+    def harm(path):
+        path.unlink()
+        make(path)
+
+    return harm
+
+
+UNREADABLE = {
+    "folder": replaced_by(Path.mkdir),
+    "pipe": replaced_by(os.mkfifo),
+    "loop": replaced_by(lambda path: path.symlink_to(path.name)),
+    "device": replaced_by(lambda path: path.symlink_to("/dev/zero")),
+    "empty": lambda path: path.write_bytes(b""),
+    "cut": lambda path: path.write_bytes(path.read_bytes()[:100]),
+    "flipped": lambda path: path.write_bytes(bytes(x ^ 4 for x in path.read_bytes())),
+}
+
+
+@pytest.mark.parametrize("harm", UNREADABLE.values(), ids=UNREADABLE)
+@pytest.mark.parametrize("file", ["about/metadata", "policy/manifest.ocdbt", "policy/d"])
+def test_a_file_that_cannot_be_read_costs_one_line_and_no_time(run_copy, harm, file):
+    folder = find_checkpoint(run_copy, "best")
+    path = folder / file
+    harm(next(path.iterdir()) if path.is_dir() else path)
+    said = refused(folder)
+    assert len(said) < 400
+    assert any(reason in said for reason in ("cannot be read", "damaged", "changed after"))
+    # Another one is the best now, or all is refused.
+    load_checkpoint(run_copy, 0)
+
+
+@pytest.mark.parametrize("rate", ["high", [1], {}, 2.0, float("1e300")])
+def test_a_success_rate_that_is_none_is_not_the_best(write, rate):
+    run_dir = write((0, 0.1), (10, 0.2))
+    path = run_dir / "checkpoints" / f"{10:012}" / "about" / "metadata"
+    about = json.loads(path.read_text())
+    about["success_rate"] = rate
+    del about["sha256"]["about"]
+    about["sha256"]["about"] = checkpoint_store._digest_json(about)
+    path.write_text(json.dumps(about))
+    assert load_checkpoint(run_dir).env_steps == 0
 
 
 def test_the_best_is_found_beside_one_that_cannot_be_read(run_copy):

@@ -5,6 +5,7 @@ import json
 import math
 import os
 import re
+import shutil
 import struct
 import threading
 import time
@@ -291,6 +292,16 @@ def test_tensorboard_plays_the_videos_of_evaluations_and_keeps_them_on_resume(tm
     # A training that resumes before the last one makes that anew.
     TensorBoardSink(folder, HISTORY).close()
     assert videos(folder) == [(steps, gifs[steps], (8, 4)) for steps in (0, 512)]
+
+
+def test_a_video_that_was_cut_is_left_out_on_resume(tmp_path):
+    gifs = {steps: film(tmp_path, steps).with_suffix(".gif") for steps in (0, 512)}
+    gifs[0].write_bytes(gifs[0].read_bytes()[:7])
+    (tmp_path / "videos" / "notes").mkdir()
+    shutil.copy(gifs[512], tmp_path / "videos" / "notes")
+    folder = tmp_path / "tensorboard"
+    TensorBoardSink(folder, HISTORY).close()
+    assert [step for step, *_ in videos(folder)] == [512]
 
 
 def test_tensorboard_leaves_alone_what_is_not_its_own(tmp_path):

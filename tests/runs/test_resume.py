@@ -723,6 +723,27 @@ def test_a_run_that_ended_before_its_first_checkpoint_begins_as_another(config, 
     assert load_config(tmp_path / "config.yaml") == config
 
 
+def test_a_run_without_checkpoints_says_that_it_starts_from_zero(config, tmp_path, capsys):
+    write_run(tmp_path, config, {})
+    assert train.main(["--resume", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith("the run has no checkpoint: starting from zero\n")
+    assert "resuming" not in out
+
+
+@pytest.mark.parametrize("length", [0, 1, 700, -4])
+def test_a_configuration_that_was_cut_is_not_taken_for_another_runs(run_copy, smoke, length):
+    path = run_copy / "config.yaml"
+    kept = path.read_text().splitlines(keepends=True)[:length] if length < 0 else ""
+    path.write_text("".join(kept) or path.read_text()[:length])
+    before = contents(run_copy)
+    for arguments in (["--resume"], ["--config", smoke, "--run-dir"]):
+        said = refused(train.main, [*arguments, str(run_copy)])
+        assert said.startswith(f"the run {run_copy} is damaged: config.yaml ")
+        assert said.endswith(": restore the file, or train into a new folder")
+    assert contents(run_copy) == before
+
+
 def test_a_changed_interval_moves_the_reports_and_nothing_else(
     config, tmp_path, stop_after, monkeypatch, states
 ):
