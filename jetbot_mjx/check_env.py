@@ -42,14 +42,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for name, findings in check_task(config):
         errors += len(findings)
         remaining.remove(name)
-        print(f"{'wrong' if findings else 'ok':5}  {name:8}  {CHECKS[name][1]}", flush=True)
+        cli.tell(f"{'wrong' if findings else 'ok':5}  {name:8}  {CHECKS[name][1]}")
         for finding in findings:
-            print(f"{'':7}- {finding}", flush=True)
+            cli.tell(f"{'':7}- {finding}")
     # Summarise.
     if errors and remaining:
-        print(f"not checked until that is corrected: {', '.join(remaining)}")
+        cli.tell(f"not checked until that is corrected: {', '.join(remaining)}")
     total = f"{errors} error{'s' * (errors > 1)}" if errors else "no errors"
-    print(f"{config.task.name}: {total}")
+    cli.tell(f"{config.task.name}: {total}")
     return BROKEN if errors else 0
 
 
