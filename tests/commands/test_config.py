@@ -434,7 +434,7 @@ def test_a_bad_override_in_python_is_refused_in_its_own_terms(overrides, said):
 
 
 def test_what_is_no_configuration_is_refused():
-    with pytest.raises(ConfigError, match="config = 5 is wrong: give a name, a YAML file or a Con"):
+    with pytest.raises(ConfigError, match="config = 5 is wrong: it should be a name, a file or"):
         load_config(5)
 
 
