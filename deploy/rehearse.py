@@ -133,13 +133,19 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument(
         "--delay",
         type=at_least(0.0),
-        help=f"of the motors [s] (default: {nominal.delay:g}; with --camera 0)",
+        help=f"delay of the motors [s] (default: {nominal.delay:g}; with --camera 0)",
     )
     parser.add_argument(
-        "--lag", type=at_least(0.0), default=nominal.lag, help="of the motors [s] (default: 0.1)"
+        "--lag",
+        type=at_least(0.0),
+        default=nominal.lag,
+        help="lag of the motors [s] (default: 0.1)",
     )
     parser.add_argument(
-        "--dead-band", type=float, default=nominal.dead_band[0], help="motor value (default: 0.12)"
+        "--dead-band",
+        type=float,
+        default=nominal.dead_band[0],
+        help="motor value below which a wheel stands still (default: 0.12)",
     )
     parser.add_argument("--rate", type=at_least(1.0), help=f"poses per second (default: {_RATE:g})")
     parser.add_argument(
@@ -158,7 +164,10 @@ def _parser() -> argparse.ArgumentParser:
         help="share of the goals to reach for exit code 0 (default: 0.95)",
     )
     parser.add_argument(
-        "--lost", type=at_least(0.0, 1.0), default=0.0, help="share of lost motor values"
+        "--lost",
+        type=at_least(0.0, 1.0),
+        default=0.0,
+        help="share of lost motor commands (default: 0)",
     )
     _add_camera_arguments(parser)
     return parser
@@ -166,21 +175,24 @@ def _parser() -> argparse.ArgumentParser:
 
 def _add_camera_arguments(parser: argparse.ArgumentParser) -> None:
     usual = CameraModel()
-    parser.add_argument("--camera", action="store_true", help="drive by pictures alone")
+    parser.add_argument("--camera", action="store_true", help="drive by the camera alone")
     parser.add_argument(
         "--latency",
         type=at_least(0.0),
         default=usual.latency,
-        help="from the light to the driver [s] (default: 0.08)",
+        help="latency of the camera [s] (default: 0.08)",
     )
     parser.add_argument(
-        "--frame-rate", type=at_least(1.0), default=usual.rate, help="pictures per second"
+        "--frame-rate", type=at_least(1.0), default=usual.rate, help="images per second"
     )
     parser.add_argument(
-        "--dropped", type=at_least(0.0, 1.0), default=usual.dropped, help="share of lost pictures"
+        "--dropped", type=at_least(0.0, 1.0), default=usual.dropped, help="share of lost images"
     )
     parser.add_argument(
-        "--appearance", choices=("plain", "varied"), default="plain", help="of the pictures"
+        "--appearance",
+        choices=("plain", "varied"),
+        default="plain",
+        help="appearance of the scene (default: plain)",
     )
     parser.add_argument(
         "--faults", type=int, default=20, help="drives with a broken camera (default: 20)"
@@ -223,7 +235,7 @@ def main(arguments: list[str] | None = None) -> int:
                 raise DriveError(f"--{name} {getattr(options, name)}: give at least {least}")
         for name in ("rate", "noise"):
             if options.camera and getattr(options, name) is not None:
-                raise DriveError(f"--{name} is of poses, which --camera has not: leave it out")
+                raise DriveError(f"--{name} concerns poses, and --camera uses none: leave it out")
         policy = load_policy(options.policy)
         began = time.monotonic()
         delay = options.delay

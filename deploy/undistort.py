@@ -94,7 +94,9 @@ def _size(text: str, path: str) -> tuple:
             raise DriveError(f"--undistort {path} is not a calibration: it lacks {name}")
         sides.append(int(found.group(1)))
     if min(sides) < 1:
-        raise DriveError(f"--undistort {path}: pictures of {sides[0]} x {sides[1]} pixels are none")
+        raise DriveError(
+            f"--undistort {path}: pictures of {sides[0]} x {sides[1]} pixels are impossible"
+        )
     return sides[0], sides[1]
 
 

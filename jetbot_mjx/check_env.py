@@ -26,12 +26,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Parse.
     parser = cli.Parser(prog="jetbot-mjx check_env", description=__doc__)
     parser.add_argument(
-        "task", nargs="?", metavar="package.module:Class", help="default: that of --config"
+        "task",
+        nargs="?",
+        metavar="package.module:Class",
+        help="the task (default: the task of --config)",
     )
     cli.add_config_arguments(parser, positional=False)
     options = parser.parse_args(arguments)
     if not options.task and options.config is None:
-        parser.error("name a task as package.module:Class, or a --config that does")
+        parser.error("give a task as package.module:Class, or a --config that names one")
     name = options.task if ":" in (options.task or "") else f"{_BUILT_IN}:{options.task}"
     config = cli.config_of(options, *([f"task.name={name}"] if options.task else []))
     with cli.exit_on_interrupt():

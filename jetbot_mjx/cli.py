@@ -269,7 +269,7 @@ def number(kind: type, least: float, most: float = _LARGEST) -> Callable[[str], 
             value = kind(text)
         except ValueError:
             what = "whole number" if kind is int else "number"
-            raise argparse.ArgumentTypeError(f"{text!r} is no {what}") from None
+            raise argparse.ArgumentTypeError(f"{text!r} is not a {what}") from None
         # A comparison with NaN is false.
         if not value >= least:
             raise argparse.ArgumentTypeError(f"{text} is too small: give at least {least}")
@@ -358,12 +358,12 @@ def add_config_arguments(
       positional: Whether the name alone is accepted, without `--config` before it.
     """
     group = group or parser.add_mutually_exclusive_group(required=required)
-    what = "YAML file, or the name of a configuration that comes with the package"
-    text = f"{what}; `{PROGRAM} configs` lists them"
-    group.add_argument("--config", type=Path, metavar="CONFIG", help=text)
+    text = f"name of a configuration (`{PROGRAM} configs` lists them) or YAML file"
+    same = "the configuration, in place of CONFIG"
+    group.add_argument("--config", type=Path, metavar="CONFIG", help=same if positional else text)
     if positional:
         group.add_argument(
-            "config", type=Path, nargs="?", action=_KeepIfAbsent, metavar="CONFIG", help="the same"
+            "config", type=Path, nargs="?", action=_KeepIfAbsent, metavar="CONFIG", help=text
         )
     parser.add_argument(
         "--set",
@@ -371,7 +371,7 @@ def add_config_arguments(
         action="append",
         default=[],
         metavar="SECTION.KEY=VALUE",
-        help="override one setting; may be given again",
+        help="override one setting; may be repeated",
     )
 
 

@@ -61,7 +61,7 @@ def _wandb_project(name: str) -> str:
     """Reject a project name that Weights & Biases would reject after the training has started."""
     if not 0 < len(name) <= 128 or set(name) & set("/\\#?%:") or not name.isprintable():
         raise ValueError(
-            f"{shown(name)} is no project's name: it should have 1 to 128 characters, none of"
+            f"{shown(name)} is not a project name: it should have 1 to 128 characters, none of"
             " /\\#?%:"
         )
     return name
@@ -718,9 +718,9 @@ class Config(_Section):
         """
         if self.cpu_devices not in (None, local_device_count):
             raise ConfigError(
-                f"cpu_devices = {self.cpu_devices}: JAX has begun with {local_device_count}: call"
-                f" jax.config.update('jax_num_cpu_devices', {self.cpu_devices}) before its first"
-                " computation, or leave the setting out"
+                f"cpu_devices = {self.cpu_devices}: JAX has already started with"
+                f" {local_device_count}: call jax.config.update('jax_num_cpu_devices',"
+                f" {self.cpu_devices}) before its first computation, or remove the setting"
             )
 
     def check_devices(self, device_count: int) -> None:
@@ -1044,7 +1044,7 @@ def _explain(error: ErrorDetails) -> str:
         return f"{key} = {value} is wrong: it should be true, false, a finite number or text"
     match error["type"]:
         case "invalid_key":
-            return f"{key} = {value} is no key: keys should be strings"
+            return f"{key} = {value} is not a key: keys should be strings"
         case "missing" if isinstance(error["input"], list | tuple):
             value = shown(list(error["input"]))
             return f"{'.'.join(location[:-1])} = {value} is wrong: it lacks items"

@@ -20,7 +20,7 @@ def _parser(default: int, most: int) -> cli.Parser:
         type=cli.whole_number(1, most),
         default=default,
         metavar="N",
-        help=f"the first N of the fixed goals (default: {default:,})",
+        help=f"drive to the first N of the fixed goals (default: {default:,})",
     )
     parser.add_argument(
         "--output",
@@ -48,7 +48,10 @@ def _parser(default: int, most: int) -> cli.Parser:
         " from them for each goal (default: the ranges of the run, if any)",
     )
     parser.add_argument(
-        "--min-success", type=cli.fraction, default=0.0, help="exit with 1 below this success rate"
+        "--min-success",
+        type=cli.fraction,
+        default=0.0,
+        help="exit with code 1 if the success rate is below this, 0 to 1",
     )
     return parser
 

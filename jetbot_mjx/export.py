@@ -31,7 +31,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name in names:
             if name not in (*FORMATS, "all"):
                 known = ", ".join([*FORMATS, "all"])
-                raise argparse.ArgumentTypeError(f"{name!r} is none of {known}")
+                raise argparse.ArgumentTypeError(f"{name!r} is not one of {known}")
         return list(FORMATS) if "all" in names else names
 
     # Parse.
@@ -42,10 +42,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         type=formats,
         action="extend",
         metavar="|".join([*FORMATS, "all"]),
-        help="what to write; several with commas between them (default: numpy)",
+        help="file format to write, or several with commas between them (default: numpy)",
     )
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help=f"the folder (default: RUN/{FOLDER})"
+        "--out", type=Path, metavar="DIR", help=f"folder to write (default: RUN/{FOLDER})"
     )
     options = parser.parse_args(arguments)
     # Export.

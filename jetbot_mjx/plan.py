@@ -27,7 +27,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--memory",
         type=cli.number(float, 0.001),
         metavar="GIB",
-        help="default: what the device has",
+        help="memory of each device (default: that of this machine's devices)",
     )
     options = parser.parse_args(arguments)
     config = cli.config_of(options)

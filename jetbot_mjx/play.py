@@ -25,7 +25,7 @@ def _origin(text: str) -> str:
             name = None
     if not name or parts.scheme not in ("http", "https"):
         raise argparse.ArgumentTypeError(
-            f"{text!r} is no origin: write it as https://hub.example.org or http://localhost:3000"
+            f"{text!r} is not an origin: write it as https://hub.example.org or http://localhost:3000"
         )
     default = {"http": 80, "https": 443}[parts.scheme]
     host = f"[{name}]" if ":" in name else name
@@ -34,13 +34,34 @@ def _origin(text: str) -> str:
 
 def _parser(agents: Sequence[str]) -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx play", description=__doc__)
-    default = f"of {_DEFAULT_POLICY}.yaml, comes with the package"
+    default = f"pretrained:{_DEFAULT_POLICY}"
     cli.add_checkpoint_arguments(parser, default=default)
-    parser.add_argument("--viewer", choices=("browser", "native"), default="browser")
-    parser.add_argument("--agent", choices=agents, default="policy", help="who drives at first")
-    parser.add_argument("--seed", type=cli.whole_number(0), default=0, help="of the goals")
+    parser.add_argument(
+        "--viewer",
+        choices=("browser", "native"),
+        default="browser",
+        help="a page in the browser, or MuJoCo's own window (default: browser)",
+    )
+    parser.add_argument(
+        "--agent",
+        choices=agents,
+        default="policy",
+        help="initial driver; the page can switch it (default: policy)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=cli.whole_number(0),
+        default=0,
+        help="random seed of the goals (default: 0)",
+    )
     robots = cli.whole_number(1, 256)  # what two CPU cores still drive in real time
-    parser.add_argument("--robots", type=robots, default=1, metavar="N", help="drive N at once")
+    parser.add_argument(
+        "--robots",
+        type=robots,
+        default=1,
+        metavar="N",
+        help="number of robots that drive at once (default: 1)",
+    )
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: this machine alone)"
     )
@@ -55,7 +76,8 @@ def _parser(agents: Sequence[str]) -> cli.Parser:
         action="append",
         default=[],
         metavar="URL",
-        help="let a page of another origin connect, as https://hub.example.org; may be given again",
+        help="allow pages of this origin to connect too, such as https://hub.example.org; may be"
+        " repeated",
     )
     return parser
 
@@ -76,8 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser(AGENTS).parse_args(arguments)
     cli.prepare_device()
     if options.run is None:
-        name = f"{_DEFAULT_POLICY}.yaml"
-        cli.tell(f"no run is named: this policy comes with the package, trained by {name}")
+        cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
     successes, episodes = live.play_live(
         PRETRAINED / _DEFAULT_POLICY if options.run is None else options.run,
         viewer=options.viewer,

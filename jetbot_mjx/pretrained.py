@@ -23,7 +23,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx pretrained", description=__doc__)
     parser.add_argument(
-        "--out", type=Path, default=FOLDER, metavar="DIR", help=f"the folder (default: {FOLDER})"
+        "--out",
+        type=Path,
+        default=FOLDER,
+        metavar="DIR",
+        help=f"folder for the copies (default: {FOLDER})",
     )
     options = parser.parse_args(arguments)
     with cli.exit_on_interrupt():

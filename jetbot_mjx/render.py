@@ -27,10 +27,13 @@ def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
         "--episodes",
         type=cli.whole_number(1, most),
         metavar="N",
-        help="the first N of the fixed goals (default: 20, of a gallery 4)",
+        help="drive to the first N of the fixed goals (default: 20; 4 with --gallery)",
     )
     group.add_argument(
-        "--goals", type=goals, metavar="I,J-K", help="these of the fixed goals, as in 3,17 or 0-7"
+        "--goals",
+        type=goals,
+        metavar="I,J-K",
+        help="drive to these of the fixed goals, such as 3,17 or 0-7",
     )
     number = cli.whole_number(1, most)
     group.add_argument(
@@ -42,7 +45,9 @@ def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
         help="the first, the middle and the last checkpoint of the run side by side",
     )
     parser.add_argument(
-        "--strip", action="store_true", help="an image: an untrained, an early, a trained policy"
+        "--strip",
+        action="store_true",
+        help="one image of an untrained, an early and a trained policy",
     )
     return parser
 

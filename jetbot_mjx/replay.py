@@ -19,7 +19,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 1 if the state stayed finite this time.
     """
     parser = cli.Parser(prog="jetbot-mjx replay", description=__doc__)
-    parser.add_argument("file", type=Path, help="a file in a run's nan_dumps/")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a file in a run's nan_dumps/")
     options = parser.parse_args(arguments)
     with cli.exit_on_interrupt():
         from jetbot_mjx.envs.jetbot_env import make_env

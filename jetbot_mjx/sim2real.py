@@ -21,16 +21,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0.
     """
     parser = cli.Parser(prog="jetbot-mjx sim2real", description=__doc__)
-    parser.add_argument("log", type=Path, help="a file of deploy/drive.py --log")
+    parser.add_argument("log", type=Path, metavar="LOG", help="a file of deploy/drive.py --log")
     seconds = cli.number(float, 0)
     parser.add_argument(
-        "--delay", type=seconds, default=0.0, metavar="S", help="of the motors (default: 0)"
+        "--delay",
+        type=seconds,
+        default=0.0,
+        metavar="S",
+        help="delay of the motors [s] (default: 0)",
     )
     parser.add_argument(
-        "--lag", type=seconds, metavar="S", help="of the motors (default: the calibration's)"
+        "--lag",
+        type=seconds,
+        metavar="S",
+        help="lag of the motors [s] (default: that of the calibration)",
     )
     parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="the folder (default: that of the log)"
+        "--output",
+        type=Path,
+        metavar="DIR",
+        help="folder of the results (default: that of the log)",
     )
     options = parser.parse_args(arguments)
     with cli.exit_on_interrupt():

@@ -24,16 +24,20 @@ def _parser() -> cli.Parser:
     source.add_argument(
         "--resume", type=cli.run_path, metavar="RUN", help="continue the run in this folder"
     )
-    parser.add_argument("--seed", type=int, help="the same as --set seed=N")
-    parser.add_argument("--seeds", type=int, help="the same as --set seeds=N: N policies at once")
+    parser.add_argument("--seed", type=int, help="random seed, the same as --set seed=N")
     parser.add_argument(
-        "--init-from", metavar="RUN", help="begin with the policy of another run, of any task"
+        "--seeds", type=int, help="train N policies at once, the same as --set seeds=N"
     )
-    parser.add_argument("--run-dir", type=Path, help="default: runs/<config>-<date>-<time>")
+    parser.add_argument(
+        "--init-from", metavar="RUN", help="start from the policy of another run, of any task"
+    )
+    parser.add_argument(
+        "--run-dir", type=Path, help="run folder (default: runs/<config>-<date>-<time>)"
+    )
     parser.add_argument(
         "--distributed",
         action="store_true",
-        help="one of several processes that train one policy, under srun, mpirun, or with"
+        help="this is one of several processes that train one policy, under srun, mpirun, or with"
         " JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID",
     )
     return parser

@@ -68,8 +68,8 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         self._configure(config, *given)
         if drawn := ", ".join(self.config.randomization.drawn):
             raise UserError(
-                f"randomization.{drawn}: the single robot is the preset's; take JetBotVectorEnv, of"
-                " one robot if need be"
+                f"randomization.{drawn}: this environment has the preset's robot only: use"
+                " JetBotVectorEnv, with num_envs=1 for one robot"
             )
         self.robot = MujocoJetBot(self.config)
         self.observation_space, self.action_space = self._prepare(self.robot.env)

@@ -55,7 +55,7 @@ def find_backend() -> str:
     wanted = os.environ.get("MUJOCO_GL", "").lower().strip()
     if wanted not in (*_BACKENDS, *_UNDECIDED):
         raise UserError(
-            f"MUJOCO_GL = {wanted!r}: no such back end; unset it, or give egl or osmesa"
+            f"MUJOCO_GL = {wanted!r}: there is no such back end: unset it, or set egl or osmesa"
         )
     candidates = (wanted,) if wanted in _BACKENDS else _BACKENDS
     for backend in candidates:
@@ -69,4 +69,4 @@ def find_backend() -> str:
     remedy = _REMEDY_LINUX if sys.platform == "linux" else _REMEDY_ELSEWHERE
     if wanted in _BACKENDS:
         raise UserError(f"MUJOCO_GL = {wanted!r} does not work here: unset it, or {remedy}")
-    raise UserError(f"no OpenGL for pictures: {remedy}")
+    raise UserError(f"no OpenGL to render with: {remedy}")

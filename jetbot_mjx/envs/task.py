@@ -359,7 +359,7 @@ def _import_class(name: str) -> Any:
         ) from None
     except SyntaxError as error:
         raise InvalidError(
-            f"task.name = {name!r}: {error.filename}, line {error.lineno}, is no Python:"
+            f"task.name = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
             f" {error.msg}"
         ) from None
     task_class: Any = getattr(module, class_name, None)
@@ -374,7 +374,7 @@ def _check_members(name: str, task: object, members: Sequence[str]) -> None:
     """Raise an error if a task or its class lacks members of the interface."""
     missing = [member for member in members if not hasattr(task, member)]
     if missing:
-        raise InvalidError(f"task.name = {name!r} is no task: it lacks {', '.join(missing)}")
+        raise InvalidError(f"task.name = {name!r} is not a task: it lacks {', '.join(missing)}")
 
 
 METHODS = tuple(name for name in vars(Task) if name[0] != "_" and callable(getattr(Task, name)))

@@ -18,7 +18,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx runs", description=__doc__)
     parser.add_argument(
-        "folder", type=Path, nargs="?", metavar="DIR", help="the folder (default: runs)"
+        "folder", type=Path, nargs="?", metavar="DIR", help="folder of the runs (default: runs)"
     )
     options = parser.parse_args(arguments)
     with exit_on_interrupt():
@@ -26,7 +26,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
     folder = options.folder or find_run.ROOT
     if options.folder and not folder.is_dir():
-        parser.error(f"{folder} is no folder")
+        parser.error(f"{folder} is not a folder")
     cli.tell(find_run.runs_table(*find_run.scan_runs(folder)))
     if not options.folder:
         cli.tell(

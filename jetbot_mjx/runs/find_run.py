@@ -229,7 +229,7 @@ def copy_pretrained(folder: Path) -> tuple[Path, ...]:
     runs = {path: folder / path.name for path in sorted(PRETRAINED.iterdir())}
     for target in runs.values():
         if target.exists():
-            raise UserError(f"{target} is there already: give --out another folder")
+            raise UserError(f"{target} exists already: choose another folder with --out")
     for source, target in runs.items():
         with atomic_folder(target) as unfinished:
             shutil.copytree(source, unfinished, dirs_exist_ok=True)

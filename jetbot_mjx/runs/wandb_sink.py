@@ -140,7 +140,7 @@ class WandbSink:
         except Exception as error:
             self._run = None
             reason = (str(error).splitlines() or [type(error).__name__])[0]
-            self._say(f"Weights & Biases: {reason}; the training goes on without it")
+            self._say(f"Weights & Biases: {reason}; the training continues without it")
 
 
 def _read(path: Path, project: str | None) -> dict[str, Any]:

@@ -191,7 +191,9 @@ def run_folder(run_dir: str | Path, option: str) -> Path:
     """
     path = Path(run_dir).absolute()
     if find_checkpoint(path, "last") == path:
-        raise UserError(f"{option} {run_dir} is one checkpoint: give its run folder")
+        raise UserError(
+            f"{option} {run_dir} is one checkpoint: give the run folder that contains it"
+        )
     return path
 
 

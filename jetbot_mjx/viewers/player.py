@@ -60,7 +60,7 @@ class Player:
             agent.
         """
         if agent not in AGENTS:
-            raise UserError(f"--agent {agent!r} is none: choose from {', '.join(AGENTS)}")
+            raise UserError(f"--agent {agent!r} is unknown: choose from {', '.join(AGENTS)}")
         self.agent = agent
         """The agent that drives, one of `AGENTS`."""
         checkpoint = load_checkpoint(run_or_checkpoint, which)

@@ -57,8 +57,8 @@ class ControlPanel:
         self._add_drive_controls()
         gui.add_markdown(
             player.cannot_move_goal
-            or "Click on the floor, or drag the cube, to move the goal. Its time limit then begins"
-            " anew."
+            or "Click on the floor, or drag the cube, to move the goal. This restarts its time"
+            " limit."
         )
         self._switch_agent()
         self.update()
@@ -75,7 +75,7 @@ class ControlPanel:
             self.checkpoint.options = checkpoints
         if player.robots > 1 and self.robot.value != player.robot:
             self.robot.value = player.robot
-        buttons = ("Go on" if player.paused else "Pause", *_BUTTONS)
+        buttons = ("Resume" if player.paused else "Pause", *_BUTTONS)
         if buttons != self.buttons.options:
             self.buttons.options = buttons
 
@@ -108,7 +108,7 @@ class ControlPanel:
             "Checkpoint", _labels(player), initial_value=_label(player.checkpoint)
         )
         self.buttons = gui.add_button_group("", ("Pause", *_BUTTONS))
-        self.speed = speed = gui.add_slider("Real time x", *SPEEDS, 0.1, player.speed)
+        self.speed = speed = gui.add_slider("Speed ×", *SPEEDS, 0.1, player.speed)
         self.camera = camera = gui.add_dropdown(
             "Camera", CAMERAS, initial_value=self._scene.cameras.mode
         )
@@ -129,8 +129,8 @@ class ControlPanel:
             self.ahead = ahead = gui.add_slider("Ahead m/s", 0.0, limits.max_speed, 0.01, 0.0)
             self.left = left = gui.add_slider("Left °/s", -fastest, fastest, 1, 0)
             gui.add_markdown(
-                "Keys: I faster, K slower, J left, L right, H halt. The page hears of presses only:"
-                " what was asked for stays."
+                "Keys: I faster, K slower, J left, L right, H stop. A command holds until the next"
+                " key press."
             )
 
         def follow_sliders() -> None:
@@ -148,7 +148,7 @@ class ControlPanel:
             self._add_key("K", "slower", press, player.nudge, -1, 0),
             self._add_key("J", "left", press, player.nudge, 0, 1),
             self._add_key("L", "right", press, player.nudge, 0, -1),
-            self._add_key("H", "halt", press, player.drive, 0, 0),
+            self._add_key("H", "stop", press, player.drive, 0, 0),
         ]
 
     def _add_key(self, key: Any, label: str, *press: Any) -> viser.CommandHandle:

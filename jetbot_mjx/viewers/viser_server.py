@@ -85,7 +85,7 @@ class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
         # If the port is taken, viser uses the next one.
         if self.server.get_port() != port:
             self.close()
-            raise UserError(f"--port {port} was taken meanwhile: try again")
+            raise UserError(f"--port {port} has just been taken by another program: try again")
         self._player = player
         self._requests: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
         self.scene = Scene(self.server, player, self._ask)
@@ -172,8 +172,8 @@ class _OriginCheck:
                 if origin not in self._refused and len(self._refused) < _MAX_REPORTED_ORIGINS:
                     self._refused.add(origin)
                     self._tell(
-                        f"refused: a page from {origin[:200]!r} asked to connect; to let it in,"
-                        " --allow-origin names it"
+                        f"refused: a page from {origin[:200]!r} asked to connect; --allow-origin"
+                        " lets it in"
                     )
                 return connection.respond(http.HTTPStatus.FORBIDDEN, "another page's origin\n")
         return None
@@ -220,15 +220,16 @@ def free_port(host: str, port: int | None) -> int:
                     probe.bind(address[4])
         except (socket.gaierror, UnicodeError) as error:
             reason = getattr(error, "strerror", error)
-            raise UserError(f"--host {host!r} is no address: {reason}") from None
+            raise UserError(f"--host {host!r} is not an address: {reason}") from None
         except OSError as error:
             if error.errno == errno.EADDRNOTAVAIL:
-                raise UserError(f"--host {host!r} is no address of this machine") from None
-            reason = error.strerror
+                raise UserError(f"--host {host!r} is not an address of this machine") from None
+            in_use = error.errno == errno.EADDRINUSE
+            reason = "is already in use" if in_use else f"cannot be opened ({error.strerror})"
         else:
             return one
     which = f"--port {port}" if port is not None else f"every port from {FIRST_PORT} on"
-    raise UserError(f"{which} cannot be had at --host {host} ({reason}): name another port")
+    raise UserError(f"{which} {reason} at --host {host}: choose another port")
 
 
 def _quiet() -> contextlib.AbstractContextManager[Any]:

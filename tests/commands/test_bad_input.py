@@ -67,7 +67,7 @@ MERGED = laughs(9, ", &a{n} {{<<: [{list}]}}", "&a0 {x: 1}")
         (f"seed: {'[' * 3000}", "is nested too deeply"),  # RecursionError
         ("ppo: {network: {policy_hidden_layer_sizes: 32}}", "it should be a list"),
         ("ppo: {network: {policy_hidden_layer_sizes: []}}", "should have at least 1 item"),
-        ("ppo: {1: 2}", "is no key: keys should be strings"),
+        ("ppo: {1: 2}", "is not a key: keys should be strings"),
         ("camera: {position: [0, 0]}", "camera.position = [0, 0] is wrong: it lacks items"),
         ("task: {options: {a: [1]}}", "task.options.a = [1] is wrong"),
     ],

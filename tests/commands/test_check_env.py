@@ -46,7 +46,7 @@ def test_a_configuration_names_its_task(root, monkeypatch):
         (["broken_tasks:Nobody"], "broken_tasks has no 'Nobody'"),
         (["Nobody"], "jetbot_mjx has no 'Nobody'"),
         (["GoalTask", "--set", "task.optoins.a=1"], "optoins"),
-        (["broken_tasks:Drawn"], "is no task: it lacks sample"),
+        (["broken_tasks:Drawn"], "is not a task: it lacks sample"),
     ],
 )
 def test_a_users_mistake_is_one_line(arguments, told):
@@ -58,4 +58,4 @@ def test_a_command_that_names_nothing_is_refused(capsys):
     with pytest.raises(SystemExit) as left:
         check_env.main([])
     assert left.value.code == 2
-    assert "name a task as package.module:Class" in capsys.readouterr().err
+    assert "give a task as package.module:Class" in capsys.readouterr().err

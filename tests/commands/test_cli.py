@@ -150,7 +150,7 @@ def test_train_refuses_a_path_without_a_file(refused, path, said):
         ("task.name=GoalTask", "task.name = 'GoalTask' is wrong: write package.module:Class"),
         ("task.name=nowhere:Task", "no module named 'nowhere' can be imported"),
         ("task.name=jetbot_mjx:GaolTask", "jetbot_mjx has no 'GaolTask'"),
-        ("task.name=builtins:str", "is no task: it lacks "),
+        ("task.name=builtins:str", "is not a task: it lacks "),
     ],
 )
 def test_train_refuses_a_bad_setting(refused, setting, said):
@@ -262,8 +262,8 @@ both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "
         (["run", "--more"], "unrecognized arguments: --more"),
         (["run", "--episodes", "0"], "argument --episodes: 0 is too small: give at least 1"),
         (["run", "--episodes", "-3"], "argument --episodes: -3 is too small: give at least 1"),
-        (["run", "--episodes", "many"], "argument --episodes: 'many' is no whole number"),
-        (["run", "--episodes", "1.5"], "argument --episodes: '1.5' is no whole number"),
+        (["run", "--episodes", "many"], "argument --episodes: 'many' is not a whole number"),
+        (["run", "--episodes", "1.5"], "argument --episodes: '1.5' is not a whole number"),
         (["run", "--checkpoint", "first"], "'first' is neither best, last nor a number of steps"),
         (["run", "--checkpoint", "-1"], "'-1' is neither best, last nor a number of steps"),
         (["run", "--checkpoint"], "argument --checkpoint: expected one argument"),
@@ -281,7 +281,7 @@ def test_a_mistaken_command_line_is_refused(refused, command, arguments, said):
         ("2", "2 is too large: give at most 1"),
         ("-0.1", "-0.1 is too small: give at least 0"),
         ("nan", "nan is too small: give at least 0"),
-        ("95%", "'95%' is no number"),
+        ("95%", "'95%' is not a number"),
     ],
 )
 def test_evaluate_refuses_a_success_rate_that_is_none(refused, value, said):

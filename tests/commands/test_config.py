@@ -247,7 +247,7 @@ BAD_VALUES = {
     "infinite option": ("task: {options: {a: -.inf}}", "task.options.a = -inf", "a finite number"),
     "half a letter": ('task: {options: {a: "\\ud800"}}', r"task.options.a = '\ud800'", "text"),
     "half a letter for a key": ('task: {options: {"\\udcff": 1}}', r"'\udcff'", "is wrong"),
-    "no letter of a project": ('wandb: "a\\ud800"', r"'a\ud800' is no project", "characters"),
+    "no letter of a project": ('wandb: "a\\ud800"', r"'a\ud800' is not a project", "characters"),
     "nan": ("ppo: {learning_rate: .nan}", "ppo.learning_rate = nan", "finite"),
     "infinity": ("ppo: {reward_scaling: .inf}", "ppo.reward_scaling = inf", "finite"),
     "infinity by overflow": ("ppo: {entropy_cost: 1e400}", "ppo.entropy_cost = inf", "finite"),
@@ -530,7 +530,7 @@ def test_environments_that_devices_cannot_share_are_refused(num_envs, batch_size
         ("no_such_package.task:Task", "no module named 'no_such_package' can be imported"),
         ("jetbot_mjx.no_such:Task", "no module named 'jetbot_mjx.no_such' can be imported"),
         ("jetbot_mjx:GaolTask", "jetbot_mjx has no 'GaolTask'"),
-        ("builtins:str", "is no task: it lacks "),
+        ("builtins:str", "is not a task: it lacks "),
     ],
 )
 def test_a_task_that_is_none_is_refused(name, said):

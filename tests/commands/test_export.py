@@ -525,7 +525,7 @@ def test_a_missing_package_is_told_with_its_remedy(run_dir, monkeypatch, tmp_pat
 
 def test_a_folder_with_something_else_is_left_alone(run_dir, tmp_path):
     (tmp_path / "thesis.txt").write_text("years of work")
-    with pytest.raises(UserError, match="is there and no export"):
+    with pytest.raises(UserError, match="exists and is not an export"):
         export_policy(run_dir, output=tmp_path)
     assert os.listdir(tmp_path) == ["thesis.txt"]
 
@@ -558,7 +558,7 @@ def test_an_unknown_format_is_told(run_dir, capsys):
     with pytest.raises(SystemExit) as left:
         export.main([str(run_dir), "--format", "numpy,torch"])
     assert left.value.code == 2
-    assert "'torch' is none of numpy, onnx, stablehlo, all" in capsys.readouterr().err
+    assert "'torch' is not one of numpy, onnx, stablehlo, all" in capsys.readouterr().err
 
 
 def test_a_shorter_recording_is_the_beginning_of_a_longer_one(exported, run_dir):

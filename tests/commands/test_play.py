@@ -97,7 +97,7 @@ def test_a_busy_port_is_refused_at_once(smoke_run, nothing_loads):
     pytest.importorskip("viser")
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(UserError, match=f"--port {port} cannot be had"):
+        with pytest.raises(UserError, match=f"--port {port} is already in use"):
             play.main([str(smoke_run), "--port", str(port)])
 
 
@@ -149,16 +149,16 @@ def test_origins_are_read_as_browsers_write_them(text, origin):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["--allow-origin", "hub.example.org"], "'hub.example.org' is no origin: write it as"),
-        (["--allow-origin", "https://hub/user"], "is no origin"),
-        (["--allow-origin", "http://hub:port"], "is no origin"),
-        (["--allow-origin", "http://["], "is no origin"),
-        (["--allow-origin", "*"], "is no origin"),
+        (["--allow-origin", "hub.example.org"], "'hub.example.org' is not an origin: write it as"),
+        (["--allow-origin", "https://hub/user"], "is not an origin"),
+        (["--allow-origin", "http://hub:port"], "is not an origin"),
+        (["--allow-origin", "http://["], "is not an origin"),
+        (["--allow-origin", "*"], "is not an origin"),
         (["--agent", "nobody"], "invalid choice: 'nobody'"),
         (["--viewer", "vnc"], "invalid choice: 'vnc'"),
         (["--port", "0"], "0 is too small: give at least 1"),
         (["--port", "70000"], "70000 is too large: give at most 65535"),
-        (["--port", "http"], "'http' is no whole number"),
+        (["--port", "http"], "'http' is not a whole number"),
         (["--robots", "0"], "0 is too small: give at least 1"),
         (["--robots", "9999"], "9999 is too large: give at most 256"),
         (["--seed", "-1"], "-1 is too small"),

@@ -101,10 +101,10 @@ def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):
     )
     assert play.main([]) == 0
     assert given == [(PRETRAINED / "jetbot_egocentric", "best")]
-    assert "no run is named" in capsys.readouterr().out
+    assert "no RUN given" in capsys.readouterr().out
     assert play.main(["runs/mine"]) == 0
     assert given[1] == (Path("runs/mine"), "best")
-    assert "no run is named" not in capsys.readouterr().out
+    assert "no RUN given" not in capsys.readouterr().out
 
 
 def test_nothing_in_it_names_the_machine_it_was_made_on():

@@ -257,7 +257,7 @@ def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, co
 
 
 def test_one_checkpoint_makes_no_gallery(run_copy):
-    with pytest.raises(UserError, match="is one checkpoint: give its run folder"):
+    with pytest.raises(UserError, match="is one checkpoint: give the run folder that contains it"):
         render_gallery(run_copy / "checkpoints" / f"{65_536:012}")
     with pytest.raises(UserError, match="no such folder"):
         render_gallery(run_copy / "nothing")
@@ -290,7 +290,10 @@ def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
 
 @pytest.mark.parametrize(
     ("wanted", "said"),
-    [("osmesa", "'osmesa' does not work here"), ("software", "'software': no such back end")],
+    [
+        ("osmesa", "'osmesa' does not work here"),
+        ("software", "'software': there is no such back end"),
+    ],
 )
 def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
     tmp_path, monkeypatch, wanted, said

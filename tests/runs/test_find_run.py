@@ -210,7 +210,7 @@ def test_the_command_refuses_what_is_no_folder(capsys):
     with pytest.raises(SystemExit) as left:
         command.main(["nowhere"])
     assert left.value.code == 2
-    assert "nowhere is no folder" in capsys.readouterr().err
+    assert "nowhere is not a folder" in capsys.readouterr().err
 
 
 # Configurations.

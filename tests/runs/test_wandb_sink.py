@@ -218,7 +218,7 @@ def test_its_failure_costs_one_line_and_not_the_training(wandb, track, where, re
         sink.write(step, {"a": 1.0})
     sink.close()
     sink.close()
-    assert track.said[-1] == f"Weights & Biases: {reason}; the training goes on without it"
+    assert track.said[-1] == f"Weights & Biases: {reason}; the training continues without it"
     assert len([line for line in track.said if "without" in line]) == 1
 
 

@@ -48,7 +48,7 @@ def on_one(tmp_path_factory):
 
 @pytest.mark.cpu
 def test_a_cpu_that_is_divided_otherwise_is_refused_before_a_folder_is_made(tmp_path):
-    with pytest.raises(ConfigError, match="cpu_devices = 5: JAX has begun with 1"):
+    with pytest.raises(ConfigError, match="cpu_devices = 5: JAX has already started with 1"):
         session.run(load_config(SMOKE, ["cpu_devices=5"]), tmp_path / "run")
     assert not (tmp_path / "run").exists()
 

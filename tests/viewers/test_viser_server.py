@@ -104,7 +104,7 @@ def test_a_page_from_elsewhere_is_refused_and_our_own_let_in(player, unused_port
         # A name that was pointed at this machine after the page had been served.
         assert not knock(browser, f"http://evil.example:{port}", host=f"evil.example:{port}")
         assert len(told) == 4
-        assert "'http://evil.example' asked to connect; to let it in, --allow-origin" in told[0]
+        assert "'http://evil.example' asked to connect; --allow-origin lets it in" in told[0]
         for number in range(20):
             assert not knock(browser, f"http://evil.example:{number + 1}")
         assert len(told) == 10
@@ -172,7 +172,7 @@ def test_starting_and_stopping_say_nothing(player, capfd, unused_port):
 def test_a_busy_port_is_refused_where_it_was_asked_for():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(UserError, match=f"--port {port} cannot be had") as caught:
+        with pytest.raises(UserError, match=f"--port {port} is already in use") as caught:
             free_port("127.0.0.1", port)
     assert "\n" not in str(caught.value)
     assert free_port("127.0.0.1", port) == port
@@ -189,7 +189,7 @@ def test_without_a_wish_the_next_free_port_is_taken(monkeypatch):
 def test_a_port_that_is_taken_meanwhile_is_refused(player):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(UserError, match=f"--port {port} was taken meanwhile"):
+        with pytest.raises(UserError, match=f"--port {port} has just been taken"):
             ViserViewer(player, host="127.0.0.1", port=port, tell=print)
 
 
@@ -197,7 +197,7 @@ def test_a_port_that_is_taken_meanwhile_is_refused(player):
     "host", ["nowhere.invalid", "203.0.113.1", "", "a..b", "x" * 300, "\udcff"]
 )
 def test_an_address_of_no_machine_or_another_is_refused(host):
-    with pytest.raises(UserError, match=f"--host {re.escape(repr(host))} is no address"):
+    with pytest.raises(UserError, match=f"--host {re.escape(repr(host))} is not an address"):
         free_port(host, None)
 
 
@@ -592,7 +592,7 @@ def test_the_buttons_pause_step_and_begin_anew(browser, player):
     player.paused = False
     press(browser, "Pause")
     assert player.paused
-    assert browser.panel.buttons.options[0] == "Go on"
+    assert browser.panel.buttons.options[0] == "Resume"
     before = player.time
     press(browser, "Step")
     assert player.time == pytest.approx(before + 1 / 60)
@@ -600,7 +600,7 @@ def test_the_buttons_pause_step_and_begin_anew(browser, player):
     press(browser, "New episode")
     assert player.time == 0
     assert not np.allclose(player.snapshot.goal_w, goal_w)
-    press(browser, "Go on")
+    press(browser, "Resume")
     assert not player.paused
     assert browser.panel.buttons.options[0] == "Pause"
 

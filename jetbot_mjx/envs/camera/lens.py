@@ -196,6 +196,6 @@ def _undistort_fisheye(
 
 def _no_lens(coefficients: tuple[float, ...]) -> InvalidError:
     return InvalidError(
-        f"camera.distortion = {list(coefficients)} with this lens, matrix and field of view is no"
-        " lens: every pixel should look less than 89 degrees aside, in a direction of its own"
+        f"camera.distortion = {list(coefficients)} with this lens, matrix and field of view is not"
+        " a lens: every pixel should look less than 89 degrees aside, in a direction of its own"
     )

@@ -24,7 +24,7 @@ def layout(probe: TaskProbe) -> Iterator[str]:
     """Check names, sizes, units, frames and smallest deviations of the observation."""
     fields = probe.task.layout
     if not isinstance(fields, tuple) or not all(isinstance(field, Field) for field in fields):
-        yield "layout is no tuple of Field(name, size, unit, frame): make it one"
+        yield "layout is not a tuple of Field(name, size, unit, frame): make it one"
         return
     if not fields and not probe.config.task.sees:
         yield "layout is empty: name at least one Field"
@@ -99,10 +99,10 @@ def types(probe: TaskProbe) -> Iterator[str]:
     yield from _weak("sample", jax.eval_shape(task.sample, first_key()))
     rewarded = jax.eval_shape(task.reward, before, after, goal, action)
     if not (isinstance(rewarded, tuple) and len(rewarded) == 2 and isinstance(rewarded[1], dict)):
-        yield "reward returns something else than (reward, {name: term}): return both"
+        yield "reward returns something other than (reward, {name: term}): return both"
         return
     if not isinstance(jax.eval_shape(task.markers, goal), dict):
-        yield "markers returns something else than {name: place}: return a dict"
+        yield "markers returns something other than {name: place}: return a dict"
         return
     # Check each result.
     results = jax.eval_shape(call_methods(task), probe.example)

@@ -127,7 +127,10 @@ def _scene(probe: TaskProbe) -> Iterator[str]:
     # Compare the mocap bodies with `markers`.
     names, solids = _mocap_bodies(model), _mocap_bodies(solid)
     for name in sorted(placed - names):
-        yield f"markers places {name!r}, no mocap body: add_body(name={name!r}, mocap=True)"
+        yield (
+            f"markers places {name!r}, which is not a mocap body: add_body(name={name!r},"
+            " mocap=True)"
+        )
     for name in sorted((names | solids) - placed - {"goal"}):
         yield f"markers does not say where {name!r} stands, a mocap body of build_scene"
     # Look for contacts at the start of episodes, and for geoms without a contact pair.
@@ -137,7 +140,7 @@ def _scene(probe: TaskProbe) -> Iterator[str]:
     for i in range(solid.ngeom):
         if i not in paired and (solid.geom_contype[i] or solid.geom_conaffinity[i]):
             yield (
-                f"geom {solid.geom(i).name or i!r} can collide and meets nothing: give it"
+                f"geom {solid.geom(i).name or i!r} can collide and is in no contact pair: give it"
                 " contype=0, conaffinity=0, and a pair where the robot is to run into it"
             )
 
@@ -157,7 +160,7 @@ def _touching(probe: TaskProbe, solid: mujoco.MjModel) -> Iterator[str]:
         if name not in robot_geoms:
             yield (
                 f"{name!r} touches something in {often} of {DRAWS if solid.nmocap else 1} episodes"
-                " as they begin: leave room about the robot, 0.2 m from the origin"
+                " as they begin: leave room around the robot, 0.2 m from the origin"
             )
 
 

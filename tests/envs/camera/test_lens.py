@@ -149,7 +149,7 @@ def test_a_lens_that_is_none_is_refused_in_one_line(camera):
     with pytest.raises(InvalidError, match=r"^camera\.") as error:
         Camera(CameraConfig(**camera), make_model([]), ROBOT)
     assert "\n" not in str(error.value)
-    assert "is no lens: every pixel should look" in str(error.value)
+    assert "is not a lens: every pixel should look" in str(error.value)
 
 
 def test_an_environment_says_what_is_wrong_with_its_lens():

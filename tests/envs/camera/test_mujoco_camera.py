@@ -111,7 +111,7 @@ def test_a_policy_is_evaluated_by_both_appearances(with_opengl):
 
 def test_without_opengl_one_line_says_so(env, monkeypatch):
     def missing():
-        raise UserError("no OpenGL for pictures: install one")
+        raise UserError("no OpenGL to render with: install one")
 
     monkeypatch.setattr(mujoco_camera, "context_class", missing)
     with pytest.raises(UserError, match="no OpenGL") as caught:
