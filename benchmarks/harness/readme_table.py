@@ -65,18 +65,31 @@ def success_table(results: Results) -> str:
 
 
 def summary_table(results: Results) -> str:
-    """Return the times to success from a warm start: a row for each machine and observation."""
-    rows = []
+    """Return the times to success from a warm start: a row for each machine and observation.
+
+    Several files of one machine and observation are those of several hosts: their row has the
+    range of the medians.
+    """
+    hosts: dict[tuple[str, str], list[list[Any]]] = {}
     for values in _files_with(results, "runs"):
         runs = [run for run in values["runs"] if run.get("start") == "warm"]
-        if not runs or values["config"]["trainer"] != "resumable":
-            continue
-        machine, observation, _, _, _, success, _, _, reached = _success_row(
-            values, runs, warm=False
+        if runs and values["config"]["trainer"] == "resumable":
+            key = _machine(values, runs[0]["versions"]), values["config"]["task"]["observation"]
+            hosts.setdefault(key, []).append(runs)
+    rows = []
+    for (machine, observation), files in hosts.items():
+        runs = [run for runs in files for run in runs]
+        success = min(run["policy"]["success_rate"] for run in runs)
+        times = [[run["target_reached_seconds"] for run in runs] for runs in files]
+        time = "not by all"
+        if not any(None in one for one in times):
+            medians = sorted(times, key=statistics.median)
+            time = " to ".join(dict.fromkeys((_seconds(medians[0]), _seconds(medians[-1]))))
+        rows.append(
+            [machine, f"`{observation}`", f"{success:.2%}", f"{len(runs)}", f"{len(files)}", time]
         )
-        rows.append([machine, observation, success, f"{len(runs)}", reached])
-    head = ("machine", "observation", "success", "seeds", "time to 99 %")
-    return _table(head, "llrrr", rows)
+    head = ("machine", "observation", "success", "seeds", "hosts", "time to 99 %")
+    return _table(head, "llrrrr", rows)
 
 
 def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) -> list[str]:
@@ -86,7 +99,9 @@ def _success_row(values: Mapping[str, Any], runs: Sequence[Any], *, warm: bool) 
     observation = values["config"]["task"]["observation"]
     impl = values["config"]["physics"].get("impl")
     return [
-        _machine(values, runs[0]["versions"]) + (", warm cache" if warm else ""),
+        _machine(values, runs[0]["versions"])
+        + (f" beside {values['processor']}" if "processor" in values else "")
+        + (", warm cache" if warm else ""),
         f"`{observation}`",
         f"`{values['command'].split('/')[-1]}`",
         values["config"]["trainer"] + (", XLA's physics" if impl == "xla" else ""),

@@ -11,6 +11,7 @@ compilation. `--set trainer=brax` measures Brax's own `ppo.train`.
 import argparse
 import json
 import os
+import platform
 import re
 import statistics
 import sys
@@ -141,6 +142,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return 1 if any(run["policy"]["success_rate"] < options.target for run in runs) else 0
 
 
+def _processor() -> str:
+    """Return the model name of the host's processor."""
+    text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
+    found = re.search(r"^model name\s*: (.*)$", text, re.MULTILINE)
+    return found[1] if found else platform.processor() or platform.machine()
+
+
 def _results(
     options: argparse.Namespace, config: Config, runs: list[dict[str, Any]]
 ) -> dict[str, Any]:
@@ -149,6 +157,7 @@ def _results(
         "overrides": options.overrides,
         "target": options.target,
         "cpu_cores": os.cpu_count(),
+        "processor": _processor(),
         "config": config.model_dump(mode="json"),
         "runs": runs,
     }

@@ -87,6 +87,13 @@ def test_every_page_is_in_the_navigation():
     assert sorted(nav()) == sorted(ALL_PAGES)
 
 
+def test_every_page_is_linked_from_the_first():
+    """From the overview, and the reference of each room from the page of public names."""
+    linked = {page: set(re.findall(r"\]\(([^)#]+\.md)", PAGES[page])) for page in PAGES}
+    rooms = {f"api/{page}" for page in linked["api/index.md"]}
+    assert linked["index.md"] | rooms | {"index.md"} >= set(ALL_PAGES)
+
+
 def test_every_module_has_its_place_in_the_reference():
     told = re.findall(r"^::: jetbot_mjx\.([\w.]+)$", "\n".join(ALL_PAGES.values()), flags=re.M)
     package = ROOT / "jetbot_mjx"
