@@ -1,6 +1,8 @@
 # The two commands are `make train` and `make test`; both set up what they need, once.
 PYTHON ?= python3
 VENV ?= .venv
+# The versions to install; the newest ones with CONSTRAINTS=/dev/null.
+CONSTRAINTS ?= constraints.txt
 CONFIG ?= configs/jetbot.yaml
 RUN ?= runs/$(notdir $(basename $(CONFIG)))-$(shell date +%Y%m%d-%H%M%S)
 
@@ -16,7 +18,7 @@ setup: $(STAMP)
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "error: jetbot_mjx needs Python 3.11 or later, not %d.%d; say make PYTHON=python3.11" % sys.version_info[:2])'
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[dev]'
+	$(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS) --editable '.[dev]'
 	@touch $@
 
 # Stable-Baselines3, whose tests are otherwise left out. Not part of `setup`: on Linux pip takes torch
@@ -24,7 +26,7 @@ $(STAMP): pyproject.toml constraints.txt
 sb3: $(SB3_STAMP)
 
 $(SB3_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[sb3]'
+	$(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS) --editable '.[sb3]'
 	@touch $@
 
 # Trains the tutorial's task on whatever device JAX finds, then evaluates and renders it. A machine
@@ -42,7 +44,7 @@ test: setup
 
 # Every command and the tests, on this machine's NVIDIA GPU.
 test-gpu: setup
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[cuda]'
+	$(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS) --editable '.[cuda]'
 	$(BIN)/python tests/on_gpu.py
 
 test-slow: setup
@@ -52,6 +54,7 @@ check: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
+	$(BIN)/zizmor --offline --quiet --strict-collection .github
 
 # Runs the notebooks and stores their outputs in them.
 notebooks: setup
@@ -69,7 +72,7 @@ docs: $(DOCS_STAMP)
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 
 $(DOCS_STAMP): $(STAMP)
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable '.[docs]'
+	$(BIN)/python -m pip install --quiet --constraint $(CONSTRAINTS) --editable '.[docs]'
 	@touch $@
 
 # Builds the wheel, and uses it as its users do: in an empty folder, under the newest Python there is, with the newest of
