@@ -130,7 +130,7 @@ def run_command(
         if not ran_out(error):
             raise
         print(
-            "error: the device's memory does not suffice: choose a smaller --episodes",
+            "error: the device's memory is too small: choose a smaller --episodes",
             file=sys.stderr,
         )
         code = USER_ERROR

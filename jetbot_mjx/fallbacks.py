@@ -17,7 +17,7 @@ _COSTS = {
     "camera.impl": "training is several times slower",
     "ppo.update": "training is 2 to 4 times slower",
     "environment step": "training is up to 2 times slower",
-    "compilation cache": "every start compiles anew, for about half a minute",
+    "compilation cache": "every start compiles again, for about half a minute",
 }
 """What each fallback costs, roughly: docs/troubleshooting.md has the measurements."""
 

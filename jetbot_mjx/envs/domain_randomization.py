@@ -1,4 +1,4 @@
-"""Randomize the robot and what it sees: fixed parameters, or drawn anew in every episode.
+"""Randomize the robot and what it sees: fixed parameters, or drawn in every episode.
 
 The drawn parameters and the states of actuators, sensors and camera are data in
 `State.episode_params`: `NewEpisodeWrapper` replaces them where a new episode begins, and
@@ -103,7 +103,7 @@ class DomainRandomizationWrapper(Wrapper):
           env: the environment, unbatched, with the model of its preset.
           robot_params: parameters of the robot in every episode, which may be traced; None: those
             of the preset.
-          ranges: ranges of the parameters that are drawn anew in every episode, which replace
+          ranges: ranges of the parameters that are drawn in every episode, which replace
             those of `robot_params` and `look_params`; None: no parameter is drawn.
           look_params: look parameters in every episode, which may be traced; None: the plain scene.
 

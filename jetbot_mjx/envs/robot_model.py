@@ -109,7 +109,7 @@ ISAAC = Robot(
 )
 
 REAL = Robot(
-    chassis_mass=0.634,  # EST: sum of the BOM's parts, 0.69 kg in all (0.60 to 0.85)
+    chassis_mass=0.634,  # EST: sum of the BOM's parts, 0.69 kg in total (0.60 to 0.85)
     chassis_com=(-0.0346, 0.0, 0.0257),  # EST: the BOM's parts at their CAD places
     chassis_inertia=(6.2e-4, 1.08e-3, 1.14e-3),  # EST: likewise
     wheel_mass=0.030,  # EST: a TT-motor wheel of 65 mm

@@ -340,7 +340,7 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
 
 
 def _import_class(name: str) -> Any:
-    """Import what a name `package.module:Class` stands for, which may be no class."""
+    """Import what a name `package.module:Class` refers to, which may not be a class."""
     module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
         # Python itself separates a class from its module by a dot.

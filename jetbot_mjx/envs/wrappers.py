@@ -234,7 +234,7 @@ class NewEpisodeWrapper(Wrapper):
     """A wrapper that begins a new episode in the step in which one ends.
 
     Brax's `AutoResetWrapper` restores the first state it ever saw, goal included. This wrapper
-    draws goal and robot parameters anew, from the key in the state.
+    draws a new goal and new robot parameters, from the key in the state.
 
     After a step that ended an episode, `reward`, `done`, `metrics` and `info` belong to the old
     episode; `pipeline_state`, `obs`, `goal`, `key` and `episode_params` belong to the new one.

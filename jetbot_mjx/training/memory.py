@@ -263,7 +263,7 @@ def advice(config: Config, each: Sizes, device_count: int, limit: int | None) ->
     fits = next_that_fits(config, each, device_count, limit)
     available = "" if limit is None else f" ({limit / GIB:.2f} GiB)"
     problem = (
-        f"the device's memory{available} does not suffice for ppo.num_envs = {wanted.num_envs},"
+        f"the device's memory{available} is too small for ppo.num_envs = {wanted.num_envs},"
         f" which takes about {wanted.total / GIB:.2f} GiB: "
     )
     if fits is None:

@@ -139,7 +139,7 @@ def test_out_of_memory_the_next_size_that_fits_is_named(config, tmp_path, monkey
         session.run(config, tmp_path / "run")
     line = str(caught.value)
     assert "\n" not in line
-    assert "the device's memory (8.00 GiB) does not suffice for ppo.num_envs = 128" in line
+    assert "the device's memory (8.00 GiB) is too small for ppo.num_envs = 128" in line
     assert "--set ppo.num_envs=64 --set ppo.batch_size=32 takes" in line
 
 

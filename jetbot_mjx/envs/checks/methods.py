@@ -232,7 +232,7 @@ def endings(probe: TaskProbe) -> Iterator[str]:
     for where, results in by_robot.items():
         if (results["success"] & ~results["terminated"]).any():
             yield (
-                f"success without terminated (a robot {where}): what is done has ended for good,"
+                f"success without terminated (a robot {where}): a task that is done has ended,"
                 " so terminated must hold wherever success does"
             )
             break
