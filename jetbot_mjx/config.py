@@ -660,7 +660,7 @@ class Config(_Section):
         ):
             if is_set and self.trainer == "brax":
                 raise ValueError(
-                    f"{setting} is not known to trainer = 'brax': take trainer = 'resumable'"
+                    f"{setting} is not supported by trainer = 'brax': use trainer = 'resumable'"
                     f"{other_remedy}"
                 )
         return self

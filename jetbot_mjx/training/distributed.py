@@ -39,12 +39,12 @@ def check(config: Config) -> None:
       UserError: its trainer or its number of seeds needs a single process.
     """
     if config.trainer == "brax":
-        raise UserError("--distributed is not known to trainer = 'brax': take 'resumable'")
+        raise UserError("--distributed is not supported by trainer = 'brax': use 'resumable'")
     if config.init_from is not None:
-        raise UserError("--distributed cannot begin with another run's policy: leave init_from out")
+        raise UserError("--distributed cannot begin with another run's policy: remove init_from")
     if config.seeds > 1:
         raise UserError(
-            f"--distributed trains one policy, not seeds = {config.seeds}: leave one of them out"
+            f"--distributed trains one policy, not seeds = {config.seeds}: remove one of them"
         )
 
 

@@ -131,7 +131,7 @@ def test_requested_where_it_cannot_run_it_is_an_error_of_one_line(root, tmp_path
 
 def test_brax_trainer_does_not_know_it():
     with pytest.raises(
-        ConfigError, match=r"ppo\.update = 'fused' is not known to trainer = 'brax'"
+        ConfigError, match=r"ppo\.update = 'fused' is not supported by trainer = 'brax'"
     ):
         parse_config(
             {

@@ -166,9 +166,12 @@ def test_train_refuses_a_bad_seed(refused):
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("seeds=2", "seeds = 2 is not known to trainer = 'brax'"),
-        ("deterministic=true", "deterministic = true is not known to trainer = 'brax'"),
-        ("ppo.normalizer=physical", "ppo.normalizer = 'physical' is not known to trainer = 'brax'"),
+        ("seeds=2", "seeds = 2 is not supported by trainer = 'brax'"),
+        ("deterministic=true", "deterministic = true is not supported by trainer = 'brax'"),
+        (
+            "ppo.normalizer=physical",
+            "ppo.normalizer = 'physical' is not supported by trainer = 'brax'",
+        ),
     ],
 )
 def test_train_refuses_what_the_stock_trainer_cannot_do(refused, setting, said):

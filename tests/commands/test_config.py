@@ -548,6 +548,6 @@ def test_brax_s_trainer_takes_every_configuration_of_the_package(name):
     config = load_config(name, ["trainer=brax"])
     assert (config.ppo.normalizer, config.ppo.network.shared_cnn) == ("brax", False)
     # What is given stays: a default is none.
-    with pytest.raises(ConfigError, match=r"ppo\.normalizer = 'physical' is not known to"):
+    with pytest.raises(ConfigError, match=r"ppo\.normalizer = 'physical' is not supported"):
         load_config(name, ["trainer=brax", "ppo.normalizer=physical"])
     assert load_config(name).ppo.normalizer == "physical"

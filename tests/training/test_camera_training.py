@@ -167,7 +167,7 @@ def test_a_task_whose_policy_sees_passes_its_checks(config_file, capsys):
         ({"init_from": "pretrained:jetbot_egocentric"}, "cannot begin with another's"),
         (
             {"trainer": "brax", "ppo": {"network": {"shared_cnn": True}}},
-            "ppo.network.shared_cnn = true is not known to trainer = 'brax'",
+            "ppo.network.shared_cnn = true is not supported by trainer = 'brax'",
         ),
     ],
 )

@@ -322,7 +322,7 @@ def test_a_mistaken_variable_costs_one_line(monkeypatch, values, said):
     ("arguments", "said"),
     [
         (["--seeds", "2"], "--distributed trains one policy, not seeds = 2"),
-        (STOCK, "--distributed is not known to trainer = 'brax'"),
+        (STOCK, "--distributed is not supported by trainer = 'brax'"),
     ],
 )
 def test_what_several_processes_cannot_do_is_refused_before_they_meet(arguments, said):

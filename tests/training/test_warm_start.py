@@ -148,7 +148,7 @@ def test_what_does_not_fit_is_refused_before_anything_is_written(changes, told, 
 
 
 def test_brax_s_trainer_cannot():
-    with pytest.raises(ConfigError, match="init_from is not known to trainer = 'brax'"):
+    with pytest.raises(ConfigError, match="init_from is not supported by trainer = 'brax'"):
         config_of(
             init_from=SOURCE,
             trainer="brax",
