@@ -54,6 +54,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.argv[1:] = words[1:]
         module = f"jetbot_mjx.{COMMANDS[words[0]][0]}"
         runpy.run_module(module, run_name="__main__", alter_sys=True)
+    if arguments is None:
+        cli.run_command(lambda _: _overview(words))
+    return _overview(words)
+
+
+def _overview(words: Sequence[str]) -> int:
+    """Print the list of commands, or refuse a command that does not exist."""
     parser = _parser()
     if words and not words[0].startswith("-"):
         # Only to explain an error: it takes longer than the list of commands.

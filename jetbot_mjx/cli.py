@@ -14,7 +14,6 @@ import ctypes
 import difflib
 import functools
 import gc
-import io
 import os
 import sys
 import threading
@@ -24,7 +23,13 @@ from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from jetbot_mjx.errors import UserError, printable, printable_lines, ran_out
 from jetbot_mjx.imports import install_lazy_imports
-from jetbot_mjx.interrupts import exit_on_interrupt, repeat_lost_interrupts
+from jetbot_mjx.interrupts import (
+    INTERRUPTED,
+    exit_if_interrupt_waits,
+    exit_on_interrupt,
+    repeat_lost_interrupts,
+)
+from jetbot_mjx.runs.output import READER_LEFT, protect_output, write_error
 
 if TYPE_CHECKING:
     from jetbot_mjx.config import Config
@@ -33,7 +38,7 @@ PROGRAM = "jetbot-mjx"
 """Name of the console script, with which every command's usage begins."""
 
 USER_ERROR = 2
-INTERRUPTED = 130
+_BUG = 1
 
 _GARBAGE_THRESHOLDS = 1_000_000, 50, 100
 """Thresholds of Python's garbage collector during the start of a command. With its own, which begin
@@ -93,15 +98,20 @@ class Parser(argparse.ArgumentParser):
 
 
 def run_command(
-    command: Callable[[Sequence[str] | None], int], *, at_once: bool = False
+    command: Callable[[Sequence[str] | None], int],
+    *,
+    at_once: bool = False,
+    writes_files: bool = False,
 ) -> NoReturn:
     """Run a command's `main` and exit the process.
 
     Args:
       command: a function that takes the arguments and returns the exit code.
-      at_once: whether to exit without Python's clean-up, for a command that has closed everything
-        it opened: JAX takes a second to release a GPU, and a compiler's thread, which cannot be
-        interrupted, may abort the process.
+      at_once: whether to exit without Python's clean-up, for a command that computes and closes
+        everything it opens: JAX takes a second to release a GPU, and a compiler's thread, which
+        cannot be interrupted, may abort the process. Ctrl-C does not wait for a compiler either.
+      writes_files: whether the results are in files, so that the command has succeeded even if its
+        output could not be written.
     """
     # Prepare the process: its memory, its threads, its output, its imports and its signals.
     usual = gc.get_threshold()
@@ -113,39 +123,28 @@ def run_command(
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # Pydantic would look for plugins in all installed packages.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    for stream in (sys.stdout, sys.stderr):
-        # A character that the terminal cannot show must not fail a command that has finished.
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")
+    protect_output()
     install_lazy_imports()
     repeat_lost_interrupts()
+    if at_once:
+        exit_if_interrupt_waits()
     # Run the command and convert known errors to an exit code.
     try:
         code = command(None)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        code = USER_ERROR
-    # JAX raises a subclass, which is not named here because that would import JAX.
-    except RuntimeError as error:
-        if not ran_out(error):
-            raise
-        print(
-            "error: the device's memory is too small: choose a smaller --episodes",
-            file=sys.stderr,
-        )
-        code = USER_ERROR
-    except KeyboardInterrupt:
-        print("interrupted", file=sys.stderr)
-        code = INTERRUPTED
-    except BrokenPipeError:
-        # The reader of the output has closed the pipe, so nothing more can be printed.
-        sys.stderr.close()
-        code = USER_ERROR
+    except BaseException as error:
+        code = _report_error(error)
+        if code is None:
+            if not at_once:
+                raise
+            sys.excepthook(type(error), error, error.__traceback__)
+            code = _BUG
+        # It has ended early, for example after its help.
+        writes_files = False
     # Exit.
+    code = _report_lost_output(code, writes_files=writes_files)
     if at_once:
-        with contextlib.suppress(BrokenPipeError, ValueError):
-            sys.stdout.flush()
-            sys.stderr.flush()
+        sys.stdout.flush()
+        sys.stderr.flush()
         os._exit(code)
     sys.exit(code)
 
@@ -157,6 +156,46 @@ def tell(text: str) -> None:
       text: one line or several.
     """
     print(printable_lines(text), flush=True)
+
+
+def _report_error(error: BaseException) -> int | None:
+    """Print the line about an error that is no bug, and return its exit code; None if it is one."""
+    match error:
+        case SystemExit(code=None):
+            return 0
+        case SystemExit(code=int(code)):
+            # `argparse` has printed what is wrong, or the help.
+            return code
+        case UserError():
+            print(f"error: {error}", file=sys.stderr)
+            return USER_ERROR
+        # JAX raises a subclass, which is not named here because that would import JAX.
+        case RuntimeError() if ran_out(error):
+            print(
+                "error: the device's memory does not suffice: choose a smaller --episodes",
+                file=sys.stderr,
+            )
+            return USER_ERROR
+        case KeyboardInterrupt():
+            print("interrupted", file=sys.stderr)
+            return INTERRUPTED
+        case _:
+            return None
+
+
+def _report_lost_output(code: int, *, writes_files: bool) -> int:
+    """Print a line if standard output could not be written, and return the exit code.
+
+    A reader that leaves, such as `head`, has read what it wanted.
+    """
+    sys.stdout.flush()
+    error = write_error(sys.stdout)
+    if error is None or error.errno in READER_LEFT:
+        return code
+    failed = not (code or writes_files)
+    kind = "error" if failed else "warning"
+    print(f"{kind}: standard output cannot be written: {error.strerror}", file=sys.stderr)
+    return USER_ERROR if failed else code
 
 
 def prepare_device() -> None:

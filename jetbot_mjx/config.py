@@ -579,10 +579,10 @@ class Config(_Section):
     and `ppo.network.shared_cnn` are then `brax` and false."""
     deterministic: bool = False
     """Whether a GPU computes bit-identical results for a seed, more slowly; a CPU always does."""
-    cpu_devices: Count | None = None
-    """Devices that the CPU is divided into, each with its share of the environments, which can be
-    faster on several cores; results depend on it. null: as JAX has them, one as a rule. A GPU is
-    not divided."""
+    cpu_devices: Annotated[int, BeforeValidator(_integral), Field(ge=1, le=1024)] | None = None
+    """Devices that the CPU is divided into, at most 1,024, each with its share of the environments,
+    which can be faster on several cores; results depend on it. null: as JAX has them, one as a
+    rule. A GPU is not divided."""
     init_from: str | None = None
     """A run whose networks and normaliser to begin with, instead of those of the seed: its folder,
     or a name such as `pretrained:jetbot_egocentric`. The observation may differ."""
@@ -591,7 +591,7 @@ class Config(_Section):
     checkpoints_to_keep: Count = 50
     """Number of latest checkpoints to keep, besides the first and the best."""
     preemption_notice: Annotated[float, Field(ge=2, allow_inf_nan=False)] = 30.0
-    """[s] time after SIGTERM or SIGINT within which the process must save and exit."""
+    """[s] time after SIGTERM, SIGHUP or SIGINT within which the process must save and exit."""
     stop_at_success: Annotated[float, Field(gt=0, le=1, allow_inf_nan=False)] | None = None
     """Training ends at the first evaluation with this success rate; null: never before the end."""
     tensorboard: bool = True

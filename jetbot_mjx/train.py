@@ -90,11 +90,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
         from jetbot_mjx.training import session
     result = session.train(config, run_dir, programs)
     if distributed.is_primary():
-        how = f"stopped; to resume: jetbot-mjx train --resume {run_dir}"
-        cli.tell(session.summary(result) if result.finished else how)
+        cli.tell(session.closing_message(result))
     distributed.leave()
     return 0 if result.finished else preemption.STOPPED
 
 
 if __name__ == "__main__":
-    cli.run_command(main, at_once=True)
+    cli.run_command(main, at_once=True, writes_files=True)

@@ -117,7 +117,7 @@ def _train_once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, 
         else:
             kind = _LogsAndCheckpoints if mode == "saved" else _LogsOnly
             run_dir, programs = Path(folder), ProgramCache(compiler_options(config))
-            objects = env, program.ppo, programs, None, versions()
+            objects = env, program.ppo, programs, None, versions(), []
             parts = session.Training(config, run_dir, [run_dir], *objects)
             with (
                 mock.patch.object(session, "RunRecorder", kind),

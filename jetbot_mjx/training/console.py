@@ -8,6 +8,7 @@ from typing import Literal, TextIO
 
 from jetbot_mjx.errors import printable_lines
 from jetbot_mjx.runs.metrics import MetricValues, mean_of, process_seconds
+from jetbot_mjx.runs.output import write_error
 
 Phase = Literal["compiling", "training", "evaluating", "saving", "rendering"]
 
@@ -27,6 +28,12 @@ class Terminal:
         self._total = total_steps
         self._stream = stream or sys.stdout
         self._last_line = -math.inf
+        self._lost = False
+
+    @property
+    def lost(self) -> bool:
+        """Return whether something could not be printed: its reader has gone, or a disk is full."""
+        return self._lost or write_error(self._stream) is not None
 
     def begin(self) -> None:
         """Show that compilation has begun, after which nothing else happens for a while."""
@@ -81,7 +88,11 @@ class Terminal:
         return f"ETA {max(0, self._total - env_steps) / env_steps_per_second:5.0f} s"
 
     def _print(self, *parts: str) -> None:
-        print("  ".join(part for part in parts if part), file=self._stream, flush=True)
+        try:
+            print("  ".join(part for part in parts if part), file=self._stream, flush=True)
+        except (OSError, ValueError):
+            # In a program that imports the package: the training outlives its terminal there too.
+            self._lost = True
         self._last_line = time.monotonic()
 
 

@@ -6,7 +6,6 @@ make the same collective calls in the same order, and none waits for a process t
 """
 
 import os
-import sys
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -18,6 +17,7 @@ from jaxtyping import Int, PyTree
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.interrupts import tell
 
 JOIN_SECONDS = 120
 """Longest time that the processes wait for each other at the start [s]."""
@@ -225,11 +225,9 @@ def _read_number(name: str) -> int | None:
 def _exit_unconnected(address: str | None) -> None:
     """End this process with one line, because not all processes have connected."""
     where = f" at {address}" if address else ""
-    print(
+    tell(
         f"error: --distributed: not all processes have connected{where} within {JOIN_SECONDS} s:"
         f" start as many as {_COUNT} says, each with its own {_INDEX}, where that address can be"
-        " reached",
-        file=sys.stderr,
-        flush=True,
+        " reached"
     )
     os._exit(_USER_ERROR)

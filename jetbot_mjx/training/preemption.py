@@ -4,25 +4,32 @@ After the first signal the training finishes its current call, saves and ends. I
 uses `Preemption`, the process exits at once if that takes longer than the configured notice, or at
 a second signal. The earlier checkpoints stay complete, because a checkpoint gets its name only when
 it is complete. A program that imports the package uses `DeferredSignals`: its process never exits
-here.
+here. A process that
+still compiles has nothing to save, and does not wait for the compiler.
 """
 
 import os
 import signal
-import sys
 import threading
 import time
+from collections.abc import Callable
 from types import FrameType
 from typing import Self
+
+from jetbot_mjx.interrupts import SignalListener, tell
 
 STOPPED = 75
 """Exit code of a training that was stopped on request and can be resumed (`EX_TEMPFAIL`)."""
 
-_SIGNALS = (signal.SIGTERM, signal.SIGINT)
+# A terminal that is closed sends SIGHUP, which Windows does not have.
+_SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
 _SHARE_OF_NOTICE = 0.8
 """Share of the notice after which the process exits without saving."""
-_END = 0
-"""Byte that ends the listener; no signal has this number."""
+_COMPILING_SECONDS = 1.0
+"""Time after which the process exits while the training compiles [s]."""
+
+
+_WITHOUT_SAVING = "leaving without another save; the last complete checkpoint is intact"
 
 
 class StopRequest:
@@ -36,6 +43,7 @@ class StopRequest:
         """
         self.notice = notice
         self._requested = threading.Event()
+        self._compiling: Callable[[], str] | None = None
 
     @property
     def requested(self) -> bool:
@@ -45,6 +53,18 @@ class StopRequest:
     def wait(self, seconds: float) -> bool:
         """Wait for a request for some seconds, and return whether there is one."""
         return self._requested.wait(seconds)
+
+    def begin_compiling(self, say: Callable[[], str]) -> None:
+        """Tell that the training compiles, so that there is nothing to save yet.
+
+        Args:
+          say: returns what a process says that ends meanwhile.
+        """
+        self._compiling = say
+
+    def begin_training(self) -> None:
+        """Tell that the training has compiled: from now on it saves when it is asked to stop."""
+        self._compiling = None
 
     def __enter__(self) -> Self:
         """Return the object itself."""
@@ -91,12 +111,7 @@ class DeferredSignals(StopRequest):
 
 
 class Preemption(StopRequest):
-    """A `Preemption` listens for signals; as a context manager it restores the former handlers.
-
-    Python runs a signal handler only between two of its own instructions, so not while a program
-    compiles. Therefore Python's wakeup file descriptor sends the signal's number through a pipe to
-    a thread, which also limits the time.
-    """
+    """A `Preemption` listens for signals; as a context manager it restores the former handlers."""
 
     def __init__(self, notice: float) -> None:
         """Prepare to listen.
@@ -105,25 +120,20 @@ class Preemption(StopRequest):
           notice: time after a signal at which the process must have ended [s].
         """
         super().__init__(notice)
+        self._began = 0.0
         self._timer: threading.Timer | None = None
-        self._listener: threading.Thread | None = None
+        self._listener: SignalListener | None = None
 
     def __enter__(self) -> Self:
         """Begin to listen; do nothing outside the main thread, where Python allows no handlers."""
         self._former = {}
         if threading.current_thread() is not threading.main_thread():
             return self
-        self._reader, self._writer = os.pipe()
-        # On Windows, Python 3.11 cannot do this, and does not need it.
-        if hasattr(os, "set_blocking"):
-            os.set_blocking(self._writer, False)
-        self._former_fd = signal.set_wakeup_fd(self._writer, warn_on_full_buffer=False)
+        self._listener = SignalListener(self._receive).__enter__()
         for number in _SIGNALS:
             # A shell makes its background jobs ignore Ctrl-C; keep it so.
             if signal.getsignal(number) is not signal.SIG_IGN:
                 self._former[number] = signal.signal(number, _ignore)
-        self._listener = threading.Thread(target=self._listen, daemon=True)
-        self._listener.start()
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -132,49 +142,40 @@ class Preemption(StopRequest):
             return
         for number, handler in self._former.items():
             signal.signal(number, handler)
-        signal.set_wakeup_fd(self._former_fd)
-        os.write(self._writer, bytes([_END]))
-        self._listener.join()
-        os.close(self._reader)
-        os.close(self._writer)
+        self._listener.__exit__(*exception)
         if self._timer is not None:
             self._timer.cancel()
 
-    def _listen(self) -> None:
-        """Read the numbers of the signals that arrive, until `_END`."""
-        began = 0.0
-        while (number := os.read(self._reader, 1)[0]) != _END:
-            # The wakeup file descriptor receives every signal that has a Python handler.
-            if number not in _SIGNALS:
-                continue
-            name = signal.Signals(number).name
-            if not self._requested.is_set():
-                began = time.monotonic()
-                self._requested.set()
-                limit = min(_SHARE_OF_NOTICE * self.notice, threading.TIMEOUT_MAX)
-                self._timer = threading.Timer(
-                    limit, _exit_without_saving, [f"{limit:.0f} s after {name}"]
-                )
-                self._timer.daemon = True
-                self._timer.start()
-                print(
-                    f"\n{name}: finishing this step and saving (once more to leave without saving)",
-                    file=sys.stderr,
-                    flush=True,
-                )
-            # Ignore a repetition: schedulers and terminals also signal the whole process group.
-            elif time.monotonic() - began > 0.5:
-                _exit_without_saving(f"second {name}")
+    def _receive(self, number: int) -> None:
+        """Handle a signal."""
+        # The wakeup file descriptor receives every signal that has a Python handler.
+        if number not in _SIGNALS:
+            return
+        name = signal.Signals(number).name
+        compiling = self._compiling
+        if not self._requested.is_set():
+            self._began = time.monotonic()
+            self._requested.set()
+            limit = min(_SHARE_OF_NOTICE * self.notice, threading.TIMEOUT_MAX)
+            if compiling:
+                limit = min(limit, _COMPILING_SECONDS)
+            say = compiling or (lambda: f"{limit:.0f} s after {name}: {_WITHOUT_SAVING}")
+            self._timer = threading.Timer(limit, _exit, [say])
+            self._timer.daemon = True
+            self._timer.start()
+            saving = "finishing this step and saving (once more to leave without saving)"
+            tell(f"\n{name}: {'ending' if compiling else saving}")
+        # Ignore a repetition: schedulers and terminals also signal the whole process group.
+        elif time.monotonic() - self._began > 0.5:
+            _exit(compiling or (lambda: f"second {name}: {_WITHOUT_SAVING}"))
 
 
-def _exit_without_saving(reason: str) -> None:
-    """End this process at once, whatever its threads do."""
-    print(
-        f"{reason}: leaving without another save; the last complete checkpoint is intact",
-        file=sys.stderr,
-        flush=True,
-    )
-    os._exit(STOPPED)
+def _exit(say: Callable[[], str]) -> None:
+    """End this process at once, whatever its threads do and whoever reads its output."""
+    try:
+        tell(say())
+    finally:
+        os._exit(STOPPED)
 
 
 def _ignore(number: int, frame: FrameType | None) -> None:

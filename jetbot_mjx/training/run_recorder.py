@@ -13,6 +13,7 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.envs.opengl import find_backend
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.interrupts import tell
 from jetbot_mjx.runs.checkpoint import POLICY
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
 from jetbot_mjx.runs.metrics import (
@@ -30,6 +31,7 @@ from jetbot_mjx.runs.nan_dump import save_nan_dump
 from jetbot_mjx.runs.resume import to_trees
 from jetbot_mjx.runs.run_dir import make_folder, writing_to
 from jetbot_mjx.runs.sb3_tags import aliases
+from jetbot_mjx.runs.train_log import TRAIN_LOG
 from jetbot_mjx.runs.wandb_sink import WandbSink
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.console import Phase, Terminal
@@ -110,6 +112,7 @@ class RunRecorder(TrainerCallback):
       evaluate: a function that evaluates a policy on the fixed goals of training.
       video: renders a policy after an evaluation; None: no videos.
       terminal: shows the progress.
+      say: tells the user a message, on the terminal and in the log of the run.
       clock: measures the time that is spent on compilation.
     """
 
@@ -118,6 +121,7 @@ class RunRecorder(TrainerCallback):
     evaluate: Callable[[PolicyParams], Summary]
     video: "EvaluationVideo | None"
     terminal: Terminal
+    say: Callable[[str], None]
     clock: CompileClock
 
     def __post_init__(self) -> None:
@@ -128,6 +132,7 @@ class RunRecorder(TrainerCallback):
         self._unlogged_compile_seconds = 0.0
         self._recording_seconds = 0.0
         self._awaiting_first_step = False
+        self._unread = False
 
     @property
     def standings(self) -> list[Standing]:
@@ -154,14 +159,9 @@ class RunRecorder(TrainerCallback):
         """Return the time of all processes that worked on the run, from their start [s]."""
         return self._earlier_seconds + process_seconds()
 
-    def say(self, *lines: str) -> None:
-        """Print lines on the terminal."""
-        for line in lines:
-            self.terminal.say(line)
-
     def begin(self, headline: str) -> None:
         """Print the headline, and show that compilation has begun."""
-        self.terminal.say(headline)
+        self.say(headline)
         self.terminal.begin()
 
     def on_interval(self, progress: Sequence[Progress]) -> bool:
@@ -196,6 +196,7 @@ class RunRecorder(TrainerCallback):
         # Show the metrics, and render the videos.
         self._report_first_step()
         self.terminal.write(progress[0].env_steps, logged)
+        self._report_unread()
         self._render_videos(progress)
         self._recording_seconds = time.perf_counter() - began - evaluating
         if progress[0].env_steps > 0:
@@ -214,6 +215,7 @@ class RunRecorder(TrainerCallback):
         self._report_first_step()
         steps = env_steps - self.seeds[0].standing.env_steps
         self.terminal.update(env_steps, metrics, steps / max(seconds, 1e-9))
+        self._report_unread()
 
     def on_nan_dump(self, seed_index: int, env_steps: int, nan_dump: NanDump) -> None:
         """Save the dump for replay, and print the command that replays it."""
@@ -221,7 +223,7 @@ class RunRecorder(TrainerCallback):
         with writing_to(seed.run_dir):
             path = save_nan_dump(seed.run_dir, seed.config, env_steps, nan_dump)
         if path is not None:
-            self.terminal.say(
+            self.say(
                 f"a state became non-finite before step {env_steps:,}, and its environment was"
                 f" reset: jetbot-mjx replay {path}"
             )
@@ -241,7 +243,7 @@ class RunRecorder(TrainerCallback):
         try:
             find_backend()
         except UserError as error:
-            self.terminal.say(f"evaluation.video: no videos are rendered: {error}")
+            self.say(f"evaluation.video: no videos are rendered: {error}")
             self.video = None
             return
         for seed, one in zip(self.seeds, progress, strict=True):
@@ -260,12 +262,25 @@ class RunRecorder(TrainerCallback):
         self._awaiting_first_step = False
         self._lap()
         cache = f"{self.clock.cached} of {self.clock.programs} programs from the cache"
-        if self.clock.cached:
-            cache += f", which saved {self.clock.saved_seconds:.1f} s"
-        self.terminal.say(
+        # Loading a small program may take longer than compiling it took.
+        if (saved := round(self.clock.saved_seconds, 1)) > 0:
+            cache += f", which saved {saved:.1f} s"
+        self.say(
             f"first training step done {process_seconds():.1f} s after the start;"
             f" {self._compile_seconds:.1f} s of it compiling ({cache})"
         )
+
+    def _report_unread(self) -> None:
+        """Tell once that the output can no longer be written, and that the training goes on."""
+        if self._unread or not self.terminal.lost:
+            return
+        self._unread = True
+        text = (
+            "standard output cannot be written: the training goes on, and its messages are in"
+            f" {TRAIN_LOG} in the run folder"
+        )
+        self.say(text)
+        tell(text)
 
     def _lap(self) -> float:
         seconds = self.clock.lap()

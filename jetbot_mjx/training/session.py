@@ -48,6 +48,7 @@ from jetbot_mjx.runs.task_code import (
     stored_task_class,
     write_task_code,
 )
+from jetbot_mjx.runs.train_log import log_message
 from jetbot_mjx.runs.wandb_sink import check_tracking
 from jetbot_mjx.training import distributed, ppo_trainer
 from jetbot_mjx.training.callbacks import TrainerCallback
@@ -291,6 +292,11 @@ def _train(training: Training, stop: StopRequest) -> Result:
     opened: list[tuple[RunRecorder, list[TrainState]]] = []
     with contextlib.ExitStack() as stack:
         clock = stack.enter_context(CompileClock())
+        # Several processes end together, after the first checkpoint.
+        if jax.process_count() == 1:
+            stop.begin_compiling(
+                functools.partial(stop_message, training.run_dir, training.run_dirs)
+            )
         stack.enter_context(stop)
         seeds = [one.seed for one in config.of_each_seed()]
         trainer = ppo_trainer.CompiledTrainer(training.ppo, seeds, training.programs)
@@ -301,7 +307,8 @@ def _train(training: Training, stop: StopRequest) -> Result:
             opened.append((recorder, resumption.states if resumption else []))
             if recorder.complete:
                 # Of the messages, the last one would say that the training resumes.
-                recorder.say(*messages[:-1], _complete_message(config, recorder.standings))
+                for line in (*messages[:-1], _complete_message(config, recorder.standings)):
+                    recorder.say(line)
                 return _COMPLETE
             if training.warm_start:
                 messages.append(training.warm_start.describe())
@@ -367,10 +374,15 @@ def open_recorder(
     terminal = SilentTerminal(total_steps)
     if training.verbose:
         terminal = open_terminal(run_dirs, total_steps, histories)
+
+    def say(text: str) -> None:
+        log_message(training.run_dir, text)
+        terminal.say(text)
+
     seeds = []
     for index, seed_config in enumerate(config.of_each_seed()):
         folder, history = run_dirs[index], histories[index]
-        sinks = open_sinks(seed_config, folder, history, terminal.say, len(run_dirs))
+        sinks = open_sinks(seed_config, folder, history, say, len(run_dirs))
         about = {
             **about_policy(seed_config, env),
             "versions": training.versions,
@@ -379,7 +391,7 @@ def open_recorder(
         standing = Standing.from_json(resumed.progress[index])
         fingerprint = digest(resumed.states[index].policy_params) if resumption else ""
         seeds.append(SeedRecorder(seed_config, folder, sinks, about, standing, fingerprint))
-    return RunRecorder(config, seeds, evaluate, video, terminal, clock)
+    return RunRecorder(config, seeds, evaluate, video, terminal, say, clock)
 
 
 def _evaluation(training: Training) -> Callable[[PolicyParams], Summary]:
@@ -491,6 +503,29 @@ def _headline(config: Config, run_dir: Path) -> str:
         f" {config.ppo.num_timesteps:,} steps in {config.ppo.num_envs:,} environments{seeds} on"
         f" {jax.device_count()} x {device.device_kind}{hosts}\nrun folder: {run_dir}"
     )
+
+
+def stop_message(run_dir: Path, run_dirs: Sequence[Path]) -> str:
+    """Return the line about a training that was stopped, and write it to the log of the run.
+
+    Args:
+      run_dir: the run folder.
+      run_dirs: the folder of each seed.
+    """
+    text = "stopped before the first checkpoint: the same command starts from the beginning"
+    if all(map(checkpoint_steps, run_dirs)):
+        text = f"stopped; to resume: jetbot-mjx train --resume {run_dir}"
+    log_message(run_dir, text)
+    return text
+
+
+def closing_message(result: Result) -> str:
+    """Return the text that a training prints at last, and write it to the log of the run."""
+    if not result.finished:
+        return stop_message(result.run_dir, result.run_dirs)
+    text = summary(result)
+    log_message(result.run_dir, text)
+    return text
 
 
 def summary(result: Result) -> str:

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 
 import pytest
 
@@ -96,6 +97,56 @@ cli.run_command(command)
 def test_a_command_at_work_is_interrupted_wherever_it_is(what, code, said, tmp_path):
     done = python(tmp_path, "-c", COMMAND.format(what=what))
     assert (done.returncode, done.stderr) == (code, said)
+
+
+def test_a_command_does_not_wait_for_a_compiler_in_the_main_thread(tmp_path):
+    source = COMMAND.replace("cli.run_command(command)", "cli.run_command(command, at_once=True)")
+    # As XLA does, it computes without Python's lock and answers no signal.
+    source = source.format(
+        what="import hashlib, os, threading\n"
+        "    threading.Timer(0.5, os.kill, [os.getpid(), signal.SIGINT]).start()\n"
+        "    print(time.monotonic(), flush=True)\n"
+        "    hashlib.pbkdf2_hmac('sha256', b'', b'salt', 2**31 - 1)"
+    )
+    done = python(tmp_path, "-c", source)
+    assert (done.returncode, done.stderr) == (130, "interrupted\n")
+    assert time.monotonic() - float(done.stdout) < 2.5
+
+
+COMPILING = """
+import sys, time
+import jax
+import jax.numpy as jnp
+from jetbot_mjx import cli
+from jetbot_mjx.compiler.background import in_background
+
+jax.config.update("jax_enable_compilation_cache", False)
+
+def long(x):
+    for _ in range(2_000):
+        x = jnp.sin(x) @ x
+    return x
+
+def command(_):
+    lowered = jax.jit(long).lower(jnp.ones((3, 3)))
+    in_background(lowered.compile)
+    time.sleep(0.2)
+    raise {error}
+
+cli.run_command(command, at_once=True)
+"""
+
+
+@pytest.mark.parametrize(
+    "error",
+    ["ValueError: wrong", "SystemExit: wrong"],
+)
+def test_an_error_while_a_thread_compiles_has_its_traceback_and_exit_code(error, tmp_path):
+    raised = "{}('{}')".format(*error.split(": "))
+    done = python(tmp_path, "-c", COMPILING.format(error=raised))
+    assert done.returncode == 1, done.stderr
+    assert done.stderr.startswith("Traceback")
+    assert done.stderr.endswith(f"\n{error}\n")
 
 
 def test_other_exceptions_that_are_lost_are_told(tmp_path):

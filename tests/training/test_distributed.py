@@ -179,7 +179,7 @@ def test_only_the_first_prints_and_writes(stopped, finished):
     assert len(list((run_dir / "tensorboard").iterdir())) == 1
     assert {path.name for path in run_dir.iterdir()} == {
         *(".lock", "config.yaml", "versions.json"),
-        *("metrics.jsonl", "tensorboard", "checkpoints"),
+        *("train.log", "metrics.jsonl", "tensorboard", "checkpoints"),
     }
 
 

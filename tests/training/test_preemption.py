@@ -15,7 +15,7 @@ import gliding
 import pytest
 
 from benchmarks.reliability import torture
-from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps, read_about
+from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
 from jetbot_mjx.training import preemption
 from jetbot_mjx.training.preemption import STOPPED, Preemption
 
@@ -67,12 +67,17 @@ with gliding.everywhere():
 """
 
 
-def training(run_dir, before_training="", before_imports="", notice=300):
+def driver(before_training="", before_imports=""):
     program = DRIVER.replace("{tests}", repr(str(Path(__file__).parents[1] / "helpers")))
     program = program.replace("{before_training}", before_training)
     program = program.replace("{lazily}", gliding.LAZILY)
     program = program.replace("{before_imports}", before_imports)
-    return torture.Process(run_dir, [*SETTINGS, f"preemption_notice={notice}"], ["-c", program])
+    return ["-c", program]
+
+
+def training(run_dir, before_training="", before_imports="", notice=300):
+    program = driver(before_training, before_imports)
+    return torture.Process(run_dir, [*SETTINGS, f"preemption_notice={notice}"], program)
 
 
 def finish(run_dir):
@@ -86,13 +91,15 @@ def stop(process, moment, number=signal.SIGTERM):
     return process.wait()
 
 
-def assert_saved_and_gone(process, code, number=signal.SIGTERM):
+SAVING = "finishing this step and saving (once more to leave without saving)"
+
+
+def assert_saved_and_gone(process, code, number=signal.SIGTERM, doing=SAVING):
     assert code == STOPPED, process.stderr
-    assert process.stderr == (
-        f"\n{number.name}: finishing this step and saving (once more to leave without saving)\n"
-    )
+    assert process.stderr == (f"\n{number.name}: {doing}\n")
     last = process.stdout.splitlines()[-1]
     assert last == f"stopped; to resume: jetbot-mjx train --resume {process.run_dir}"
+    assert (process.run_dir / "train.log").read_text().endswith(f"  {last}\n")
     assert process.unfinished == set()
 
 
@@ -128,23 +135,27 @@ def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_compiling_before_the_first_checkpoint_it_writes_that(
-    undisturbed, undisturbed_run, tmp_path
+def test_compiling_before_the_first_checkpoint_it_does_not_wait_for_the_compiler(
+    undisturbed, tmp_path
 ):
-    with training(tmp_path / "run", f"dwell(CompiledTrainer, 'compile', {LONG})") as process:
-        code = stop(process, "compile")
-    assert_saved_and_gone(process, code)
-    assert checkpoint_steps(tmp_path / "run") == [0]
-    ours, theirs = (
-        read_about(checkpoint_path(run_dir, 0)) for run_dir in (tmp_path / "run", undisturbed_run)
-    )
-    assert ours["sha256"] == theirs["sha256"]
+    with training(tmp_path / "run", f"dwell(Evaluator, 'run', {LONG})") as process:
+        process.until(lambda: "now: run\n" in process.stdout)
+        began = time.monotonic()
+        process.send(signal.SIGINT)
+        assert process.wait() == STOPPED
+    assert time.monotonic() - began < 2.0
+    told = "stopped before the first checkpoint: the same command starts from the beginning"
+    assert process.stderr == f"\nSIGINT: ending\n{told}\n"
+    assert (tmp_path / "run" / "train.log").read_text().endswith(f"  {told}\n")
+    assert checkpoint_steps(tmp_path / "run") == []
+    # It is true.
+    assert torture.differences(undisturbed, finish(tmp_path / "run")) == []
 
 
 def test_compiling_after_a_checkpoint_it_does_not_wait_for_the_compiler(begun):
     with training(begun, f"dwell(CompiledTrainer, 'compile', {LONG})") as process:
         code = stop(process, "compile")
-    assert_saved_and_gone(process, code)
+    assert_saved_and_gone(process, code, doing="ending")
     assert checkpoint_steps(begun) == [0, INTERVAL]
 
 
@@ -192,6 +203,44 @@ def test_what_takes_longer_than_the_notice_is_cut_off(begun):
     torture.check_start(process, [0, INTERVAL])
 
 
+UNREAD = "standard output cannot be written: the training goes on"
+
+
+def unread(run_dir, program):
+    """Starts a training whose only reader leaves after the first line."""
+    arguments = ["--config", str(torture.CONFIG), "--run-dir", str(run_dir)]
+    for setting in SETTINGS:
+        arguments += ["--set", setting]
+    process = subprocess.Popen(
+        [sys.executable, *program, *arguments], stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+    )
+    process.stdout.readline()
+    process.stdout.close()
+    return process
+
+
+def test_a_training_goes_on_without_a_reader(begun, undisturbed):
+    with unread(begun, TRAINER) as process:
+        assert process.wait(PATIENCE) == 0
+    told = (begun / "train.log").read_text()
+    assert told.count(UNREAD) == 1
+    assert f"sha256 {undisturbed.fingerprint}" in told
+
+
+def test_ctrl_c_saves_where_the_reader_ends_by_it_too(begun):
+    # As in `train 2>&1 | tee log`.
+    with unread(begun, driver("dwell_in_calls(1)")) as process:
+        deadline = time.monotonic() + PATIENCE
+        while 2 * INTERVAL not in checkpoint_steps(begun):
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        process.send_signal(signal.SIGINT)
+        assert process.wait(PATIENCE) == STOPPED
+    assert checkpoint_steps(begun)[-1] > 2 * INTERVAL
+    last = f"stopped; to resume: jetbot-mjx train --resume {begun}\n"
+    assert (begun / "train.log").read_text().endswith(last)
+
+
 # What follows needs the module alone, and no training.
 
 LISTENER = f"""
@@ -206,30 +255,65 @@ def send(number=signal.SIGTERM):
 """
 
 
-def listen(program, notice=300):
+def listen(program, notice=300, stderr=subprocess.PIPE):
     """Runs lines of Python under `Preemption`; gives the exit code, the seconds and stderr."""
     lines = [f"with preemption.Preemption({notice}) as asked:", *program.splitlines()]
     process = subprocess.Popen(
         [sys.executable, "-c", LISTENER + "\n    ".join(lines)],
         stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
+        stderr=stderr,
         text=True,
     )
     with process:
         try:
             assert process.stdout.readline() == "listening\n"
             began = time.monotonic()
-            _, stderr = process.communicate(timeout=PATIENCE)
+            _, told = process.communicate(timeout=PATIENCE)
         finally:
             process.kill()
-    return process.returncode, time.monotonic() - began, stderr
+    return process.returncode, time.monotonic() - began, told
 
 
-def test_a_second_signal_leaves_at_once():
-    code, _, stderr = listen(
-        f"print('listening', flush=True)\nsend()\ntime.sleep(1)\nsend()\ntime.sleep({LONG})"
+@pytest.fixture(params=["full", "nobody reads", "nobody reads on"])
+def unwritable(request):
+    """Standard error that takes nothing: at the end of a full pipe a write waits for ever."""
+    reader, writer = os.pipe()
+    if request.param == "full":
+        os.close(writer)
+        writer = os.open("/dev/full", os.O_WRONLY)
+    elif request.param == "nobody reads on":
+        os.set_blocking(writer, False)
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                os.write(writer, bytes(1))
+        os.set_blocking(writer, True)
+    else:
+        os.close(reader)
+        reader = os.dup(writer)
+    yield writer
+    os.close(reader)
+    os.close(writer)
+
+
+@pytest.mark.parametrize("second", ["send()", ""], ids=["second signal", "notice"])
+def test_it_leaves_in_time_where_stderr_cannot_be_written(second, unwritable):
+    code, seconds, _ = listen(
+        f"print('listening', flush=True)\nsend()\ntime.sleep(1)\n{second}\ntime.sleep({LONG})",
+        notice=300 if second else 5,
+        stderr=unwritable,
     )
     assert code == STOPPED
+    assert seconds < 5.5
+
+
+@pytest.mark.parametrize("first", ["SIGTERM", "SIGHUP"])  # the latter of a terminal that is closed
+def test_a_second_signal_leaves_at_once(first):
+    code, _, stderr = listen(
+        f"print('listening', flush=True)\nsend(signal.{first})\n"
+        f"time.sleep(1)\nsend()\ntime.sleep({LONG})"
+    )
+    assert code == STOPPED
+    assert f"{first}: finishing this step and saving" in stderr
     assert stderr.splitlines()[-1].startswith("second SIGTERM: leaving without another save")
 
 

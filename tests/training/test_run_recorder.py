@@ -1,6 +1,7 @@
 """Films of the evaluations: what they must not touch, and what they must not cost."""
 
 import json
+import re
 import time
 
 import imageio.v3 as iio
@@ -64,7 +65,7 @@ def recorder(root, tmp_path, monkeypatch):
         clocks.append(CompileClock())
         env, programs = make_env(config), ProgramCache({})
         ppo = build_ppo(config, env)
-        parts = session.Training(config, tmp_path, folders, env, ppo, programs, None, {})
+        parts = session.Training(config, tmp_path, folders, env, ppo, programs, None, {}, [])
         return session.open_recorder(parts, clocks[-1], None)
 
     yield recorder
@@ -223,3 +224,29 @@ def test_all_logs_get_everything_and_are_all_closed(root, tmp_path):
     first, second = sinks
     written = [(first, 3, {"a": 1.0}), (second, 3, {"a": 1.0})]
     assert log == [*written, (second, "closed"), (first, "closed")]
+
+
+@pytest.mark.parametrize(
+    ("seconds", "said"),
+    [(-0.1, "1 of 2 programs from the cache)"), (0.0, ")"), (1.0, "saved 1.0 s)")],
+)
+def test_what_the_cache_saved_is_told_where_it_saved_something(recorder, capsys, seconds, said):
+    with recorder() as recording:
+        recording.clock.programs, recording.clock.cached = 2, 1
+        recording.clock.saved_seconds = seconds
+        recording.on_compiled()
+        recording.on_progress(4_096, {}, 1.0)
+    line = next(line for line in capsys.readouterr().out.splitlines() if "first training" in line)
+    assert line.endswith(said)
+    assert ("saved" in line) == (seconds > 0)
+
+
+def test_messages_are_in_the_run_folder_and_those_of_progress_are_not(recorder, tmp_path):
+    with recorder() as recording:
+        recording.begin("a headline\nof two lines")
+        recording.on_progress(4_096, {}, 1.0)
+    lines = (tmp_path / "train.log").read_text().splitlines()
+    assert [re.sub(r"^\d{4}-\d\d-\d\d \d\d:\d\d:\d\d  ", "", line) for line in lines] == [
+        "a headline",
+        "of two lines",
+    ]
