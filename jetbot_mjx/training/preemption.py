@@ -4,8 +4,9 @@ After the first signal the training finishes its current call, saves and ends. I
 uses `Preemption`, the process exits at once if that takes longer than the configured notice, or at
 a second signal. The earlier checkpoints stay complete, because a checkpoint gets its name only when
 it is complete. A program that imports the package uses `DeferredSignals`: its process never exits
-here. A process that
-still compiles has nothing to save, and does not wait for the compiler.
+here.
+
+A training that still compiles has nothing to save, so its command does not wait for the compiler.
 """
 
 import os
