@@ -172,7 +172,7 @@ def _report_error(error: BaseException) -> int | None:
         # JAX raises a subclass, which is not named here because that would import JAX.
         case RuntimeError() if ran_out(error):
             print(
-                "error: the device's memory does not suffice: choose a smaller --episodes",
+                "error: the device's memory is too small: choose a smaller --episodes",
                 file=sys.stderr,
             )
             return USER_ERROR
