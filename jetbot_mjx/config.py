@@ -796,34 +796,44 @@ def shipped_folder(name: Literal["configs", "examples"]) -> Path:
     )
 
 
-def shipped_configs() -> dict[str, Path]:
-    """Return the configurations that come with the package, by name."""
-    return {path.stem: path for path in sorted(shipped_folder("configs").glob("*.yaml"))}
+_CONFIGS = Path("configs")
 
 
-def find_config(name: str | Path) -> Path:
+def shipped_configs(folder: Path = _CONFIGS) -> dict[str, Path]:
+    """Return the configurations that come with the package, by name.
+
+    Args:
+      folder: `configs`, or a folder in it, in which other YAML files are.
+    """
+    files = (shipped_folder("configs") / folder.relative_to(_CONFIGS)).glob("*.yaml")
+    return {path.stem: path for path in sorted(files)}
+
+
+def find_config(name: str | Path, folder: Path = _CONFIGS, what: str = "config") -> Path:
     """Return the path of a configuration file.
 
     Args:
       name: the path of a file, or the name of a configuration that comes with the package, such
         as `jetbot_egocentric`.
+      folder: where that comes from, as for `shipped_configs`.
+      what: the argument that names the file, for error messages.
 
     Returns:
       The path, which need not exist if it names a folder.
 
     Raises:
-      ConfigNotFoundError: a plain name is neither a file nor a configuration of the package.
+      ConfigNotFoundError: a plain name is neither a file nor one that comes with the package.
     """
     path = Path(name)
     # A reader of the documentation may name `configs/gpu.yaml` in another folder.
-    if os.path.lexists(path) or path.parent not in (Path(), Path("configs")):
+    if os.path.lexists(path) or path.parent not in (Path(), folder):
         return path
-    shipped = shipped_configs()
+    shipped = shipped_configs(folder)
     if (found := shipped.get(path.name.removesuffix(".yaml"))) is not None:
         return found
     close = difflib.get_close_matches(path.stem, shipped, n=1)
     hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"
-    raise ConfigNotFoundError(f"config {name} does not exist: {hint}")
+    raise ConfigNotFoundError(f"{what} {name} does not exist: {hint}")
 
 
 def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:

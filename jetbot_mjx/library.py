@@ -230,10 +230,12 @@ def tune(
       config: a configuration: its name, its file or the object.
       overrides: the settings to change before the search, such as `{"ppo.num_envs": 512}`.
       space: the settings to search and their values, such as `{"ppo.learning_rate": {"low": 1e-4,
-        "high": 1e-2, "log": True}}`, or the YAML file that holds them.
-      trials: the number of trials.
+        "high": 1e-2, "log": True}}`; the YAML file that holds them; or `"ppo"`, which comes with
+        the package.
+      trials: how many trials the study shall have.
       round_size: how many trials to train at once.
-      confirm: how many of the best trials to train anew, with five new seeds each.
+      confirm: how many of the best trials to retrain with five new seeds, beside the configuration
+        as given; 0: none, and the trial with the best score is the best.
       output: the folder of the study and its results; None: a new one,
         `runs/tune-<config>-<date>-<time>`.
       storage: the database of the study; None: SQLite in the folder.

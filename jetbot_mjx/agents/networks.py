@@ -136,10 +136,19 @@ def _with_mean(params: Any, mean: np.ndarray) -> Any:
       mean: the biases of the first outputs, the mean of the action's distribution.
     """
     layers = params["params"]
-    # With `normal`, Brax has the hidden layers in a module of their own, in front of `Dense_0`.
-    last = "Dense_0" if "Dense_0" in layers else f"hidden_{len(layers) - 1}"
+    last = last_layer(layers)
     bias = layers[last]["bias"].at[: len(mean)].set(mean)
     return {"params": {**layers, last: {**layers[last], "bias": bias}}}
+
+
+def last_layer(layers: Mapping[str, Any]) -> str:
+    """Return the name of a policy network's last layer, whose first outputs are the means.
+
+    Args:
+      layers: Brax's parameters of the network, by layer.
+    """
+    # With `normal`, Brax has the hidden layers in a module of their own, in front of `Dense_0`.
+    return "Dense_0" if "Dense_0" in layers else f"hidden_{len(layers) - 1}"
 
 
 def make_networks(

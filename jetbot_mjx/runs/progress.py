@@ -140,11 +140,12 @@ def _bars(console: "Console") -> Iterator[_Display]:
 def _lines(stream: TextIO) -> _Display:
     """Return a display that prints a line for every stage that takes long, and then now and then.
 
-    A timer prints the first line of a stage, because nothing else happens in some of them.
+    A thread prints the lines of a stage in which nothing is counted for long, such as compiling.
     """
     from jetbot_mjx.runs.metrics import process_seconds
 
     lock = threading.Lock()
+    under_way: list[threading.Event] = []
 
     def say(text: str) -> None:
         # A reader that has gone does not end the command.
@@ -155,10 +156,20 @@ def _lines(stream: TextIO) -> _Display:
     def show(name: str, total: int | None) -> Iterator[Advance]:
         done, began = 0, time.monotonic()
         last_line = began
-        first = name if total is None else f"{name}: {total:,}"
-        timer = threading.Timer(_SECONDS_BEFORE_LINE, say, [first])
-        timer.daemon = True
-        timer.start()
+        finished = threading.Event()
+
+        def remind() -> None:
+            nonlocal last_line
+            if finished.wait(_SECONDS_BEFORE_LINE):
+                return
+            say(name if total is None else f"{name}: {total:,}")
+            while not finished.wait(_SECONDS_BETWEEN_LINES):
+                now = time.monotonic()
+                # Of stages inside each other, the inner one tells what takes long.
+                if under_way[-1:] == [finished] and now - last_line >= _SECONDS_BETWEEN_LINES:
+                    counted = "" if total is None else f" {done:,} of {total:,},"
+                    say(f"{name}:{counted} {now - began:.0f} s so far")
+                    last_line = now
 
         def advance(count: int) -> None:
             nonlocal done, last_line
@@ -169,9 +180,12 @@ def _lines(stream: TextIO) -> _Display:
                 say(f"{name}: {done:,} of {total:,}, about {left:.0f} s left")
                 last_line = now
 
+        under_way.append(finished)
+        threading.Thread(target=remind, daemon=True).start()
         try:
             yield advance
         finally:
-            timer.cancel()
+            finished.set()
+            under_way.remove(finished)
 
     return show

@@ -23,7 +23,7 @@ import numpy as np
 from brax.training.types import UInt64
 from jaxtyping import Array, Float, Int, PyTree
 
-from jetbot_mjx.agents.networks import PolicyParams, make_networks, make_policy
+from jetbot_mjx.agents.networks import PolicyParams, last_layer, make_networks, make_policy
 from jetbot_mjx.agents.ppo import TrainState
 from jetbot_mjx.config import Config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
@@ -171,26 +171,32 @@ def _text(value: Any) -> str:
 
 def _match_first_layer(params: PyTree, rows: Int[np.ndarray, " new"]) -> PyTree:
     """Return a network whose first layer has a row for each number of the new observation."""
-    layers = dict(params["params"])
-    first = dict(layers["hidden_0"])
-    kernel = np.asarray(first["kernel"])
-    first["kernel"] = np.where((rows >= 0)[:, None], kernel[rows], np.float32(0.0))
-    return {**params, "params": {**layers, "hidden_0": first}}
+
+    def match(path: Sequence[Any], x: Any) -> Any:
+        if [entry.key for entry in path[-2:]] != ["hidden_0", "kernel"]:
+            return x
+        return np.where((rows >= 0)[:, None], np.asarray(x)[rows], np.float32(0.0))
+
+    return jax.tree_util.tree_map_with_path(match, params)
 
 
 def _with_new_noise(trained: PyTree, fresh: PyTree) -> PyTree:
     """Return a policy with smaller means and the noise of a fresh one.
 
-    The last layer's outputs are the means of the actions, then the parameters of their deviations.
+    The last layer's outputs are the means of the actions, followed by the parameters of their
+    deviations, which `distribution_type: normal` has in a module of their own instead.
     """
-    layers = dict(trained["params"])
-    name = max(layers, key=lambda layer: int(layer.removeprefix("hidden_")))
+    layers, new = dict(trained["params"]), fresh["params"]
+    name = last_layer(layers)
+    has_own_std = "std_param" in layers
+    if has_own_std:
+        layers["std_param"] = new["std_param"]
 
     def mix(x: Float[np.ndarray, "*in out"], new: Float[np.ndarray, "*in out"]) -> np.ndarray:
-        means = x.shape[-1] // 2
+        means = x.shape[-1] if has_own_std else x.shape[-1] // 2
         return np.concatenate([MEAN_SCALE * x[..., :means], new[..., means:]], axis=-1)
 
-    layers[name] = jax.tree.map(mix, layers[name], fresh["params"][name])
+    layers[name] = jax.tree.map(mix, layers[name], new[name])
     return {**trained, "params": layers}
 
 

@@ -1,7 +1,7 @@
 """Search for hyperparameters, many trials at once, with Optuna.
 
-The study lies in the output folder. The same command with the same `--output` continues a search
-that was stopped, and several workers may share one study through `--storage`.
+The study is stored in the output folder. The same command with the same `--output` continues a
+search that was stopped, and several workers may share one study through `--storage`.
 """
 
 from collections.abc import Sequence
@@ -14,11 +14,14 @@ from jetbot_mjx.interrupts import exit_on_interrupt
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx tune", description=__doc__)
     cli.add_config_arguments(parser, required=True)
+    what = "YAML file with the settings to search, or `ppo`, which comes with the package"
+    parser.add_argument("--space", type=Path, required=True, metavar="SPACE", help=what)
     parser.add_argument(
-        "--space", type=Path, required=True, metavar="FILE", help="YAML file: what to search"
-    )
-    parser.add_argument(
-        "--trials", type=cli.positive_int, default=64, metavar="N", help="default: 64"
+        "--trials",
+        type=cli.positive_int,
+        default=64,
+        metavar="N",
+        help="how many trials the study shall have (default: 64)",
     )
     parser.add_argument(
         "--round",
@@ -28,14 +31,15 @@ def _parser() -> cli.Parser:
         help="how many trials to train at once (default: 16)",
     )
     parser.add_argument(
-        "--storage", metavar="URL", help="database of the study (default: SQLite in the output)"
+        "--storage", metavar="URL", help="database of the study (default: SQLite in --output)"
     )
     parser.add_argument(
         "--confirm",
         type=cli.whole_number(0),
         default=3,
         metavar="N",
-        help="how many of the best trials to train anew with new seeds (default: 3)",
+        help="how many of the best trials to retrain with new seeds, beside the configuration as"
+        " given; 0: none (default: 3)",
     )
     parser.add_argument(
         "--output", type=Path, metavar="DIR", help="default: runs/tune-<config>-<date>-<time>"
@@ -55,12 +59,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     cli.wake_driver()
     config = cli.config_of(options)
-    cli.divide_cpu(config.cpu_devices)
     cli.wake_device()
     with exit_on_interrupt():
         from jetbot_mjx.runs.metrics import process_seconds
         from jetbot_mjx.runs.run_dir import default_run_dir
         from jetbot_mjx.tuning import results
+        from jetbot_mjx.tuning.search import CONFIRM_SEEDS
         from jetbot_mjx.tuning.space import read_space
     space = read_space(options.space, config)
     cli.prepare_device()
@@ -76,10 +80,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             storage=options.storage,
             say=cli.tell,
         )
+    if found.entrants:
+        cli.tell(
+            f"\nretrained with {CONFIRM_SEEDS} new seeds, evaluated on the report's goals:\n\n"
+            f"{results.entrants_table(found.entrants)}\n"
+        )
     cli.tell(
-        "\ntrained anew with new seeds, evaluated on the report's goals:\n\n"
-        f"{results.entrants_table(found.entrants)}\n\n{process_seconds():.1f} s in all\n"
-        f"results: {folder}\nnext: jetbot-mjx train {found.config_file}"
+        f"total {process_seconds():.1f} s\nresults: {folder}\n"
+        f"next: jetbot-mjx train {found.config_file}"
     )
     return 0
 

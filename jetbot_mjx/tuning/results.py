@@ -4,18 +4,29 @@ import csv
 import io
 import statistics
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import matplotlib.pyplot as plt
-import optuna
 
 from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.errors import requires_extra
 from jetbot_mjx.runs.metrics import process_seconds
+from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import write_text, writing_to
-from jetbot_mjx.tuning.search import CONFIRM_SEEDS, Entrant, Search, completed_trials
+from jetbot_mjx.tuning.search import (
+    CONFIRM_SEEDS,
+    Entrant,
+    Search,
+    completed_trials,
+    quiet,
+    ranked_trials,
+)
 from jetbot_mjx.tuning.space import Parameter, with_values
+
+with requires_extra("tune", "tune"):
+    import optuna
 
 _PLOTS = ("optimization_history", "param_importances", "slice", "parallel_coordinate")
 
@@ -29,6 +40,8 @@ class TuningResult(NamedTuple):
     """The file with the best configuration, `best.yaml`."""
     config: Config
     """The best configuration."""
+    values: Mapping[str, Any]
+    """Values of the settings that differ from the given configuration in the best one."""
     entrants: tuple[Entrant, ...]
     """The final trainings: of the given configuration, then of the best trials."""
     study: optuna.Study
@@ -36,16 +49,15 @@ class TuningResult(NamedTuple):
 
     def __repr__(self) -> str:
         """Return the folder and the best values in one line."""
-        best = self.best
-        return (
-            f"TuningResult(folder={str(self.folder)!r}, best={best.name!r},"
-            f" success={statistics.fmean(best.success_rates):.1%}, values={dict(best.values)})"
-        )
+        text = f"TuningResult(folder={str(self.folder)!r}"
+        if (best := self.best) is not None:
+            text += f", best={best.name!r}, success={statistics.fmean(best.success_rates):.1%}"
+        return f"{text}, values={dict(self.values)})"
 
     @property
-    def best(self) -> Entrant:
-        """Return the entrant with the best configuration."""
-        return best_entrant(self.entrants)
+    def best(self) -> Entrant | None:
+        """Return the entrant with the best configuration; None: nothing was retrained."""
+        return best_entrant(self.entrants) if self.entrants else None
 
 
 def run_search(
@@ -59,15 +71,16 @@ def run_search(
     storage: str | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> TuningResult:
-    """Search, train the best trials anew, and write the results.
+    """Search, retrain the best trials, and write the results.
 
     Args:
       config: the configuration in which settings are changed.
       space: the settings and their values.
       folder: where the study and its results are stored.
       trials: how many completed trials the study shall have.
-      round_size: how many trials to train at once.
-      confirm: how many of the best trials to train anew, with `CONFIRM_SEEDS` new seeds each.
+      round_size: how many to train at once.
+      confirm: how many of the best trials to retrain with `CONFIRM_SEEDS` new seeds; 0: retrain
+        nothing, and the trial with the best score is the best.
       storage: a database URL; None: SQLite in the folder.
       say: called with one line about each round.
 
@@ -75,14 +88,15 @@ def run_search(
       The result.
 
     Raises:
-      UserError: as for `Search`, its method `run` and `write_results`.
+      UserError: as for `Search`, its methods `run` and `confirm`, and `write_results`.
     """
     search = Search(config, space, folder, storage=storage, say=say)
     search.run(trials, round_size)
-    say(f"search done {process_seconds():.1f} s after the start")
-    entrants = search.confirm(confirm, CONFIRM_SEEDS)
-    path = write_results(folder, config, search.study, entrants)
-    return TuningResult(folder, path, load_config(path), tuple(entrants), search.study)
+    say(f"search finished after {process_seconds():.1f} s")
+    entrants = search.confirm(confirm, CONFIRM_SEEDS, round_size)
+    path = write_results(folder, config, search, entrants)
+    values = best_values(search, entrants)
+    return TuningResult(folder, path, load_config(path), values, tuple(entrants), search.study)
 
 
 def best_entrant(entrants: Sequence[Entrant]) -> Entrant:
@@ -90,16 +104,28 @@ def best_entrant(entrants: Sequence[Entrant]) -> Entrant:
     return max(entrants, key=lambda one: statistics.fmean(one.areas))
 
 
+def best_values(search: Search, entrants: Sequence[Entrant]) -> Mapping[str, Any]:
+    """Return the values of the best entrant, or if there is none, of the trial with the best score.
+
+    Args:
+      search: the finished search.
+      entrants: the final trainings.
+    """
+    if entrants:
+        return best_entrant(entrants).values
+    return search.values_of(ranked_trials(search.study)[0])
+
+
 def write_results(
-    folder: Path, config: Config, study: optuna.Study, entrants: Sequence[Entrant]
+    folder: Path, config: Config, search: Search, entrants: Sequence[Entrant]
 ) -> Path:
     """Write `best.yaml`, `trials.csv`, `trials.md` and the plots.
 
     Args:
       folder: an existing folder.
       config: the configuration that the search began from.
-      study: the finished study.
-      entrants: the final trainings.
+      search: the finished search.
+      entrants: the final trainings; if there are none, the trial with the best score is the best.
 
     Returns:
       The path of `best.yaml`.
@@ -107,12 +133,15 @@ def write_results(
     Raises:
       UserError: a file cannot be written.
     """
-    best = best_entrant(entrants)
+    study = search.study
     path = folder / "best.yaml"
+    tables = [*([entrants_table(entrants)] if entrants else []), _trials_table(study)]
     with writing_to(folder):
-        write_text(path, with_values(config, best.values, source="tune").to_yaml())
+        write_text(
+            path, with_values(config, best_values(search, entrants), source="tune").to_yaml()
+        )
         write_text(folder / "trials.csv", _csv(study))
-        write_text(folder / "trials.md", f"{entrants_table(entrants)}\n\n{_trials_table(study)}\n")
+        write_text(folder / "trials.md", "\n\n".join(tables) + "\n")
         _plot(folder, study)
     return path
 
@@ -142,7 +171,7 @@ def _trials_table(study: optuna.Study) -> str:
         f"| trial | mean success | last success [%] | mean time [s] | {' | '.join(names)} |",
         "|" + "---|" * (4 + len(names)),
     ]
-    for trial in sorted(completed_trials(study), key=lambda one: -(one.value or 0.0)):
+    for trial in ranked_trials(study):
         values = " | ".join(_short(trial.params.get(name)) for name in names)
         lines.append(
             f"| {trial.number} | {trial.value:.2%} | {100 * trial.user_attrs['success_rate']:.2f}"
@@ -164,24 +193,28 @@ def _csv(study: optuna.Study) -> str:
 
 
 def _plot(folder: Path, study: optuna.Study) -> None:
-    """Draw Optuna's plots; those that need more trials or settings than there are, are left out."""
-    for name in _PLOTS:
-        if len(completed_trials(study)) < 2:
-            return
-        # Optuna sets a style for all figures, and a notebook shows those that are left open.
-        with warnings.catch_warnings(), plt.ioff(), plt.rc_context():
-            warnings.simplefilter("ignore")
-            draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
-            more: dict[str, Any] = {}
-            if name == "param_importances":
-                # Optuna's default evaluator needs scikit-learn.
-                more["evaluator"] = optuna.importance.PedAnovaImportanceEvaluator()
-            axes = draw(study, **more)
-            figure = (axes if hasattr(axes, "figure") else axes.flat[0]).figure
-            figure.set_size_inches(11, 6)
-            figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
-            plt.close(figure)
+    """Draw Optuna's plots, which need two trials."""
+    if len(completed_trials(study)) < 2:
+        return
+    with stage("plots", len(_PLOTS)) as advance, quiet():
+        for name in _PLOTS:
+            # Optuna sets a style for all figures, and a notebook shows those that are left open.
+            with warnings.catch_warnings(), plt.ioff(), plt.rc_context():
+                warnings.simplefilter("ignore")
+                draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
+                more: dict[str, Any] = {}
+                if name == "param_importances":
+                    # Optuna's default evaluator needs scikit-learn.
+                    more["evaluator"] = optuna.importance.PedAnovaImportanceEvaluator()
+                axes = draw(study, **more)
+                figure = (axes if hasattr(axes, "figure") else axes.flat[0]).figure
+                figure.set_size_inches(11, 6)
+                figure.savefig(folder / f"{name}.png", dpi=110, bbox_inches="tight")
+                plt.close(figure)
+            advance(1)
 
 
 def _short(value: Any) -> str:
+    if isinstance(value, tuple):
+        return str(list(value))
     return f"{value:.4g}" if isinstance(value, float) else str(value)

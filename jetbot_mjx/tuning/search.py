@@ -6,12 +6,12 @@ share one study through its storage. While a round runs, the worker renews a hea
 storage. If a worker dies, the next one that looks marks its trials as failed and enqueues the same
 values again, so that nothing is lost.
 
-The best trials and the configuration as it was given are then trained anew with seeds that the
-search has not used, and evaluated on the report's goals, which chose nothing.
+The best trials and the configuration as it was given are then retrained with seeds that the search
+has not used, and evaluated on the report's goals, which chose nothing.
 """
 
 import contextlib
-import operator
+import functools
 import threading
 import time
 import warnings
@@ -22,18 +22,19 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jetbot_mjx.config import Config
-from jetbot_mjx.errors import MissingPackageError, UserError
+from jetbot_mjx.config import Config, ConfigError
+from jetbot_mjx.errors import UserError, ran_out, requires_extra
 from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, report_keys
+from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import make_folder
 from jetbot_mjx.tuning.space import TRACED, Parameter, with_values
 from jetbot_mjx.tuning.trials import Outcome, Trials, mean_seconds
 
-try:
+with requires_extra("tune", "tune"):
     import optuna
-except ModuleNotFoundError:
-    raise MissingPackageError("tune needs Optuna: pip install 'jetbot_mjx[tune]'") from None
+    import sqlalchemy
+    import sqlalchemy.exc
 
 _BEAT_SECONDS = 5
 """How often a worker renews its heartbeat [s]."""
@@ -41,9 +42,21 @@ _STALE_SECONDS = 30
 """After how long without a heartbeat a worker counts as dead [s]."""
 _POLL_SECONDS = 2.0
 CONFIRM_SEEDS = 5
-"""How many new seeds the best trials are trained with."""
+"""Number of new seeds with which the best trials are retrained."""
+_LOCKED_SECONDS = 60
+"""How long a worker waits for others to write to SQLite [s]."""
+_OPENINGS = 3
+"""How often a worker tries to open the database, a second apart."""
 _CONFIRM_SEED = 1_000_000
-"""The first seed of the final trainings, beyond those of the search."""
+"""Distance of the first seed of the final trainings from the first one of the search."""
+
+_STATES = optuna.trial.TrialState
+_STORAGE_ERRORS = optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlchemyError
+_OPENING_ERRORS = ImportError, ValueError, RuntimeError
+"""For a driver that is not installed, a port that is not a number, or another Optuna's database."""
+
+_Static = tuple[tuple[str, Any], ...]
+"""Names and values of the static settings of trials that one program trains."""
 
 
 class Entrant(NamedTuple):
@@ -60,7 +73,7 @@ class Entrant(NamedTuple):
 
 
 @contextlib.contextmanager
-def _quiet() -> Iterator[None]:
+def quiet() -> Iterator[None]:
     """Keep Optuna from logging, and from warnings that do not matter here, inside the context."""
     verbosity = optuna.logging.get_verbosity()
     optuna.logging.set_verbosity(optuna.logging.ERROR)
@@ -74,20 +87,10 @@ def _quiet() -> Iterator[None]:
         optuna.logging.set_verbosity(verbosity)
 
 
-def _open_storage(url: str) -> optuna.storages.RDBStorage:
-    """Open a study's database, which enqueues the trials of killed workers again."""
-    return optuna.storages.RDBStorage(
-        url,
-        heartbeat_interval=_BEAT_SECONDS,
-        grace_period=_STALE_SECONDS,
-        heartbeat_stale_trial_callback=optuna.storages.RetryHeartbeatStaleTrialCallback(),
-    )
-
-
 class Search:
     """A `Search` runs trials of one study."""
 
-    @_quiet()
+    @quiet()
     def __init__(
         self,
         config: Config,
@@ -109,40 +112,61 @@ class Search:
           say: called with one line about each round.
 
         Raises:
-          UserError: the folder or the storage cannot be used, or the study has another space.
+          ConfigError: trials cannot be trained as the configuration asks for.
+          UserError: `init_from` is not a run, the folder or the storage cannot be used, or the
+            study has another space.
         """
+        _check_config(config)
         self._config = config
         self._space = list(space)
-        self._traced_names = [one.name for one in space if one.name in TRACED]
-        self._static_names = [one.name for one in space if one.name not in TRACED]
+        flat = config.flat()
+        # An option of a task may be searched that the configuration does not have.
+        self._given = {one.name: _frozen(flat[one.name]) for one in space if one.name in flat}
         self._evaluations = evaluations
         self._say = say
         self._batches: dict[tuple[Any, ...], Trials] = {}
+        folder = folder.resolve()
         new = not folder.exists()
         make_folder(folder)
-        url = storage or f"sqlite:///{folder.absolute() / 'study.db'}"
+        file = sqlalchemy.URL.create("sqlite", database=str(folder / "study.db"))
+        self._url = storage or file.render_as_string()
+        self._retry = optuna.storages.RetryHeartbeatStaleTrialCallback()
         try:
-            self._storage = _open_storage(url)
-            self.study = optuna.create_study(
-                storage=self._storage,
-                study_name=folder.name,
-                direction="maximize",
-                load_if_exists=True,
-            )
-            # Workers that join later draw other values than the first.
-            seed = config.seed + len(self.study.get_trials(deepcopy=False))
-            self.study.sampler = optuna.samplers.TPESampler(
-                seed=seed % 2**32, multivariate=True, group=True, n_startup_trials=16
-            )
-        # SQLAlchemy has many kinds of errors for a URL, a driver or a host that is wrong.
-        except Exception as error:
-            reason = next(iter(str(error).splitlines()), type(error).__name__)
+            with stage("opening the study"), self._reports_storage(*_OPENING_ERRORS):
+                self._storage = self._open()
+                self.study = optuna.create_study(
+                    storage=self._storage,
+                    sampler=self._sampler(0),
+                    study_name=folder.name,
+                    direction="maximize",
+                    load_if_exists=True,
+                )
+            with self._reports_storage():
+                self._check_study()
+        except UserError:
             if new and not any(folder.iterdir()):
                 folder.rmdir()
-            raise UserError(f"--storage {url} cannot be used: {reason}") from None
-        self._check_space()
+            raise
 
-    @_quiet()
+    def _open(self) -> optuna.storages.RDBStorage:
+        """Return the database, whose tables only one of several workers can create."""
+        is_sqlite = self._url.startswith("sqlite")
+        connect = functools.partial(
+            optuna.storages.RDBStorage,
+            self._url,
+            {"connect_args": {"timeout": _LOCKED_SECONDS}} if is_sqlite else None,
+            heartbeat_interval=_BEAT_SECONDS,
+            grace_period=_STALE_SECONDS,
+            heartbeat_stale_trial_callback=self._retry,
+        )
+        for _ in range(_OPENINGS - 1):
+            try:
+                return connect()
+            except (sqlalchemy.exc.DBAPIError, optuna.exceptions.StorageInternalError):
+                time.sleep(1.0)
+        return connect()
+
+    @quiet()
     def run(self, trials: int, round_size: int) -> None:
         """Run rounds of trials until the study has enough.
 
@@ -151,65 +175,76 @@ class Search:
           round_size: how many to train at once.
 
         Raises:
-          UserError: the values of no trial of a round fit together.
+          UserError: no trial of a round could be trained, the memory is too small, or the
+            storage cannot be used.
         """
-        with stage("trials", max(0, trials - len(completed_trials(self.study)))) as advance:
-            while (count := self._next_round(trials, round_size)) > 0:
+        done = len(completed_trials(self.study))
+        with self._reports_storage(), stage("trials", max(0, trials - done)) as advance:
+            while (count := min(round_size, self._next_round(trials))) > 0:
                 self._run_round(count, trials)
-                advance(count)
+                before, done = done, len(completed_trials(self.study))
+                advance(done - before)
 
     def _run_round(self, count: int, trials: int) -> None:
         """Run `count` trials at once, and tell how many of `trials` the study has."""
         began = time.perf_counter()
-        asked = [self.study.ask() for _ in range(count)]
-        with self._heartbeat(asked):
-            self._train(asked)
-        errors = [one.user_attrs.get("error") for one in self._stored(asked)]
-        if all(errors):
-            raise UserError(
-                f"none of the last {count} trials could be trained, such as: {errors[0]}"
-            )
+        with self._alive() as asked:
+            with stage("drawing values", count) as advance:
+                for index in range(count):
+                    asked.append(self.study.ask())
+                    if index == 0:
+                        # Workers that begin at the same time draw different values.
+                        self.study.sampler = self._sampler(asked[0].number)
+                    advance(1)
+                drawn = [{one.name: one.suggest(trial) for one in self._space} for trial in asked]
+            self._train(asked, drawn)
+        failed = [one for one in self._stored(asked) if "error" in one.user_attrs]
+        reason = failed[0].user_attrs["error"] if failed else ""
+        if len(failed) == count:
+            raise UserError(f"none of the last {count} trials could be trained, such as: {reason}")
         best = max((one.value for one in completed_trials(self.study)), default=float("nan"))
         self._say(
             f"{len(completed_trials(self.study))} of {trials} trials, best mean success {best:.2%};"
             f" this round of {count} took {time.perf_counter() - began:.1f} s"
+            + (f"; {len(failed)} could not be trained, such as: {reason}" if failed else "")
         )
 
-    def confirm(self, count: int, seeds: int) -> list[Entrant]:
-        """Train the best trials and the given configuration anew, with new seeds.
+    def confirm(self, count: int, seeds: int, round_size: int) -> list[Entrant]:
+        """Retrain the best trials and the given configuration with new seeds.
 
         Args:
-          count: how many of the best trials.
+          count: how many of the best trials; 0: retrain nothing.
           seeds: how many trainings of each.
+          round_size: how many to train at once.
 
         Returns:
           The given configuration first, then the best trials in the order of their score.
+
+        Raises:
+          UserError: as for `run`.
         """
-        ranked = sorted(completed_trials(self.study), key=lambda trial: -(trial.value or 0.0))
+        if count == 0:
+            return []
         chosen: dict[str, Mapping[str, Any]] = {"as given": {}}
-        for trial in ranked:
-            if len(chosen) <= count and trial.params not in chosen.values():
-                chosen[f"trial {trial.number}"] = trial.params
+        for trial in ranked_trials(self.study):
+            values = self.values_of(trial)
+            if len(chosen) <= count and values not in (self._given, *chosen.values()):
+                chosen[f"trial {trial.number}"] = values
         # Train all seeds of all entrants, grouped by their static settings.
         work = [
-            (name, values, _CONFIRM_SEED + index)
+            (name, values, (self._config.seed + _CONFIRM_SEED + index) % 2**32)
             for name, values in chosen.items()
             for index in range(seeds)
         ]
         done: dict[str, list[tuple[Outcome, float, float]]] = {name: [] for name in chosen}
-        for batch, members in self._groups([values for _, values, _ in work]):
-            outcomes = batch.run(
-                [self._values(work[i][1], self._traced_names) for i in members],
-                [work[i][2] for i in members],
-            )
-            stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
-            with stage("episodes of the report's goals", len(members) * REPORT_GOALS):
-                episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
-            rates = np.asarray(episodes.success).mean(axis=1).tolist()
-            seconds = mean_seconds(episodes, self._config)
-            results = zip(outcomes, rates, seconds, strict=True)
-            for i, result in zip(members, results, strict=True):
-                done[work[i][0]].append(result)
+        with stage("final trainings", len(work)) as advance:
+            for key, members in self._groups([values for _, values, _ in work]).items():
+                # In parts of one size, which the program of a round can train.
+                for part in np.array_split(members, -(-len(members) // round_size)):
+                    results = self._final([work[i] for i in part], key)
+                    for i, result in zip(part, results, strict=True):
+                        done[work[i][0]].append(result)
+                    advance(len(part))
         return [
             Entrant(
                 name,
@@ -221,7 +256,23 @@ class Search:
             for name, found in done.items()
         ]
 
-    def _check_space(self) -> None:
+    def values_of(self, trial: Any) -> dict[str, Any]:
+        """Return the values of a trial that is stored."""
+        return {one.name: one.from_optuna(trial.params[one.name]) for one in self._space}
+
+    def _final(
+        self, work: Sequence[tuple[str, Mapping[str, Any], int]], key: _Static
+    ) -> list[tuple[Outcome, float, float]]:
+        """Train values with seeds; return the outcomes, and success and time on the report."""
+        batch = self._batch(key)
+        outcomes = self._outcomes(batch, [values for _, values, _ in work], [x[2] for x in work])
+        stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
+        with stage("episodes of the report's goals", len(work) * REPORT_GOALS):
+            episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
+        rates = np.asarray(episodes.success).mean(axis=1).tolist()
+        return list(zip(outcomes, rates, mean_seconds(episodes, batch.config), strict=True))
+
+    def _check_study(self) -> None:
         """Refuse a study that was begun with another space or configuration."""
         given = {"space": [str(one) for one in self._space], "config": self._config.to_yaml()}
         stored = self.study.user_attrs
@@ -234,52 +285,96 @@ class Search:
                     " new --output"
                 )
         # Begin with the given configuration, if the space contains it.
-        own = self._values({}, [one.name for one in self._space])
+        own = self._given
         if not self.study.get_trials(deepcopy=False) and all(
-            one.contains(own[one.name]) for one in self._space
+            one.name in own and one.contains(own[one.name]) for one in self._space
         ):
-            self.study.enqueue_trial(own, skip_if_exists=True)
+            first = {one.name: one.to_optuna(own[one.name]) for one in self._space}
+            self.study.enqueue_trial(first, skip_if_exists=True)
+
+    def _sampler(self, number: int) -> optuna.samplers.BaseSampler:
+        """Return a sampler for the trials from a number on."""
+        seed = (self._config.seed + number) % 2**32
+        return optuna.samplers.TPESampler(
+            seed=seed, multivariate=True, group=True, n_startup_trials=16
+        )
+
+    @contextlib.contextmanager
+    def _reports_storage(self, *errors: type[Exception]) -> Iterator[None]:
+        """Convert the errors of a database, and others, to a one-line `UserError`."""
+        try:
+            yield
+        except (*_STORAGE_ERRORS, *errors) as error:
+            # Optuna's own message names only what may have happened.
+            reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
+            raise UserError(f"--storage {self._url} cannot be used: {reason}") from None
 
     def _stored(self, asked: Sequence[Any]) -> list[Any]:
         """Return trials as the storage has them."""
         numbers = {trial.number for trial in asked}
         return [one for one in self.study.get_trials(deepcopy=False) if one.number in numbers]
 
-    def _next_round(self, trials: int, round_size: int) -> int:
+    def _next_round(self, trials: int) -> int:
         """Return how many trials to ask for, after waiting for other workers' last ones."""
-        while True:
-            optuna.storages.fail_stale_trials(self.study)
-            running = self.study.get_trials(
-                deepcopy=False, states=(optuna.trial.TrialState.RUNNING,)
-            )
-            missing = trials - len(completed_trials(self.study)) - len(running)
-            if missing > 0 or not running:
-                return min(round_size, max(missing, 0))
-            time.sleep(_POLL_SECONDS)
+        missing = self._missing(trials)
+        if missing is None:
+            with stage(
+                "waiting for trials of other workers; those of a killed one are run again after"
+                f" {_STALE_SECONDS} s"
+            ):
+                while missing is None:
+                    time.sleep(_POLL_SECONDS)
+                    missing = self._missing(trials)
+        return missing
+
+    def _missing(self, trials: int) -> int | None:
+        """Return how many trials are missing; None: those that other workers run may be enough."""
+        optuna.storages.fail_stale_trials(self.study)
+        running = self.study.get_trials(deepcopy=False, states=(_STATES.RUNNING,))
+        # Optuna never fails a trial whose worker was killed before its first heartbeat.
+        table = sqlalchemy.text("SELECT trial_id FROM trial_heartbeats")
+        with self._storage.engine.connect() as connection:
+            beating = set(connection.execute(table).scalars())
+        for trial in running:
+            if trial._trial_id not in beating:
+                self._storage.record_heartbeat(trial._trial_id)
+        missing = trials - len(completed_trials(self.study)) - len(running)
+        return None if missing <= 0 and running else max(missing, 0)
 
     @contextlib.contextmanager
-    def _heartbeat(self, trials: Sequence[Any]) -> Iterator[None]:
-        """Tell the storage that these trials are alive, from a thread."""
+    def _alive(self) -> Iterator[list[Any]]:
+        """Tell the storage that the trials of a list are alive, from a thread.
+
+        After an error or Ctrl-C, those that are not finished are enqueued again.
+        """
+        asked: list[Any] = []
         finished = threading.Event()
 
         def beat() -> None:
             while True:
-                for trial in trials:
-                    self._storage.record_heartbeat(trial._trial_id)
+                # The worker itself reports a storage that cannot be used.
+                with contextlib.suppress(*_STORAGE_ERRORS):
+                    for trial in tuple(asked):
+                        self._storage.record_heartbeat(trial._trial_id)
                 if finished.wait(_BEAT_SECONDS):
                     return
 
         thread = threading.Thread(target=beat, daemon=True)
         thread.start()
         try:
-            yield
+            yield asked
+        except BaseException:
+            for one in self._stored(asked):
+                if one.state == _STATES.RUNNING:
+                    self.study.tell(one.number, state=_STATES.FAIL)
+                    self._retry(self.study, one)
+            raise
         finally:
             finished.set()
             thread.join()
 
-    def _train(self, asked: Sequence[Any]) -> None:
+    def _train(self, asked: Sequence[Any], drawn: Sequence[Mapping[str, Any]]) -> None:
         """Train a round of trials, and tell the study of each group as soon as it is done."""
-        drawn = [{one.name: one.suggest(trial) for one in self._space} for trial in asked]
         valid = []
         for trial, values in zip(asked, drawn, strict=True):
             try:
@@ -287,40 +382,114 @@ class Search:
                 valid.append((trial, values))
             # Values that do not fit together, such as a batch size and a number of environments.
             except UserError as error:
-                trial.set_user_attr("error", str(error))
-                self.study.tell(trial, state=optuna.trial.TrialState.FAIL)
-        for batch, members in self._groups([values for _, values in valid]):
-            outcomes = batch.run(
-                [self._values(valid[i][1], self._traced_names) for i in members],
-                [self._config.seed + valid[i][0].number for i in members],
+                self._fail(trial, error)
+        for key, members in self._groups([values for _, values in valid]).items():
+            trials = [valid[i][0] for i in members]
+            try:
+                batch = self._batch(key)
+            # Values that the environment or the networks refuse.
+            except UserError as error:
+                for trial in trials:
+                    self._fail(trial, error)
+                continue
+            seeds = [(self._config.seed + trial.number) % 2**32 for trial in trials]
+            outcomes = self._outcomes(batch, [valid[i][1] for i in members], seeds)
+            with stage("storing trials", len(trials)) as advance:
+                for trial, outcome in zip(trials, outcomes, strict=True):
+                    self._tell(trial, outcome)
+                    advance(1)
+
+    def _tell(self, trial: Any, outcome: Outcome) -> None:
+        # Another worker may have taken this one for dead, after Ctrl-Z for example.
+        if self._is_running(trial):
+            trial.set_user_attr("success_rate", outcome.success_rates[-1])
+            trial.set_user_attr("mean_seconds", outcome.mean_seconds)
+            for step, rate in enumerate(outcome.success_rates):
+                trial.report(rate, step)
+            self.study.tell(trial, outcome.area)
+
+    def _fail(self, trial: Any, error: UserError) -> None:
+        if self._is_running(trial):
+            trial.set_user_attr("error", str(error))
+            self.study.tell(trial, state=_STATES.FAIL)
+
+    def _is_running(self, trial: Any) -> bool:
+        return self._storage.get_trial(trial._trial_id).state == _STATES.RUNNING
+
+    def _outcomes(
+        self, batch: Trials, drawn: Sequence[Mapping[str, Any]], seeds: Sequence[int]
+    ) -> list[Outcome]:
+        """Train trials of one group at once."""
+        values = [{**self._given, **one} for one in drawn]
+        try:
+            return batch.run(values, seeds)
+        # JAX raises a subclass.
+        except RuntimeError as error:
+            if not ran_out(error):
+                raise
+            raise UserError(
+                f"the device's memory is too small to train {len(values)} trials at once:"
+                " choose a smaller --round"
+            ) from None
+
+    def _groups(self, drawn: Sequence[Mapping[str, Any]]) -> dict[_Static, list[int]]:
+        """Return the indices of the trials that one program trains, by their static settings.
+
+        A setting that is null is static: a program without it differs from one that has it.
+        """
+        groups: dict[_Static, list[int]] = {}
+        for index, one in enumerate(drawn):
+            values = {**self._given, **one}
+            key = tuple(
+                (name, value)
+                for name, value in values.items()
+                if name not in TRACED or value is None
             )
-            for i, outcome in zip(members, outcomes, strict=True):
-                trial, _ = valid[i]
-                trial.set_user_attr("success_rate", outcome.success_rates[-1])
-                trial.set_user_attr("mean_seconds", outcome.mean_seconds)
-                for step, rate in enumerate(outcome.success_rates):
-                    trial.report(rate, step)
-                self.study.tell(trial, outcome.area)
-
-    def _groups(self, drawn: Sequence[Mapping[str, Any]]) -> Iterator[tuple[Trials, list[int]]]:
-        """Yield the programs and the indices of the trials that each of them trains."""
-        groups: dict[tuple[Any, ...], list[int]] = {}
-        for index, values in enumerate(drawn):
-            key = tuple(self._values(values, self._static_names).values())
             groups.setdefault(key, []).append(index)
-        for key, members in groups.items():
-            if key not in self._batches:
-                static = dict(zip(self._static_names, key, strict=True))
-                config = with_values(self._config, static, source="tune")
-                self._batches[key] = Trials(config, self._traced_names, self._evaluations)
-            yield self._batches[key], members
+        return groups
 
-    def _values(self, drawn: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
-        """Return the values of settings: those that were drawn, or those of the configuration."""
-        given = {name: operator.attrgetter(name)(self._config) for name in names}
-        return {name: drawn.get(name, value) for name, value in given.items()}
+    def _batch(self, key: _Static) -> Trials:
+        """Return the programs for static settings."""
+        if key not in self._batches:
+            static = dict(key)
+            config = with_values(self._config, static, source="tune")
+            traced = [
+                one.name for one in self._space if one.name in TRACED and one.name not in static
+            ]
+            with stage("preparing the environment and the networks"):
+                self._batches[key] = Trials(config, traced, self._evaluations)
+        return self._batches[key]
 
 
 def completed_trials(study: optuna.Study) -> list[Any]:
     """Return the trials that were trained to their end."""
-    return study.get_trials(deepcopy=False, states=(optuna.trial.TrialState.COMPLETE,))
+    return study.get_trials(deepcopy=False, states=(_STATES.COMPLETE,))
+
+
+def ranked_trials(study: optuna.Study) -> list[Any]:
+    """Return the trials that were trained to their end, the best first."""
+    return sorted(completed_trials(study), key=lambda trial: -(trial.value or 0.0))
+
+
+def _check_config(config: Config) -> None:
+    """Raise an error if trials cannot be trained as a configuration asks for.
+
+    Raises:
+      ConfigError: a setting is not one of trials.
+      UserError: `init_from` is not a run.
+    """
+    if config.trainer != "resumable":
+        raise ConfigError(
+            f"trainer = {config.trainer!r} cannot be tuned: take trainer = 'resumable'"
+        )
+    if config.seeds > 1:
+        raise ConfigError(
+            f"seeds = {config.seeds} cannot be tuned: leave it out. Every trial has a seed of its"
+            " own, and the best trials are retrained with new seeds"
+        )
+    if config.init_from is not None:
+        load_checkpoint(config.init_from)
+
+
+def _frozen(value: Any) -> Any:
+    return tuple(value) if isinstance(value, list) else value

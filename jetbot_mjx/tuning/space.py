@@ -3,16 +3,25 @@
     ppo.learning_rate: {low: 1.0e-4, high: 1.0e-2, log: true}
     ppo.discounting: {low: 0.9, high: 0.99}
     ppo.unroll_length: {choices: [8, 16, 32]}
+    ppo.network.policy_hidden_layer_sizes: {choices: [[64, 64], [128, 128, 128]]}
 
-An entry with whole numbers as `low` and `high` draws whole numbers.
+A range of a setting that is a whole number draws whole numbers.
 """
 
 import difflib
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
-from jetbot_mjx.config import Config, ConfigError, parse_config, read_yaml
+from jetbot_mjx.config import (
+    ALL_KEYS,
+    Config,
+    ConfigError,
+    find_config,
+    parse_config,
+    read_yaml,
+)
 from jetbot_mjx.errors import clipped, shown
 
 TRACED = (
@@ -27,6 +36,12 @@ TRACED = (
     "ppo.reward_scaling",
 )
 """Settings that only enter the arithmetic: trials with other values share one compiled program."""
+
+SHIPPED = Path("configs/spaces")
+"""Folder of the spaces that come with the package."""
+
+_SECTIONS = ("robot", "task", "camera", "physics", "randomization", "ppo")
+"""Sections of the configuration that can be searched: the others do not change what is learned."""
 
 _KEYS = ("low", "high", "log", "choices")
 
@@ -45,7 +60,7 @@ class Parameter(NamedTuple):
     @property
     def whole(self) -> bool:
         """Return whether the range holds whole numbers only."""
-        return isinstance(self.low, int) and isinstance(self.high, int)
+        return isinstance(self.low, int)
 
     def contains(self, value: Any) -> bool:
         """Return whether the setting may take this value."""
@@ -59,16 +74,27 @@ class Parameter(NamedTuple):
     def suggest(self, trial: Any) -> Any:
         """Ask an Optuna trial for a value."""
         if self.choices:
-            return trial.suggest_categorical(self.name, list(self.choices))
+            names = [self.to_optuna(choice) for choice in self.choices]
+            return self.from_optuna(trial.suggest_categorical(self.name, names))
         suggest = trial.suggest_int if self.whole else trial.suggest_float
         return suggest(self.name, self.low, self.high, log=self.log)
+
+    def to_optuna(self, value: Any) -> Any:
+        """Return a value as Optuna stores it: a list as text."""
+        return str(list(value)) if isinstance(value, tuple) else value
+
+    def from_optuna(self, stored: Any) -> Any:
+        """Return the value that Optuna has stored."""
+        found = [choice for choice in self.choices if self.to_optuna(choice) == stored]
+        return found[0] if found else stored
 
 
 def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Parameter]:
     """Read what a search may change.
 
     Args:
-      space: the YAML file, or its content.
+      space: the YAML file; the name of a space that comes with the package, such as `ppo`; or the
+        content of such a file.
       config: the configuration in which the settings are changed.
 
     Returns:
@@ -80,7 +106,7 @@ def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Pa
     """
     name, values = "space", space
     if not isinstance(values, Mapping):
-        name, values = str(space), read_yaml(Path(str(space)), "--space")
+        name, values = str(space), read_yaml(find_config(str(space), SHIPPED, "--space"), "--space")
     if not values:
         raise ConfigError(
             f"{name} is empty: write lines such as ppo.discounting: {{low: 0.9, high: 0.99}}"
@@ -96,25 +122,64 @@ def _parameter(name: Any, entry: Any, path: str, config: Config) -> Parameter:
         )
     for key in entry:
         if key not in _KEYS:
+            # A configuration is nested, and a space is not.
+            inner = [one for one in ALL_KEYS if one.startswith(f"{name}.{key}")]
             close = difflib.get_close_matches(str(key), _KEYS, n=1)
             hint = f"did you mean {close[0]}?" if close else f"known are {', '.join(_KEYS)}"
+            hint = f"write {inner[0]}: {{low: A, high: B}}, not indented" if inner else hint
             raise ConfigError(f"{where}.{clipped(str(key))} is unknown: {hint}")
-    choices, low, high = entry.get("choices"), entry.get("low"), entry.get("high")
-    log = entry.get("log", False)
-    if choices is not None:
-        if not isinstance(choices, list | tuple) or not choices or len(entry) > 1:
-            raise ConfigError(f"{where} is wrong: choices should be a list, without other keys")
-        found = Parameter(str(name), choices=tuple(choices))
+    if "choices" in entry:
+        found = _list(str(name), entry, where)
     else:
-        if not (_is_number(low) and _is_number(high) and low < high):
-            raise ConfigError(f"{where} is wrong: low and high should be numbers, low the smaller")
-        if not isinstance(log, bool) or (log and low <= 0):
-            raise ConfigError(f"{where}.log = {shown(log)} is wrong: true needs a low above 0")
-        found = Parameter(str(name), low, high, log)
+        found = _range(str(name), entry, where)
     # If both ends of a range are valid, so is what lies between them.
-    for value in found.choices or (low, high):
+    for value in entry.get("choices", (found.low, found.high)):
         with_values(config, {found.name: value}, source=path, alone=True)
-    return found
+    if found.name.partition(".")[0] not in _SECTIONS:
+        raise ConfigError(
+            f"{where} cannot be searched: only settings of {', '.join(_SECTIONS)} can"
+        )
+    return _typed(found, config)
+
+
+def _list(name: str, entry: Mapping[str, Any], where: str) -> Parameter:
+    choices = entry["choices"]
+    if not isinstance(choices, list | tuple) or not choices or len(entry) > 1:
+        raise ConfigError(f"{where} is wrong: choices should be a list, without other keys")
+    for choice in choices:
+        if isinstance(choice, Mapping):
+            inner = clipped(f"{name}.{next(iter(choice), 'key')}")
+            raise ConfigError(
+                f"{where}: {shown(choice)} is not a choice: search its keys, such as {inner}"
+            )
+        if choices.count(choice) > 1:
+            raise ConfigError(f"{where}: {shown(choice)} is given twice among the choices")
+    return Parameter(
+        name, choices=tuple(tuple(one) if isinstance(one, list) else one for one in choices)
+    )
+
+
+def _range(name: str, entry: Mapping[str, Any], where: str) -> Parameter:
+    low, high, log = entry.get("low"), entry.get("high"), entry.get("log", False)
+    if not (_is_number(low) and _is_number(high) and low < high):
+        raise ConfigError(f"{where} is wrong: low and high should be numbers, low the smaller")
+    if not isinstance(log, bool) or (log and low <= 0):
+        raise ConfigError(f"{where}.log = {shown(log)} is wrong: true needs a low above 0")
+    return Parameter(name, low, high, log)
+
+
+def _typed(found: Parameter, config: Config) -> Parameter:
+    """Return a range with ends of the setting's type, which decides what is drawn."""
+    low, high = found.low, found.high
+    if low is None or high is None:
+        return found
+    if found.name in ALL_KEYS:
+        # No setting that may be null is a whole number.
+        whole = isinstance(config.flat()[found.name], int)
+    else:
+        whole = isinstance(low, int) and isinstance(high, int)
+    kind = int if whole else float
+    return found._replace(low=kind(low), high=kind(high))
 
 
 def _is_number(value: Any) -> TypeGuard[int | float]:
@@ -148,6 +213,9 @@ def with_values(
     try:
         return parse_config(changed, source)
     except ConfigError as error:
-        if alone and not any(f"{name} = " in str(error) for name in values):
+        # The error of an item of a list names its index: `ppo.network...sizes.0 = ...`.
+        if alone and not any(
+            re.search(rf"{re.escape(one)}(\.\d+)? = ", str(error)) for one in values
+        ):
             return config
         raise

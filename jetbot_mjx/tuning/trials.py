@@ -24,7 +24,9 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.evaluation.evaluator import policy_controller, training_keys
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
+from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.progress import stage
+from jetbot_mjx.training.warm_start import make_warm_start
 from jetbot_mjx.tuning.space import TRACED
 
 SECTION = "ppo."
@@ -56,9 +58,12 @@ class Trials:
           config: the run; the values of its traced settings do not matter.
           names: the settings among `TRACED` that differ between the trials.
           evaluations: how often each policy is evaluated, at equal distances.
+
+        Raises:
+          UserError: the environment or the networks refuse a setting, or do not fit `init_from`.
         """
         assert set(names) <= set(TRACED), names
-        self._config = config
+        self.config = config
         self._names = tuple(names)
         env = make_env(config)
         self._env = wrap_for_training(env, config.task.episode_length)
@@ -67,7 +72,10 @@ class Trials:
         ppo.try_backend()
         if not ppo.is_fused:
             unfused = config.ppo.model_copy(update={"update": "xla"})
-            self._config = config.model_copy(update={"ppo": unfused})
+            self.config = config.model_copy(update={"ppo": unfused})
+        self._warm_start = None
+        if config.init_from is not None:
+            self._warm_start = make_warm_start(load_checkpoint(config.init_from), config, env)
         episodes = rollout_fn(
             maybe_randomize(env), [policy_controller(self._networks)], config.task.episode_length
         )
@@ -79,7 +87,8 @@ class Trials:
             ppo = self._ppo(traced)
             return ppo.unpacked(ppo.advance(ppo.packed(state), steps, jnp.ones((), bool))[0])
 
-        # `jax.jit` compiles anew for each number of trials.
+        # `jax.jit` compiles again for each number of trials.
+        self._compiled: set[int] = set()
         jit = functools.partial(jax.jit, compiler_options=compiler_options(config))
         self._init = jit(init)
         self._advance = jit(jax.vmap(advance, in_axes=(0, 0, None)), donate_argnums=1)
@@ -105,8 +114,13 @@ class Trials:
         }
         keys = jnp.asarray([seeds[min(i, count - 1)] for i in range(width)], jnp.uint32)
         # Train, and evaluate after each interval.
-        state = self._init(traced, keys)
-        goals = training_keys(self._config.evaluation.episodes)
+        goals = training_keys(self.config.evaluation.episodes)
+        with stage(f"compiling the training of {width} policies"):
+            state = self._begin(traced, keys)
+            if width not in self._compiled:
+                state = self._advance(traced, state, np.int32(0))
+                self.evaluate(state.policy_params, goals)
+                self._compiled.add(width)
         rates, episodes = [], None
         with stage(f"intervals of training {count} policies", len(self._steps)) as advance:
             for steps in self._steps:
@@ -115,7 +129,7 @@ class Trials:
                 rates.append(np.asarray(episodes.success).mean(axis=1))
                 advance(1)
         assert episodes is not None
-        seconds = mean_seconds(episodes, self._config)
+        seconds = mean_seconds(episodes, self.config)
         params = jax.device_get(state.policy_params)
         return [
             Outcome(
@@ -138,9 +152,17 @@ class Trials:
         """
         return self._episodes(0, params, keys)
 
+    def _begin(self, traced: Mapping[str, Array], seeds: UInt32[Array, " n"]) -> TrainState:
+        """Return the stacked states before the first step."""
+        state = self._init(traced, seeds)
+        if self._warm_start is None:
+            return state
+        each = [jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(seeds))]
+        return jax.tree.map(lambda *x: jnp.stack(x), *map(self._warm_start.apply, each))
+
     def _ppo(self, traced: Mapping[str, Float[Array, ""]]) -> PPO:
         # `model_copy` does not validate, so that traced values pass.
-        return PPO(self._config.ppo.model_copy(update=dict(traced)), self._env, self._networks)
+        return PPO(self.config.ppo.model_copy(update=dict(traced)), self._env, self._networks)
 
 
 def mean_seconds(episodes: Episodes, config: Config) -> list[float]:

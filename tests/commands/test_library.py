@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+import warnings
 from pathlib import Path
 
 import gliding
@@ -175,13 +176,28 @@ def test_hyperparameters_are_searched(tmp_path, monkeypatch, blank_figures, capf
     )
     assert capfd.readouterr() == ("", "")
     assert found.config == load_config(tmp_path / "t" / "best.yaml")
-    assert set(found.best.values) <= set(space)
+    assert set(found.values) <= set(space)
     assert len(found.study.trials) == 2
     assert repr(found).startswith(f"TuningResult(folder='{tmp_path}/t', best='")
     assert optuna.logging.get_verbosity() == level
     assert dict(plt.rcParams) == style
     assert plt.fignum_exists(figure.number)
     plt.close(figure)
+
+
+def test_a_search_without_final_trainings_returns_the_best_trial(tmp_path, monkeypatch):
+    optuna = pytest.importorskip("optuna")
+    from test_search import Quick
+
+    monkeypatch.setattr("jetbot_mjx.tuning.search.Trials", Quick)
+    level, filters = optuna.logging.get_verbosity(), list(warnings.filters)
+    space = {"ppo.learning_rate": {"low": 1e-4, "high": 1e-2}}
+    found = tune("smoke", SMALL, space=space, trials=1, confirm=0, output=tmp_path / "t")
+    assert (found.entrants, found.best) == ((), None)
+    assert found.values == found.study.best_trial.params
+    assert found.config.ppo.learning_rate == found.values["ppo.learning_rate"]
+    assert repr(found) == f"TuningResult(folder='{tmp_path}/t', values={found.values})"
+    assert (optuna.logging.get_verbosity(), list(warnings.filters)) == (level, filters)
 
 
 def test_an_environment_is_built_from_a_name():

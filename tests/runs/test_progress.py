@@ -56,6 +56,21 @@ def test_a_long_stage_tells_how_far_it_is_and_how_long_it_will_take(monkeypatch)
     ]
 
 
+def test_a_stage_in_which_nothing_is_counted_is_told_again(monkeypatch):
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.1)
+    monkeypatch.setattr(progress, "_SECONDS_BETWEEN_LINES", 0.3)
+    stream = io.StringIO()
+    with show_progress(stream), stage("trials", 8), stage("compiling"):
+        deadline = time.monotonic() + 10
+        while stream.getvalue().count("\n") < 4 and time.monotonic() < deadline:
+            time.sleep(0.01)
+    said = [line.split(" s  ")[1] for line in stream.getvalue().splitlines()]
+    # Only the inner one.
+    assert sorted(said[:2]) == ["compiling", "trials: 8"]
+    assert all(re.fullmatch(r"compiling: \d+ s so far", line) for line in said[2:])
+    assert len(said) >= 4
+
+
 def test_a_reader_that_has_gone_ends_no_command(monkeypatch):
     monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
 

@@ -126,6 +126,30 @@ def test_the_noise_begins_anew_and_the_direction_stays(source):
     np.testing.assert_array_equal(last[:, 2:], new[:, 2:])
 
 
+@gliding.everywhere()
+def test_a_normal_distribution_starts_from_a_policy_too(tmp_path):
+    network = {"network": {"distribution_type": "normal", "policy_hidden_layer_sizes": [16]}}
+    assert session.run(config_of(ppo={**network}), tmp_path / "source").finished
+    source = load_checkpoint(tmp_path / "source").params.policy["params"]
+    changes = {"seed": 1, "init_from": str(tmp_path / "source"), "ppo": {**network}}
+    assert session.run(config_of(**changes), tmp_path / "run").finished
+    start = load_checkpoint(tmp_path / "run", 0).params.policy["params"]
+    fresh = networks_of(config := config_of(**changes), make_env(config))
+    new = fresh.policy_network.init(jax.random.PRNGKey(0))["params"]
+    first = [x["MLP_0"]["hidden_0"]["kernel"] for x in (start, source)]
+    np.testing.assert_array_equal(*first)
+    mean = np.float32(0.25) * source["Dense_0"]["kernel"]
+    np.testing.assert_array_equal(start["Dense_0"]["kernel"], mean)
+    np.testing.assert_array_equal(start["std_param"]["value"], new["std_param"]["value"])
+    assert not np.array_equal(source["std_param"]["value"], new["std_param"]["value"])
+    # A field that is new, here in front of the first one, has a row of zeros.
+    rows = np.asarray([-1, *range(7)])
+    matched = warm_start._match_first_layer({"params": source}, rows)["params"]["MLP_0"]
+    kernel = source["MLP_0"]["hidden_0"]["kernel"]
+    np.testing.assert_array_equal(matched["hidden_0"]["kernel"][1:], kernel)
+    assert not matched["hidden_0"]["kernel"][0].any()
+
+
 @pytest.mark.parametrize(
     ("changes", "told"),
     [

@@ -1,12 +1,16 @@
 """A study goes on where it was stopped, shares its work, and loses nothing."""
 
+import sys
+from pathlib import Path
 from typing import ClassVar
 
 import optuna
 import pytest
+import sqlalchemy.exc
 
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import progress
 from jetbot_mjx.tuning import results, search
 from jetbot_mjx.tuning.space import Parameter
 from jetbot_mjx.tuning.trials import Outcome
@@ -30,6 +34,9 @@ class Quick:
         self.config, self.names = config, names
 
     def run(self, values, seeds):
+        # As in the program: arguments are numbers, and seeds of 32 bits.
+        assert all(isinstance(one[name], int | float) for one in values for name in self.names)
+        assert all(0 <= seed < 2**32 for seed in seeds)
         self.calls.append((self.config.ppo.unroll_length, len(values), tuple(seeds)))
         return [
             Outcome((0.5, 1 - abs(one["ppo.learning_rate"] - 3e-3) * 10), 1.0, {"w": seed})
@@ -89,7 +96,7 @@ def test_the_trials_of_a_dead_worker_are_run_again(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "_BEAT_SECONDS", 1)
     dead = search.Search(CONFIG, SPACE, tmp_path / "s")
     # It asks, beats once, and is gone.
-    with search._quiet():
+    with search.quiet():
         trials = [dead.study.ask() for _ in range(2)]
     values = []
     for trial in trials:
@@ -107,8 +114,9 @@ def test_the_trials_of_a_dead_worker_are_run_again(tmp_path, monkeypatch):
 def test_values_that_do_not_fit_together_fail_with_their_reason(tmp_path):
     space = [Parameter("ppo.batch_size", choices=(24,)), SPACE[0]]
     one = search.Search(CONFIG, space, tmp_path / "s")
-    with search._quiet():
-        one._train([one.study.ask()])
+    with search.quiet():
+        trial = one.study.ask()
+        one._train([trial], [{each.name: each.suggest(trial) for each in space}])
     (stored,) = one.study.trials
     assert stored.state == FAIL
     assert "is not a multiple of num_envs" in stored.user_attrs["error"]
@@ -120,6 +128,177 @@ def test_a_search_in_which_nothing_fits_ends(tmp_path):
         search.Search(CONFIG, space, tmp_path / "s").run(4, 4)
 
 
+def test_a_setting_may_be_null_in_the_configuration_or_among_the_choices(tmp_path):
+    config = parse_config({"ppo": {"max_grad_norm": None}})
+    clipped = Parameter("ppo.max_grad_norm", 0.3, 3.0)
+    one = search.Search(config, [SPACE[0], clipped], tmp_path / "range")
+    one.run(4, 4)
+    # The program of the given configuration does not clip.
+    assert one.confirm(1, 2, 4)[0].values == {}
+    assert {length for _, length, _ in Quick.calls[-2:]} == {2}
+    either = Parameter("ppo.max_grad_norm", choices=(None, 1.0))
+    two = search.Search(config, [SPACE[0], either], tmp_path / "choices")
+    two.run(8, 8)
+    assert two.study.trials[0].params["ppo.max_grad_norm"] is None
+    assert len(two.confirm(2, 2, 4)) == 3
+
+
+def test_choices_may_be_lists(tmp_path):
+    name = "ppo.network.policy_hidden_layer_sizes"
+    config = parse_config({"ppo": {"network": {"policy_hidden_layer_sizes": [16]}}})
+    space = [SPACE[0], Parameter(name, choices=((16,), (8, 8)))]
+    one = search.Search(config, space, tmp_path / "s")
+    one.run(6, 3)
+    assert [trial.state for trial in one.study.trials] == [COMPLETE] * 6
+    # Optuna stores them as text; the first one is the given configuration.
+    assert one.study.trials[0].params[name] == "[16]"
+    assert "[8, 8]" in {trial.params[name] for trial in one.study.trials}
+    entrants = one.confirm(2, 2, 4)
+    assert {entrant.values.get(name) for entrant in entrants} <= {None, (16,), (8, 8)}
+    path = results.write_results(tmp_path, config, one, entrants)
+    assert load_config(path).ppo.network.policy_hidden_layer_sizes in ((16,), (8, 8))
+
+
+def test_the_largest_seed_can_be_searched(tmp_path):
+    config = parse_config({"seed": 2**32 - 1})
+    one = search.Search(config, SPACE, tmp_path / "s")
+    one.run(4, 4)
+    one.confirm(1, 2, 4)
+    assert set(Quick.calls[-1][2]) <= {999_999, 1_000_000}
+
+
+@pytest.mark.parametrize(
+    ("changes", "told"),
+    [
+        ({"init_from": "/nowhere"}, "no checkpoint at /nowhere: no such folder"),
+        ({"seeds": 2}, "seeds = 2 cannot be tuned: leave it out"),
+        (
+            {
+                "trainer": "brax",
+                "ppo": {"normalizer": "brax", "learning_rate_schedule": "NONE"},
+            },
+            "trainer = 'brax' cannot be tuned: take trainer = 'resumable'",
+        ),
+    ],
+)
+def test_what_trials_cannot_do_is_refused_before_anything_is_written(tmp_path, changes, told):
+    with pytest.raises(UserError, match=told):
+        search.Search(parse_config(changes), SPACE, tmp_path / "s")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_trial_killed_before_its_first_heartbeat_is_run_again(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(search, "_STALE_SECONDS", 1)
+    monkeypatch.setattr(search, "_POLL_SECONDS", 0.2)
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 0.0)
+    with search.quiet():
+        search.Search(CONFIG, SPACE, tmp_path / "s").study.ask()
+    again = search.Search(CONFIG, SPACE, tmp_path / "s")
+    with progress.show_progress(sys.stderr):
+        again.run(1, 1)
+    assert [trial.state for trial in again.study.trials] == [FAIL, COMPLETE]
+    assert "waiting for trials of other workers" in capsys.readouterr().err
+
+
+def test_an_interrupted_round_is_run_again_at_once(tmp_path, monkeypatch):
+    with monkeypatch.context() as patch:
+        patch.setattr(Quick, "run", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            search.Search(CONFIG, SPACE, tmp_path / "s").run(3, 3)
+    again = search.Search(CONFIG, SPACE, tmp_path / "s")
+    waiting = [trial.params for trial in again.study.trials if trial.state == WAITING]
+    assert len(waiting) == 3
+    again.run(3, 3)
+    states = [trial.state for trial in again.study.trials]
+    assert (states.count(FAIL), states.count(COMPLETE)) == (3, 3)
+    assert [trial.params for trial in again.study.trials if trial.state == COMPLETE] == waiting
+
+
+def interrupted(self, values, seeds):
+    raise KeyboardInterrupt
+
+
+def test_a_trial_that_another_worker_took_for_dead_is_left_to_it(tmp_path, monkeypatch):
+    one = search.Search(CONFIG, SPACE, tmp_path / "s")
+    run = Quick.run
+
+    def slow(self, values, seeds):
+        monkeypatch.setattr(Quick, "run", run)
+        other = optuna.load_study(study_name="s", storage=one._url)
+        other.tell(0, state=FAIL)
+        return run(self, values, seeds)
+
+    monkeypatch.setattr(Quick, "run", slow)
+    one.run(2, 2)
+    assert [trial.state for trial in one.study.trials].count(COMPLETE) == 2
+
+
+def test_values_that_a_network_refuses_fail_with_their_reason(tmp_path, monkeypatch):
+    def refuse(self, config, names, evaluations):
+        if config.ppo.unroll_length == 8:
+            raise UserError("eight is too short")
+        self.config, self.names = config, names
+
+    monkeypatch.setattr(Quick, "__init__", refuse)
+    said = []
+    one = search.Search(CONFIG, SPACE, tmp_path / "s", say=said.append)
+    one.run(8, 8)
+    assert len(search.completed_trials(one.study)) == 8
+    assert "could not be trained, such as: eight is too short" in said[0]
+
+
+def test_too_many_trials_for_the_memory_are_told(tmp_path, monkeypatch):
+    def run(self, values, seeds):
+        raise RuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setattr(Quick, "run", run)
+    with pytest.raises(UserError, match="trials at once: choose a smaller --round"):
+        search.Search(CONFIG, SPACE[:1], tmp_path / "s").run(4, 4)
+
+
+def test_workers_that_begin_at_once_draw_other_values(tmp_path):
+    one, two = (search.Search(CONFIG, SPACE[:1], tmp_path / "s") for _ in range(2))
+    one.run(4, 4)
+    two.run(8, 4)
+    drawn = [trial.params["ppo.learning_rate"] for trial in two.study.trials]
+    assert len(set(drawn)) == 8
+
+
+def test_a_worker_waits_for_the_tables_that_another_creates(tmp_path, monkeypatch):
+    calls = []
+
+    class Racing(optuna.storages.RDBStorage):
+        def __init__(self, *arguments, **options):
+            calls.append(arguments)
+            if len(calls) == 1:
+                raise sqlalchemy.exc.IntegrityError("INSERT", {}, Exception("UNIQUE constraint"))
+            super().__init__(*arguments, **options)
+
+    monkeypatch.setattr(optuna.storages, "RDBStorage", Racing)
+    search.Search(CONFIG, SPACE, tmp_path / "s")
+    assert len(calls) == 2
+
+
+@pytest.mark.parametrize("name", ["a b", "50%20?#", "{x}"])
+def test_any_folder_can_hold_a_study(tmp_path, monkeypatch, name):
+    (folder := tmp_path / name).mkdir()
+    monkeypatch.chdir(folder)
+    one = search.Search(CONFIG, SPACE, Path())
+    assert one.study.study_name == name
+    assert [path.name for path in folder.iterdir()] == ["study.db"]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_without_final_trainings_the_best_trial_is_the_best(tmp_path):
+    one = search.Search(CONFIG, SPACE[:1], tmp_path / "s")
+    one.run(8, 4)
+    assert one.confirm(0, 5, 4) == []
+    path = results.write_results(tmp_path, CONFIG, one, [])
+    best = one.study.best_trial.params["ppo.learning_rate"]
+    assert load_config(path).ppo.learning_rate == best
+    assert (tmp_path / "trials.md").read_text().startswith("| trial |")
+
+
 def test_a_storage_that_cannot_be_used_is_named(tmp_path):
     with pytest.raises(UserError, match="--storage nonsense cannot be used"):
         search.Search(CONFIG, SPACE, tmp_path / "s", storage="nonsense")
@@ -129,16 +308,16 @@ def test_results_are_written(tmp_path):
     folder = tmp_path / "s"
     one = search.Search(CONFIG, SPACE, folder)
     one.run(8, 4)
-    entrants = one.confirm(2, seeds=3)
+    entrants = one.confirm(2, 3, 4)
     assert [len(each.areas) for each in entrants] == [3, 3, 3]
     assert entrants[0].name == "as given"
+    # The given configuration, which was the first trial, is not retrained twice.
+    assert "trial 0" not in {each.name for each in entrants}
     assert entrants[0].success_rates == (0.5,) * 3
     # A failed episode counts with its whole time: 60 and 256 steps of 1/60 s.
     assert entrants[0].mean_seconds[0] == pytest.approx((60 + 256) / 2 / 60)
-    path = results.write_results(folder, CONFIG, one.study, entrants)
+    path = results.write_results(folder, CONFIG, one, entrants)
     best = results.best_entrant(entrants)
-    from jetbot_mjx.config import load_config
-
     assert load_config(path).ppo.learning_rate == best.values["ppo.learning_rate"]
     assert len((folder / "trials.csv").read_text().splitlines()) == 9
     assert best.name in (folder / "trials.md").read_text()

@@ -95,3 +95,21 @@ def test_outcomes_are_measured(trials, outcomes):
         assert 0 < one.mean_seconds <= 40 / 60 + 1e-6
     stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
     assert trials.evaluate(stacked, report_keys(5)).success.shape == (3, 5)
+
+
+def test_trials_begin_with_another_policy(trials, tmp_path):
+    from jetbot_mjx.runs.checkpoint import load_checkpoint
+    from jetbot_mjx.training import session
+
+    run = CONFIG.model_copy(update={"checkpoint_interval": 1024, "tensorboard": False})
+    assert session.run(run, tmp_path / "run").finished
+    source = load_checkpoint(tmp_path / "run").params
+    config = CONFIG.model_copy(update={"init_from": str(tmp_path / "run")})
+    begun = Trials(config, NAMES, evaluations=1)
+    traced = {name.removeprefix("ppo."): jnp.full(2, 0.9) for name in NAMES}
+    state = begun._begin(traced, jnp.asarray([0, 1], jnp.uint32))
+    for ours, theirs in zip(leaves(state.params.value), leaves(source.value), strict=True):
+        np.testing.assert_array_equal(ours, np.stack([theirs, theirs]))
+    # Environments and noise are those of each seed.
+    assert not np.array_equal(*np.asarray(state.key))
+    assert len(begun.run(VALUES, [3, 3, 4])) == 3

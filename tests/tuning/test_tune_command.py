@@ -1,5 +1,7 @@
 """The command: a small search from configuration to `best.yaml`, continued, and refused."""
 
+import sys
+
 import pytest
 
 from jetbot_mjx.config import load_config
@@ -29,6 +31,16 @@ def test_a_search_ends_in_a_configuration(tmp_path, capsys):
     # Once more: nothing is searched again.
     assert command.main(arguments) == 0
     assert "of 4 trials" not in capsys.readouterr().out
+
+
+def test_without_optuna_the_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name in ("search", "results"):
+        monkeypatch.delitem(sys.modules, f"jetbot_mjx.tuning.{name}", raising=False)
+        monkeypatch.delattr(f"jetbot_mjx.tuning.{name}", raising=False)
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(UserError, match=r"tune needs optuna, .*pip install 'jetbot_mjx\[tune\]'"):
+        command.main(["smoke", "--space", "ppo"])
 
 
 def test_a_mistake_writes_nothing(tmp_path, monkeypatch):
