@@ -181,6 +181,11 @@ class MujocoPhysics(Physics):
         """Name of the simulator, which is not a value of `physics.impl`."""
         return "mujoco"
 
+    @property
+    def is_kernel(self) -> bool:
+        """Return False: XLA calls back to C MuJoCo."""
+        return False
+
     def step(
         self,
         state: PhysicsState,

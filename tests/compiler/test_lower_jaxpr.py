@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax.sharding import Mesh, PartitionSpec
 from run_program import evaluate
 
 from jetbot_mjx.compiler import lower_jaxpr, xla_options
@@ -193,6 +194,31 @@ def test_an_operation_that_jax_expands_is_lowered_as_its_expansion():
     x = np.float32(np.random.default_rng(3).normal(size=(20, *VECTOR.shape)))
     (ours,) = evaluate(lower_jaxpr.scalarize(function, VECTOR), [x])
     np.testing.assert_array_equal(ours, x * 4**3)
+
+
+@pytest.mark.parametrize("check_vma", [True, False])
+def test_a_function_is_lowered_in_a_program_for_several_devices_too(check_vma):
+    def function(x):
+        return jnp.concatenate([jnp.hypot(x, x[::-1]), jnp.zeros(2)])
+
+    programs = []
+
+    def outer(x):
+        programs.append(lower_jaxpr.scalarize(function, VECTOR))
+        # What is lowered there may also have been traced with the values of the devices.
+        closed = jax.make_jaxpr(function)(x[0])
+        programs.append(
+            lower_jaxpr.scalarize_part(closed, closed.jaxpr.invars, closed.jaxpr.outvars)
+        )
+        return x
+
+    mesh = Mesh(np.array(jax.devices()[:1]), ("devices",))
+    specs = {"in_specs": PartitionSpec("devices"), "out_specs": PartitionSpec("devices")}
+    jax.make_jaxpr(jax.shard_map(outer, mesh=mesh, check_vma=check_vma, **specs))(jnp.ones((2, 4)))
+    x = np.float32(np.random.default_rng(3).normal(size=(20, *VECTOR.shape)))
+    for program in programs:
+        (ours,) = evaluate(program, [x])
+        np.testing.assert_allclose(ours, in_full_precision(function, x), rtol=1e-6)
 
 
 def test_a_product_of_two_dtypes_is_one_of_the_results():

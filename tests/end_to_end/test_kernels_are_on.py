@@ -1,15 +1,14 @@
 """With what is installed, kernels compute whatever kernels can: on new versions before all."""
 
 import jax
-import jax.numpy as jnp
 import pytest
 
 from jetbot_mjx.compiler import llvm_backend, ptx_backend
+from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import load_config, shipped_configs
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.fallbacks import collect
-from jetbot_mjx.training.ppo_trainer import build_ppo
+from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
 
 IMAGES = "it takes observations without images"
 WITHOUT_FUSED_UPDATE = {
@@ -31,9 +30,7 @@ def test_no_shipped_configuration_falls_back(name, capsys):
     with collect() as found:
         env = make_env(config)
         ppo = build_ppo(config, env)
-        wrapped = wrap_for_training(env, 100)
-        keys = jax.random.split(jax.random.PRNGKey(0), 2)
-        jax.eval_shape(lambda keys: wrapped.step(wrapped.reset(keys), jnp.zeros((2, 2))), keys)
+        CompiledTrainer(ppo, [0], ProgramCache({})).trace()
     assert env.physics.impl == BACKENDS[jax.default_backend()].IMPL
     reason = WITHOUT_FUSED_UPDATE.get(name)
     assert found == ([("ppo.update", reason)] if reason else [])

@@ -44,6 +44,7 @@ from jetbot_mjx.runs.checkpoint_store import (
 from jetbot_mjx.runs.resume import TRAINING, resume, to_trees
 from jetbot_mjx.runs.run_dir import write_run
 from jetbot_mjx.training import ppo_trainer, session
+from jetbot_mjx.training.preemption import StopRequest
 
 STEPS = [0, 16_384, 32_768, 49_152, 65_536]
 LAST, BEFORE = STEPS[-1], STEPS[-2]
@@ -177,19 +178,14 @@ def test_twice_as_long_is_resumed_half_way(smoke, tmp_path, same, capsys):
     assert load_config(run_dir / "config.yaml").ppo.num_timesteps == 65_536
 
 
-class StopAfter:
+class StopAfter(StopRequest):
     """Asks a training to stop after so many training steps."""
 
     notice = 300.0
 
     def __init__(self, training_steps):
+        super().__init__(self.notice)
         self._left = training_steps
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *exception):
-        pass
 
     def wait(self, seconds):
         time.sleep(seconds)
