@@ -569,7 +569,7 @@ def test_one_robot_sees_what_the_batch_sees():
 
 def test_robots_that_are_drawn_are_a_batch():
     drawn = {"randomization": {"friction": [0.5, 1.0], "mass": [0.9, 1.1]}}
-    with pytest.raises(UserError, match=r"randomization\.friction, mass: .*take JetBotVectorEnv"):
+    with pytest.raises(UserError, match=r"randomization\.friction, mass: .*use JetBotVectorEnv"):
         JetBotGymEnv(config=drawn)
     with everywhere():
         batch = JetBotVectorEnv(num_envs=3, config=drawn)

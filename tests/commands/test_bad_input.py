@@ -60,7 +60,7 @@ MERGED = laughs(9, ", &a{n} {{<<: [{list}]}}", "&a0 {x: 1}")
         (f"seed: [{MERGED}]", "is not valid YAML: its aliases stand for more than 100,000"),
         ("seed: [&a 1, &a 2]", "seed = [1, 2] is wrong"),
         ("seed: &a [*a]", "is not valid YAML: its aliases stand for more than 100,000"),
-        (f"wandb: '{'/' * 50_000}'", "is no project's name"),
+        (f"wandb: '{'/' * 50_000}'", "is not a project name"),
         (f"ppo: {{network: {{policy_hidden_layer_sizes: {[8] * 101}}}}}", "at most 100 items"),
         ("seed: !!int x", "is not valid YAML"),  # ValueError
         ("seed: !!bool x", "is not valid YAML"),  # KeyError

@@ -140,7 +140,7 @@ def test_the_recording_is_what_the_policy_saw_in_its_environment(exported, run_d
         obs, action = recording["obs"], recording["action"]
     assert obs.shape == (10_000, env.observation_size)
     keys = report_keys(1)
-    np.testing.assert_array_equal(obs[0], env.reset(keys[0]).obs)
+    np.testing.assert_array_equal(obs[0], jax.jit(env.reset)(keys[0]).obs)
     # In C MuJoCo it moves as it was told: MJX, one step on.
     physics = env.reset(keys[0]).pipeline_state
     data = mujoco.MjData(env.mj_model)

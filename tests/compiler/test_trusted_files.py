@@ -176,7 +176,7 @@ def test_a_cache_folder_that_cannot_be_made_costs_one_line(settings, tmp_path, c
     (tmp_path / "caches").write_text("a file where a folder should be")
     assert used() is None
     line = capfd.readouterr().err
-    assert line.startswith("slow: compilation cache: every start compiles anew")
+    assert line.startswith("slow: compilation cache: every start compiles again")
     assert f": {tmp_path / 'caches'}" in line
     assert line.count("\n") == 1
 

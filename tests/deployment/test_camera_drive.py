@@ -458,7 +458,7 @@ def test_fewer_than_no_drives_is_a_mistake(folder, name, capsys):
 @pytest.mark.parametrize("name", ["rate", "noise"])
 def test_poses_have_no_place_beside_a_camera(folder, name, capsys):
     assert rehearse.main([str(folder), "--camera", f"--{name}", "30"]) == 2
-    said = f"error: --{name} is of poses, which --camera has not: leave it out\n"
+    said = f"error: --{name} concerns poses, and --camera uses none: leave it out\n"
     assert capsys.readouterr().err == said
 
 

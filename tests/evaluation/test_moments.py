@@ -100,5 +100,5 @@ def test_a_report_shows_what_the_policy_saw(tmp_path):
     assert (tmp_path / "seen.png").stat().st_size > 10_000
     page = (tmp_path / "report.html").read_text("utf-8")
     assert "What the policy saw" in page
-    assert "The first goal that was reached" in page
+    assert "The first goal reached" in page
     assert "(seen.png)" in (tmp_path / "report.md").read_text("utf-8")

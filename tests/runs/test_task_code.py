@@ -308,6 +308,6 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     assert env.task.factor == 4
     for folder in run_dirs:
         folder.mkdir(parents=True)
-    session._store_run(session.Training(two, tmp_path / "two", run_dirs, *[None] * 5, code))
+    session._store_run(session.Training(two, tmp_path / "two", run_dirs, *[None] * 6, code))
     for folder in (tmp_path / "two", *run_dirs):
         assert read_task_code(folder) == code

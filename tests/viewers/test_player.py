@@ -430,7 +430,7 @@ def test_presses_add_up_and_the_first_against_a_turn_ends_it(player):
 
 
 def test_who_is_no_agent_is_refused(player):
-    with pytest.raises(UserError, match="'nobody' is none: choose from policy, scripted"):
+    with pytest.raises(UserError, match="'nobody' is unknown: choose from policy, scripted"):
         Player(player.run_dir, agent="nobody")
 
 
