@@ -94,7 +94,9 @@ wheel: $(STAMP)
 	$(USE) evaluate pretrained:jetbot_egocentric --episodes 64 --output report
 	$(USE) export latest --format all
 	$(USE) runs
-	$(USE) new_task my_task.py
+	$(USE) new-task my_task.py
+	$(USE) check-env --config my_task.yaml
+	$(USE) train obstacle --run-dir runs/obstacle --set ppo.num_timesteps=131_072
 	.cache/wheel/venv/bin/python -m pytest -p no:cacheprovider --numprocesses 2 --dist loadfile \
 		tests/end_to_end/test_kernels_are_on.py tests/compiler/test_lower_jaxpr.py tests/viewers/test_viser_server.py
 

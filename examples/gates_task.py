@@ -1,6 +1,6 @@
 """A task with a memory: drive through gates, one after the other.
 
-    PYTHONPATH=examples jetbot-mjx train examples/gates.yaml
+    jetbot-mjx train gates
 
 The number of gates passed is part of the goal, and `advance` counts it. A gate counts when the
 robot's axle midpoint crosses the line between its posts from the front; a robot that misses one

@@ -1,8 +1,8 @@
 """A task outside the package: drive to the goal and around a pillar.
 
-Put the folder of this file on `PYTHONPATH` and name the class in a YAML file:
+Name the class in a YAML file beside this one, and train it:
 
-    PYTHONPATH=examples jetbot-mjx train examples/obstacle.yaml
+    jetbot-mjx train obstacle
 
 A subclass of `GoalTask` overrides only what differs: what is drawn for an episode, the
 observation, the reward, and when the episode ends. Environment, trainer, evaluation and rendering

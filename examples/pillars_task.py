@@ -1,6 +1,6 @@
 """A task with solid obstacles: drive to the goal between pillars that the robot can run into.
 
-    PYTHONPATH=examples jetbot-mjx train examples/pillars.yaml
+    jetbot-mjx train pillars
 
 Unlike the pillar of `obstacle_task.py`, which ends the episode, these are solid: contact forces
 keep the robot out of them. A robot may brush past a pillar, or push against it until the time

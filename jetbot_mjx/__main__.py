@@ -4,29 +4,27 @@
 A command is imported only if it is chosen, so that the list is printed at once.
 """
 
-import difflib
 import runpy
 import sys
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 from jetbot_mjx import __version__, cli
 
 COMMANDS: Mapping[str, tuple[str, str]] = {
-    "pretrained": ("pretrained", "copy the policies that come with the package"),
     "train": ("train", "train a policy into a run folder"),
-    "configs": ("training.configs", "list the configurations that come with the package"),
-    "runs": ("runs.command", "list the runs there are"),
-    "tune": ("tuning.command", "search for hyperparameters, many trials at once"),
-    "plan": ("plan", "predict the memory that a training needs"),
     "evaluate": ("evaluate", "evaluate policies on fixed goals, and compare them"),
     "render": ("render", "write videos and plots of a policy that drives"),
     "play": ("play", "watch a policy live in the browser, and interact with it"),
+    "configs": ("training.configs", "list the configurations that come with the package"),
+    "runs": ("runs.command", "list your runs, and those that come with the package"),
+    "new-task": ("new_task", "write a task to start from"),
+    "check-env": ("check_env", "check a task before it is trained"),
+    "plan": ("plan", "predict the memory that a training needs"),
+    "tune": ("tuning.command", "search for hyperparameters, many trials at once"),
     "export": ("export", "write a policy to files that run without this package"),
     "sim2real": ("sim2real", "compare the log of a real drive with the simulator"),
     "replay": ("replay", "replay the steps that led to a non-finite state"),
-    "new_task": ("new_task", "write a task to start from"),
-    "check_env": ("check_env", "check a task before it is trained"),
+    "pretrained": ("pretrained", "copy the policies that come with the package"),
 }
 """The commands by name, in the order in which a user needs them: the module, and what it does."""
 
@@ -62,15 +60,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _overview(words: Sequence[str]) -> int:
     """Print the list of commands, or refuse a command that does not exist."""
     parser = _parser()
-    if words and not words[0].startswith("-"):
-        # Only to explain an error: it takes longer than the list of commands.
-        from jetbot_mjx.config import shipped_configs
-
-        close = difflib.get_close_matches(words[0], COMMANDS, n=1)
-        if Path(words[0]).stem in shipped_configs():
-            close = [f"train {words[0]}"]
-        remedy = f": did you mean {close[0]}?" if close else ""
-        parser.error(f"there is no command {words[0]!r}{remedy}")
+    if words and (words[0] not in ("-h", "--help", "--version") or len(words) > 1):
+        meant = cli.command_meant_by(words, COMMANDS)
+        remedy = f": did you mean {meant}?" if meant else ""
+        what = "no command before" if words[0].startswith("-") else "no command"
+        parser.error(f"there is {what} {words[0]!r}{remedy}")
     parser.parse_args(words)
     parser.print_help()
     return 0

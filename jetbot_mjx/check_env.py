@@ -1,4 +1,4 @@
-"""Check a task before it is trained: `jetbot-mjx check_env my_task:MyTask`.
+"""Check a task before it is trained: `jetbot-mjx check-env my_task:MyTask`.
 
 Every mistake is reported in one line that says how to correct it. A built-in task is named by its
 class alone, such as `GoalTask`. `--config my_task.yaml` checks a task with the settings of a run.
@@ -24,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 1 if the task has an error.
     """
     # Parse.
-    parser = cli.Parser(prog="jetbot-mjx check_env", description=__doc__)
+    parser = cli.Parser(prog="jetbot-mjx check-env", description=__doc__)
     parser.add_argument(
         "task",
         nargs="?",
@@ -35,6 +35,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if not options.task and options.config is None:
         parser.error("give a task as package.module:Class, or a --config that names one")
+    if (options.task or "").endswith((".yaml", ".yml")):
+        parser.error(f"{options.task} is a YAML file: did you mean --config {options.task}?")
+    if (options.task or "").endswith(".py"):
+        module = options.task.removesuffix(".py").replace("/", ".")
+        parser.error(f"{options.task} is a file: name its class too, as {module}:Class")
     name = options.task if ":" in (options.task or "") else f"{_BUILT_IN}:{options.task}"
     config = cli.config_of(options, *([f"task.name={name}"] if options.task else []))
     with cli.exit_on_interrupt():

@@ -4,8 +4,9 @@ The exit codes are: 0 success · 1 finished, but below the requested `--min-succ
 does not fit · 2 an error that the user can correct · 75 a training that was asked to stop, is
 saved, and continues with the same command · 130 interrupted.
 
-A command module imports only this module at its top and the rest in `main`, after `run_command` has
-installed the lazy imports. For the same reason this module imports JAX only where it uses it.
+A command module imports only this module at its top, and the rest in `main`, after it has parsed
+its arguments: a mistyped command answers before JAX, MuJoCo or NumPy is imported. For the same
+reason this module imports them only where it uses them.
 """
 
 import argparse
@@ -15,13 +16,15 @@ import difflib
 import functools
 import gc
 import os
+import shlex
 import sys
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
 from jetbot_mjx.errors import UserError, printable, printable_lines, ran_out
+from jetbot_mjx.evaluation.goal_set import parse_goals
 from jetbot_mjx.imports import install_lazy_imports
 from jetbot_mjx.interrupts import (
     INTERRUPTED,
@@ -62,39 +65,86 @@ class Parser(argparse.ArgumentParser):
         options = self._option_string_actions
         for word in words:
             name = word.partition("=")[0]
+            if name == "--list":
+                self.error(
+                    f"unrecognized arguments: {name}: `{PROGRAM} configs` lists the configurations,"
+                    f" and `{PROGRAM} runs` the runs"
+                )
             if name.startswith("--") and not any(one.startswith(name) for one in options):
-                self.error(f"unrecognized arguments: {name}{self._remedy(name.strip('-'), name)}")
+                self.error(f"unrecognized arguments: {name}{self._remedy(word, name)}")
         parsed, extra = self.parse_known_args(words, namespace)
         assert parsed is not None
         if extra:
-            remedy = self._remedy(extra[0].partition("=")[0])
+            remedy = self._remedy(extra[0])
             half = [one for one in getattr(parsed, "overrides", []) if "=" not in one]
+            positionals = [one.metavar for one in self._get_positional_actions()]
             if half:
                 remedy = f": did you mean --set {half[-1]}={extra[0]}?"
+            elif not remedy and positionals and extra[0][:1] != "-":
+                remedy = f": give only one {positionals[0]}"
             self.error(f"unrecognized arguments: {' '.join(extra)}{remedy}")
         return parsed
 
-    def _remedy(self, setting: str, option: str = "") -> str:
+    def _remedy(self, word: str, option: str = "") -> str:
         """Return what was probably meant by an unknown argument, or nothing.
 
         Args:
-          setting: the argument, if it was meant as a setting such as `num_envs`.
-          option: the argument as an option, such as `--num_envs`; empty if it is none.
+          word: the argument, perhaps with a value, such as `num_envs=128` or `--num_envs`.
+          option: the name of the argument if it is an option, such as `--num_envs`.
         """
         close = difflib.get_close_matches(option, self._option_string_actions, n=1, cutoff=0.65)
         if "--set" in self._option_string_actions:
             # Only to explain an error: it takes longer than the rest of the parser.
-            from jetbot_mjx.config import ALL_KEYS
+            from jetbot_mjx.config import keys_meant_by
 
-            name = setting.replace("-", "_")
-            meant = [key for key in ALL_KEYS if name in (key, key.rpartition(".")[2])]
-            close = [f"--set {key}=..." for key in meant] or close
+            setting, _, value = word.strip("-").partition("=")
+            meant = keys_meant_by(setting.replace("-", "_"), similar=not close)
+            option_of = {"seed": "--seed", "seeds": "--seeds"}
+            if meant and option_of.get(meant[0]) in self._option_string_actions:
+                close = [f"{option_of[meant[0]]} {value or '...'}"]
+            elif meant:
+                close = [f"--set {meant[0]}={value or '...'}"]
         return f": did you mean {close[0]}?" if close else ""
 
     def error(self, message: str) -> NoReturn:
         """Print the error in one line and exit with code 2."""
         message = printable(" ".join(message.splitlines()))
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
+
+
+def command_meant_by(words: Sequence[str], commands: Collection[str]) -> str:
+    """Return what was probably meant by words that begin with no command, or nothing.
+
+    Args:
+      words: what was typed after the program's name.
+      commands: the names of all commands.
+    """
+    # Only to explain an error: it takes longer than the list of commands.
+    from jetbot_mjx.config import run_around, shipped_configs
+
+    first, path = words[0], Path(words[0])
+    if first in ("help", "-h", "--help"):
+        return f"{words[1]} --help" if words[1:] and words[1] in commands else "--help"
+    if first.startswith("-"):
+        return f"train {shlex.join(words)}" if first in ("--config", "--resume", "--set") else ""
+    if path.stem in shipped_configs() or (path.suffix == ".yaml" and os.path.isfile(path)):
+        return f"train {shlex.quote(first)}"
+    if run_around(path):
+        return f"evaluate {shlex.quote(first)}"
+    close = difflib.get_close_matches(first, commands, n=1)
+    return _OTHER_COMMANDS.get(first) or (close[0] if close else "")
+
+
+_OTHER_COMMANDS = {
+    **dict.fromkeys(("enjoy", "watch", "view", "viewer", "visualize"), "play"),
+    **dict.fromkeys(("test", "eval", "compare", "report"), "evaluate"),
+    **dict.fromkeys(("video", "record"), "render"),
+    **dict.fromkeys(("list", "ls"), "runs"),
+    **dict.fromkeys(("sweep", "search", "optimize"), "tune"),
+    "new": "new-task",
+    "resume": "train --resume RUN",
+}
+"""What other programs call a command; it is suggested, and not accepted."""
 
 
 def run_command(
@@ -321,6 +371,7 @@ def number(kind: type, least: float, most: float = _LARGEST) -> Callable[[str], 
 
 whole_number = functools.partial(number, int)
 positive_int = whole_number(1)
+seed = whole_number(0, 2**32 - 1)
 fraction = number(float, 0, 1)
 
 
@@ -334,12 +385,45 @@ def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     raise argparse.ArgumentTypeError(f"{text!r} is neither best, last nor a number of steps")
 
 
-def run_path(text: str) -> Path:
-    """Parse an argument that names a run or a checkpoint."""
-    with exit_on_interrupt():
-        from jetbot_mjx.runs.find_run import find_run
+def goals(text: str) -> list[int]:
+    """Parse an argument that lists fixed goals."""
+    try:
+        return parse_goals(text)
+    except UserError as error:
+        raise argparse.ArgumentTypeError(str(error)) from None
 
-    return find_run(text)
+
+def origin(text: str) -> str:
+    """Parse an argument that is a page's origin, as browsers write it."""
+    import urllib.parse
+
+    try:
+        parts = urllib.parse.urlsplit(text.lower())
+        port, name = parts.port, parts.hostname
+    except ValueError:
+        port = name = None
+    else:
+        if parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
+            name = None
+    if not name or parts.scheme not in ("http", "https"):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not an origin: write it as https://hub.example.org or http://localhost:3000"
+        )
+    default = {"http": 80, "https": 443}[parts.scheme]
+    host = f"[{name}]" if ":" in name else name
+    return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
+
+
+def find_run(name: str) -> Path:
+    """Return the path of the run or checkpoint that an argument names, after all are parsed.
+
+    Raises:
+      NotFoundError: as for `runs.find_run`.
+    """
+    with exit_on_interrupt():
+        from jetbot_mjx.runs import find_run
+
+    return find_run.find_run(name)
 
 
 def add_checkpoint_arguments(
@@ -362,7 +446,7 @@ def add_checkpoint_arguments(
         nargs, what = "+", f"{what}; several are compared"
     elif default is not None:
         nargs, what = "?", f"{what} (default: {default})"
-    parser.add_argument("run", nargs=nargs, type=run_path, metavar="RUN", help=what)
+    parser.add_argument("run", nargs=nargs, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
         type=which_checkpoint,
@@ -385,7 +469,6 @@ def add_config_arguments(
     parser: argparse.ArgumentParser,
     group: "argparse._MutuallyExclusiveGroup | None" = None,
     *,
-    required: bool = False,
     positional: bool = True,
 ) -> None:
     """Add the arguments `CONFIG`, `--config` and `--set`, which select a configuration.
@@ -393,10 +476,9 @@ def add_config_arguments(
     Args:
       parser: The parser of the command.
       group: The mutually exclusive group that both belong to, or None for one of their own.
-      required: Whether a configuration must be given.
       positional: Whether the name alone is accepted, without `--config` before it.
     """
-    group = group or parser.add_mutually_exclusive_group(required=required)
+    group = group or parser.add_mutually_exclusive_group()
     text = f"name of a configuration (`{PROGRAM} configs` lists them) or YAML file"
     same = "the configuration, in place of CONFIG"
     group.add_argument("--config", type=Path, metavar="CONFIG", help=same if positional else text)
@@ -412,6 +494,12 @@ def add_config_arguments(
         metavar="SECTION.KEY=VALUE",
         help="override one setting; may be repeated",
     )
+
+
+def require_config(parser: Parser, options: argparse.Namespace) -> None:
+    """Exit with an error if no configuration is named."""
+    if options.config is None:
+        parser.error(f"name a configuration, as in `{parser.prog} jetbot`")
 
 
 def config_of(options: argparse.Namespace, *overrides: str) -> "Config":

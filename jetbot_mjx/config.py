@@ -10,10 +10,10 @@ is a number, and rejects a key that is given twice.
 """
 
 import difflib
-import functools
 import io
 import math
 import os
+import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
@@ -36,6 +36,7 @@ from ruamel.yaml.error import YAMLError
 from ruamel.yaml.nodes import Node
 
 from jetbot_mjx.errors import InvalidError, NotFoundError, clipped, shown
+from jetbot_mjx.imports import find_task_beside
 
 Overrides = Mapping[str, Any] | Sequence[str]
 """Settings that replace those of a configuration: `{"ppo.num_envs": 256}`, or a list of
@@ -783,11 +784,11 @@ def _flat(values: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     return flat
 
 
-def shipped_folder(name: Literal["configs", "examples"]) -> Path:
-    """Return a folder at the top level of the repository, which a wheel holds inside the package.
+def shipped_folder(name: str) -> Path:
+    """Return a folder of the repository that a wheel holds inside the package.
 
     Args:
-      name: the name of the folder.
+      name: `configs`, `examples`, or a folder in them.
     """
     package = Path(__file__).parent
     return next(
@@ -796,26 +797,35 @@ def shipped_folder(name: Literal["configs", "examples"]) -> Path:
     )
 
 
-_CONFIGS = Path("configs")
+_CONFIGS = ("configs", "examples")
 
 
-def shipped_configs(folder: Path = _CONFIGS) -> dict[str, Path]:
-    """Return the configurations that come with the package, by name.
+def run_around(path: Path) -> Path | None:
+    """Return the run folder that a path is, or is inside of at `checkpoints/`; None if neither."""
+    inside = [path, path.parent, path.parent.parent, path.parent.parent.parent]
+    for place, folder in enumerate(inside):
+        if os.path.isfile(folder / "config.yaml"):
+            return folder if place == 0 or inside[place - 1].name == "checkpoints" else None
+    return None
+
+
+def shipped_configs(folders: Sequence[str] = _CONFIGS) -> dict[str, Path]:
+    """Return the configurations that come with the package, by name; the examples come last.
 
     Args:
-      folder: `configs`, or a folder in it, in which other YAML files are.
+      folders: the folders that hold them, or others in the repository with YAML files.
     """
-    files = (shipped_folder("configs") / folder.relative_to(_CONFIGS)).glob("*.yaml")
-    return {path.stem: path for path in sorted(files)}
+    files = [file for one in folders for file in sorted(shipped_folder(one).glob("*.yaml"))]
+    return {file.stem: file for file in files}
 
 
-def find_config(name: str | Path, folder: Path = _CONFIGS, what: str = "config") -> Path:
+def find_config(name: str | Path, folders: Sequence[str] = _CONFIGS, what: str = "config") -> Path:
     """Return the path of a configuration file.
 
     Args:
       name: the path of a file, or the name of a configuration that comes with the package, such
         as `jetbot_egocentric`.
-      folder: where that comes from, as for `shipped_configs`.
+      folders: where that comes from, as for `shipped_configs`.
       what: the argument that names the file, for error messages.
 
     Returns:
@@ -826,18 +836,22 @@ def find_config(name: str | Path, folder: Path = _CONFIGS, what: str = "config")
     """
     path = Path(name)
     # A reader of the documentation may name `configs/gpu.yaml` in another folder.
-    if os.path.lexists(path) or path.parent not in (Path(), folder):
+    if os.path.lexists(path) or path.parent.as_posix() not in (".", *folders):
         return path
-    shipped = shipped_configs(folder)
+    shipped = shipped_configs(folders)
     if (found := shipped.get(path.name.removesuffix(".yaml"))) is not None:
         return found
     close = difflib.get_close_matches(path.stem, shipped, n=1)
     hint = f"did you mean {close[0]}?" if close else f"give a file, or one of {', '.join(shipped)}"
+    if what == "config" and "=" in path.name:
+        hint = f"did you mean --set {path.name}?"
     raise ConfigNotFoundError(f"{what} {name} does not exist: {hint}")
 
 
 def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:
     """Read a configuration, apply overrides, and check the result.
+
+    The module of `task.name` is found beside the file, from now on in the whole process.
 
     Args:
       config: the name of a configuration that comes with the package; a YAML file with the settings
@@ -851,7 +865,10 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
     Raises:
       ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
         type, out of bounds or at odds with another.
+      InvalidError: the task's module is beside the file, and another one of its name was found
+        before.
     """
+    file = None
     if isinstance(config, Config):
         if not overrides:
             return config
@@ -859,7 +876,8 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
     elif config is None:
         values, name = {}, "config"
     elif isinstance(config, str | Path):
-        values, name = read_yaml(find_config(config)), str(config)
+        file = find_config(config)
+        values, name = read_yaml(file), str(config)
     else:
         raise ConfigError(
             f"config = {shown(config)} is wrong: it should be a name, a file or Config"
@@ -878,7 +896,10 @@ def load_config(config: "str | Path | Config | None", overrides: Overrides = ())
             given = f"--set {clipped(override)}"
             name += f" {given}"
             _apply_override(values, override, given)
-    return parse_config(values, source=name)
+    resolved = parse_config(values, source=name)
+    if file is not None:
+        find_task_beside(file, resolved.task.name.partition(":")[0])
+    return resolved
 
 
 def parse_config(values: Mapping[str, Any], source: str = "config") -> Config:
@@ -918,8 +939,10 @@ def read_yaml(path: Path, what: str = "config") -> dict[str, Any]:
         raise ConfigNotFoundError(message) from None
     except (OSError, UnicodeDecodeError) as error:
         if path.is_dir():
-            is_run = what == "config" and (path / "config.yaml").is_file()
-            remedy = f"to continue that run, give --resume {path}" if is_run else "give a YAML file"
+            run = run_around(path) if what == "config" else None
+            remedy = "give a YAML file"
+            if run is not None:
+                remedy = f"to continue that run, give --resume {shlex.quote(str(run))}"
             raise ConfigError(f"{what} {path} is a folder: {remedy}") from None
         reason = error.strerror if isinstance(error, OSError) else "it is not UTF-8 text"
         raise ConfigError(f"{what} {path} cannot be read: {reason}") from None
@@ -955,6 +978,9 @@ _YAML_PROBLEMS = {
     ),
 }
 """What is meant by messages that speak of a parser's inner life."""
+
+_MOST_SECTIONS = 8
+"""Largest number of nested sections that a message names."""
 
 _MOST_YAML_CHARACTERS = 100_000
 _MOST_YAML_VALUES = 100_000
@@ -1066,12 +1092,20 @@ def _explain(error: ErrorDetails) -> str:
             most = error.get("ctx", {}).get("max_length")
             return f"{key} = {value} is wrong: it should have at most {most} items"
         case "extra_forbidden":
-            return f"{key} = {value} is unknown: {_likely_key(location)}"
+            # Of an unknown section, tell the first key.
+            value = error["input"]
+            while isinstance(value, Mapping) and value and len(location) < _MOST_SECTIONS:
+                name, value = next(iter(value.items()))
+                location.append(clipped(str(name), 100))
+            return f"{'.'.join(location)} = {shown(value)} is unknown: {_likely_key(location)}"
         case "value_error":
             prefix = f"{key}: " if key else ""
             return prefix + str(error["ctx"]["error"]) if "ctx" in error else error["msg"]
         case "model_type" | "model_attributes_type":
-            return f"{key} = {value} is not a section: write its keys below it, indented"
+            inside = next(one for one in ALL_KEYS if one.startswith(f"{key}."))
+            empty = error["input"] is None
+            remedy = "write its keys below it, indented" if empty else f"set {inside}"
+            return f"{key} = {value} is not a section: {remedy}"
         case _:
             wanted = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
             return f"{key} = {value} is wrong: it should be {_KINDS.get(wanted, wanted)}"
@@ -1094,12 +1128,66 @@ def _likely_key(location: Sequence[str]) -> str:
     if not sections and key in ALL_KEYS:
         section, _, last = key.rpartition(".")
         return f"write `{last}` below `{section}:`, indented"
-    # A key may be that of another section, such as learning_rate without `ppo.`.
-    elsewhere = [name for name in ALL_KEYS if name.rpartition(".")[2] == key]
-    known = list(type(functools.reduce(getattr, sections, Config())).model_fields)
-    likely = elsewhere or difflib.get_close_matches(key, known, n=1)
-    return f"did you mean {likely[0]}?" if likely else f"known are {', '.join(known)}"
+    if likely := keys_meant_by(".".join(location)):
+        return f"did you mean {' or '.join(likely)}?"
+    section = Config()
+    for name in sections:
+        section = getattr(section, name, Config())
+    return f"known are {', '.join(type(section).model_fields)}"
 
+
+def keys_meant_by(key: str, *, similar: bool = True) -> list[str]:
+    """Return the full keys that were probably meant by an unknown one, the likeliest first.
+
+    Args:
+      key: the key, with its section or without, perhaps as another library calls it.
+      similar: whether keys that are only spelt like it count too.
+    """
+    section, _, last = key.rpartition(".")
+    if last in _OTHER_NAMES:
+        return [_OTHER_NAMES[last]]
+    # A key may be that of another section, such as learning_rate without `ppo.`.
+    names = {known: known.rpartition(".")[2] for known in ALL_KEYS}
+    likely = [known for known, name in names.items() if last == name]
+    if likely or not similar:
+        return likely
+    own = [known for known in ALL_KEYS if known.rpartition(".")[0] == section]
+    for keys, cutoff in ((own, 0.6), (ALL_KEYS, 0.8)):
+        close = difflib.get_close_matches(last, {names[known] for known in keys}, 1, cutoff)
+        likely = [known for known in keys if names[known] in close]
+        if likely:
+            return likely
+    return difflib.get_close_matches(key, ALL_KEYS, 1, 0.8)
+
+
+_OTHER_NAMES = {
+    "lr": "ppo.learning_rate",
+    "gamma": "ppo.discounting",
+    "discount": "ppo.discounting",
+    "lam": "ppo.gae_lambda",
+    "n_envs": "ppo.num_envs",
+    "n_steps": "ppo.unroll_length",
+    "num_steps": "ppo.unroll_length",
+    "n_epochs": "ppo.num_updates_per_batch",
+    "num_epochs": "ppo.num_updates_per_batch",
+    "update_epochs": "ppo.num_updates_per_batch",
+    "total_timesteps": "ppo.num_timesteps",
+    "timesteps": "ppo.num_timesteps",
+    "minibatches": "ppo.num_minibatches",
+    "minibatch_size": "ppo.batch_size",
+    "clip_range": "ppo.clipping_epsilon",
+    "clip_coef": "ppo.clipping_epsilon",
+    "ent_coef": "ppo.entropy_cost",
+    "entropy_coef": "ppo.entropy_cost",
+    "vf_coef": "ppo.vf_loss_coefficient",
+    "target_kl": "ppo.desired_kl",
+    "net_arch": "ppo.network.policy_hidden_layer_sizes",
+    "random_seed": "seed",
+    "num_seeds": "seeds",
+    "n_seeds": "seeds",
+}
+"""Settings by the names that Stable-Baselines3, CleanRL, rsl_rl and Brax have for them; they are
+suggested, and not accepted."""
 
 ALL_KEYS = tuple(Config().flat())
 """Every setting with its section, such as `ppo.learning_rate`."""

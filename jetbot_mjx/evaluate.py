@@ -7,20 +7,21 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
+from jetbot_mjx.evaluation.goal_set import MOST_GOALS, REPORT_GOALS
 
 BELOW_TARGET = 1
 """Exit code if a success rate is below `--min-success`."""
 
 
-def _parser(default: int, most: int) -> cli.Parser:
+def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx evaluate", description=__doc__)
     cli.add_checkpoint_arguments(parser, several=True)
     parser.add_argument(
         "--episodes",
-        type=cli.whole_number(1, most),
-        default=default,
+        type=cli.whole_number(1, MOST_GOALS),
+        default=REPORT_GOALS,
         metavar="N",
-        help=f"drive to the first N of the fixed goals (default: {default:,})",
+        help=f"drive to the first N of the fixed goals (default: {REPORT_GOALS:,})",
     )
     parser.add_argument(
         "--output",
@@ -65,11 +66,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0, or 1 if a success rate is below `--min-success`.
     """
+    options = _parser().parse_args(arguments)
+    runs = [cli.find_run(name) for name in options.run]
     with cli.exit_on_interrupt():
         from jetbot_mjx.evaluation import evaluate_runs, tables
-        from jetbot_mjx.evaluation.evaluator import MOST_GOALS, REPORT_GOALS
         from jetbot_mjx.runs.run_dir import seed_folders
-    options = _parser(REPORT_GOALS, MOST_GOALS).parse_args(arguments)
     cli.prepare_device()
     settings = {
         "episodes": options.episodes,
@@ -80,11 +81,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "simulator": options.simulator,
     }
     with cli.show_progress():
-        if len(options.run) > 1 or seed_folders(Path(options.run[0])):
-            result = evaluate_runs.compare_runs(options.run, **settings)
+        if len(runs) > 1 or seed_folders(runs[0]):
+            result = evaluate_runs.compare_runs(runs, **settings)
             text = tables.summarize_comparison(result)
         else:
-            result = evaluate_runs.evaluate_run(options.run[0], **settings)
+            result = evaluate_runs.evaluate_run(runs[0], **settings)
             text = tables.summarize_report(result)
     cli.tell(text)
     below = tables.below_target(result, options.min_success)

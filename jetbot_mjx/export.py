@@ -12,6 +12,34 @@ from pathlib import Path
 
 from jetbot_mjx import cli
 
+_FORMATS = ("numpy", "onnx", "stablehlo")
+_FOLDER = "policy"
+
+
+def _formats(text: str) -> list[str]:
+    names = text.split(",")
+    for name in names:
+        if name not in (*_FORMATS, "all"):
+            known = ", ".join([*_FORMATS, "all"])
+            raise argparse.ArgumentTypeError(f"{name!r} is not one of {known}")
+    return list(_FORMATS) if "all" in names else names
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(prog="jetbot-mjx export", description=__doc__)
+    cli.add_checkpoint_arguments(parser)
+    parser.add_argument(
+        "--format",
+        type=_formats,
+        action="extend",
+        metavar="|".join([*_FORMATS, "all"]),
+        help="file format to write, or several with commas between them (default: numpy)",
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help=f"folder to write (default: RUN/{_FOLDER})"
+    )
+    return parser
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line and export.
@@ -22,40 +50,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
+    options = _parser().parse_args(arguments)
+    run = cli.find_run(options.run)
     with cli.exit_on_interrupt():
-        from jetbot_mjx.deployment.exporters import FORMATS
-        from jetbot_mjx.deployment.policy_export import FOLDER, export_policy, summarize_export
-
-    def formats(text: str) -> list[str]:
-        names = text.split(",")
-        for name in names:
-            if name not in (*FORMATS, "all"):
-                known = ", ".join([*FORMATS, "all"])
-                raise argparse.ArgumentTypeError(f"{name!r} is not one of {known}")
-        return list(FORMATS) if "all" in names else names
-
-    # Parse.
-    parser = cli.Parser(prog="jetbot-mjx export", description=__doc__)
-    cli.add_checkpoint_arguments(parser)
-    parser.add_argument(
-        "--format",
-        type=formats,
-        action="extend",
-        metavar="|".join([*FORMATS, "all"]),
-        help="file format to write, or several with commas between them (default: numpy)",
-    )
-    parser.add_argument(
-        "--out", type=Path, metavar="DIR", help=f"folder to write (default: RUN/{FOLDER})"
-    )
-    options = parser.parse_args(arguments)
-    # Export.
+        from jetbot_mjx.deployment.policy_export import export_policy, summarize_export
     cli.prepare_device()
     with cli.show_progress():
         exported = export_policy(
-            options.run,
+            run,
             formats=tuple(dict.fromkeys(options.format or ("numpy",))),
             which=options.checkpoint,
-            output=options.out,
+            output=options.output,
         )
     cli.tell(summarize_export(exported))
     return 0

@@ -1,9 +1,10 @@
-"""Write a task to start from: `jetbot-mjx new_task my_task.py`.
+"""Write a task to start from: `jetbot-mjx new-task my_task.py`.
 
 It is the example `examples/obstacle_task.py` under your name, with its settings as YAML in the same
-folder. Both pass `check_env` and can be trained unchanged. No file is overwritten.
+folder. Both pass `check-env` and can be trained unchanged. No file is overwritten.
 """
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -20,13 +21,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    parser = cli.Parser(prog="jetbot-mjx new_task", description=__doc__)
+    parser = cli.Parser(prog="jetbot-mjx new-task", description=__doc__)
     parser.add_argument("module", type=Path, metavar="MODULE.py", help="file to be written")
     files = write_task_template(parser.parse_args(arguments).module)
-    folder = files.config.parent
+    config = shlex.quote(str(files.config))
     cli.tell(f"wrote {files.module} and {files.config}")
-    cli.tell(f"next: PYTHONPATH={folder} jetbot-mjx check_env --config {files.config}")
-    cli.tell(f"      PYTHONPATH={folder} jetbot-mjx train {files.config}")
+    cli.tell(f"next: jetbot-mjx check-env --config {config}")
+    cli.tell(f"      jetbot-mjx train {config}")
     return 0
 
 

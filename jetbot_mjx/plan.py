@@ -22,7 +22,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 1 if the configuration does not fit as it is.
     """
     parser = cli.Parser(prog="jetbot-mjx plan", description=__doc__)
-    cli.add_config_arguments(parser, required=True)
+    cli.add_config_arguments(parser)
     parser.add_argument(
         "--memory",
         type=cli.number(float, 0.001),
@@ -30,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="memory of each device (default: that of this machine's devices)",
     )
     options = parser.parse_args(arguments)
+    cli.require_config(parser, options)
     config = cli.config_of(options)
     with cli.exit_on_interrupt():
         from jetbot_mjx.training.memory_plan import memory_table, plan_memory

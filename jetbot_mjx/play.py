@@ -3,36 +3,16 @@
 Without RUN, a policy that comes with the package drives.
 """
 
-import argparse
-import urllib.parse
 from collections.abc import Sequence
 
 from jetbot_mjx import cli
 
 _LARGEST_PORT = 65_535
 _DEFAULT_POLICY = "jetbot_egocentric"
+_AGENTS = ("policy", "scripted", "random", "constant", "keyboard")
 
 
-def _origin(text: str) -> str:
-    """Parse an argument that is a page's origin, as browsers write it."""
-    try:
-        parts = urllib.parse.urlsplit(text.lower())
-        port, name = parts.port, parts.hostname
-    except ValueError:
-        port = name = None
-    else:
-        if parts.path not in ("", "/") or parts.query or parts.fragment or parts.username:
-            name = None
-    if not name or parts.scheme not in ("http", "https"):
-        raise argparse.ArgumentTypeError(
-            f"{text!r} is not an origin: write it as https://hub.example.org or http://localhost:3000"
-        )
-    default = {"http": 80, "https": 443}[parts.scheme]
-    host = f"[{name}]" if ":" in name else name
-    return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
-
-
-def _parser(agents: Sequence[str]) -> cli.Parser:
+def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx play", description=__doc__)
     default = f"pretrained:{_DEFAULT_POLICY}"
     cli.add_checkpoint_arguments(parser, default=default)
@@ -44,7 +24,7 @@ def _parser(agents: Sequence[str]) -> cli.Parser:
     )
     parser.add_argument(
         "--agent",
-        choices=agents,
+        choices=_AGENTS,
         default="policy",
         help="initial driver; the page can switch it (default: policy)",
     )
@@ -72,7 +52,7 @@ def _parser(agents: Sequence[str]) -> cli.Parser:
     )
     parser.add_argument(
         "--allow-origin",
-        type=_origin,
+        type=cli.origin,
         action="append",
         default=[],
         metavar="URL",
@@ -91,16 +71,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
+    options = _parser().parse_args(arguments)
+    run = cli.find_run(options.run or f"pretrained:{_DEFAULT_POLICY}")
     with cli.exit_on_interrupt():
-        from jetbot_mjx.runs.checkpoint import PRETRAINED
         from jetbot_mjx.viewers import live
-        from jetbot_mjx.viewers.step_fns import AGENTS
-    options = _parser(AGENTS).parse_args(arguments)
     cli.prepare_device()
     if options.run is None:
         cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
     successes, episodes = live.play_live(
-        PRETRAINED / _DEFAULT_POLICY if options.run is None else options.run,
+        run,
         viewer=options.viewer,
         agent=options.agent,
         which=options.checkpoint,

@@ -4,6 +4,7 @@ There is one run for each of four configurations. The copies are run folders lik
 evaluate them, render them, compare them with your own runs, or train them further.
 """
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -23,7 +24,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx pretrained", description=__doc__)
     parser.add_argument(
-        "--out",
+        "--output",
         type=Path,
         default=FOLDER,
         metavar="DIR",
@@ -33,13 +34,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
     with cli.exit_on_interrupt():
         from jetbot_mjx.runs.find_run import copy_pretrained
 
-    runs = copy_pretrained(options.out)
+    runs = copy_pretrained(options.output)
     for path in runs:
         cli.tell(f"run folder: {path}")
+    run = shlex.quote(str(runs[0]))
     cli.tell(
-        f"next: jetbot-mjx evaluate {runs[0]}\n"
-        f"      jetbot-mjx render {runs[0]}\n"
-        f"      jetbot-mjx play {runs[0]}"
+        f"next: jetbot-mjx evaluate {run}\n"
+        f"      jetbot-mjx render {run}\n"
+        f"      jetbot-mjx play {run}"
     )
     return 0
 

@@ -7,35 +7,29 @@ image of an untrained, an early and a trained policy.
 """
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 from jetbot_mjx import cli
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 
 
-def _parser(most: int, parse_goals: Callable[[str], list[int]]) -> cli.Parser:
-    def goals(text: str) -> list[int]:
-        try:
-            return parse_goals(text)
-        except UserError as error:
-            raise argparse.ArgumentTypeError(str(error)) from None
-
+def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx render", description=__doc__)
     cli.add_checkpoint_arguments(parser)
     group = parser.add_mutually_exclusive_group()
     group.add_argument(
         "--episodes",
-        type=cli.whole_number(1, most),
+        type=cli.whole_number(1, REPORT_GOALS),
         metavar="N",
         help="drive to the first N of the fixed goals (default: 20; 4 with --gallery)",
     )
     group.add_argument(
         "--goals",
-        type=goals,
+        type=cli.goals,
         metavar="I,J-K",
         help="drive to these of the fixed goals, such as 3,17 or 0-7",
     )
-    number = cli.whole_number(1, most)
+    number = cli.whole_number(1, REPORT_GOALS)
     group.add_argument(
         "--many", type=number, metavar="N", help="N robots in one scene, each with its own goal"
     )
@@ -77,13 +71,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.evaluation.evaluator import REPORT_GOALS
-        from jetbot_mjx.viewers import gallery, many
-    parser = _parser(REPORT_GOALS, gallery.parse_goals)
+    parser = _parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    run, which, episodes = options.run, options.checkpoint, options.episodes
+    run, which, episodes = cli.find_run(options.run), options.checkpoint, options.episodes
+    with cli.exit_on_interrupt():
+        from jetbot_mjx.viewers import gallery, many
     cli.prepare_device()
     with cli.show_progress():
         if options.gallery:

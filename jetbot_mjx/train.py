@@ -21,12 +21,10 @@ def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx train", description=__doc__)
     source = parser.add_mutually_exclusive_group()
     cli.add_config_arguments(parser, source)
-    source.add_argument(
-        "--resume", type=cli.run_path, metavar="RUN", help="continue the run in this folder"
-    )
-    parser.add_argument("--seed", type=int, help="random seed, the same as --set seed=N")
+    source.add_argument("--resume", metavar="RUN", help="continue the run in this folder")
+    parser.add_argument("--seed", type=cli.seed, help="random seed, the same as --set seed=N")
     parser.add_argument(
-        "--seeds", type=int, help="train N policies at once, the same as --set seeds=N"
+        "--seeds", type=cli.positive_int, help="train N policies at once, the same as --set seeds=N"
     )
     parser.add_argument(
         "--init-from", metavar="RUN", help="start from the policy of another run, of any task"
@@ -47,12 +45,13 @@ def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with cli.exit_on_interrupt():
         from jetbot_mjx.runs.find_run import find_run_config
         from jetbot_mjx.runs.run_dir import default_run_dir
-    if options.resume:
-        options.config = find_run_config(options.resume)
+    resumed = cli.find_run(options.resume) if options.resume else None
+    if resumed:
+        options.config = find_run_config(resumed)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}
     overrides = [f"{key}={json.dumps(x)}" for key, x in given.items() if x is not None]
     config = cli.config_of(options, *overrides)
-    return config, options.resume or options.run_dir or default_run_dir(options.config)
+    return config, resumed or options.run_dir or default_run_dir(options.config)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

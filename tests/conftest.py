@@ -46,7 +46,7 @@ import jax
 import pytest
 from unpainted import unpainted
 
-from jetbot_mjx import fallbacks
+from jetbot_mjx import fallbacks, imports
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs import opengl, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
@@ -96,6 +96,10 @@ def forget_modules(tmp_path_factory):
     for name in set(sys.modules) - before:
         if (getattr(sys.modules[name], "__file__", None) or "").startswith(temporary):
             del sys.modules[name]
+    sys.path[:] = [folder for folder in sys.path if not folder.startswith(temporary)]
+    for name, folder in [*imports.TASK_FOLDERS.items()]:
+        if str(folder).startswith(temporary):
+            del imports.TASK_FOLDERS[name]
 
 
 @pytest.fixture(scope="session")

@@ -68,7 +68,7 @@ COMMANDS = [
     Command(f"{_RUN}.export {{runs}}/mine --format numpy"),
     Command(f"{_RUN}.export {{runs}}/mine --format stablehlo"),
     Command(f"{_RUN}.export {{runs}}/mine --format onnx", needs=("onnx", "onnxruntime")),
-    Command(f"{_RUN}.pretrained --out {{runs}}/pretrained"),
+    Command(f"{_RUN}.pretrained --output {{runs}}/pretrained"),
     Command(f"{_RUN}.evaluate {{runs}}/pretrained/jetbot_egocentric --min-success 0.95"),
     Command(f"{_RUN}.new_task {{runs}}/my_task.py"),
     Command(f"{_RUN}.check_env GoalTask --set robot.preset=real"),
@@ -93,9 +93,7 @@ def main() -> int:
     output.mkdir(parents=True, exist_ok=True)
     environment = {
         **os.environ,
-        "PYTHONPATH": os.pathsep.join(
-            ["examples", str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]
-        ),
+        "PYTHONPATH": os.pathsep.join([str(ROOT), *filter(None, [os.environ.get("PYTHONPATH")])]),
         "JAX_COMPILATION_CACHE_DIR": str(folder / "cache"),
         "XLA_PYTHON_CLIENT_PREALLOCATE": "false",
     }

@@ -38,7 +38,8 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.best_known import FILE, FORMAT, settings_of
-from jetbot_mjx.evaluation.evaluator import BASELINES, GOAL_SET_VERSION, REPORT_GOALS, report_keys
+from jetbot_mjx.evaluation.evaluator import BASELINES, report_keys
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 from jetbot_mjx.runs.run_dir import versions, write_text, writing_to
 

@@ -73,7 +73,9 @@ def export_policy(
     policy, reference = portable_policy(checkpoint), as_jax(checkpoint, env)
     with writing_to(folder):
         if folder.exists() and not (folder / FILE).is_file():
-            raise UserError(f"{folder} exists and is not an export: choose a new folder with --out")
+            raise UserError(
+                f"{folder} exists and is not an export: choose a new folder with --output"
+            )
     with atomic_folder(folder) as unfinished:
         recording = record(checkpoint, env)
         # Write each format and check its output against JAX.

@@ -107,7 +107,7 @@ class JetBotEnv(brax.envs.Env):
                 reason = f"MJX does not support {reason}"
             raise UserError(
                 f"task.name = {config.task.name!r}: its scene cannot be simulated: {reason}"
-                f" (jetbot-mjx check_env {config.task.name} says more)"
+                f" (jetbot-mjx check-env {config.task.name} says more)"
             ) from None
 
     def __repr__(self) -> str:

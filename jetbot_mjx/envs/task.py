@@ -10,6 +10,7 @@ import importlib
 import math
 import os
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -20,6 +21,7 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt32
 from jetbot_mjx.config import TaskConfig
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
+from jetbot_mjx.imports import find_task_here
 
 Goal = PyTree
 """Arrays in any pytree that a task draws for an episode; `GoalTask` draws a position [m], world
@@ -350,12 +352,21 @@ def _import_class(name: str) -> Any:
     if module_name.endswith(".py"):
         likely = f"{module_name.removesuffix('.py').replace(os.sep, '.')}:{class_name}"
         raise InvalidError(f"task.name = {name!r} names a file: write the module, {likely}")
+    find_task_here(module_name)
     try:
         module = importlib.import_module(module_name)
     except ModuleNotFoundError as error:
+        if f"{module_name}.".startswith(f"{error.name}."):
+            here = sorted(path.stem for path in Path().glob("*.py"))
+            close = difflib.get_close_matches(module_name, here, n=1)
+            hint = f": did you mean {close[0]}:{class_name}?" if close else ""
+            raise MissingPackageError(
+                f"task.name = {name!r}: there is no {module_name.replace('.', os.sep)}.py beside"
+                f" the YAML file or in the current folder, and no such package{hint}"
+            ) from None
         raise MissingPackageError(
-            f"task.name = {name!r}: no module named {error.name!r} can be imported;"
-            " install it, or name its folder in PYTHONPATH"
+            f"task.name = {name!r}: {module_name} imports {error.name!r}, which is not installed:"
+            " install it"
         ) from None
     except SyntaxError as error:
         raise InvalidError(

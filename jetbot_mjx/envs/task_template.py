@@ -44,8 +44,7 @@ def write_task_template(path: Path) -> TaskFiles:
         raise UserError(f"{path}: a module {name} exists already: choose another name")
     # Copy the example under the new names.
     renamed = {
-        "examples/obstacle.yaml": files.config.name,
-        "PYTHONPATH=examples": "PYTHONPATH=.",
+        "jetbot-mjx train obstacle": f"jetbot-mjx train {files.config.name}",
         "obstacle_task": name,
         "ObstacleTask": "".join(word[:1].upper() + word[1:] for word in name.split("_")),
     }

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.rollout import Episodes
 
 FILE = Path(__file__).parents[1] / "assets" / "best_known.json"

@@ -27,7 +27,8 @@ from jetbot_mjx.evaluation.bootstrap import (
     median_estimate,
     probability_of_improvement,
 )
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary, json_values
+from jetbot_mjx.evaluation.evaluator import Summary, json_values
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import CurvePoint, Report
 from jetbot_mjx.runs.run_dir import shortened
 

@@ -14,13 +14,8 @@ from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
-from jetbot_mjx.evaluation.evaluator import (
-    BASELINES,
-    REPORT_GOALS,
-    Evaluator,
-    report_keys,
-    summarize,
-)
+from jetbot_mjx.evaluation.evaluator import BASELINES, Evaluator, report_keys, summarize
+from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.evaluation.html_report import write_comparison, write_report
 from jetbot_mjx.evaluation.moments import MomentFinder
 from jetbot_mjx.evaluation.report import (

@@ -21,17 +21,9 @@ from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State, robot_state
 from jetbot_mjx.errors import check_count
+from jetbot_mjx.evaluation.goal_set import MOST_GOALS
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
 from jetbot_mjx.runs.progress import stage
-
-GOAL_SET_VERSION = 1
-"""Version number that increases whenever the goals or the rules of the report change."""
-
-REPORT_GOALS = 1024
-"""Default number of fixed goals in a report."""
-
-MOST_GOALS = 1_048_576
-"""Largest number of goals that the user can ask for."""
 
 _REPORT_SEED = 20_251
 _TRAINING_SEED = 20_252

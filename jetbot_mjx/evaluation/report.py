@@ -15,14 +15,8 @@ from jaxtyping import Float, Int
 
 from jetbot_mjx.config import Config, RandomizationConfig
 from jetbot_mjx.evaluation import best_known
-from jetbot_mjx.evaluation.evaluator import (
-    GOAL_SET_VERSION,
-    REPORT_GOALS,
-    Summary,
-    final_distances,
-    json_values,
-    success_and_time,
-)
+from jetbot_mjx.evaluation.evaluator import Summary, final_distances, json_values, success_and_time
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes

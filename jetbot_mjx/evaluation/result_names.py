@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, REPORT_GOALS
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.runs.run_dir import read_text
 
 PARTS = ("robustness", "randomized", "mujoco", "rendered")

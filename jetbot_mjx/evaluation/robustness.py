@@ -38,13 +38,13 @@ from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
 from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.evaluation.evaluator import (
     BASELINES,
-    GOAL_SET_VERSION,
     Evaluator,
     Summary,
     json_values,
     policy_controller,
     summarize,
 )
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
 from jetbot_mjx.runs.progress import stage
 

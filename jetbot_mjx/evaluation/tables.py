@@ -4,7 +4,8 @@ from collections.abc import Mapping
 
 from jetbot_mjx.evaluation.bootstrap import Estimate
 from jetbot_mjx.evaluation.comparison import Comparison
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, Summary
+from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
 from jetbot_mjx.evaluation.result_names import fuller_report
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, robust_range

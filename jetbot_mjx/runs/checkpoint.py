@@ -312,9 +312,7 @@ def _find(path: Path, which: Which) -> Path:
         names = ", ".join(run.path.name for run in runs[:8]) + (", ..." if runs[8:] else "")
         raise missing(f"it holds {len(runs)} runs; name one of {names}")
     if not (path / FOLDER).is_dir():
-        raise missing(
-            f"it holds neither {FOLDER}/ nor {POLICY}/; give a run folder or a checkpoint in it"
-        )
+        raise missing(f"it holds neither {FOLDER}/ nor {POLICY}/; {suggest_run(path)}")
     steps = checkpoint_steps(path)
     if not steps:
         raise CheckpointNotFoundError(f"no checkpoint in {path / FOLDER}: the run saved none")

@@ -6,12 +6,14 @@ the package, as `pretrained:NAME`.
 
 import difflib
 import os
+import shlex
 import shutil
 import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+from jetbot_mjx.config import run_around
 from jetbot_mjx.errors import NotFoundError, UserError, clipped, printable
 from jetbot_mjx.runs.metrics import METRICS, read_history
 from jetbot_mjx.runs.run_dir import (
@@ -19,7 +21,7 @@ from jetbot_mjx.runs.run_dir import (
     DamagedRunError,
     atomic_folder,
     read_config,
-    stored_config,
+    shortened,
 )
 from jetbot_mjx.runs.text_table import text_table
 
@@ -103,11 +105,18 @@ def find_run_config(run_dir: Path) -> Path:
 
     Raises:
       NotFoundError: there is no run in the folder.
-      UserError: the path holds something else, or cannot be read.
+      DamagedRunError: as for `read_config`.
+      UserError: the folder cannot be read.
     """
-    if stored_config(run_dir) is None:
-        hint = suggest_run(run_dir)
-        raise NotFoundError(f"--resume {run_dir}: there is no run in this folder; {hint}")
+    try:
+        os.lstat(run_dir / CONFIG)
+    except (FileNotFoundError, NotADirectoryError):
+        hint = suggest_run(run_dir, "a run folder")
+        message = f"--resume {run_dir}: there is no run in this folder; {hint}"
+        raise NotFoundError(message) from None
+    except OSError as error:
+        raise UserError(f"--resume {run_dir} cannot be read: {error.strerror}") from None
+    read_config(run_dir)
     return run_dir / CONFIG
 
 
@@ -229,22 +238,29 @@ def copy_pretrained(folder: Path) -> tuple[Path, ...]:
     runs = {path: folder / path.name for path in sorted(PRETRAINED.iterdir())}
     for target in runs.values():
         if target.exists():
-            raise UserError(f"{target} exists already: choose another folder with --out")
+            raise UserError(f"{target} exists already: choose another folder with --output")
     for source, target in runs.items():
         with atomic_folder(target) as unfinished:
             shutil.copytree(source, unfinished, dirs_exist_ok=True)
     return tuple(runs.values())
 
 
-def suggest_run(path: Path, root: Path = ROOT) -> str:
-    """Return a remedy for a path at which there is no run."""
-    names = [_LATEST, *(run.path.name for run in list_runs(root))]
+def suggest_run(path: Path, what: str = "a run folder or a checkpoint in it") -> str:
+    """Return a remedy for a path at which there is no run.
+
+    Args:
+      path: the path.
+      what: what to give instead, if no name is similar.
+    """
+    names = [_LATEST, *(run.path.name for run in list_runs())]
     names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
     if path.name == _PREFIX[:-1]:
         return f"write {_PREFIX}NAME, as in {names[-1]}"
+    if (run := run_around(path)) and run != path:
+        return f"did you mean {shlex.quote(str(shortened(run)))}?"
     if close := difflib.get_close_matches(path.name, names, n=1):
         return f"did you mean {close[0]}?"
-    return "give a run folder or a checkpoint in it"
+    return f"give {what}"
 
 
 def _age(seconds: float) -> str:

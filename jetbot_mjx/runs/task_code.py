@@ -23,7 +23,9 @@ from pathlib import Path, PurePosixPath
 from types import ModuleType
 from typing import Any, NamedTuple
 
+from jetbot_mjx.config import shipped_folder
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.imports import find_task_here, import_root, source_file
 from jetbot_mjx.runs.run_dir import (
     read_bytes,
     read_text,
@@ -66,24 +68,25 @@ def collect_task_code(name: str) -> TaskCode | None:
       to an installed package, or all files together are larger than `MAX_BYTES`.
     """
     module = name.partition(":")[0]
-    root = _import_root(module)
+    find_task_here(module)
+    root = import_root(module)
     if root is None or _is_installed(root, module):
         return None
     files: dict[str, bytes] = {}
     names, seen = [module], set()
     while names:
         one = names.pop()
-        if one in seen or _import_root(one) != root or _is_installed(root, one):
+        if one in seen or import_root(one) != root or _is_installed(root, one):
             continue
         seen.add(one)
         if "." in one:
             names.append(one.rpartition(".")[0])
-        file = _source_file(root, one)
+        file = source_file(root, one)
         if file is not None:
             content = file.read_bytes()
             files[file.relative_to(root).as_posix()] = content
             names += _imported_names(content, one, is_package=file.name == "__init__.py")
-    if _source_file(root, module) is None:
+    if source_file(root, module) is None:
         return None
     if sum(map(len, files.values())) > MAX_BYTES:
         _say(
@@ -175,13 +178,14 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type
     if code is None or code.module != module or module.partition(".")[0] == _PACKAGE:
         return None
     # Prefer the module itself if nothing changed, so that its classes are the user's own.
-    root = _import_root(module)
-    on_disk = root is not None and _source_file(root, module) is not None
+    find_task_here(module)
+    root = import_root(module)
+    on_disk = root is not None and source_file(root, module) is not None
     if root is not None and on_disk and all(_holds(root / path, text) for path, text in code.files):
         return None
     # Import the stored files.
     folder = shortened(run_dir / FOLDER)
-    main = _source_file(run_dir / FOLDER, module)
+    main = source_file(run_dir / FOLDER, module)
     if main is None:
         raise UserError(f"{folder} holds no source of {module}: delete it to run {module} itself")
     if silent:
@@ -196,38 +200,20 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type
         found = importer.load(module)
     except ModuleNotFoundError as error:
         raise UserError(
-            f"{shortened(main)} cannot be imported: no module named {error.name!r}; install it, or"
-            " name its folder in PYTHONPATH"
+            f"{shortened(main)} cannot be imported: no module named {error.name!r}: install it"
         ) from None
     if not hasattr(found, class_name):
         raise UserError(f"task.name = {name!r}: {shortened(main)} has no {class_name!r}")
     return getattr(found, class_name)
 
 
-def _import_root(module: str) -> Path | None:
-    """Return the folder that the import of a module begins in; None if Python does not find it."""
-    top = module.partition(".")[0]
-    try:
-        spec = importlib.util.find_spec(top)
-    except (ImportError, ValueError):  # a module without a spec, such as `__main__`
-        return None
-    if spec is None:
-        return None
-    if spec.submodule_search_locations:
-        return Path(next(iter(spec.submodule_search_locations))).absolute().parent
-    return Path(spec.origin).absolute().parent if spec.has_location and spec.origin else None
-
-
 def _is_installed(root: Path, module: str) -> bool:
     top = module.partition(".")[0]
-    of_python = top in sys.stdlib_module_names or {"site-packages", "dist-packages"} & {*root.parts}
-    return top == _PACKAGE or bool(of_python)
-
-
-def _source_file(root: Path, module: str) -> Path | None:
-    path = root.joinpath(*module.split("."))
-    candidates = path / "__init__.py", path.with_name(f"{path.name}.py")
-    return next((file for file in candidates if file.is_file()), None)
+    if top == _PACKAGE or top in sys.stdlib_module_names:
+        return True
+    # The examples are installed with this package, but imported only where they are asked for.
+    is_example = root == shipped_folder("examples").resolve()
+    return bool({"site-packages", "dist-packages"} & {*root.parts}) and not is_example
 
 
 def _imported_names(source: bytes, module: str, *, is_package: bool) -> list[str]:

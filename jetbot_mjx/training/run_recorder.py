@@ -2,6 +2,7 @@
 
 import contextlib
 import dataclasses
+import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -225,7 +226,7 @@ class RunRecorder(TrainerCallback):
         if path is not None:
             self.say(
                 f"a state became non-finite before step {env_steps:,}, and its environment was"
-                f" reset: jetbot-mjx replay {path}"
+                f" reset: jetbot-mjx replay {shlex.quote(str(path))}"
             )
 
     def on_compiled(self) -> None:

@@ -9,6 +9,7 @@ import contextlib
 import functools
 import importlib.util
 import pickle
+import shlex
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -514,7 +515,7 @@ def stop_message(run_dir: Path, run_dirs: Sequence[Path]) -> str:
     """
     text = "stopped before the first checkpoint: the same command starts from the beginning"
     if all(map(checkpoint_steps, run_dirs)):
-        text = f"stopped; to resume: jetbot-mjx train --resume {run_dir}"
+        text = f"stopped; to resume: jetbot-mjx train --resume {shlex.quote(str(run_dir))}"
     log_message(run_dir, text)
     return text
 
@@ -550,13 +551,14 @@ def summary(result: Result) -> str:
             f"{len(lines)} seeds: {over_seeds.value:.2%} success in the mean"
             f" (95 % interval {over_seeds.low:.2%} .. {over_seeds.high:.2%})"
         )
+    first = shlex.quote(str(result.run_dirs[0]))
     lines += [
         f"total {result.wall_seconds:.1f} s",
-        f"next: jetbot-mjx evaluate {result.run_dir}",
-        f"      jetbot-mjx render {result.run_dirs[0]}",
-        f"      jetbot-mjx play {result.run_dirs[0]}",
+        f"next: jetbot-mjx evaluate {shlex.quote(str(result.run_dir))}",
+        f"      jetbot-mjx render {first}",
+        f"      jetbot-mjx play {first}",
     ]
     if importlib.util.find_spec("tensorboard") is not None:
         # TensorBoard names runs by their folder below this one.
-        lines.append(f"      tensorboard --logdir {result.run_dir.parent}")
+        lines.append(f"      tensorboard --logdir {shlex.quote(str(result.run_dir.parent))}")
     return "\n".join(lines)

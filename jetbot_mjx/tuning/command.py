@@ -4,6 +4,7 @@ The study is stored in the output folder. The same command with the same `--outp
 search that was stopped, and several workers may share one study through `--storage`.
 """
 
+import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -13,7 +14,7 @@ from jetbot_mjx.interrupts import exit_on_interrupt
 
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx tune", description=__doc__)
-    cli.add_config_arguments(parser, required=True)
+    cli.add_config_arguments(parser)
     what = "YAML file with the settings to search, or `ppo`, which comes with the package"
     parser.add_argument("--space", type=Path, required=True, metavar="SPACE", help=what)
     parser.add_argument(
@@ -56,7 +57,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    options = _parser().parse_args(arguments)
+    options = (parser := _parser()).parse_args(arguments)
+    cli.require_config(parser, options)
     cli.wake_driver()
     config = cli.config_of(options)
     cli.wake_device()
@@ -87,7 +89,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
     cli.tell(
         f"total {process_seconds():.1f} s\nresults: {folder}\n"
-        f"next: jetbot-mjx train {found.config_file}"
+        f"next: jetbot-mjx train {shlex.quote(str(found.config_file))}"
     )
     return 0
 

@@ -24,7 +24,8 @@ import numpy as np
 
 from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx.errors import UserError, ran_out, requires_extra
-from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, report_keys
+from jetbot_mjx.evaluation.evaluator import report_keys
+from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.progress import stage
 from jetbot_mjx.runs.run_dir import make_folder

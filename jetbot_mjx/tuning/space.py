@@ -37,8 +37,8 @@ TRACED = (
 )
 """Settings that only enter the arithmetic: trials with other values share one compiled program."""
 
-SHIPPED = Path("configs/spaces")
-"""Folder of the spaces that come with the package."""
+SHIPPED = ("configs/spaces",)
+"""Folders of the spaces that come with the package."""
 
 _SECTIONS = ("robot", "task", "camera", "physics", "randomization", "ppo")
 """Sections of the configuration that can be searched: the others do not change what is learned."""

@@ -1,10 +1,7 @@
 """Render a policy that drives to the fixed goals of the report: videos, and plots from above."""
 
 import io
-import numbers
-import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from itertools import groupby
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,8 +12,9 @@ from PIL import Image
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.errors import InvalidError, UserError, check_count
-from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
+from jetbot_mjx.errors import UserError, check_count
+from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
+from jetbot_mjx.evaluation.goal_set import REPORT_GOALS, check_goals, format_goals
 from jetbot_mjx.evaluation.plots import plot_trajectories, theme, to_png
 from jetbot_mjx.evaluation.result_names import name_with_count
 from jetbot_mjx.evaluation.rollout import Episodes
@@ -104,7 +102,7 @@ def render_run(
         names = [name_with_count(name, episodes, EPISODES) for name in ("episodes", "trajectories")]
     else:
         check_goals(goals)
-        names = (f"goals-{_ranges(goals)}",) * 2
+        names = (f"goals-{format_goals(goals)}",) * 2
     # Run the episodes.
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     env = checkpoint.make_env()
@@ -260,60 +258,3 @@ def _write_videos(
         write_mp4(files["video"], frames(advance))
     with stage("writing the gif"), writing_to(files["gif"]):
         write_gif(files["gif"], gif_frames)
-
-
-def check_goals(goals: Sequence[int]) -> None:
-    """Raise an error if an index is outside of the fixed goal set or occurs twice.
-
-    Args:
-      goals: The indices.
-
-    Raises:
-      UserError: an index is invalid or occurs twice, or there is none.
-    """
-    if not goals:
-        raise UserError("goals = [] is empty: give at least one index")
-    for place, goal in enumerate(goals):
-        if not isinstance(goal, numbers.Integral):
-            raise InvalidError(f"goals: {goal!r} is wrong: give indices, as in [3, 17]")
-        if not 0 <= goal < REPORT_GOALS:
-            raise UserError(
-                f"goal {goal} is not one of the {REPORT_GOALS:,} fixed goals: they are 0 to"
-                f" {REPORT_GOALS - 1}"
-            )
-        if goal in goals[:place]:
-            raise UserError(f"goal {goal} is given twice: give it once")
-
-
-def _ranges(goals: Sequence[int]) -> str:
-    """Format indices as `3,17`, or `0-7` for consecutive ones."""
-    runs = [
-        [goal for _, goal in run] for _, run in groupby(enumerate(goals), lambda p: p[1] - p[0])
-    ]
-    return ",".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else f"{run[0]}" for run in runs)
-
-
-def parse_goals(text: str) -> list[int]:
-    """Return the goals that a text lists as indices and ranges, such as `3,17` or `0-7`.
-
-    Args:
-      text: Indices and ranges, separated by commas.
-
-    Returns:
-      The indices, in the order of the text.
-
-    Raises:
-      UserError: the text is not such a list, or `check_goals` rejects an index.
-    """
-    goals: list[int] = []
-    for part in text.split(","):
-        found = re.fullmatch(r"(\d{1,9})(?:-(\d{1,9}))?", part.strip(), re.ASCII)
-        if found is None:
-            raise UserError(f"{part!r} is not a goal: write indices and ranges, as in 3,17 or 0-7")
-        first, last = int(found[1]), int(found[2] or found[1])
-        if last < first:
-            raise UserError(f"{part} is a reversed range: write {last}-{first}")
-        # Limit the length: an index beyond the last goal is rejected below anyway.
-        goals += range(first, min(last, first + REPORT_GOALS) + 1)
-    check_goals(goals)
-    return goals

@@ -169,7 +169,7 @@ def test_all_else_comes_from_a_configuration(form, tmp_path):
         ({"render_mode": "ascii"}, "render_mode = 'ascii' is unknown: known are human"),
         ({"seed": -1}, "seed = -1"),
         ({"config": 3}, "config = 3"),
-        ({"config": {"task": {"observatoin": "world"}}}, "did you mean observation"),
+        ({"config": {"task": {"observatoin": "world"}}}, "did you mean task.observation"),
         ({"config": "nothing.yaml"}, "does not exist"),
     ],
 )

@@ -42,7 +42,7 @@ def test_a_configuration_names_its_task(root, monkeypatch):
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (["nowhere.at_all:Task"], "no module named 'nowhere'"),
+        (["nowhere.at_all:Task"], "there is no nowhere/at_all.py beside"),
         (["broken_tasks:Nobody"], "broken_tasks has no 'Nobody'"),
         (["Nobody"], "jetbot_mjx has no 'Nobody'"),
         (["GoalTask", "--set", "task.optoins.a=1"], "optoins"),

@@ -126,7 +126,7 @@ def test_an_export_tells_how_far_each_file_is_from_jax(exported, run_dir, shortl
         assert file["file"] == FORMATS[name].file
         assert file["largest_difference"] < 1e-5
     # Again, in place of the first, from a run folder that holds `policy/` by now.
-    assert export.main([str(run_dir), "--out", str(run_dir / "again")]) == 0
+    assert export.main([str(run_dir), "--output", str(run_dir / "again")]) == 0
     assert "20 observations" in capsys.readouterr().out
     assert json.loads((run_dir / "again" / "policy.json").read_text())["files"].keys() == {"numpy"}
     same = (run_dir / "again" / "policy.py").read_bytes()
@@ -334,7 +334,7 @@ def test_the_files_for_a_robot_are_python_3_6(exported, root):
 def seeing(tmp_path_factory):
     """The export of the policy that comes with the package."""
     folder = tmp_path_factory.mktemp("seeing") / "policy"
-    command = ["pretrained:jetbot_camera", "--format", "all", "--out", str(folder)]
+    command = ["pretrained:jetbot_camera", "--format", "all", "--output", str(folder)]
     assert export.main(command) == 0
     return folder
 
@@ -519,7 +519,7 @@ def test_a_missing_package_is_told_with_its_remedy(run_dir, monkeypatch, tmp_pat
     with pytest.raises(
         MissingPackageError, match=r"--format onnx needs onnx.*pip install 'jetbot_mjx\[export"
     ):
-        export.main([str(run_dir), "--format", "all", "--out", str(tmp_path / "p")])
+        export.main([str(run_dir), "--format", "all", "--output", str(tmp_path / "p")])
     assert os.listdir(tmp_path) == []
 
 
@@ -543,13 +543,13 @@ def test_a_folder_that_cannot_be_is_told(run_dir, tmp_path):
 )
 def test_several_formats_are_all_written(run_dir, tmp_path, shortly, arguments):
     out = tmp_path / "policy"
-    assert export.main([str(run_dir), "--out", str(out), *arguments]) == 0
+    assert export.main([str(run_dir), "--output", str(out), *arguments]) == 0
     names = {path.name for path in out.iterdir()}
     assert names == {"policy.stablehlo", "policy.py", "policy.json", "recording.npz"}
 
 
 def test_without_a_format_it_is_numpy(run_dir, tmp_path, shortly):
-    assert export.main([str(run_dir), "--out", str(tmp_path / "policy")]) == 0
+    assert export.main([str(run_dir), "--output", str(tmp_path / "policy")]) == 0
     files = json.loads((tmp_path / "policy" / "policy.json").read_text())["files"]
     assert list(files) == ["numpy"]
 
@@ -566,3 +566,8 @@ def test_a_shorter_recording_is_the_beginning_of_a_longer_one(exported, run_dir)
     short = record(checkpoint, checkpoint.make_env(), 20)
     with np.load(exported / "recording.npz") as recording:
         np.testing.assert_array_equal(short.inputs["obs"], recording["obs"][:20])
+
+
+def test_the_formats_and_the_folder_are_those_of_the_exporters():
+    assert tuple(FORMATS) == export._FORMATS
+    assert export._FOLDER == policy_export.FOLDER

@@ -9,6 +9,7 @@ from importlib.util import find_spec
 import pytest
 
 from jetbot_mjx import cli
+from jetbot_mjx.__main__ import COMMANDS
 from jetbot_mjx.imports import LazyModule, standing_in
 
 
@@ -118,18 +119,47 @@ def test_glfw_is_there_when_asked_for():
     assert done.stdout.startswith("False <function init "), done.stderr[-2000:]
 
 
-def test_a_mistyped_command_says_so_before_anything_heavy_is_loaded():
-    code = """
-import sys
-from command_modules import train
+MISTYPED = {
+    "train": ["smoke", "--sed", "1"],
+    "evaluate": ["runs/mine", "--episodes", "1e3"],
+    "render": ["runs/mine", "--goals", "99999"],
+    "play": ["runs/mine", "--port", "99999"],
+    "configs": ["--all"],
+    "runs": ["--all"],
+    "new-task": [],
+    "check-env": [],
+    "plan": [],
+    "tune": ["smoke"],
+    "export": ["runs/mine", "--format", "torch"],
+    "sim2real": ["log", "--delay", "x"],
+    "replay": [],
+    "pretrained": ["--all"],
+}
+
+REPORTED = """
+import importlib, sys
+from jetbot_mjx import __main__ as entry
+for name, arguments in {mistyped}.items():
+    module = importlib.import_module(f"jetbot_mjx.{{entry.COMMANDS[name][0]}}")
+    try:
+        module.main(arguments)
+    except SystemExit as error:
+        heavy = [one for one in {heavy} if one in sys.modules]
+        print(name, error.code, *heavy, flush=True)
 try:
-    train.main(["--config", "nowhere.yaml", "--sed", "1"])
+    entry.main(["trian", "smoke"])
 except SystemExit as error:
-    loaded = [name for name in ("brax", "flax", "mujoco", "optax", "orbax") if name in sys.modules]
-    print(error.code, loaded)
+    print("-", error.code, *[one for one in {heavy} if one in sys.modules])
 """
+
+
+def test_a_usage_error_is_reported_before_anything_heavy_is_imported():
+    heavy = ["jax", "brax", "mujoco", "numpy", "matplotlib", "scipy", "orbax", "optuna", "PIL"]
+    code = REPORTED.format(mistyped=MISTYPED, heavy=heavy)
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout == "2 []\n", done.stderr[-2000:]
+    assert done.stdout.splitlines() == [f"{name} 2" for name in (*MISTYPED, "-")], done.stderr
+    assert len(done.stderr.splitlines()) == len(MISTYPED) + 1
+    assert set(MISTYPED) == set(COMMANDS)
 
 
 ROCM = """

@@ -49,7 +49,7 @@ def test_a_background_job_ignores_it_while_it_loads(tmp_path):
     background = (
         "import os, signal, sys\n"
         "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "os.execv(sys.executable, [sys.executable, '-m', 'jetbot_mjx.evaluate'])"
+        "os.execv(sys.executable, [sys.executable, '-m', 'jetbot_mjx.evaluate', 'runs/mine'])"
     )
     done = python(tmp_path, "-c", background)
     assert done.returncode == 1

@@ -21,7 +21,7 @@ import jetbot_mjx
 from jetbot_mjx import evaluate, load_config, load_policy, make_env, render, train, tune
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError
 from jetbot_mjx.evaluation.comparison import Comparison
-from jetbot_mjx.evaluation.evaluator import REPORT_GOALS
+from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.evaluation.report import Report
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.training import session
@@ -227,7 +227,11 @@ def test_a_default_is_that_of_the_commands():
     [
         (lambda run: train(), InvalidError, 'give a configuration, as in train("jetbot"), or a'),
         (lambda run: train("jetbo"), NotFoundError, "config jetbo does not exist: did you mean j"),
-        (lambda run: train("smoke", {"ppo.num_env": 1}), InvalidError, "did you mean num_envs?"),
+        (
+            lambda run: train("smoke", {"ppo.num_env": 1}),
+            InvalidError,
+            "did you mean ppo.num_env",
+        ),
         (lambda run: train("smoke", resume=run), InvalidError, "leave out config and run_dir"),
         (lambda run: train(resume="nowhere"), NotFoundError, "there is no run in this folder"),
         (lambda run: train("smoke", run_dir=run), UserError, "holds another run"),

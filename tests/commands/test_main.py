@@ -14,13 +14,13 @@ def test_every_command_is_listed_with_what_it_does(capsys):
     listed = {}
     assert overview.main([]) == 0
     for line in capsys.readouterr().out.splitlines():
-        if found := re.fullmatch(r"    (\w+) {2,}(.+)", line):
+        if found := re.fullmatch(r"    ([\w-]+) {2,}(.+)", line):
             listed[found[1]] = found[2]
     assert listed == {name: text for name, (_, text) in overview.COMMANDS.items()}
     at_root = {path.stem for path in (ROOT / PACKAGE).glob("*.py")}
     modules = [module for module, _ in overview.COMMANDS.values()]
     alone = {module for module in modules if "." not in module}
-    assert alone == at_root - {"__init__", "__main__", "cli", *COMMON}
+    assert alone == at_root - {"__init__", "__main__", "cli", "library", *COMMON}
     for module in modules:
         assert callable(importlib.import_module(f"jetbot_mjx.{module}").main)
 
@@ -37,7 +37,7 @@ def test_it_is_printed_at_once():
 
 @pytest.mark.parametrize(
     ("asked", "remedy"),
-    [("evalute", ": did you mean evaluate?"), ("dance", "")],
+    [("evalute", ": did you mean evaluate?"), ("dance", ""), ("d" * 300, "")],
 )
 def test_what_is_no_command_is_one_line(asked, remedy, capsys):
     with pytest.raises(SystemExit) as left:

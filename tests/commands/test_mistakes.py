@@ -73,7 +73,6 @@ def home(tmp_path_factory, smoke_run):
 def type_(home, monkeypatch, capfd):
     """Types a command as a user would; returns the exit code and all that it prints."""
     monkeypatch.chdir(home)
-    monkeypatch.syspath_prepend(str(home))
     monkeypatch.setenv("COLUMNS", "80")
 
     def type_(line):

@@ -9,9 +9,10 @@ import urllib.request
 
 import pytest
 
-from jetbot_mjx import play, viewers
+from jetbot_mjx import cli, play, viewers
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers import live, mujoco_window
+from jetbot_mjx.viewers.step_fns import AGENTS
 
 
 @pytest.fixture
@@ -143,7 +144,7 @@ class FakePlayer:
     ],
 )
 def test_origins_are_read_as_browsers_write_them(text, origin):
-    assert play._origin(text) == origin
+    assert cli.origin(text) == origin
 
 
 @pytest.mark.parametrize(
@@ -178,3 +179,7 @@ def test_a_run_that_is_not_there_is_one_line(tmp_path):
     pytest.importorskip("viser")
     with pytest.raises(UserError, match="no such folder"):
         play.main([str(tmp_path / "none")])
+
+
+def test_the_agents_are_those_of_the_viewer():
+    assert play._AGENTS == AGENTS

@@ -70,12 +70,12 @@ def test_it_can_be_trained_further(runs):
 def test_nothing_is_overwritten(runs):
     kept = runs[1] / "config.yaml"
     kept.write_text("mine")
-    with pytest.raises(UserError, match="runs/pretrained/camera_real is there already: give"):
+    with pytest.raises(UserError, match="runs/pretrained/camera_real exists already: choose"):
         pretrained.main([])
     for path in sorted(runs[0].rglob("*"), reverse=True):
         path.unlink() if path.is_file() else path.rmdir()
     runs[0].rmdir()
-    with pytest.raises(UserError, match="runs/pretrained/jetbot_camera is there already: give"):
+    with pytest.raises(UserError, match="runs/pretrained/jetbot_camera exists already: choose"):
         pretrained.main([])
     assert kept.read_text() == "mine"
     assert not runs[0].exists()
@@ -88,7 +88,7 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path):
 
 
 def test_it_tells_where_the_runs_are(tmp_path, capsys):
-    assert pretrained.main(["--out", str(tmp_path / "here")]) == 0
+    assert pretrained.main(["--output", str(tmp_path / "here")]) == 0
     printed = capsys.readouterr().out
     for name in NAMES:
         assert f"run folder: {tmp_path / 'here' / name}\n" in printed

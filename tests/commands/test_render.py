@@ -14,8 +14,9 @@ from command_modules import render
 from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import evaluate_run
-from jetbot_mjx.evaluation.evaluator import REPORT_GOALS, Evaluator, report_keys
+from jetbot_mjx.evaluation import evaluate_run, goal_set
+from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
+from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.runs import progress
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run
@@ -154,8 +155,8 @@ def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
     ],
 )
 def test_goals_are_written_as_indices_and_ranges(text, goals, name):
-    assert gallery.parse_goals(text) == goals
-    assert gallery._ranges(goals) == name
+    assert goal_set.parse_goals(text) == goals
+    assert goal_set.format_goals(goals) == name
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,6 @@ import importlib
 import re
 import runpy
 import shutil
-import sys
 from pathlib import Path
 
 import jax
@@ -153,9 +152,7 @@ def execute(page, words, reader, monkeypatch):
     reader(page)
     while re.fullmatch(r"\w+=.*", words[0]):
         name, _, value = words[0].partition("=")
-        if name == "PYTHONPATH":
-            monkeypatch.syspath_prepend(value)
-        elif name != "JAX_DEFAULT_MATMUL_PRECISION":  # JAX reads it once, when it is imported
+        if name != "JAX_DEFAULT_MATMUL_PRECISION":  # JAX reads it once, when it is imported
             monkeypatch.setenv(name, value)
         words = words[1:]
     return run(words[2].removeprefix("jetbot_mjx."), words[3:])
@@ -177,7 +174,7 @@ def test_a_documented_training_trains(page, words, reader, monkeypatch, capsys):
 def pillar(reader, monkeypatch):
     """The run of the page about tasks, unless it is there."""
     if not Path("runs/pillar").exists():
-        page, words = DOCUMENTED["PYTHONPATH=. jetbot-mjx train my_task.yaml --run-dir runs/pillar"]
+        page, words = DOCUMENTED["jetbot-mjx train my_task.yaml --run-dir runs/pillar"]
         assert execute(page, words, reader, monkeypatch) == 0
 
 
@@ -352,11 +349,7 @@ def test_documented_tasks_are_written_and_checked(tmp_path):
         name = words[start].removeprefix("jetbot_mjx.")
         with pytest.MonkeyPatch.context() as patch:
             patch.chdir(folder)
-            # As `python -m` does.
-            patch.syspath_prepend(str(folder))
-            patch.delitem(sys.modules, "my_task", raising=False)
             assert run(name, words[start + 1 :]) == 0, words
-            sys.modules.pop("my_task", None)
 
 
 def test_no_kind_of_command_is_left_out():

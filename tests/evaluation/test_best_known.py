@@ -13,7 +13,8 @@ from benchmarks.learning import best_known as benchmark
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import best_known
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, report_keys
+from jetbot_mjx.evaluation.evaluator import report_keys
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.html_report import write_report
 from jetbot_mjx.evaluation.report import SECTORS, compare_with_best_known
 from jetbot_mjx.evaluation.rollout import rollout_fn

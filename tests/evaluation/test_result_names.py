@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from jetbot_mjx.evaluation.evaluator import GOAL_SET_VERSION, REPORT_GOALS
+from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.result_names import (
     PARTS,
     find_report,

@@ -37,10 +37,8 @@ TINY = (
 
 @pytest.fixture(scope="module")
 def load(root):
-    """Return a loader of the example's configuration, with its folder on the path."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(root / "examples"))
-        yield lambda *overrides: load_config(root / "examples" / "obstacle.yaml", overrides)
+    """Return a loader of the example's configuration."""
+    return lambda *overrides: load_config(root / "examples" / "obstacle.yaml", overrides)
 
 
 @pytest.fixture(scope="module")
@@ -213,7 +211,6 @@ def test_training_and_evaluation_run_end_to_end(load, env, tmp_path):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["pillars", "gates"])
-def test_the_larger_examples_reach_nine_tenths(name, root, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(str(root / "examples"))
-    session.run(load_config(root / "examples" / f"{name}.yaml"), tmp_path / "run")
+def test_the_larger_examples_reach_nine_tenths(name, tmp_path):
+    session.run(load_config(name), tmp_path / "run")
     assert evaluate_run(tmp_path / "run").policy.success_rate >= 0.9

@@ -1,6 +1,7 @@
 """What the end of a training says comes next."""
 
 import importlib.util
+import shlex
 from pathlib import Path
 
 import pytest
@@ -25,3 +26,11 @@ def test_the_end_names_the_next_commands_and_tensorboard_where_it_is_installed(
         "      jetbot-mjx play runs/mine",
     ]
     assert lines[5:] == (["      tensorboard --logdir runs"] if installed else [])
+
+
+def test_the_next_commands_can_be_copied_where_the_folder_has_blanks():
+    mine = Path("my runs/mine")
+    standing = session.Standing(best=Summary(4, 4, 1.0, 0.5, 1.0, 1.5, 2.0, 0.9, 0.8, 0.1, 0))
+    result = session.Result(mine, [mine], [standing], ["abc"], finished=True, wall_seconds=1.0)
+    commands = session.summary(result).partition("next:")[2].splitlines()
+    assert [shlex.split(line)[-1] for line in commands[:3]] == ["my runs/mine"] * 3

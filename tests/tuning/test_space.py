@@ -69,7 +69,7 @@ def test_a_space_that_does_not_exist_is_told_with_the_shipped_ones(tmp_path, mon
         ("ppo.learning_rate: {choices: []}", "choices should be a list"),
         ("ppo.learning_rate: {choices: [1.0], low: 1}", "without other keys"),
         ("ppo.learning_rate: {low: -1.0, high: 1.0}", "ppo.learning_rate = -1.0"),
-        ("ppo.learning_rat: {low: 0.1, high: 1.0}", "did you mean learning_rate?"),
+        ("ppo.learning_rat: {low: 0.1, high: 1.0}", "did you mean ppo.learning_rate?"),
         ("rate: {low: 0.1, high: 1.0}", "rate = 0.1 is unknown"),
         ("ppo: {learning_rate: {low: 0.1, high: 1.0}}", "write ppo.learning_rate: {low: A, high"),
         ("ppo.network: {choices: [{activation: elu}]}", "such as ppo.network.activation"),

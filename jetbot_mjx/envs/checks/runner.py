@@ -83,7 +83,7 @@ def require_trainable(task: Task, config: Config) -> None:
     """
     probe = TaskProbe(task, config)
     where = f"task.name = {config.task.name!r}"
-    more = f"jetbot-mjx check_env {config.task.name} says more"
+    more = f"jetbot-mjx check-env {config.task.name} says more"
     try:
         found = jax.eval_shape(call_methods(task), probe.example)
     except Exception as error:

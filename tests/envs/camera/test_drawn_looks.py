@@ -177,7 +177,7 @@ def test_fixed_looks_are_those_of_every_episode():
         ("randomization.clutter=[0, 1.5]", "whole numbers from 0 to 8"),
         ("randomization.camera_interval=[0, 2]", "whole numbers from 1 to 60"),
         ("randomization.walls=[0, 2]", "numbers from 0 to 0.8"),
-        ("randomization.exposur=[1, 2]", "did you mean exposure?"),
+        ("randomization.exposur=[1, 2]", "did you mean randomization.exposure?"),
     ],
 )
 def test_a_wrong_range_is_refused_in_one_line(tmp_path, override, message):

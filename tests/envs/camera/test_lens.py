@@ -179,7 +179,7 @@ def test_an_environment_says_what_is_wrong_with_its_lens():
         ({"pitch": 91}, "camera.pitch = 91 is wrong"),
         ({"colour": "blue"}, "camera.colour = 'blue' is wrong"),
         ({"lens": "wide"}, "camera.lens = 'wide' is wrong"),
-        ({"color": "rgb"}, "camera.color = 'rgb' is unknown: did you mean colour?"),
+        ({"color": "rgb"}, "camera.color = 'rgb' is unknown: did you mean camera.colour?"),
         ({"calibration_size": [224, 224]}, "camera: calibration_size"),
     ],
 )
