@@ -246,10 +246,10 @@ def test_physics_stays_within_its_number_of_kernels_and_operations():
     count = kernels.count_kernels(kernels.compiled_text(config, "physics"))
     found = sum(count.kernels.values())
     print(f"\n{found} kernels, {count.launches} launches")
-    # Some 490 and 1,120 on a CPU, fewer on a GPU; the bounds leave room for another XLA, not for
+    # Some 490 and 1,570 on a CPU, fewer on a GPU; the bounds leave room for another XLA, not for
     # another loop.
     assert 100 < found < 560
-    assert count.launches < 1_300
+    assert count.launches < 1_750
     # Some 5,800, and 2,800 products.
     scalars = kernels.count_scalars(config)
     assert 4_000 < sum(scalars.values()) < 7_000

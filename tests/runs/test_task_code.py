@@ -308,10 +308,6 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     assert env.task.factor == 4
     for folder in run_dirs:
         folder.mkdir(parents=True)
-<<<<<<< HEAD
-    session._store_run(session.Training(two, tmp_path / "two", run_dirs, *[None] * 6, code))
-=======
     session._store_run(session.Training(two, tmp_path / "two", run_dirs, *[None] * 5, [], code))
->>>>>>> 6be7a98 (A task's module is found beside its YAML file; examples are trained by name; usage errors are reported before anything heavy is imported, and suggest whole keys)
     for folder in (tmp_path / "two", *run_dirs):
         assert read_task_code(folder) == code
