@@ -374,11 +374,11 @@ def test_a_training_works_in_a_thread_beside_a_running_loop(tmp_path):
 
 
 def interrupt_after_a_checkpoint(run_dir, number):
-    """Sends this process a signal, from a thread, as soon as the run has a checkpoint."""
+    """Sends this process a signal, from a thread, as soon as the run has made a step."""
 
     def send():
         deadline = time.monotonic() + PATIENCE
-        while not list(run_dir.glob("checkpoints/*[0-9]")) and time.monotonic() < deadline:
+        while not list(run_dir.glob("checkpoints/*[1-9]*")) and time.monotonic() < deadline:
             time.sleep(0.01)
         os.kill(os.getpid(), number)
 

@@ -24,7 +24,7 @@ def test_the_back_end_of_this_device_can_be_used():
     assert BACKENDS[jax.default_backend()].obstacle() is None
 
 
-@pytest.mark.parametrize("name", sorted(shipped_configs()))
+@pytest.mark.parametrize("name", sorted(shipped_configs(["configs"])))
 def test_no_shipped_configuration_falls_back(name, capsys):
     config = load_config(name)
     with collect() as found:

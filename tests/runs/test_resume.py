@@ -376,7 +376,7 @@ DAMAGES = {
     ),
     "manifest flipped": (
         lambda newest, _: flip(newest / POLICY / "manifest.ocdbt", 10**6),
-        "Error decoding manifest",
+        "a file in policy is damaged or missing",
     ),
     "manifest cut": (lambda newest, _: cut(newest / TRAINING / "manifest.ocdbt"), "cannot be read"),
     "manifest missing": (
