@@ -182,7 +182,7 @@ class MujocoPhysics(Physics):
         return "mujoco"
 
     @property
-    def is_kernel(self) -> bool:
+    def may_be_kernel(self) -> bool:
         """Return False: XLA calls back to C MuJoCo."""
         return False
 

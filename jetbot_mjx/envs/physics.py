@@ -86,9 +86,10 @@ class Physics:
         return "xla" if backend is None or self._kernel_step() is None else backend.IMPL
 
     @property
-    def is_kernel(self) -> bool:
-        """Return whether a step is one kernel, on some platform that this process has."""
-        return self._kernel_step() is not None
+    def may_be_kernel(self) -> bool:
+        """Return whether a step may be one kernel: there is a back end, and nothing has failed."""
+        failed = isinstance(self._kernel, UnsupportedError)
+        return bool(available_backends(self._config.impl)) and not failed
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:

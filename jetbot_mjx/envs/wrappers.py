@@ -274,19 +274,20 @@ class KernelWrapper(Wrapper):
         super().__init__(env)
         physics = env.unwrapped.physics
 
+        def report_unsupported(error: UnsupportedError) -> None:
+            # If physics is no kernel, it has told the reason.
+            if physics.may_be_kernel:
+                reason = f"one kernel cannot do {error}: docs/own-task.md says what to avoid"
+                report(Fallback("environment step", reason))
+
         # Pyright would want the names of the methods' arguments.
         def compiled(function: Callable[..., Any]) -> Any:
-            return OneKernel(function, lambda: physics.is_kernel, _report_unsupported)
+            return OneKernel(function, lambda: physics.may_be_kernel, report_unsupported)
 
         self.reset = compiled(env.reset)
         self.step = compiled(env.step)
         # A step of a packed state has one array in and one array out.
         self.step_packed = compiled(functools.partial(_step_packed, env))
-
-
-def _report_unsupported(error: UnsupportedError) -> None:
-    reason = f"one kernel cannot do {error}"
-    report(Fallback("environment step", f"{reason}: docs/own-task.md says what to avoid"))
 
 
 def _step_packed(env: Any, packed: Packed, action: Float[Array, "2"]) -> Packed:

@@ -6,7 +6,9 @@ import pytest
 
 from jetbot_mjx.compiler.background import in_background
 from jetbot_mjx.compiler.program_cache import ProgramCache
+from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs import physics
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.envs.wrappers import wrap_for_training
@@ -79,3 +81,16 @@ def test_a_program_from_the_cache_reports_what_it_was_traced_with(tmp_path, pref
             later.prefetch("double")
         assert later.find("double") is not None
     assert found == [SLOW]
+
+
+def test_where_physics_is_no_kernel_that_alone_is_said(monkeypatch, capsys):
+    def refuse(*arguments):
+        raise UnsupportedError("the operation that_is_new")
+
+    monkeypatch.setattr(physics, "scalarize", refuse)
+    env = wrap_for_training(make_env(parse_config({})), 10)
+    keys = jax.random.split(jax.random.PRNGKey(0), 2)
+    with collect() as found:
+        jax.eval_shape(lambda keys: env.step(env.reset(keys), jnp.zeros((2, 2))), keys)
+    assert [what for what, _ in found] == ["physics.impl"]
+    assert capsys.readouterr().err.count("\n") == 1

@@ -24,7 +24,14 @@ def test_the_back_end_of_this_device_can_be_used():
     assert BACKENDS[jax.default_backend()].obstacle() is None
 
 
-@pytest.mark.parametrize("name", sorted(shipped_configs(["configs"])))
+NAMES = sorted(shipped_configs(["configs"]))
+QUICK = ("camera_real", "jetbot_egocentric")
+"""All others are traced by `make wheel`, with the newest versions, and by `make test-slow`."""
+
+
+@pytest.mark.parametrize(
+    "name", [pytest.param(x, marks=[] if x in QUICK else [pytest.mark.slow]) for x in NAMES]
+)
 def test_no_shipped_configuration_falls_back(name, capsys):
     config = load_config(name)
     with collect() as found:
