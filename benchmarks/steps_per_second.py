@@ -29,6 +29,7 @@ from benchmarks.throughput.rate_plots import draw
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.fallbacks import collect
 
 
 def run(
@@ -179,14 +180,18 @@ def main(arguments: Sequence[str] | None = None) -> int:
     def report(row: Row) -> None:
         rows.append(row)
         print(_table_row(row), flush=True)
-        write(output, {**measured, "results": [row._asdict() for row in rows]})
+        rates = [row._asdict() for row in rows]
+        write(output, {**measured, "fallbacks": fallbacks, "results": rates})
 
     print(
         f"{options.config.name} on {jax.device_count()} x {measured['device']}, median of"
         f" {sizes.repeats} repeats\n{_TABLE_HEAD}",
         flush=True,
     )
-    run(config, num_envs, sizes, rates=rates, report=report)
+    with collect() as fallbacks:
+        run(config, num_envs, sizes, rates=rates, report=report)
+    for fallback in fallbacks:
+        print(f"slow: {fallback}")
     for row in rows:
         if row.nonfinite_envs:
             print(f"{row.rate} at {row.num_envs}: {row.nonfinite_envs} non-finite states")
