@@ -13,10 +13,10 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 _COSTS = {
-    "physics.impl": "training is about 5 times slower",
-    "camera.impl": "training is several times slower",
+    "physics.impl": "training is 5 to 11 times slower",
+    "camera.impl": "images take up to 7 times as long",
     "ppo.update": "training is 2 to 4 times slower",
-    "environment step": "training is up to 2 times slower",
+    "environment step": "training is up to 3 times slower",
     "compilation cache": "every start compiles again, for about half a minute",
 }
 """What each fallback costs, roughly: docs/troubleshooting.md has the measurements."""
