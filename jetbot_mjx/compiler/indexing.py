@@ -173,6 +173,8 @@ def _gather(equation: Any, x: ScalarArray, indices: ScalarArray) -> ScalarArray:
 def _sort(equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
     if equation.params["num_keys"] != 1:
         raise UnsupportedError("sorting by more than one key")
+    if not all(map(is_constant, operands[0].ravel())):
+        raise UnsupportedError("a sort of values that depend on the state")
     keys = constant_values(operands[0], equation.outvars[0].aval.dtype)
     order = np.argsort(keys, equation.params["dimension"], kind="stable")
     return [np.take_along_axis(x, order, equation.params["dimension"]) for x in operands]

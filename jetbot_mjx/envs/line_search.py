@@ -22,11 +22,27 @@ _library = solver._linesearch, solver._LSPoint.create
 _lock = threading.RLock()
 
 
+class _Thread(threading.local):
+    """What holds for the present thread alone: others may trace MJX meanwhile."""
+
+    in_context = False
+    is_relative = False
+    """Whether the costs of points are relative."""
+
+
+_thread = _Thread()
+
+
 @contextlib.contextmanager
 def relative_costs() -> Iterator[None]:
-    """Replace MJX's line search by this module's in a context."""
+    """Replace MJX's line search by this module's in a context, for the present thread."""
     # One thread at a time: otherwise a second thread would restore the first one's replacement.
-    with _lock, mock.patch.object(solver, "_linesearch", _line_search):
+    with (
+        _lock,
+        mock.patch.object(solver, "_linesearch", _line_search),
+        mock.patch.object(solver._LSPoint, "create", _point),
+        mock.patch.object(_thread, "in_context", True),
+    ):
         yield
 
 
@@ -37,12 +53,17 @@ def _line_search(m: Model, d: Data, ctx: solver.Context) -> solver.Context:
     """
     search, _ = _library
     rows: Any = d._impl
-    if m.opt.cone != ConeType.PYRAMIDAL or rows.nf:
+    if not _thread.in_context or m.opt.cone != ConeType.PYRAMIDAL or rows.nf:
         return search(m, d, ctx)
     # MJX takes the difference of a point's cost and `gauss` for the cost of the constraints.
     relative = ctx.replace(gauss=ctx.gauss - ctx.cost)
-    with mock.patch.object(solver._LSPoint, "create", _relative_point):
+    with mock.patch.object(_thread, "is_relative", True):
         return search(m, d, relative).replace(gauss=ctx.gauss)
+
+
+def _point(*arguments: Any) -> solver._LSPoint:
+    _, create = _library
+    return _relative_point(*arguments) if _thread.is_relative else create(*arguments)
 
 
 def _relative_point(

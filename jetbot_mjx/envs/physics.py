@@ -193,7 +193,9 @@ class Physics:
         reason = f"one kernel cannot do {self._kernel}"
         if self._config.impl != "auto":
             raise UserError(f"physics.impl = {self._config.impl}: {reason}; choose xla or auto")
-        report(Fallback("physics.impl", f"{reason}: try the versions in constraints.txt"))
+        report(
+            Fallback("physics.impl", f"{reason}: try the versions that its constraints.txt names")
+        )
         return None
 
     def _lower(self) -> kernel.Kernel:

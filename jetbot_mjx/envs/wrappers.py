@@ -277,7 +277,7 @@ class KernelWrapper(Wrapper):
         def report_unsupported(error: UnsupportedError) -> None:
             # If physics is no kernel, it has told the reason.
             if physics.may_be_kernel:
-                reason = f"one kernel cannot do {error}: docs/own-task.md says what to avoid"
+                reason = f"one kernel cannot do {error}: the page on own tasks says what to avoid"
                 report(Fallback("environment step", reason))
 
         # Pyright would want the names of the methods' arguments.

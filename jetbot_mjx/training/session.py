@@ -195,7 +195,11 @@ def train(
     check_tracking(config)
     stop = stop or Preemption(config.preemption_notice)
     with collect() as fallbacks:
-        return _compose(config, run_dir, programs, fallbacks, stop, verbose=verbose)
+        result = _compose(config, run_dir, programs, fallbacks, stop, verbose=verbose)
+    if distributed.is_primary():
+        for fallback in fallbacks:
+            log_message(run_dir, f"slow: {fallback}")
+    return result
 
 
 def _compose(

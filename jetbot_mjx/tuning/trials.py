@@ -115,7 +115,7 @@ class Trials:
         keys = jnp.asarray([seeds[min(i, count - 1)] for i in range(width)], jnp.uint32)
         # Train, and evaluate after each interval.
         goals = training_keys(self.config.evaluation.episodes)
-        with stage(f"compiling the training of {width} policies"):
+        with stage(f"compiling the training of {width} {'policy' if width == 1 else 'policies'}"):
             state = self._begin(traced, keys)
             if width not in self._compiled:
                 state = self._advance(traced, state, np.int32(0))

@@ -50,7 +50,7 @@ def test_what_a_task_does_that_no_kernel_can_is_said_with_its_line(capsys):
         jax.eval_shape(lambda keys: env.step(env.reset(keys), jnp.zeros((2, 2))), keys)
     ((what, reason),) = found
     assert what == "environment step"
-    assert "an index that depends on the state" in reason
+    assert "a sort of values that depend on the state" in reason
     assert "test_fallbacks.py:" in reason
     assert capsys.readouterr().err.startswith("slow: environment step: ")
 

@@ -244,7 +244,7 @@ def filled_up(x):
     ("function", "reason"),
     [
         (lambda x: x[x[0].astype(int)], "depends on the state"),
-        (lambda x: jnp.sort(x), "depends on the state"),
+        (lambda x: jnp.sort(x), "a sort of values that depend on the state"),
         (filled_up, "more than 64 times"),
         (lambda x: jax.lax.fori_loop(0, 5, lambda i, x: x[x[0].astype(int)[:3]], x), "the state"),
         (lambda x: x.astype(jnp.float16) * 2, "float16"),

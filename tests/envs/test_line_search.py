@@ -157,9 +157,9 @@ def test_relative_costs_are_differences_of_mjx_costs(xml):
 
 def test_a_search_ends_where_mjxs_does_when_the_gain_is_large():
     model, data, context = problem()
-    ours, theirs = (
-        search(find, model, data, context) for find in (line_search._line_search, library[0])
-    )
+    theirs = search(library[0], model, data, context)
+    with line_search.relative_costs():
+        ours = search(solver._linesearch, model, data, context)
     assert not np.array_equal(ours.qacc, context.qacc)
     np.testing.assert_allclose(ours.qacc, theirs.qacc, rtol=1e-4)
     assert ours.gauss == context.gauss
@@ -176,7 +176,9 @@ def test_a_search_ends_where_mjxs_does_when_the_gain_is_large():
 )
 def test_costs_that_are_not_quadratic_are_mjxs_part(xml, cone):
     beginning = problem(xml, cone)
-    ours, theirs = (search(find, *beginning) for find in (line_search._line_search, library[0]))
+    theirs = search(library[0], *beginning)
+    with line_search.relative_costs():
+        ours = search(solver._linesearch, *beginning)
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
@@ -204,3 +206,26 @@ def test_threads_take_turns():
     thread.join()
     assert seen == [True]
     assert solver._linesearch is library[0]
+
+
+def test_another_thread_has_mjx_s_own_line_search_meanwhile():
+    env = make_env(parse_config({}))
+    model = env.physics.model
+    state = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
+
+    def program():
+        def step(qpos, qvel):
+            data = mjx.make_data(env.physics.mj_model).replace(qpos=qpos, qvel=qvel)
+            return forward.step(model, data).qvel
+
+        return str(jax.make_jaxpr(step)(state.qpos, state.qvel))
+
+    alone, texts = program(), []
+    with line_search.relative_costs():
+        thread = threading.Thread(target=lambda: texts.append(program()))
+        thread.start()
+        thread.join()
+        assert program() != alone
+    assert texts == [alone]
+    assert (solver._linesearch, solver._LSPoint.create) == library
+    assert program() == alone

@@ -91,6 +91,7 @@ def test_an_interrupted_training_ends_with_the_same_bits(run, config_file):
 def test_a_checkpoint_tells_what_of_the_training_was_slow(run):
     told = read_about(checkpoint_path(run, 3 * STEP))["fallbacks"]
     assert told == [["ppo.update", "it takes observations without images"]]
+    assert "slow: ppo.update: " in (run / "train.log").read_text("utf-8")
 
 
 def test_a_policy_takes_what_it_was_trained_on_and_nothing_else(run):

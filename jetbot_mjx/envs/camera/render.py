@@ -172,7 +172,9 @@ class Camera:
         reason = f"one kernel cannot do {found}"
         if self.config.impl != "auto":
             raise UserError(f"camera.impl = {self.config.impl}: {reason}; choose xla or auto")
-        report(Fallback("camera.impl", f"{reason}: try the versions in constraints.txt"))
+        report(
+            Fallback("camera.impl", f"{reason}: try the versions that its constraints.txt names")
+        )
         return None
 
     def _make_kernel(self, structure: Any) -> Kernel:
