@@ -130,6 +130,7 @@ def _parse_line(line: str) -> History | None:
         return None
     is_valid = (
         isinstance(env_steps, int)
+        and not isinstance(env_steps, bool)
         and 0 <= env_steps < 2**53
         and _is_number(timestamp)
         and 0 <= timestamp <= _LATEST
@@ -140,7 +141,9 @@ def _parse_line(line: str) -> History | None:
 
 def _is_number(value: object) -> bool:
     """Return whether a JSON value is a number that a float can hold."""
-    return isinstance(value, int | float) and abs(value) <= sys.float_info.max
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) <= sys.float_info.max
 
 
 class JsonlSink:
