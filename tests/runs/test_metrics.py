@@ -121,6 +121,7 @@ def test_a_history_is_read_as_it_was_written(logged, tmp_path):
         '{"timestamp": 4.5}\n',
         '{"env_steps": "many", "timestamp": 4.5}\n',
         '{"env_steps": null, "timestamp": 4.5}\n',
+        '{"env_steps": true, "timestamp": 4.5}\n',
         "\udcff\udcfe\n",
     ],
 )
