@@ -7,9 +7,9 @@
 
 from pathlib import Path
 
-from jetbot_mjx.imports import install_lazy_imports
+from jetbot_mjx.startup import install_lazy_imports
 
-# Before anything imports MJX, which prints a line about each of its parts that is missing.
+# Measure programs that start as the commands do.
 install_lazy_imports()
 
 ROOT = Path(__file__).resolve().parents[1]

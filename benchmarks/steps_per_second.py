@@ -11,9 +11,11 @@ benchmarks/README.md explains how each is measured and how to read the table.
 """
 
 import argparse
+import itertools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -26,7 +28,7 @@ from benchmarks.harness.results import check_output, conditions, counts, default
 from benchmarks.harness.timing import Row
 from benchmarks.reliability.regressions import MOST_SLOWDOWN, Change, changes, read_baseline
 from benchmarks.throughput.rate_plots import draw
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.fallbacks import collect
@@ -139,6 +141,30 @@ def _change_line(change: Change) -> str:
     )
 
 
+def _read_earlier(
+    path: Path | None, measured: Mapping[str, Any], asked: Iterable[tuple[str, int]]
+) -> dict[tuple[str, int], float]:
+    """Read the rates to compare with; none without a file.
+
+    Args:
+      path: The file given by `--compare`.
+      measured: The conditions of this measurement.
+      asked: The rates that will be measured, each with its number of environments.
+
+    Raises:
+      UserError: The file cannot be compared with, or has none of the rates.
+    """
+    if path is None:
+        return {}
+    baseline = read_baseline(path, measured)
+    if not set(asked) & set(baseline):
+        raise UserError(
+            f"--compare {path} has none of these rates: it has"
+            f" {', '.join(f'{rate} at {count}' for rate, count in baseline) or 'no rate at all'}"
+        )
+    return baseline
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Measure the rates, print the table, and write the JSON file and the plot.
 
@@ -154,7 +180,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     # Check all arguments before minutes of measuring.
     options = _parser().parse_args(arguments)
     config = load_config(options.config, options.overrides)
-    cli.divide_cpu(config.cpu_devices)
+    startup.divide_cpu(config.cpu_devices)
     sizes = Sizes(options.repeats, options.unroll, options.training_steps)
     num_envs = options.num_envs or [config.ppo.num_envs]
     rates = [rate for rate in MEASUREMENTS if rate not in options.skip]
@@ -166,14 +192,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     output = options.output or default_output()
     check_output(output)
     measured = conditions(config, sizes)
-    baseline = read_baseline(options.compare, measured) if options.compare else {}
-    if options.compare and not {(rate, count) for rate in rates for count in num_envs} & set(
-        baseline
-    ):
-        raise UserError(
-            f"--compare {options.compare} has none of these rates: it has"
-            f" {', '.join(f'{rate} at {count}' for rate, count in baseline) or 'no rate at all'}"
-        )
+    baseline = _read_earlier(options.compare, measured, itertools.product(rates, num_envs))
     # Measure; the file is written after every row, so that an interrupted sweep keeps its rows.
     rows: list[Row] = []
 

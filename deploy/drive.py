@@ -430,24 +430,7 @@ def _parser() -> argparse.ArgumentParser:
         metavar=("X", "Y"),
         help="position of the goal [m]; with --camera for the log alone",
     )
-    parser.add_argument("--camera", action="store_true", help="drive by the robot's camera alone")
-    parser.add_argument(
-        "--undistort", metavar="FILE", help="OpenCV's calibration of the lens, to take it out"
-    )
-    parser.add_argument(
-        "--arrive-within",
-        type=at_least(0.01, 1.0),
-        metavar="M",
-        help="with --camera: distance from the axle to the edge of the goal when reached [m]"
-        f" (default: {ARRIVE_WITHIN:g})",
-    )
-    parser.add_argument(
-        "--goal-colour",
-        nargs=3,
-        type=at_least(0.0, 255.0),
-        metavar=("R", "G", "B"),
-        help=f"colour of the goal (default: {' '.join(map(str, GOAL_COLOUR))})",
-    )
+    _add_camera_arguments(parser)
     parser.add_argument("--calibration", metavar="FILE", help="file that calibrate.py wrote")
     parser.add_argument(
         "--tracker",
@@ -480,6 +463,28 @@ def _parser() -> argparse.ArgumentParser:
         "--dry-run", action="store_true", help="turn no motor; by dead reckoning, or --camera"
     )
     return parser
+
+
+def _add_camera_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what a drive by the camera needs: its switch, its lens and the goal that it sees."""
+    parser.add_argument("--camera", action="store_true", help="drive by the robot's camera alone")
+    parser.add_argument(
+        "--undistort", metavar="FILE", help="OpenCV's calibration of the lens, to take it out"
+    )
+    parser.add_argument(
+        "--arrive-within",
+        type=at_least(0.01, 1.0),
+        metavar="M",
+        help="with --camera: distance from the axle to the edge of the goal when reached [m]"
+        f" (default: {ARRIVE_WITHIN:g})",
+    )
+    parser.add_argument(
+        "--goal-colour",
+        nargs=3,
+        type=at_least(0.0, 255.0),
+        metavar=("R", "G", "B"),
+        help=f"colour of the goal (default: {' '.join(map(str, GOAL_COLOUR))})",
+    )
 
 
 def _pose_source(options: argparse.Namespace, calibration: Calibration) -> Any:

@@ -6,11 +6,6 @@ noise of `--noise` metres. Goals are drawn as in the tutorial, and each drive st
 With `--camera` a policy drives by pictures: see rehearse_camera.py.
 """
 
-# Before anything imports MJX, which prints a line about each of its parts that is missing.
-from jetbot_mjx.imports import install_lazy_imports  # isort: skip
-
-install_lazy_imports()
-
 import argparse
 import json
 import math

@@ -2,12 +2,15 @@
 
 - `configuration.md`: The types, bounds, defaults and explanations come from the schema of `Config`,
   the refusals from its checks, and the values of the shipped files from the files.
+- The tables of quantities that may differ, in pages that hold `<!-- table: NAME -->`, come from
+  `QUANTITIES` and the shipped files.
 - `api/ROOM.md`: The public names and the modules of each room come from its folder.
 
-Nothing on these pages is written by hand.
+Nothing of this is written by hand.
 """
 
 import ast
+import importlib
 import inspect
 import itertools
 import json
@@ -25,8 +28,12 @@ from ruamel.yaml import YAML
 
 from jetbot_mjx.config import (
     CHANGEABLE_ON_RESUME,
+    QUANTITIES,
     Config,
     ConfigError,
+    LookParams,
+    RandomizationConfig,
+    RobotParams,
     load_config,
     parse_config,
 )
@@ -128,8 +135,10 @@ def _walk(
         yield from _walk(*arguments)
 
 
-def _meanings(model: type[BaseModel]) -> dict[str, str]:
+def _meanings(model: type) -> dict[str, str]:
     """Return the docstrings of a section's settings, which pydantic would read at every start."""
+    if model is RandomizationConfig:
+        return _meanings(RobotParams) | _meanings(LookParams)
     (tree,) = ast.parse(textwrap.dedent(inspect.getsource(model))).body
     assert isinstance(tree, ast.ClassDef)
     return {
@@ -138,6 +147,39 @@ def _meanings(model: type[BaseModel]) -> dict[str, str]:
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name)
         if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant)
     }
+
+
+def _ranges_in(name: str, table: type) -> Iterator[str]:
+    """Yield the lines of a table of quantities with the ranges of a shipped configuration."""
+    drawn = load_config(ROOT / "configs" / f"{name}.yaml").randomization.drawn
+    yield f"| key | meaning | range in `{name}` | source |"
+    yield "|---|---|---|---|"
+    for key, meaning in _meanings(table).items():
+        shown = ", ".join(f"{end:g}" for end in drawn.get(key, ())) or "-"
+        shown = shown.replace("3.1416", "π")
+        yield f"| `{key}` | {meaning} | {shown} | {QUANTITIES[key].bounds.source} |"
+
+
+def _robustness_values() -> Iterator[str]:
+    """Yield the lines of a table of the values at which `--robustness` evaluates a policy."""
+    yield "| field | parameter | unit | values | source of the range |"
+    yield "|---|---|---|---|---|"
+    for name, one in QUANTITIES.items():
+        values = ", ".join(f"{value:g}" for value in one.evaluated.values)
+        cells = (f"`{name}`", one.evaluated.label, one.evaluated.unit, values, one.bounds.source)
+        yield f"| {' | '.join(cells)} |"
+
+
+_TABLES = {
+    "robot_ranges": lambda: _ranges_in("real_jetbot", RobotParams),
+    "look_ranges": lambda: _ranges_in("camera_real", LookParams),
+    "robustness_values": _robustness_values,
+}
+
+
+def with_tables(text: str) -> str:
+    """Return the Markdown of a page with its tables of quantities in place of their names."""
+    return re.sub(r"<!-- table: (\w+) -->", lambda found: "\n".join(_TABLES[found[1]]()), text)
 
 
 def _kind(schema: Mapping[str, Any], bounds: Sequence[str]) -> str:
@@ -287,34 +329,38 @@ def page() -> str:
 
 
 def room_pages() -> dict[str, str]:
-    """Return the reference of each room, and of the root, as Markdown by the name of its page."""
+    """Return the reference of the compiler, the root and each room, by the name of its page."""
     package = ROOT / "jetbot_mjx"
-    faces = {path.parent.name: path for path in sorted(package.glob("*/__init__.py"))}
-    pages = {f"api/{room}.md": _room_page(room, face) for room, face in faces.items()}
-    return {**pages, "api/root.md": _room_page("", package / "__init__.py")}
+    pages = {
+        f"api/{face.parent.name}.md": _package_page(f"`{face.parent.name}`", face)
+        for face in sorted(package.glob("*/__init__.py"))
+    }
+    return {
+        **pages,
+        "api/root.md": _package_page("Commands", package / "__init__.py", inside="*.py"),
+        "api/onekernel.md": _package_page("`onekernel`", ROOT / "onekernel" / "__init__.py"),
+    }
 
 
-def _room_page(room: str, face: Path) -> str:
-    prefix = f"{room}." if room else ""
-    found = face.parent.rglob("*.py") if room else face.parent.glob("*.py")
-    paths = sorted(path for path in found if path.name != "__init__.py")
-    names = (".".join(path.relative_to(face.parent).with_suffix("").parts) for path in paths)
-    text = face.read_text("utf-8")
-    first, _, rest = (ast.get_docstring(ast.parse(text)) or "").partition("\n\n")
-    title = f"`{room}`" if room else "Configuration and commands"
-    modules = (f"::: jetbot_mjx.{prefix}{name}\n" for name in names)
-    return "\n".join(
-        [f"# {title}\n", f"{first}\n", _import_line(room, text), f"{rest}\n", *modules]
-    )
+def _package_page(title: str, face: Path, inside: str = "**/*.py") -> str:
+    """Return the reference of a package.
 
-
-def _import_line(room: str, text: str) -> str:
-    """Return how the public names of a room are imported, from the text of its `__init__.py`."""
-    public = (name for name in re.findall(r" as (\w+),?$", text, re.MULTILINE) if name[0] != "_")
-    if not (imported := "".join(f"    {name},\n" for name in sorted(public))):
-        return ""
-    home = f"jetbot_mjx.{room}" if room else "jetbot_mjx"
-    return f"```python\nfrom {home} import (\n{imported})\n```\n"
+    Args:
+      title: the heading.
+      face: its `__init__.py`.
+      inside: which of the modules inside the page has.
+    """
+    home = ".".join(face.parent.relative_to(ROOT).parts)
+    first, _, rest = (ast.get_docstring(ast.parse(face.read_text("utf-8"))) or "").partition("\n\n")
+    modules = []
+    for path in sorted(face.parent.glob(inside)):
+        if path != face:
+            parts = path.relative_to(ROOT).with_suffix("").parts
+            modules.append(f"::: {'.'.join(parts).removesuffix('.__init__')}\n")
+    names = sorted(importlib.import_module(home).__all__)
+    imported = "".join(f"    {name},\n" for name in names)
+    block = f"```python\nfrom {home} import (\n{imported})\n```\n" if names else ""
+    return "\n".join([f"# {title}\n", f"{first}\n", block, f"{rest}\n", *modules])
 
 
 def on_files(files: Any, *, config: Any) -> Any:
@@ -324,6 +370,11 @@ def on_files(files: Any, *, config: Any) -> Any:
     for name, text in {PAGE: page(), **room_pages()}.items():
         files.append(File.generated(config, name, content=text))
     return files
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Put the tables into a page; MkDocs calls this."""
+    return with_tables(markdown)
 
 
 if __name__ == "__main__":

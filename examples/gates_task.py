@@ -16,8 +16,7 @@ import mujoco
 from jaxtyping import Array, Bool, Float, Int32, UInt32
 
 from jetbot_mjx.config import TaskConfig
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.task import Field, GoalTask, RobotState
+from jetbot_mjx.envs import Field, GoalTask, RobotState, kinematics
 
 GATES = 3
 OPENING = 0.3  # [m] between the axes of a gate's posts; the robot is 0.13 m wide

@@ -20,8 +20,7 @@ from jaxtyping import Array, Bool, Float, UInt32
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from jetbot_mjx.config import NonNegative, Positive, TaskConfig
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.task import Field, GoalTask, Layout, RobotState
+from jetbot_mjx.envs import Field, GoalTask, Layout, RobotState, kinematics
 from jetbot_mjx.errors import UserError
 
 # The pillar in the observation, in the form of the goal: position of its axis.

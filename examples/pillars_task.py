@@ -17,8 +17,7 @@ import mujoco
 from jaxtyping import Array, Bool, Float, UInt32
 
 from jetbot_mjx.config import TaskConfig
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.task import Field, GoalTask, RobotState
+from jetbot_mjx.envs import Field, GoalTask, RobotState, kinematics
 
 PILLARS = 3
 PILLAR_RADIUS = 0.06  # [m]

@@ -2,7 +2,8 @@
 
 The subpackages, each of which imports only from those before it:
 
-- `compiler`: one kernel for all robots from a JAX function of one
+- `config`: the settings of a run, and the table of all that may be randomised
+- `terminal`: progress and tables of the commands
 - `envs`: robot, task, physics, episodes
 - `agents`: networks and PPO
 - `runs`: what a run folder holds
@@ -12,8 +13,9 @@ The subpackages, each of which imports only from those before it:
 - `tuning`: search for hyperparameters
 - `deployment`: a policy without JAX
 - `adapters`: Gymnasium and Stable-Baselines3, for other people's programs
+- `startup`: how a command prepares its process, so that it starts sooner
 
-The root holds the modules that all subpackages use (`config`, `errors`), the functions for other
+The root holds the modules that all subpackages use (such as `errors`), the functions for other
 programs (`library`), and the commands, which share only the run folder: `jetbot-mjx` lists them. A
 public name is imported at its first use, so that a mistyped command fails at once and a GPU
 initialises while the rest is imported.
@@ -21,42 +23,26 @@ initialises while the rest is imported.
 
 import sys
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
 
-from jetbot_mjx.imports import load_lazily as _load_lazily
-
-if TYPE_CHECKING:
-    from jetbot_mjx.config import load_config as load_config
-    from jetbot_mjx.envs.jetbot_env import JetBotEnv as JetBotEnv
-    from jetbot_mjx.envs.jetbot_env import make_env as make_env
-    from jetbot_mjx.envs.state import State as State
-    from jetbot_mjx.envs.task import GoalTask as GoalTask
-    from jetbot_mjx.envs.task import Task as Task
-    from jetbot_mjx.envs.wrappers import wrap_for_training as wrap_for_training
-    from jetbot_mjx.library import evaluate as evaluate
-    from jetbot_mjx.library import render as render
-    from jetbot_mjx.library import train as train
-    from jetbot_mjx.library import tune as tune
-    from jetbot_mjx.runs.checkpoint import PRETRAINED as PRETRAINED
-    from jetbot_mjx.runs.checkpoint import load_policy as load_policy
+import lazy_loader
 
 __version__ = "0.1.0"
 
-# Configurations and runs refer to tasks by these names, independently of the module they are in.
-__getattr__, __dir__ = _load_lazily(__name__)
+# The stub lists the public names. Configurations and runs refer to `jetbot_mjx:GoalTask`.
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 
 class _Package(ModuleType):
-    """The type of this package, whose functions `train`, `evaluate` and `render` stay functions.
+    """The type of this package, whose public functions stay functions.
 
     `python -m jetbot_mjx.train` needs a module of that name, and when a module is imported, Python
     sets it as an attribute of its package. Without this class `jetbot_mjx.train` would be the
     function or the module of the command, depending on what the program imported first.
     """
 
-    def __setattr__(self, name: str, value: Any) -> None:
+    def __setattr__(self, name: str, value: object) -> None:
         """Set an attribute, unless a module would take the place of a public name."""
-        if not (isinstance(value, ModuleType) and name in ("train", "evaluate", "render")):
+        if not (isinstance(value, ModuleType) and name in ("train", "evaluate", "render", "tune")):
             super().__setattr__(name, value)
 
 

@@ -6,7 +6,7 @@ class alone, such as `GoalTask`. `--config my_task.yaml` checks a task with the 
 
 from collections.abc import Sequence
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 BROKEN = 1
 """Exit code for a task that has an error."""
@@ -42,8 +42,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{options.task} is a file: name its class too, as {module}:Class")
     name = options.task if ":" in (options.task or "") else f"{_BUILT_IN}:{options.task}"
     config = cli.config_of(options, *([f"task.name={name}"] if options.task else []))
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.envs.checks.runner import CHECKS, check_task
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.envs import CHECKS, check_task
     cli.prepare_device()
     # Check, and print each result as soon as it is known.
     errors, remaining = 0, list(CHECKS)

@@ -11,28 +11,26 @@ reason this module imports them only where it uses them.
 
 import argparse
 import contextlib
-import ctypes
 import difflib
 import functools
-import gc
 import os
 import shlex
 import sys
-import threading
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NoReturn
 
-from jetbot_mjx.errors import UserError, printable, printable_lines, ran_out
-from jetbot_mjx.evaluation.goal_set import parse_goals
-from jetbot_mjx.imports import install_lazy_imports
-from jetbot_mjx.interrupts import (
-    INTERRUPTED,
-    exit_if_interrupt_waits,
-    exit_on_interrupt,
-    repeat_lost_interrupts,
+from jetbot_mjx import startup
+from jetbot_mjx.errors import (
+    READER_LEFT,
+    UserError,
+    printable,
+    printable_lines,
+    ran_out,
+    write_error,
 )
-from jetbot_mjx.runs.output import READER_LEFT, protect_output, write_error
+from jetbot_mjx.evaluation import parse_goals
+from jetbot_mjx.interrupts import INTERRUPTED
 
 if TYPE_CHECKING:
     from jetbot_mjx.config import Config
@@ -42,15 +40,6 @@ PROGRAM = "jetbot-mjx"
 
 USER_ERROR = 2
 _BUG = 1
-
-_GARBAGE_THRESHOLDS = 1_000_000, 50, 100
-"""Thresholds of Python's garbage collector during the start of a command. With its own, which begin
-at 700 objects, it takes a third of the time that imports and JAX's tracing take, and finds nothing.
-A start that finds its programs compiled makes fewer objects than the first of these.
-"""
-
-_START_SECONDS = 60
-"""Time after which the collector works as usual, for commands that run for long [s]."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -66,10 +55,9 @@ class Parser(argparse.ArgumentParser):
         for word in words:
             name = word.partition("=")[0]
             if name == "--list":
-                self.error(
-                    f"unrecognized arguments: {name}: `{PROGRAM} configs` lists the configurations,"
-                    f" and `{PROGRAM} runs` the runs"
-                )
+                taken = {one.metavar for one in self._actions} & _LISTS.keys() or _LISTS
+                hint = " and ".join(text for metavar, text in _LISTS.items() if metavar in taken)
+                self.error(f"unrecognized arguments: {name}: {hint}")
             if name.startswith("--") and not any(one.startswith(name) for one in options):
                 self.error(f"unrecognized arguments: {name}{self._remedy(word, name)}")
         parsed, extra = self.parse_known_args(words, namespace)
@@ -112,6 +100,13 @@ class Parser(argparse.ArgumentParser):
         self.exit(USER_ERROR, f"{self.prog}: error: {message} (--help lists the arguments)\n")
 
 
+_LISTS = {
+    "CONFIG": f"`{PROGRAM} configs` lists the configurations",
+    "RUN": f"`{PROGRAM} runs` lists the runs",
+}
+"""The command that lists the possible values of an argument, by the name of the value."""
+
+
 def command_meant_by(words: Sequence[str], commands: Collection[str]) -> str:
     """Return what was probably meant by words that begin with no command, or nothing.
 
@@ -125,8 +120,10 @@ def command_meant_by(words: Sequence[str], commands: Collection[str]) -> str:
     first, path = words[0], Path(words[0])
     if first in ("help", "-h", "--help"):
         return f"{words[1]} --help" if words[1:] and words[1] in commands else "--help"
+    if first in ("--config", "--resume", "--set"):
+        return f"train {shlex.join(words)}"
     if first.startswith("-"):
-        return f"train {shlex.join(words)}" if first in ("--config", "--resume", "--set") else ""
+        return _OTHER_COMMANDS.get(first, "")
     if path.stem in shipped_configs() or (path.suffix == ".yaml" and os.path.isfile(path)):
         return f"train {shlex.quote(first)}"
     if run_around(path):
@@ -143,8 +140,9 @@ _OTHER_COMMANDS = {
     **dict.fromkeys(("sweep", "search", "optimize"), "tune"),
     "new": "new-task",
     "resume": "train --resume RUN",
+    "--list": "configs or runs",
 }
-"""What other programs call a command; it is suggested, and not accepted."""
+"""The commands by the names that other programs use; these are suggested, and not accepted."""
 
 
 def run_command(
@@ -158,28 +156,19 @@ def run_command(
     Args:
       command: a function that takes the arguments and returns the exit code.
       at_once: whether to exit without Python's clean-up, for a command that computes and closes
-        everything it opens: JAX takes a second to release a GPU, and a compiler's thread, which
-        cannot be interrupted, may abort the process. Ctrl-C does not wait for a compiler either.
+        everything it opens. Ctrl-C does not wait for a compiler either.
       writes_files: whether the results are in files, so that the command has succeeded even if its
         output could not be written.
     """
-    # Prepare the process: its memory, its threads, its output, its imports and its signals.
-    usual = gc.get_threshold()
-    gc.set_threshold(*_GARBAGE_THRESHOLDS)
-    timer = threading.Timer(_START_SECONDS, gc.set_threshold, usual)
-    timer.daemon = True
-    timer.start()
-    # JAX computes. NumPy would start a thread for every core, which takes longer than its import.
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    # Pydantic would look for plugins in all installed packages.
-    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    protect_output()
-    install_lazy_imports()
-    repeat_lost_interrupts()
-    if at_once:
-        exit_if_interrupt_waits()
+    startup.protect_output()
     # Run the command and convert known errors to an exit code.
     try:
+        startup.collect_garbage_late()
+        startup.set_environment()
+        startup.install_lazy_imports()
+        startup.repeat_interrupts()
+        if at_once:
+            startup.exit_if_stuck()
         code = command(None)
     except BaseException as error:
         code = _report_error(error)
@@ -193,9 +182,7 @@ def run_command(
     # Exit.
     code = _report_lost_output(code, writes_files=writes_files)
     if at_once:
-        sys.stdout.flush()
-        sys.stderr.flush()
-        os._exit(code)
+        startup.exit_at_once(code)
     sys.exit(code)
 
 
@@ -254,10 +241,10 @@ def prepare_device() -> None:
     Raises:
       UserError: as for `require_device`.
     """
-    from jetbot_mjx.compiler.program_cache import use_compilation_cache
+    from jetbot_mjx.devices import require_device
 
     require_device()
-    use_compilation_cache()
+    startup.enable_jax_cache()
 
 
 def show_progress() -> contextlib.AbstractContextManager[None]:
@@ -265,77 +252,9 @@ def show_progress() -> contextlib.AbstractContextManager[None]:
 
     The commands that take more than two seconds use it.
     """
-    from jetbot_mjx.runs import progress
+    from jetbot_mjx.terminal import show_progress
 
-    return progress.show_progress(sys.stderr)
-
-
-def require_device() -> None:
-    """Raise an error if JAX has no usable device.
-
-    Raises:
-      UserError: `JAX_PLATFORMS` names a missing platform, or JAX is set to 64 bits.
-    """
-    import jax
-
-    from jetbot_mjx.compiler.backends import require_float32
-
-    require_float32()
-    try:
-        jax.devices()
-    # JAX fails by an assertion where the plugin for a platform is not installed.
-    except (RuntimeError, AssertionError):
-        wanted = os.environ.get("JAX_PLATFORMS")
-        raise UserError(
-            f"JAX_PLATFORMS = {wanted!r} cannot be used here: unset it, or install what it needs"
-        ) from None
-
-
-def divide_cpu(devices: int | None) -> None:
-    """Divide the CPU into devices, if JAX has not begun yet; a training refuses another number.
-
-    Args:
-      devices: the setting `cpu_devices`; None: leave it to JAX.
-    """
-    import jax
-
-    if devices is not None:
-        with contextlib.suppress(RuntimeError):
-            jax.config.update("jax_num_cpu_devices", devices)
-
-
-def wake_driver() -> None:
-    """Start to open NVIDIA's driver in a thread, if there is one, while the host imports JAX.
-
-    JAX opens it later, and holds Python's lock meanwhile: on an H200 for a fifth of a second.
-    """
-
-    def open_driver() -> None:
-        # JAX reports what is wrong with the driver.
-        with contextlib.suppress(OSError, AttributeError):
-            ctypes.CDLL("libcuda.so.1").cuInit(0)
-
-    platforms = os.environ.get("JAX_PLATFORMS")
-    if not platforms or {"cuda", "gpu"} & set(platforms.split(",")):
-        threading.Thread(target=open_driver, daemon=True).start()
-
-
-def wake_device() -> None:
-    """Start to initialise the device in a thread, while the host continues.
-
-    JAX then allocates GPU memory as needed, unless `XLA_PYTHON_CLIENT_PREALLOCATE` requests its
-    default of allocating three quarters at once, which takes two seconds and leaves little memory
-    for other processes.
-    """
-    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
-    import jax
-
-    def touch() -> None:
-        # The first code that needs the device will report the error.
-        with contextlib.suppress(RuntimeError, AssertionError):
-            jax.block_until_ready(jax.device_put(0.0, jax.local_devices()[0]))
-
-    threading.Thread(target=touch, daemon=True).start()
+    return show_progress(sys.stderr)
 
 
 _LARGEST = 2**31 - 1
@@ -420,10 +339,10 @@ def find_run(name: str) -> Path:
     Raises:
       NotFoundError: as for `runs.find_run`.
     """
-    with exit_on_interrupt():
+    with startup.exit_on_interrupt():
         from jetbot_mjx.runs import find_run
 
-    return find_run.find_run(name)
+    return find_run(name)
 
 
 def add_checkpoint_arguments(
@@ -459,7 +378,13 @@ def add_checkpoint_arguments(
 class _KeepIfAbsent(argparse.Action):
     """An action of a positional argument that may be absent: another one may have set its value."""
 
-    def __call__(self, parser: Any, namespace: Any, values: Any, option_string: Any = None) -> None:
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: object,
+        option_string: str | None = None,
+    ) -> None:
         """Store the value if there is one."""
         if values is not None:
             setattr(namespace, self.dest, values)

@@ -5,10 +5,12 @@ message stays short and a terminal shows every character instead of obeying it.
 """
 
 import contextlib
+import errno
 import math
 import numbers
 import reprlib
 from collections.abc import Iterator
+from typing import TextIO
 
 
 class UserError(Exception):
@@ -41,6 +43,26 @@ def check_count(name: str, value: object, most: float = math.inf) -> None:
         raise InvalidError(f"{name} = {value!r} is wrong: it should be a whole number from 1 on")
     if int(value) > most:
         raise InvalidError(f"{name} = {value} is wrong: it should be at most {most}")
+
+
+@contextlib.contextmanager
+def os_errors(message: str, kind: type[UserError] = UserError) -> Iterator[None]:
+    """Convert an `OSError` inside the context to a one-line error.
+
+    Args:
+      message: the beginning of the line; the system's reason follows it.
+      kind: the class of the error.
+
+    Raises:
+      UserError: an `OSError` was raised.
+    """
+    try:
+        yield
+    except UserError:
+        # Some of them are `OSError`s too.
+        raise
+    except OSError as error:
+        raise kind(f"{message}: {error.strerror or error}") from None
 
 
 @contextlib.contextmanager
@@ -119,3 +141,16 @@ _SHORT = _ShortRepr()
 def ran_out(error: Exception) -> bool:
     """Return whether JAX failed because a device ran out of memory."""
     return "RESOURCE_EXHAUSTED" in str(error)
+
+
+READER_LEFT = {errno.EPIPE, errno.EIO, errno.ECONNRESET}
+"""Errors of a pipe, a terminal or a socket whose other end was closed."""
+
+
+def write_error(stream: TextIO | None) -> OSError | None:
+    """Return the last error of a stream that keeps it instead of raising it; None if there is none.
+
+    A command protects its standard output and standard error so.
+    """
+    raw = getattr(getattr(stream, "buffer", None), "raw", None)
+    return getattr(raw, "error", None)

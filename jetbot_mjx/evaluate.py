@@ -6,8 +6,8 @@ One policy gets a report. Several seeds, or several runs, are compared as well.
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli
-from jetbot_mjx.evaluation.goal_set import MOST_GOALS, REPORT_GOALS
+from jetbot_mjx import cli, startup
+from jetbot_mjx.evaluation import MOST_GOALS, REPORT_GOALS
 
 BELOW_TARGET = 1
 """Exit code if a success rate is below `--min-success`."""
@@ -68,9 +68,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     runs = [cli.find_run(name) for name in options.run]
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.evaluation import evaluate_runs, tables
-        from jetbot_mjx.runs.run_dir import seed_folders
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.evaluation import (
+            below_target,
+            compare_runs,
+            evaluate_run,
+            summarize_comparison,
+            summarize_report,
+        )
+        from jetbot_mjx.runs import seed_folders
     cli.prepare_device()
     settings = {
         "episodes": options.episodes,
@@ -82,13 +88,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     }
     with cli.show_progress():
         if len(runs) > 1 or seed_folders(runs[0]):
-            result = evaluate_runs.compare_runs(runs, **settings)
-            text = tables.summarize_comparison(result)
+            result = compare_runs(runs, **settings)
+            text = summarize_comparison(result)
         else:
-            result = evaluate_runs.evaluate_run(runs[0], **settings)
-            text = tables.summarize_report(result)
+            result = evaluate_run(runs[0], **settings)
+            text = summarize_report(result)
     cli.tell(text)
-    below = tables.below_target(result, options.min_success)
+    below = below_target(result, options.min_success)
     if below:
         cli.tell("\n".join(below))
     return BELOW_TARGET if below else 0

@@ -10,7 +10,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 _FORMATS = ("numpy", "onnx", "stablehlo")
 _FOLDER = "policy"
@@ -52,8 +52,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     run = cli.find_run(options.run)
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.deployment.policy_export import export_policy, summarize_export
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.deployment import export_policy, summarize_export
     cli.prepare_device()
     with cli.show_progress():
         exported = export_policy(

@@ -19,7 +19,7 @@ _COSTS = {
     "environment step": "training is up to 3 times slower",
     "compilation cache": "every start compiles again, for about half a minute",
 }
-"""What each fallback costs, roughly: docs/troubleshooting.md has the measurements."""
+"""The rough cost of each fallback: docs/troubleshooting.md has the measurements."""
 
 
 class Fallback(NamedTuple):

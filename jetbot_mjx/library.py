@@ -12,15 +12,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, overload
 
 from jetbot_mjx import evaluation, training, tuning, viewers
-from jetbot_mjx.cli import require_device
 from jetbot_mjx.config import Config, Overrides, load_config
+from jetbot_mjx.devices import require_device
 from jetbot_mjx.errors import InvalidError, UserError, check_count, ran_out
-from jetbot_mjx.runs import metrics, progress
-from jetbot_mjx.runs.find_run import find_run, find_run_config
-from jetbot_mjx.runs.run_dir import default_run_dir, seed_folders
+from jetbot_mjx.runs import default_run_dir, find_run, find_run_config, seed_folders
+from jetbot_mjx.terminal import restart_clock, show_progress
 
 if TYPE_CHECKING:
-    from jetbot_mjx.runs.checkpoint import Which
+    from jetbot_mjx.runs import Which
 
 _FITTING = {
     "strip": ("many",),
@@ -73,6 +72,7 @@ def train(
     if run_dir is None:
         run_dir = default_run_dir(_name(config))
     with _ready(verbose):
+        restart_clock()
         return training.run(load_config(config, overrides), Path(run_dir), verbose=verbose)
 
 
@@ -255,11 +255,6 @@ def tune(
     base = load_config(config, overrides)
     parameters = tuning.read_space(space, base)
     folder = default_run_dir(Path(f"tune-{_name(config).stem}")) if output is None else Path(output)
-
-    def say(text: str) -> None:
-        if verbose:
-            print(text, file=sys.stdout, flush=True)
-
     with _ready(verbose):
         return tuning.run_search(
             base,
@@ -269,8 +264,17 @@ def tune(
             round_size=round_size,
             confirm=confirm,
             storage=storage,
-            say=say,
+            say=_print_at_once if verbose else _print_nothing,
         )
+
+
+def _print_at_once(text: str) -> None:
+    """Print a line on standard output without waiting for more."""
+    print(text, file=sys.stdout, flush=True)
+
+
+def _print_nothing(text: str) -> None:
+    """Print nothing."""
 
 
 def _name(config: str | Path | Config) -> Path:
@@ -288,8 +292,8 @@ def _ready(verbose: bool) -> Iterator[None]:
     require_device()
     with contextlib.ExitStack() as stack:
         if verbose:
-            metrics.restart_clock()
-            stack.enter_context(progress.show_progress(sys.stderr))
+            restart_clock()
+            stack.enter_context(show_progress(sys.stderr))
         try:
             yield
         # JAX raises a subclass.

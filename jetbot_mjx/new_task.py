@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from jetbot_mjx import cli
-from jetbot_mjx.envs.task_template import write_task_template
+from jetbot_mjx.envs import write_task_template
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

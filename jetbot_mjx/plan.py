@@ -6,7 +6,7 @@ shapes alone: nothing is compiled and nothing is trained.
 
 from collections.abc import Sequence
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 TOO_LARGE = 1
 """Exit code if the configuration does not fit."""
@@ -32,9 +32,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     cli.require_config(parser, options)
     config = cli.config_of(options)
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.training.memory_plan import memory_table, plan_memory
-    cli.divide_cpu(config.cpu_devices)
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.training import memory_table, plan_memory
+    startup.divide_cpu(config.cpu_devices)
     cli.prepare_device()
     plan = plan_memory(config, options.memory)
     cli.tell(memory_table(plan))

@@ -5,7 +5,7 @@ Without RUN, a policy that comes with the package drives.
 
 from collections.abc import Sequence
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 _LARGEST_PORT = 65_535
 _DEFAULT_POLICY = "jetbot_egocentric"
@@ -73,12 +73,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     run = cli.find_run(options.run or f"pretrained:{_DEFAULT_POLICY}")
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.viewers import live
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.viewers import play_live
     cli.prepare_device()
     if options.run is None:
         cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
-    successes, episodes = live.play_live(
+    successes, episodes = play_live(
         run,
         viewer=options.viewer,
         agent=options.agent,

@@ -8,7 +8,7 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 FOLDER = Path("runs/pretrained")
 
@@ -31,8 +31,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help=f"folder for the copies (default: {FOLDER})",
     )
     options = parser.parse_args(arguments)
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.runs.find_run import copy_pretrained
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.runs import copy_pretrained
 
     runs = copy_pretrained(options.output)
     for path in runs:

@@ -9,8 +9,8 @@ image of an untrained, an early and a trained policy.
 import argparse
 from collections.abc import Sequence
 
-from jetbot_mjx import cli
-from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
+from jetbot_mjx import cli, startup
+from jetbot_mjx.evaluation import REPORT_GOALS
 
 
 def _parser() -> cli.Parser:
@@ -75,19 +75,26 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     _check(parser, options)
     run, which, episodes = cli.find_run(options.run), options.checkpoint, options.episodes
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.viewers import gallery, many
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.viewers import (
+            GALLERY_EPISODES,
+            VIDEO_EPISODES,
+            render_gallery,
+            render_many,
+            render_run,
+            render_training_strip,
+        )
     cli.prepare_device()
     with cli.show_progress():
         if options.gallery:
-            rendered = gallery.render_gallery(run, episodes=episodes or gallery.GALLERY_EPISODES)
+            rendered = render_gallery(run, episodes=episodes or GALLERY_EPISODES)
         elif options.strip:
-            rendered = many.render_training_strip(run, robots=options.many or 16)
+            rendered = render_training_strip(run, robots=options.many or 16)
         elif options.many:
-            rendered = many.render_many(run, robots=options.many, which=which)
+            rendered = render_many(run, robots=options.many, which=which)
         else:
-            count = episodes or gallery.EPISODES
-            rendered = gallery.render_run(run, episodes=count, goals=options.goals, which=which)
+            count = episodes or VIDEO_EPISODES
+            rendered = render_run(run, episodes=count, goals=options.goals, which=which)
     cli.tell(rendered.describe())
     return 0
 

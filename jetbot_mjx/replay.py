@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 NOT_REPRODUCED = 1
 """Exit code if the state stays finite."""
@@ -21,19 +21,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = cli.Parser(prog="jetbot-mjx replay", description=__doc__)
     parser.add_argument("file", type=Path, metavar="FILE", help="a file in a run's nan_dumps/")
     options = parser.parse_args(arguments)
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.envs.jetbot_env import make_env
-        from jetbot_mjx.runs import nan_dump
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.envs import make_env
+        from jetbot_mjx.runs import NAN_DUMP_HEADER, format_step, load_nan_dump, replay_nan_dump
     cli.prepare_device()
-    stored = nan_dump.load_nan_dump(options.file)
+    stored = load_nan_dump(options.file)
     cli.tell(
         f"the state became non-finite before step {stored.env_steps:,} of the training; the unroll"
-        f" up to there:\n{nan_dump.HEADER}"
+        f" up to there:\n{NAN_DUMP_HEADER}"
     )
     nonfinite: list[str] = []
     env = make_env(stored.config.for_any_device(), task_class=stored.task_class)
-    for index, step in enumerate(nan_dump.replay_nan_dump(stored, env)):
-        cli.tell(nan_dump.format_step(index, step))
+    for index, step in enumerate(replay_nan_dump(stored, env)):
+        cli.tell(format_step(index, step))
         nonfinite = step.nonfinite
     if not nonfinite:
         cli.tell("the state stayed finite here: other devices and versions round differently")

@@ -8,7 +8,7 @@ the log show where the two differ, and so what is wrong in the simulation or in 
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -43,8 +43,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="folder of the results (default: that of the log)",
     )
     options = parser.parse_args(arguments)
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.deployment.drive_comparison import compare_drive, summarize_drive
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.deployment import compare_drive, summarize_drive
 
     with cli.show_progress():
         comparison = compare_drive(

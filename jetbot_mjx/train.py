@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jetbot_mjx import cli
+from jetbot_mjx import cli, startup
 
 if TYPE_CHECKING:
     from jetbot_mjx.config import Config
@@ -42,9 +42,8 @@ def _parser() -> cli.Parser:
 
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.runs.find_run import find_run_config
-        from jetbot_mjx.runs.run_dir import default_run_dir
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.runs import default_run_dir, find_run_config
     resumed = cli.find_run(options.resume) if options.resume else None
     if resumed:
         options.config = find_run_config(resumed)
@@ -69,29 +68,34 @@ def main(arguments: Sequence[str] | None = None) -> int:
         parser.error(f"{name}: --resume continues that run, in its folder")
     if not (options.resume or options.config):
         parser.error("name a configuration, as in `train jetbot`, or a run to --resume")
-    cli.wake_driver()
+    startup.wake_driver()
     config, run_dir = _config_and_folder(options)
     # Import the large modules while the GPU initialises, and load the programs during the rest.
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.training import distributed, preemption
-    cli.divide_cpu(config.cpu_devices)
+    with startup.exit_on_interrupt():
+        from jetbot_mjx import runs, training
+        from jetbot_mjx.training import is_primary
+    startup.divide_cpu(config.cpu_devices)
     if options.distributed:
-        distributed.check(config)
-        distributed.join()
-    cli.wake_device()
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.envs.program_key import open_program_cache
-        from jetbot_mjx.training import ppo_trainer  # noqa: F401
+        training.check_processes(config)
+        training.join_processes()
+    startup.wake_device()
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.envs import open_program_cache
+        from jetbot_mjx.training import CompiledTrainer  # noqa: F401
     cli.prepare_device()
     programs = open_program_cache(config)
     programs.prefetch("advance", "init")
-    with cli.exit_on_interrupt():
-        from jetbot_mjx.training import session
-    result = session.train(config, run_dir, programs)
-    if distributed.is_primary():
-        cli.tell(session.closing_message(result))
-    distributed.leave()
-    return 0 if result.finished else preemption.STOPPED
+    if not programs.loads:
+        startup.load_blas()
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.training import Preemption, run
+    result = run(config, run_dir, programs, Preemption(config.preemption_notice), verbose=True)
+    if is_primary():
+        text = training.closing_message(result)
+        runs.log_message(run_dir, text)
+        cli.tell(text)
+    training.leave_processes()
+    return 0 if result.finished else training.STOPPED
 
 
 if __name__ == "__main__":

@@ -30,41 +30,50 @@ if os.environ["JAX_PLATFORMS"] == "cpu":
         _flags.append("--xla_cpu_use_fusion_emitters=false")
     os.environ.setdefault("XLA_FLAGS", " ".join(_flags))
 os.environ.setdefault("MPLBACKEND", "agg")
+if sys.dont_write_bytecode:
+    # A hundred processes would compile every module from its source: an eighth of what they cost.
+    sys.dont_write_bytecode, sys.pycache_prefix = False, str(ROOT / ".cache" / "bytecode")
+    os.environ["PYTHONPYCACHEPREFIX"] = sys.pycache_prefix
+    del os.environ["PYTHONDONTWRITEBYTECODE"]
 # Traces and their caches are millions of objects that stay: look through them less often.
 gc.set_threshold(20_000, 20, 10)
 # A shell lets its background jobs ignore Ctrl-C: tests that press it would wait for ever.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
-# Tests borrow from each other and from `helpers`, whichever folder they are in, also in processes
-# of their own: this checkout first, and whatever else there was, for the libraries may lie there.
-_FOLDERS = [str(folder) for folder in sorted((ROOT / "tests").iterdir()) if folder.is_dir()]
-sys.path += [str(ROOT), *_FOLDERS]
-_PATHS = [str(ROOT), str(ROOT / "tests"), *_FOLDERS, *filter(None, [os.environ.get("PYTHONPATH")])]
-os.environ["PYTHONPATH"] = os.pathsep.join(_PATHS)
+# Of this checkout first, in processes of the tests too: the packages, and the tests' `helpers`.
+_PATHS = [str(ROOT / "tests"), str(ROOT)]
+sys.path[:0] = _PATHS
+os.environ["PYTHONPATH"] = os.pathsep.join([*_PATHS, *filter(None, [os.environ.get("PYTHONPATH")])])
 
 import jax
 import pytest
-from unpainted import unpainted
 
-from jetbot_mjx import fallbacks, imports
-from jetbot_mjx.config import Config, parse_config
+from helpers.durations import (  # noqa: F401
+    pytest_runtest_logstart,
+    pytest_runtest_makereport,
+    pytest_terminal_summary,
+)
+from helpers.unpainted import unpainted
+from jetbot_mjx import fallbacks
+from jetbot_mjx.config import Config, ConfigError, load_config, parse_config, task_modules
 from jetbot_mjx.envs import opengl, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.errors import UserError
 
-OWN_TASKS = program_key.TRUSTED
+_OWN_TASKS = program_key.BUILT_IN_TASKS
 # Tests replace parts of the package, of which programs that were kept would know nothing.
-program_key.TRUSTED = frozenset()
+program_key.BUILT_IN_TASKS = frozenset()
 
 _LONGEST = (
     "test_ppo",
     "test_pretrained",
     "test_notebooks",
     "test_distributed",
-    "test_resume",
-    "test_adapters",
+    "test_resumption",
+    "test_vector",
+    "test_gymnasium",
     "test_preemption",
-    "test_devices",
+    "test_eight_devices",
     "test_torture",
 )
 
@@ -97,9 +106,15 @@ def forget_modules(tmp_path_factory):
         if (getattr(sys.modules[name], "__file__", None) or "").startswith(temporary):
             del sys.modules[name]
     sys.path[:] = [folder for folder in sys.path if not folder.startswith(temporary)]
-    for name, folder in [*imports.TASK_FOLDERS.items()]:
+    for name, folder in [*task_modules.TASK_FOLDERS.items()]:
         if str(folder).startswith(temporary):
-            del imports.TASK_FOLDERS[name]
+            del task_modules.TASK_FOLDERS[name]
+
+
+@pytest.fixture(scope="session")
+def own_tasks() -> frozenset[str]:
+    """The tasks of which a user's programs are kept; the tests keep those of none."""
+    return _OWN_TASKS
 
 
 @pytest.fixture(scope="session")
@@ -155,10 +170,35 @@ def blank_figures():
         yield
 
 
+@pytest.fixture
+def write(tmp_path):
+    """Writes a YAML file and gives its path."""
+
+    def write(text):
+        path = tmp_path / "mine.yaml"
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+@pytest.fixture
+def refusal(write):
+    """The one line by which a file, with overrides, is refused."""
+
+    def refusal(text, *overrides):
+        with pytest.raises(ConfigError) as caught:
+            load_config(write(text), overrides)
+        message = str(caught.value)
+        assert len(message.splitlines()) == 1
+        return message
+
+    return refusal
+
+
 @pytest.fixture(scope="session")
 def smoke_run(tmp_path_factory) -> Path:
     """A run folder, trained once with `configs/smoke.yaml` and never written to by a test."""
-    from jetbot_mjx.config import load_config
     from jetbot_mjx.training import session
 
     folder = tmp_path_factory.getbasetemp()

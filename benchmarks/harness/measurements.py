@@ -30,6 +30,7 @@ from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.training import brax_trainer, ppo_trainer
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
@@ -178,7 +179,7 @@ class IntervalTimer(TrainerCallback):
 def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Time the resumable trainer by its own reports, without the first intervals."""
     config = training_config(config, num_envs, sizes, trainer="resumable")
-    program = ppo_trainer.CompiledTrainer.from_config(config, make_env(config))
+    program = ppo_trainer.CompiledTrainer.from_setup(Setup(config))
     preemption = Preemption(config.preemption_notice)
     return _time_trainer(
         "training",
@@ -190,8 +191,8 @@ def measure_training(config: Config, num_envs: int, sizes: Sizes) -> Row:
 def measure_brax(config: Config, num_envs: int, sizes: Sizes) -> Row:
     """Time Brax's own `ppo.train` with the same hyperparameters in the same way."""
     config = training_config(config, num_envs, sizes, trainer="brax")
-    env = make_env(config)
-    return _time_trainer("brax", config, lambda timer: brax_trainer.train(config, env, timer))
+    setup = Setup(config)
+    return _time_trainer("brax", config, lambda timer: brax_trainer.train(setup, timer))
 
 
 def _time_trainer(rate: str, config: Config, train: Callable[[IntervalTimer], None]) -> Row:

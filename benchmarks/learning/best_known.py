@@ -32,8 +32,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import CONFIGS
 from benchmarks.harness.results import check_output
 from jetbot_mjx import cli
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
 from jetbot_mjx.config import Config, load_config
+from jetbot_mjx.devices import require_device, use_compilation_cache
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.errors import UserError
@@ -277,7 +277,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.knots < 2 or options.samples < 2:
         parser.error("--knots and --samples: at least 2")
-    cli.require_device()
+    require_device()
     use_compilation_cache()
     config = load_config(options.config, options.overrides)
     check_output(options.output)

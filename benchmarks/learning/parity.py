@@ -65,9 +65,8 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 from benchmarks import CONFIGS, RESULTS
 from jetbot_mjx import cli
 from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config, parse_config
+from jetbot_mjx.devices import compiler_options, require_device, use_compilation_cache
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.robot_model import (
@@ -79,10 +78,12 @@ from jetbot_mjx.envs.robot_model import (
 )
 from jetbot_mjx.envs.state import PhysicsState
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.run_dir import versions, write_json
 from jetbot_mjx.training import brax_trainer, ppo_trainer
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
+from onekernel.aot.program_cache import ProgramCache
 
 TRAINERS = ("brax", "resumable")
 _MOST_SIGNS = 100_000
@@ -200,9 +201,9 @@ def train(
     config = _with_trainer(config, trainer, seed)
     recorder, began = _SuccessRecorder(evaluate), time.perf_counter()
     if trainer == "brax":
-        brax_trainer.train(config, env, recorder)
+        brax_trainer.train(Setup(config, env=env), recorder)
     else:
-        program = ppo_trainer.CompiledTrainer.from_config(config, env)
+        program = ppo_trainer.CompiledTrainer.from_setup(Setup(config, env=env))
         ppo_trainer.train(
             program, recorder, Preemption(config.preemption_notice), config.checkpoint_interval
         )
@@ -229,7 +230,7 @@ def run(config: Config, env: JetBotEnv, seeds: int, episodes: int) -> list[Curve
     """
     networks = make_networks(config.ppo, env.observation_size, env.action_size)
     evaluator, keys = (
-        Evaluator(env, networks, ProgramCache(compiler_options(config))),
+        Evaluator(env, networks, ProgramCache(compiler_options(config.deterministic))),
         report_keys(episodes),
     )
 
@@ -360,7 +361,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     if options.seeds < 2:
         parser.error("--seeds: a comparison needs at least 2")
-    cli.require_device()
+    require_device()
     use_compilation_cache()
     # Build both tasks with settings that both trainers have.
     config, probe = load_config(options.config, options.overrides), parse_config(PROBE)

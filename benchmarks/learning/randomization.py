@@ -24,15 +24,13 @@ from benchmarks import CONFIGS
 from benchmarks.harness.measurements import Sizes
 from benchmarks.harness.results import check_output, conditions, default_output, write
 from jetbot_mjx import cli
-from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.compiler.program_cache import ProgramCache, use_compilation_cache
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
+from jetbot_mjx.devices import require_device, use_compilation_cache
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, Sweeper, SweepResult
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.run_dir import seed_folders
 from jetbot_mjx.training import session
@@ -54,17 +52,16 @@ class PolicyEvaluator:
           episodes: The number of the report's goals for the preset's robot and the full ranges.
           goals: The number of the report's goals for each robot of the robustness evaluation.
         """
-        env = make_env(config)
+        setup = Setup(config)
+        env, networks, programs = setup.env, setup.networks, setup.programs
         self._dt, self._keys = env.dt, report_keys(episodes)
-        networks = make_networks(config.ppo, env.observation_size, env.action_size)
-        programs = ProgramCache(compiler_options(config))
         self._evaluators = {
             "preset": Evaluator(env, networks, programs),
             "ranges": Evaluator(
                 DomainRandomizationWrapper(env, ranges=config.randomization), networks, programs
             ),
         }
-        self._sweeper = Sweeper(env, networks, report_keys(goals))
+        self._sweeper = Sweeper(setup, report_keys(goals))
 
     def evaluate(self, folder: Path) -> dict[str, Any]:
         """Evaluate the last policy of a run.
@@ -254,7 +251,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = load_config(options.config, [*options.overrides, f"seeds={options.seeds}"])
     if not config.randomization.drawn:
         raise UserError(f"--config {options.config}: its randomization draws nothing")
-    cli.require_device()
+    require_device()
     use_compilation_cache()
     output = options.output or default_output("randomization-")
     check_output(output)

@@ -28,11 +28,11 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks import CONFIGS
 from jetbot_mjx import cli
-from jetbot_mjx.agents.ppo import TrainState
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.agents import TrainState
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.devices import use_compilation_cache
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.checkpoint_store import (
     FOLDER,
     checkpoint_path,
@@ -40,7 +40,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     read_about,
     read_tree,
 )
-from jetbot_mjx.runs.resume import tree_shapes
+from jetbot_mjx.runs.resumption import tree_shapes
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 CONFIG = CONFIGS / "smoke.yaml"
@@ -214,7 +214,7 @@ def finish(run_dir: Path, settings: Sequence[str], program: Sequence[str] = TRAI
 def make_template(settings: Sequence[str]) -> TrainState:
     """Return the shapes and dtypes of the state that a training with these settings saves."""
     config = load_config(CONFIG, settings)
-    return CompiledTrainer.from_config(config, make_env(config)).template()
+    return CompiledTrainer.from_setup(Setup(config)).template()
 
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:

@@ -17,12 +17,13 @@ import jax.numpy as jnp
 
 from jetbot_mjx import cli
 from jetbot_mjx.agents.ppo import PPO
-from jetbot_mjx.compiler.lower_jaxpr import scalarize
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config, parse_config
+from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import build_ppo
+from onekernel.lower.jaxpr import scalarize
 
 PROGRAMS = ("physics", "env", "training")
 
@@ -120,10 +121,10 @@ def compiled_text(config: Config, program: str) -> str:
         step: Any = batch.step
         lowered = jax.jit(step).lower(jax.eval_shape(batch.reset, keys), actions)
     else:
-        ppo = PPO(config.ppo, batch, build_ppo(config, env).networks)
-        state = jax.eval_shape(ppo.init, jax.random.PRNGKey(0))
+        ppo = PPO(config.ppo, batch, build_ppo(Setup(config, env=env)).networks)
+        state = jax.eval_shape(lambda key: ppo.packed(ppo.init(key)), jax.random.PRNGKey(0))
         lowered = jax.jit(ppo.train_step).lower(state)
-    return str(lowered.compile(compiler_options=compiler_options(config)).as_text())
+    return str(lowered.compile(compiler_options=compiler_options(config.deterministic)).as_text())
 
 
 def count_scalars(config: Config) -> dict[str, int]:

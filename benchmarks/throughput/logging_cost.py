@@ -22,13 +22,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
 from benchmarks.harness.measurements import IntervalTimer
 from jetbot_mjx import cli
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.metrics import CompileClock
-from jetbot_mjx.runs.run_dir import versions, write_json
+from jetbot_mjx.runs.run_dir import write_json
 from jetbot_mjx.training import ppo_trainer, session
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import Preemption
@@ -90,7 +89,7 @@ def measure(config: Config, repeats: int) -> dict[str, list[float]]:
       The seconds of each training from its first report until its last is written, by mode.
     """
     env = make_env(config)
-    program = ppo_trainer.CompiledTrainer.from_config(config, env)
+    program = ppo_trainer.CompiledTrainer.from_setup(Setup(config, env=env))
     compiled = program.compile()
     program.compile = lambda: compiled
     seconds: dict[str, list[float]] = {name: [] for name in MODES}
@@ -116,9 +115,10 @@ def _train_once(config: Config, env: Any, program: ppo_trainer.CompiledTrainer, 
             timed = train(IntervalTimer(clock))
         else:
             kind = _LogsAndCheckpoints if mode == "saved" else _LogsOnly
-            run_dir, programs = Path(folder), ProgramCache(compiler_options(config))
-            objects = env, program.ppo, programs, None, versions(), []
-            parts = session.Training(config, run_dir, [run_dir], *objects)
+            run_dir, setup = Path(folder), Setup(config, env=env)
+            parts = session.Training(
+                setup=setup, run_dir=run_dir, run_dirs=[run_dir], ppo=program.ppo
+            )
             with (
                 mock.patch.object(session, "RunRecorder", kind),
                 session.open_recorder(parts, clock, None) as recorder,

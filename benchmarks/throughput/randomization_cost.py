@@ -23,8 +23,9 @@ from benchmarks.harness.measurements import Sizes, prepare_env, training_config
 from benchmarks.harness.results import check_output, conditions, default_output, write
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, RandomizationConfig, load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.devices import require_device
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 SETTINGS = ("off", "on")
@@ -72,7 +73,7 @@ class _Training:
     """A compiled training that continues with every call of `repeat`."""
 
     def __init__(self, config: Config, steps: int) -> None:
-        program = CompiledTrainer.from_config(config, make_env(config))
+        program = CompiledTrainer.from_setup(Setup(config))
         self._advance = program.compile()
         self._state = program.init()
         self._steps, self._size = steps, config.ppo.steps_per_training_step
@@ -150,7 +151,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     config = load_config(options.config, options.overrides)
     if not config.randomization.drawn:
         raise UserError(f"--config {options.config}: its randomization draws nothing")
-    cli.require_device()
+    require_device()
     output = options.output or default_output("randomization-cost-")
     check_output(output)
     sizes = Sizes(options.repeats, options.unroll, options.training_steps)

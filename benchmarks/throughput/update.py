@@ -23,7 +23,8 @@ from benchmarks.harness.measurements import Sizes, training_config
 from benchmarks.harness.results import counts
 from jetbot_mjx import cli
 from jetbot_mjx.config import Config, load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.devices import require_device
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 UPDATES = ("xla", "fused")
@@ -49,7 +50,7 @@ class Training:
         """
         ppo = config.ppo.model_copy(update={"update": update})
         config = config.model_copy(update={"ppo": ppo})
-        program = CompiledTrainer.from_config(config, make_env(config))
+        program = CompiledTrainer.from_setup(Setup(config))
         self._advance, self._state = program.compile(), program.init()
         self.size = ppo.steps_per_training_step
         self.seconds(2)  # warm-up
@@ -140,7 +141,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = _parser().parse_args(arguments)
     config = load_config(options.config, options.overrides)
-    cli.require_device()
+    require_device()
     sizes = Sizes(options.repeats, training_steps=options.training_steps)
     rows = []
     for num_envs in options.num_envs:

@@ -5,8 +5,18 @@ before the colon, and that registers the environment. Stable-Baselines3's batch 
 `jetbot_mjx.adapters.stable_baselines3.JetBotVecEnv`.
 """
 
-from jetbot_mjx.imports import without_warp_lines
+import contextlib
 
-with without_warp_lines():
-    from jetbot_mjx.adapters.gymnasium import JetBotGymEnv as JetBotGymEnv
-    from jetbot_mjx.adapters.vector import JetBotVectorEnv as JetBotVectorEnv
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
+
+# Without Gymnasium there is nobody to tell.
+with contextlib.suppress(ModuleNotFoundError):
+    from gymnasium import register
+
+    register(
+        "JetBot-v0",
+        entry_point="jetbot_mjx.adapters.gymnasium:JetBotGymEnv",
+        vector_entry_point="jetbot_mjx.adapters.vector:JetBotVectorEnv",
+    )

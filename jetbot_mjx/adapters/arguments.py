@@ -4,7 +4,6 @@ import math
 import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -14,7 +13,7 @@ from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.errors import UserError, check_count
 
 Seed = int | Sequence[int | None] | None
-Source = Config | Mapping[str, Any] | str | Path | None
+Source = Config | Mapping[str, object] | str | Path | None
 """A configuration, nested settings, a YAML file, or None for the tutorial's configuration."""
 
 
@@ -72,12 +71,12 @@ def _read(config: Source) -> Config:
     raise UserError(f"config = {config!r} is wrong: give a YAML file, a mapping or a Config")
 
 
-def _check_seconds(name: str, value: Any) -> None:
+def _check_seconds(name: str, value: object) -> None:
     if not isinstance(value, numbers.Real) or not 0 < float(value) < math.inf:
         raise UserError(f"{name} = {value!r} is wrong: it should be seconds above 0")
 
 
-def as_actions(actions: Any, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
+def as_actions(actions: object, shape: tuple[int, ...]) -> Float[np.ndarray, "..."]:
     """Return actions as a float32 array of the expected shape.
 
     Args:

@@ -6,13 +6,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import UInt8
 
-from jetbot_mjx.adapters.arguments import Source, resolve
+from jetbot_mjx.adapters.arguments import Seed, Source, resolve
 from jetbot_mjx.adapters.batched_env import BatchedEnv, unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
-from jetbot_mjx.agents.cnn_sizes import is_image
-from jetbot_mjx.compiler.program_cache import use_compilation_cache
+from jetbot_mjx.agents import is_image
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.devices import use_compilation_cache
+from jetbot_mjx.envs import JetBotEnv
 from jetbot_mjx.errors import requires_extra
 
 with requires_extra("gymnasium", "the adapter"):
@@ -46,11 +46,10 @@ class AdapterBase:
     A constructor calls `_configure`, builds its simulation from `config`, and calls `_prepare`.
     """
 
-    metadata: dict[str, Any]
+    metadata: dict[str, object]
     config: Config
     """The configuration that the environment is built from."""
     render_mode: str | None
-    batch: BatchedEnv
     _renderer: FrameRenderer | None
     _is_begun = False
     """Whether there was a `reset`; the subclass sets it."""
@@ -91,8 +90,8 @@ class AdapterBase:
         return observation_space(env.observation_size), spaces.Box(-1.0, 1.0, (env.action_size,))
 
     def _poses(self) -> list[Pose]:
-        """Return the pose of every robot of `batch`; an adapter without one overrides this."""
-        return self.batch.poses()
+        """Return the pose of every robot."""
+        raise NotImplementedError
 
     def _require_reset(self, method: str) -> None:
         if not self._is_begun:
@@ -123,3 +122,48 @@ class AdapterBase:
         """Close the renderer, and what Gymnasium's own class has open."""
         self._close_renderer()
         super().close()  # pyright: ignore[reportAttributeAccessIssue]
+
+
+class BatchAdapter(AdapterBase):
+    """The base of the adapters of several robots, which run in one compiled program."""
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        skip_frame: int = 1,
+        physics_dt: float | None = None,
+        rendering_dt: float | None = None,
+        max_episode_length: int | None = None,
+        seed: Seed = 0,
+        headless: bool = True,
+        *,
+        render_mode: str | None = None,
+        config: Source = None,
+    ) -> None:
+        """Build the environment; the first reset and the first step compile.
+
+        Args:
+          num_envs: Number of robots.
+          skip_frame: See `JetBotGymEnv`, as for all arguments that are not explained here.
+          physics_dt: See `JetBotGymEnv`.
+          rendering_dt: See `JetBotGymEnv`.
+          max_episode_length: See `JetBotGymEnv`.
+          seed: Seed of the first episodes; one number counts on from environment to environment.
+          headless: See `JetBotGymEnv`; a window shows the first robot.
+          render_mode: `human`, or `rgb_array` for images of every robot.
+          config: See `JetBotGymEnv`.
+
+        Raises:
+          UserError: An argument or setting is wrong, or there is no display for a window.
+        """
+        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
+        self._configure(config, *given)
+        self.batch = BatchedEnv(self.config, num_envs, seed)
+        self._set_spaces(*self._prepare(self.batch.env))
+
+    def _set_spaces(self, observation: "spaces.Space[Any]", action: spaces.Box) -> None:
+        """Set the attributes of the environment's class from the spaces of one robot."""
+        raise NotImplementedError
+
+    def _poses(self) -> list[Pose]:
+        return self.batch.poses()

@@ -10,11 +10,9 @@ from jaxtyping import Bool, Float, UInt8
 
 from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions
 from jetbot_mjx.adapters.renderer import Pose
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.state import State
-from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.devices import compiler_options
+from jetbot_mjx.envs import State, make_env, wrap_for_training
 from jetbot_mjx.errors import check_count
 
 Observations = Float[np.ndarray, "n obs"] | UInt8[np.ndarray, "n h w c"] | dict[str, np.ndarray]
@@ -51,7 +49,7 @@ def unwrap_single(parts: Any) -> Any:
     return parts
 
 
-def observation_at(obs: Observations, index: int | np.intp) -> Any:
+def observation_at(obs: Observations, index: int | np.intp) -> np.ndarray | dict[str, np.ndarray]:
     """Return the observation of one robot."""
     if isinstance(obs, dict):
         return {name: part[index] for name, part in obs.items()}
@@ -79,7 +77,7 @@ class BatchedEnv:
         self.env = make_env(config)
         length = config.task.episode_length
         wrapped: Any = wrap_for_training(self.env, length, final_images=True)
-        options = compiler_options(config)
+        options = compiler_options(config.deterministic)
 
         def step(state: State, actions: jax.Array) -> tuple[State, tuple[Any, ...]]:
             state = wrapped.step(state, actions)

@@ -9,13 +9,11 @@ from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
-from jetbot_mjx.envs.mujoco_env import MujocoJetBot, Observation
+from jetbot_mjx.envs import MujocoJetBot, Observation
 from jetbot_mjx.errors import UserError, requires_extra
 
 with requires_extra("gymnasium", "the adapter"):
     import gymnasium
-
-ENV_ID = "JetBot-v0"
 
 
 class JetBotGymEnv(AdapterBase, gymnasium.Env):
@@ -28,7 +26,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
     a seed `reset` continues the random stream that the first one began.
     """
 
-    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 60}  # noqa: RUF012
+    metadata: dict[str, object] = {"render_modes": list(RENDER_MODES), "render_fps": 60}  # noqa: RUF012
 
     def __init__(
         self,
@@ -134,10 +132,3 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
     def _poses(self) -> list[Pose]:
         now = self._steps * self.config.physics.ctrl_dt
         return [Pose(self.robot.data.qpos, self.robot.goal, now)]
-
-
-gymnasium.register(
-    ENV_ID,
-    entry_point=f"{__name__}:{JetBotGymEnv.__name__}",
-    vector_entry_point="jetbot_mjx.adapters.vector:JetBotVectorEnv",
-)

@@ -1,20 +1,17 @@
 """Render the robot of an adapter: as images, or in MuJoCo's window."""
 
-import atexit
 import os
 import sys
 import time
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree, UInt8
 
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.viewers import mujoco_window
-from jetbot_mjx.viewers.offscreen import Renderer, overview
+from jetbot_mjx.envs import QPOS_XYZ, JetBotEnv
+from jetbot_mjx.viewers import Renderer, Window, overview, require_window
 
 RENDER_MODES = ("human", "rgb_array")
 
@@ -58,11 +55,11 @@ class FrameRenderer:
         """
         self._env, self._rendering_dt = env, rendering_dt
         self._renderer: Renderer | None = None
-        self._window: mujoco_window.Window | None = None
+        self._window: Window | None = None
         self._next = (0.0, 0.0)
         """When the next frame is due, in simulated and in real time [s]."""
         if mode == "human":
-            mujoco_window.require_window(_REMEDY)
+            require_window(_REMEDY)
 
     def frame(self, pose: Pose) -> UInt8[np.ndarray, "height width 3"]:
         """Return an RGB image from the nearest camera that sees robot, goal and origin.
@@ -72,8 +69,6 @@ class FrameRenderer:
         """
         if self._renderer is None:
             self._renderer = Renderer(self._env.mj_model)
-            # When Python exits, OpenGL may be gone before the renderer is closed.
-            atexit.register(self.close)
         markers = self._markers(pose.goal)
         middles = np.stack([np.zeros(3), pose.qpos[QPOS_XYZ], *markers.values()])
         points = np.concatenate([middles - _MARGIN, middles + _MARGIN])
@@ -87,7 +82,7 @@ class FrameRenderer:
           UserError: The window cannot be opened.
         """
         if self._window is None:
-            self._window = mujoco_window.Window(self._env.mj_model, remedy=_REMEDY)
+            self._window = Window(self._env.mj_model, remedy=_REMEDY)
         due, at = (0.0, time.monotonic()) if pose.time == 0.0 else self._next
         if pose.time < due - 1e-9 or not self._window.is_running():
             return
@@ -97,12 +92,11 @@ class FrameRenderer:
 
     def close(self) -> None:
         """Close the offscreen renderer and the window."""
-        atexit.unregister(self.close)
         for opened in (self._renderer, self._window):
             if opened is not None:
                 opened.__exit__(None, None, None)
         self._renderer = self._window = None
 
-    def _markers(self, goal: PyTree) -> dict[str, Any]:
+    def _markers(self, goal: PyTree) -> dict[str, np.ndarray]:
         markers = self._env.task.markers(jax.tree.map(jnp.asarray, goal))
         return jax.device_get(dict(markers))

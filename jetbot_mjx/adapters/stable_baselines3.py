@@ -6,9 +6,8 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Source
-from jetbot_mjx.adapters.base import AdapterBase
-from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
+from jetbot_mjx.adapters.base import BatchAdapter, spaces
+from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards, observation_at
 from jetbot_mjx.errors import UserError, requires_extra
 
 with requires_extra("sb3", "the adapter"):
@@ -17,7 +16,7 @@ with requires_extra("sb3", "the adapter"):
 Indices = None | int | Iterable[int]
 
 
-class JetBotVecEnv(AdapterBase, VecEnv):
+class JetBotVecEnv(BatchAdapter, VecEnv):
     """Robots in one compiled program, for example in `PPO("MlpPolicy", JetBotVecEnv(64))`.
 
     Where an episode ends, its `info` has `terminal_observation`, `is_success` and
@@ -25,43 +24,10 @@ class JetBotVecEnv(AdapterBase, VecEnv):
     the next episode's. Without a seed `reset` continues the random streams of the environments.
     """
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        skip_frame: int = 1,
-        physics_dt: float | None = None,
-        rendering_dt: float | None = None,
-        max_episode_length: int | None = None,
-        seed: int | None = 0,
-        headless: bool = True,
-        *,
-        render_mode: str | None = None,
-        config: Source = None,
-    ) -> None:
-        """Build the environment; the first reset and the first step compile.
-
-        Args:
-          num_envs: Number of robots.
-          skip_frame: See `JetBotGymEnv`, as for all arguments that are not explained here.
-          physics_dt: See `JetBotGymEnv`.
-          rendering_dt: See `JetBotGymEnv`.
-          max_episode_length: See `JetBotGymEnv`.
-          seed: Seed of the first episodes, unless `seed` is called; it counts on from environment
-            to environment.
-          headless: See `JetBotGymEnv`; a window shows the first robot.
-          render_mode: `human`, or `rgb_array` for one image of all robots, side by side.
-          config: See `JetBotGymEnv`.
-
-        Raises:
-          UserError: An argument or setting is wrong, or there is no display for a window.
-        """
-        self._attributes: dict[str, list[Any]] = {}
-        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self._configure(config, *given)
-        self.batch = BatchedEnv(self.config, num_envs, seed)
-        spaces = self._prepare(self.batch.env)
+    def _set_spaces(self, observation: "spaces.Space[Any]", action: "spaces.Box") -> None:
+        self._attributes: dict[str, list[object]] = {}
         metadata = self.metadata
-        super().__init__(self.batch.num_envs, *spaces)
+        VecEnv.__init__(self, self.batch.num_envs, observation, action)
         # `VecEnv` leaves nothing but the render mode in it.
         self.metadata = metadata
 
@@ -91,7 +57,7 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         self._require_reset("step")
         self.batch.start(actions)
 
-    def step_wait(self) -> tuple[Observations, Rewards, Flags, list[dict[str, Any]]]:
+    def step_wait(self) -> tuple[Observations, Rewards, Flags, list[dict[str, object]]]:
         """Wait for the step that `step_async` began.
 
         Returns:
@@ -99,7 +65,7 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         """
         steps = self.batch.finish()
         done = steps.done
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos: list[dict[str, object]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(done):
             infos[index] = {
                 "terminal_observation": observation_at(steps.final_obs, index),
@@ -124,7 +90,7 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         """Return all robots in one image; None in mode `human`, whose window every step updates."""
         return None if self.render_mode == "human" else super().render(mode)
 
-    def get_attr(self, attr_name: str, indices: Indices = None) -> list[Any]:
+    def get_attr(self, attr_name: str, indices: Indices = None) -> list[object]:
         """Return an attribute that `set_attr` set, or that the environments share.
 
         Args:
@@ -143,7 +109,7 @@ class JetBotVecEnv(AdapterBase, VecEnv):
         value = self._shared(attr_name)
         return [value for _ in chosen]
 
-    def set_attr(self, attr_name: str, value: Any, indices: Indices = None) -> None:
+    def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
         """Store a value for `get_attr`. The compiled program does not see it.
 
         Args:

@@ -5,18 +5,19 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import Seed, Source
-from jetbot_mjx.adapters.base import AdapterBase
-from jetbot_mjx.adapters.batched_env import BatchedEnv, Flags, Observations, Rewards, observation_at
+from jetbot_mjx.adapters.arguments import Seed
+from jetbot_mjx.adapters.base import BatchAdapter
+from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards, observation_at
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.errors import requires_extra
 
 with requires_extra("gymnasium", "the adapter"):
+    from gymnasium import spaces
     from gymnasium.vector import AutoresetMode, VectorEnv
     from gymnasium.vector.utils import batch_space
 
 
-class JetBotVectorEnv(AdapterBase, VectorEnv):
+class JetBotVectorEnv(BatchAdapter, VectorEnv):
     """Robots in one compiled program; where an episode ends, the next begins in the same step.
 
     With `AutoresetMode.SAME_STEP`, `infos` has `final_obs` and `final_info` of the episodes that
@@ -24,53 +25,21 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
     stream of its own, and the same goals as `JetBotGymEnv` draws from the same seed.
     """
 
-    metadata: dict[str, Any] = {  # noqa: RUF012
+    metadata: dict[str, object] = {  # noqa: RUF012
         "render_modes": list(RENDER_MODES),
         "render_fps": 60,
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
-    def __init__(
-        self,
-        num_envs: int = 1,
-        skip_frame: int = 1,
-        physics_dt: float | None = None,
-        rendering_dt: float | None = None,
-        max_episode_length: int | None = None,
-        seed: Seed = 0,
-        headless: bool = True,
-        *,
-        render_mode: str | None = None,
-        config: Source = None,
-    ) -> None:
-        """Build the environment; the first reset and the first step compile.
-
-        Args:
-          num_envs: Number of robots.
-          skip_frame: See `JetBotGymEnv`, as for all arguments that are not explained here.
-          physics_dt: See `JetBotGymEnv`.
-          rendering_dt: See `JetBotGymEnv`.
-          max_episode_length: See `JetBotGymEnv`.
-          seed: Seed of the first episodes; one number counts on from environment to environment.
-          headless: See `JetBotGymEnv`; a window shows the first robot.
-          render_mode: `human`, or `rgb_array` for an image of every robot.
-          config: See `JetBotGymEnv`.
-
-        Raises:
-          UserError: An argument or setting is wrong, or there is no display for a window.
-        """
-        given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self._configure(config, *given)
-        self.batch = BatchedEnv(self.config, num_envs, seed)
-        spaces = self._prepare(self.batch.env)
-        self.single_observation_space, self.single_action_space = spaces
+    def _set_spaces(self, observation: "spaces.Space[Any]", action: "spaces.Box") -> None:
         self.num_envs = self.batch.num_envs
-        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
-        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self.single_observation_space, self.single_action_space = observation, action
+        self.observation_space = batch_space(observation, self.num_envs)
+        self.action_space = batch_space(action, self.num_envs)
 
     def reset(
-        self, *, seed: Seed = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observations, dict[str, Any]]:
+        self, *, seed: Seed = None, options: dict[str, object] | None = None
+    ) -> tuple[Observations, dict[str, object]]:
         """Begin an episode in every environment.
 
         Args:
@@ -90,7 +59,7 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
 
     def step(
         self, actions: Float[np.ndarray, "n 2"]
-    ) -> tuple[Observations, Rewards, Flags, Flags, dict[str, Any]]:
+    ) -> tuple[Observations, Rewards, Flags, Flags, dict[str, object]]:
         """Step every environment.
 
         Args:
@@ -107,7 +76,7 @@ class JetBotVectorEnv(AdapterBase, VectorEnv):
         steps = self.batch.finish()
         done = steps.done
         # The layout is that of Gymnasium's own SyncVectorEnv.
-        infos: dict[str, Any] = {}
+        infos: dict[str, object] = {}
         if done.any():
             final_obs = np.full(self.num_envs, None, object)
             for index in np.flatnonzero(done):

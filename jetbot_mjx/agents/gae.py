@@ -1,4 +1,4 @@
-"""Compute generalised advantage estimation (GAE) without a loop, as a replacement for Brax's.
+"""Compute generalised advantage estimation (GAE) without a loop.
 
 Motivation: Brax runs backwards through an unroll with `jax.lax.scan` in every minibatch. On a GPU
 each iteration launches several very small kernels, a third of all launches of a minibatch.
@@ -12,35 +12,46 @@ the time limit truncated it:
 
 A termination stops bootstrapping from Vₜ₊₁, but a truncation does not end the task: Vₜ₊₁ already
 belongs to the next episode, so the truncated step has no advantage at all. The value targets are
-Aₜ + Vₜ.
+Vₜ' = Aₜ + Vₜ, and the advantages of Brax's loss are the δₜ that has Vₜ₊₁' in the place of Vₜ₊₁.
+
+`td_error` and `gae_step` are these equations; `fused.sample_loss` lowers them for the kernels.
 
 Source: J. Schulman et al., High-Dimensional Continuous Control Using Generalized Advantage
 Estimation, arXiv:1506.02438.
 """
 
-import contextlib
-import threading
-from collections.abc import Iterator
-from unittest import mock
-
 import jax
 import jax.numpy as jnp
-from brax.training.agents.ppo import losses
 from jaxtyping import Array, Float
 
 _MAX_UNROLL_LENGTH = 64
 """Longest unroll that is computed without a loop; the program grows with its length."""
 
-_brax = losses.compute_gae
-_lock = threading.Lock()
+
+def td_error(
+    reward: Array, discount: Array, value: Array, next_value: Array, not_truncated: Array
+) -> Array:
+    """Return δₜ, the error of the value estimate of one step, or of many.
+
+    Args:
+      reward: rₜ, scaled as in the loss.
+      discount: γ (1 - dₜ).
+      value: Vₜ.
+      next_value: Vₜ₊₁.
+      not_truncated: 1 - cₜ.
+    """
+    return (reward + discount * next_value - value) * not_truncated
 
 
-@contextlib.contextmanager
-def unrolled() -> Iterator[None]:
-    """Use this module's `compute_gae` instead of Brax's in all code that is traced inside."""
-    # One thread at a time: otherwise a second one would restore the first one's replacement.
-    with _lock, mock.patch.object(losses, "compute_gae", compute_gae):
-        yield
+def gae_step(delta: Array, factor: Array, next_gae: Array) -> Array:
+    """Return Aₜ from Aₜ₊₁.
+
+    Args:
+      delta: δₜ.
+      factor: γ λ (1 - dₜ) (1 - cₜ).
+      next_gae: Aₜ₊₁.
+    """
+    return delta + factor * next_gae
 
 
 def compute_gae(
@@ -68,18 +79,23 @@ def compute_gae(
       (1 - cₜ) (rₜ + γ (1 - dₜ) Vₜ₊₁' - Vₜ). No gradient passes through either.
     """
     if len(rewards) > _MAX_UNROLL_LENGTH:
-        return _brax(truncation, termination, rewards, values, bootstrap_value, lambda_, discount)
+        # Late: Brax imports MJX, and few trainings need this.
+        from brax.training.agents.ppo import losses
+
+        return losses.compute_gae(
+            truncation, termination, rewards, values, bootstrap_value, lambda_, discount
+        )
     # Compute δₜ and the factor of Aₜ₊₁ for all steps at once, in the order of Brax's operations.
     not_truncated = 1 - truncation
     discounts = discount * (1 - termination)
     next_values = jnp.concatenate([values[1:], bootstrap_value[None]])
-    deltas = (rewards + discounts * next_values - values) * not_truncated
+    deltas = td_error(rewards, discounts, values, next_values, not_truncated)
     factors = discounts * not_truncated * lambda_
     # Accumulate Aₜ backwards in time, which gives the targets and from them the advantages.
     gae = [deltas[-1]]
     for delta, factor in zip(deltas[-2::-1], factors[-2::-1], strict=True):
-        gae.append(delta + factor * gae[-1])
+        gae.append(gae_step(delta, factor, gae[-1]))
     targets = jnp.stack(gae[::-1]) + values
     next_targets = jnp.concatenate([targets[1:], bootstrap_value[None]])
-    advantages = (rewards + discounts * next_targets - values) * not_truncated
+    advantages = td_error(rewards, discounts, values, next_targets, not_truncated)
     return jax.lax.stop_gradient(targets), jax.lax.stop_gradient(advantages)

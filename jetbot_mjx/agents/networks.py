@@ -12,14 +12,17 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.training.acme import running_statistics, specs
-from brax.training.types import identity_observation_preprocessor
 from flax import struct
 from jaxtyping import Array, Float, UInt32
 
+from jetbot_mjx.agents.brax_parts import (
+    identity_observation_preprocessor,
+    running_statistics,
+    specs,
+)
 from jetbot_mjx.agents.cnn_sizes import check_size, is_image
-from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import NetworkConfig, PPOConfig
+from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.errors import InvalidError
 
 _ACTIVATIONS: dict[str, Callable[[jax.Array], jax.Array]] = {

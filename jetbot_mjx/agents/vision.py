@@ -23,12 +23,15 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from brax.training import networks as brax_networks
-from brax.training.agents.ppo import networks as ppo_networks
 from jaxtyping import Array, Float, UInt8
 
+from jetbot_mjx.agents import brax_parts  # noqa: F401  # before the rest of Brax
 from jetbot_mjx.agents.cnn_sizes import CNNS, Shapes, compute_dtype, is_image
 from jetbot_mjx.config import NetworkConfig
+
+# isort: split
+from brax.training import networks as brax_networks
+from brax.training.agents.ppo import networks as ppo_networks
 
 _POLICY, _VALUE = "policy", "value"
 

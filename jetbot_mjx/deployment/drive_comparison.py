@@ -1,12 +1,12 @@
 """Compare the log of a real drive with the same drive in the simulator, in an image and as JSON."""
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from jetbot_mjx.deployment.drive_log import metrics, plot, read_log, replay
-from jetbot_mjx.evaluation.plots import theme, to_png
-from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, writing_to
+from jetbot_mjx.evaluation import theme, to_png
+from jetbot_mjx.runs import JsonObject, make_folder, write_bytes, write_json, writing_to
+from jetbot_mjx.terminal import stage
 
 
 class DriveComparison(NamedTuple):
@@ -14,7 +14,7 @@ class DriveComparison(NamedTuple):
 
     image: Path
     json: Path
-    metrics: dict[str, Any]
+    metrics: JsonObject
     """Content of the JSON file."""
 
 

@@ -1,7 +1,6 @@
 """Read a log of `deploy/drive.py`, and replay its motor values on a simulated JetBot."""
 
 import json
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,7 +11,8 @@ from matplotlib.figure import Figure
 from jetbot_mjx.deployment.drive_pictures import LoggedPicture, picture_strip, read_picture
 from jetbot_mjx.deployment.simulated_camera import camera_config
 from jetbot_mjx.deployment.simulated_jetbot import ROLLING_RADIUS, MotorModel, Pose, replayed
-from jetbot_mjx.errors import UserError
+from jetbot_mjx.errors import UserError, os_errors
+from jetbot_mjx.runs import JsonObject
 
 FORMAT = "jetbot_mjx-drive/1"
 """The format that a log's first line names."""
@@ -24,7 +24,7 @@ class DriveLog(NamedTuple):
     """A `DriveLog` holds the log of one drive."""
 
     path: Path
-    header: Mapping[str, Any]
+    header: JsonObject
     """Policy, goal and pose source."""
     calibration: MotorModel
     """The motors that the driver assumed, without a delay."""
@@ -129,7 +129,7 @@ def read_log(path: Path) -> DriveLog:
     )
 
 
-def _parse_header(text: str) -> tuple[Any, MotorModel, tuple[float, float] | None]:
+def _parse_header(text: str) -> tuple[JsonObject, MotorModel, tuple[float, float] | None]:
     """Return the header, its calibration and its goal, and check its camera."""
     header = json.loads(text)
     calibration, goal_w = _parse_calibration(header), _parse_goal(header)
@@ -138,7 +138,7 @@ def _parse_header(text: str) -> tuple[Any, MotorModel, tuple[float, float] | Non
     return header, calibration, goal_w
 
 
-def _parse_pose(period: Mapping[str, Any]) -> tuple[float, tuple[float, ...]]:
+def _parse_pose(period: JsonObject) -> tuple[float, tuple[float, ...]]:
     """Return the time of a period's pose [s], and its x [m], y [m] and yaw [rad]."""
     pose = tuple(float(period[name]) for name in ("x", "y", "yaw"))
     return round(float(period["t"]) - float(period["pose_age"]), 6), pose
@@ -146,9 +146,8 @@ def _parse_pose(period: Mapping[str, Any]) -> tuple[float, tuple[float, ...]]:
 
 def _read_lines(path: Path) -> list[str]:
     try:
-        return path.read_text(encoding="utf-8").splitlines()
-    except OSError as error:
-        raise UserError(f"{path} cannot be read: {error.strerror}") from None
+        with os_errors(f"{path} cannot be read"):
+            return path.read_text(encoding="utf-8").splitlines()
     except UnicodeDecodeError:
         raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
 
@@ -163,23 +162,18 @@ def _parse_goal(header: Any) -> tuple[float, float] | None:
     return x, y
 
 
-def _parse_calibration(header: Any) -> MotorModel:
+def _parse_calibration(header: JsonObject) -> MotorModel:
     if header["format"] != FORMAT:
         raise ValueError(f"its format is {header['format']!r}, not {FORMAT!r}")
-    left, right = (header["calibration"][side] for side in ("left", "right"))
-    calibration = MotorModel(
-        dead_band=(float(left["dead_band"]), float(right["dead_band"])),
-        # The log has the speed of a wheel's rim [m/s].
-        full_speed=(
-            float(left["full_speed"]) / ROLLING_RADIUS,
-            float(right["full_speed"]) / ROLLING_RADIUS,
-        ),
-        lag=float(header["calibration"]["lag"]),
-        delay=0.0,
-    )
-    if not max(calibration.dead_band) < 1:
-        raise ValueError(f"a dead-band of {max(calibration.dead_band):g} leaves no speed")
-    return calibration
+    values = header["calibration"]
+    left, right = (float(values[side]["dead_band"]) for side in ("left", "right"))
+    if not max(left, right) < 1:
+        raise ValueError(f"a dead-band of {max(left, right):g} leaves no speed")
+    # The log has the speed of a wheel's rim [m/s].
+    rims = (float(values[side]["full_speed"]) for side in ("left", "right"))
+    fastest_left, fastest_right = (rim / ROLLING_RADIUS for rim in rims)
+    full_speed = fastest_left, fastest_right
+    return MotorModel((left, right), full_speed, lag=float(values["lag"]), delay=0.0)
 
 
 def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Replay:
@@ -202,7 +196,7 @@ def replay(log: DriveLog, *, delay: float = 0.0, lag: float | None = None) -> Re
     return Replay(log, motors, np.stack(columns, axis=-1))
 
 
-def metrics(replay: Replay) -> dict[str, Any]:
+def metrics(replay: Replay) -> JsonObject:
     """Return the metrics that compare the logged drive with the simulated one, as JSON."""
     log, distances = replay.log, replay.distances
     periods = np.diff(log.times)

@@ -1,20 +1,18 @@
 """Show what the camera of a logged drive saw, above what the simulated robot sees."""
 
 import base64
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Array, Float, UInt8
 
 from jetbot_mjx.config import PhysicsConfig
 from jetbot_mjx.deployment.simulated_camera import camera_config
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.camera.render import Camera
-from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
-from jetbot_mjx.envs.task import GOAL_HEIGHT
+from jetbot_mjx.envs import GOAL_HEIGHT, QPOS_QUAT, QPOS_XYZ, REAL, Camera, make_mj_model, turned
+from jetbot_mjx.runs import JsonObject
 
 SHOWN = 8
 """Largest number of pictures in a strip."""
@@ -28,9 +26,7 @@ class LoggedPicture(NamedTuple):
     image: UInt8[np.ndarray, "h w 3"]
 
 
-def read_picture(
-    header: Mapping[str, Any], period: Mapping[str, Any], time: float
-) -> LoggedPicture | None:
+def read_picture(header: JsonObject, period: JsonObject, time: float) -> LoggedPicture | None:
     """Return the picture of a control period; None: it has none.
 
     Args:
@@ -49,7 +45,7 @@ def read_picture(
 
 
 def picture_strip(
-    header: Mapping[str, Any],
+    header: JsonObject,
     pictures: Sequence[LoggedPicture],
     times: Float[np.ndarray, " m"],
     simulated: Float[np.ndarray, "m 3"],
@@ -76,7 +72,7 @@ def picture_strip(
 
 
 def _simulated_images(
-    image: Mapping[str, Any], poses: Float[np.ndarray, "n 3"], goal: Sequence[float]
+    image: JsonObject, poses: Float[np.ndarray, "n 3"], goal: Sequence[float]
 ) -> UInt8[np.ndarray, "n h w 3"]:
     model = make_mj_model(REAL, PhysicsConfig())
     size = {"width": image["width"], "height": image["height"]}
@@ -84,9 +80,9 @@ def _simulated_images(
     rest = jnp.asarray(model.qpos0, jnp.float32)
     cube = jnp.array([*goal, GOAL_HEIGHT], jnp.float32)
 
-    def see(pose: Any) -> Any:
+    def see(pose: Float[Array, "3"]) -> UInt8[Array, "h w 3"]:
         position = jnp.stack([pose[0], pose[1], rest[QPOS_XYZ][2]])
-        quat = kinematics.turned(rest[QPOS_QUAT], pose[2])
+        quat = turned(rest[QPOS_QUAT], pose[2])
         return camera.render(camera.pose(position, quat), {"goal": cube})
 
     return np.asarray(jax.jit(jax.vmap(see))(jnp.asarray(poses, jnp.float32)))

@@ -12,12 +12,16 @@ import types
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
 
 from jetbot_mjx.deployment.numpy_policy import Encoder, Layer, Outputs, PortablePolicy
+
+if TYPE_CHECKING:
+    import onnx
 
 _TEXT_WIDTH = 96
 
@@ -94,10 +98,10 @@ class _OnnxGraph:
     """An `_OnnxGraph` collects nodes and constants."""
 
     def __init__(self) -> None:
-        self.nodes: list[Any] = []
-        self.constants: list[Any] = []
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
 
-    def constant(self, name: str, value: Any) -> str:
+    def constant(self, name: str, value: ArrayLike) -> str:
         """Add an array of float32 and return its name."""
         from onnx import numpy_helper
 
@@ -162,7 +166,7 @@ def _write_onnx(policy: PortablePolicy, _: Act, path: Path) -> None:
     mixing = constant("mixing", [[drive, drive], [-turn, turn]])
     node("Gemm", "action", mixing, constant("half_speed", [drive, drive]), out="wheel_speeds")
 
-    def tensor(name: str, shape: Sequence[int], dtype: Any) -> Any:
+    def tensor(name: str, shape: Sequence[int], dtype: DTypeLike) -> "onnx.ValueInfoProto":
         kind = helper.np_dtype_to_tensor_dtype(np.dtype(dtype))
         return helper.make_tensor_value_info(name, kind, ["batch", *shape])
 

@@ -7,23 +7,19 @@ wheel speeds; it returns both the actions and the wheel speeds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
-from jetbot_mjx.agents.cnn_sizes import CNNS
-from jetbot_mjx.agents.networks import make_networks, make_policy
-from jetbot_mjx.agents.vision import ENCODER, HEAD
-from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.mujoco_env import MujocoJetBot, Observation
-from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
-from jetbot_mjx.evaluation.evaluator import report_keys
-from jetbot_mjx.runs.checkpoint import Checkpoint
-from jetbot_mjx.runs.progress import stage
+from jetbot_mjx import envs
+from jetbot_mjx.agents import CNNS, ENCODER, HEAD, make_networks, make_policy
+from jetbot_mjx.envs import NUMBERS, PIXELS, JetBotEnv, Observation
+from jetbot_mjx.evaluation import report_keys
+from jetbot_mjx.runs import Checkpoint
+from jetbot_mjx.terminal import stage
 
 RECORDED, RECORDED_IMAGES = 10_000, 1_000
 """Number of observations on which an export is checked, and that of observations with an image."""
@@ -131,7 +127,7 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
     """
     config = checkpoint.config
     network = config.ppo.network
-    params: Any = jax.device_get(checkpoint.params)
+    params: PyTree = jax.device_get(checkpoint.params)
     size, encoder, policy = checkpoint.about["observation_size"], None, params.policy
     statistics = params.normalizer.mean, params.normalizer.std
     if config.task.sees:
@@ -141,7 +137,7 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
     mean, std = np.zeros(size, np.float32), np.ones(size, np.float32)
     if config.ppo.normalize_observations:
         mean, std = map(np.asarray, statistics)
-    dense: Mapping[str, Any] = policy["params"]
+    dense: PyTree = policy["params"]
     if network.distribution_type == "normal":
         # Brax stores the last layer of this distribution apart, with a standard deviation.
         dense = {**dense["MLP_0"], f"hidden_{len(dense['MLP_0'])}": dense["Dense_0"]}
@@ -158,17 +154,17 @@ def portable_policy(checkpoint: Checkpoint) -> PortablePolicy:
         controller=Controller(
             max_speed=config.task.max_speed,
             max_yaw_rate=config.task.max_yaw_rate,
-            wheel_radius=CONTROLLER_WHEEL_RADIUS,
-            wheel_separation=CONTROLLER_WHEEL_SEPARATION,
+            wheel_radius=envs.CONTROLLER_WHEEL_RADIUS,
+            wheel_separation=envs.CONTROLLER_WHEEL_SEPARATION,
         ),
     )
 
 
-def _layer(params: Mapping[str, Any]) -> Layer:
+def _layer(params: PyTree) -> Layer:
     return Layer(np.asarray(params["kernel"]), np.asarray(params["bias"]))
 
 
-def _encoder(cnn: str, image_shape: Sequence[int], params: Mapping[str, Any]) -> Encoder:
+def _encoder(cnn: str, image_shape: Sequence[int], params: PyTree) -> Encoder:
     """Return the encoder with the division of the pixels by 255 in its first kernel.
 
     Args:
@@ -211,7 +207,7 @@ def as_jax(checkpoint: Checkpoint, env: JetBotEnv) -> Callable[..., Outputs]:
     policy = make_policy(networks, checkpoint.params)
 
     def act(*inputs: Array) -> Outputs:
-        obs: Any = inputs[0]
+        obs: PyTree = inputs[0]
         if checkpoint.config.task.sees:
             obs = dict(zip(_PARTS.values(), inputs, strict=False))
         with jax.default_matmul_precision("highest"):
@@ -236,7 +232,7 @@ def record(checkpoint: Checkpoint, env: JetBotEnv, count: int | None = None) -> 
     """
     if count is None:
         count = RECORDED_IMAGES if checkpoint.config.task.sees else RECORDED
-    robot = MujocoJetBot(checkpoint.config, type(env.task))
+    robot = envs.MujocoJetBot(checkpoint.config, type(env.task))
     act = jax.jit(as_jax(checkpoint, env))
     keys = iter(np.asarray(report_keys(count)))
     seen: list[dict[str, np.ndarray]] = []

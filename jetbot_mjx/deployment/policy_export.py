@@ -3,7 +3,7 @@
 import importlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,9 +18,15 @@ from jetbot_mjx.deployment.numpy_policy import (
 )
 from jetbot_mjx.deployment.policy_spec import FILE, policy_spec
 from jetbot_mjx.errors import UserError, requires_extra
-from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
-from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import atomic_folder, write_json, writing_to
+from jetbot_mjx.runs import (
+    JsonObject,
+    Which,
+    atomic_folder,
+    load_checkpoint,
+    write_json,
+    writing_to,
+)
+from jetbot_mjx.terminal import stage
 
 FOLDER = "policy"
 """Name of the folder of an export in the run folder."""
@@ -98,7 +104,7 @@ def export_policy(
 
 
 def _write_spec(
-    folder: Path, spec: dict[str, Any], differences: Mapping[str, float], recording: Recording
+    folder: Path, spec: JsonObject, differences: Mapping[str, float], recording: Recording
 ) -> None:
     arrays = {**recording.inputs, **recording._asdict()}
     del arrays["inputs"]

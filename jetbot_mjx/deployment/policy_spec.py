@@ -1,19 +1,13 @@
 """The policy spec `policy.json`: all that a program needs to use an exported policy."""
 
 import json
-from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 
 from jetbot_mjx.config import CameraConfig
 from jetbot_mjx.deployment.numpy_policy import Encoder, PortablePolicy
-from jetbot_mjx.envs.camera.lens import intrinsics
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
-from jetbot_mjx.envs.task import GOAL_HEIGHT, Layout
-from jetbot_mjx.runs.checkpoint import Checkpoint
-from jetbot_mjx.runs.run_dir import read_text, versions
+from jetbot_mjx.envs import GOAL_HEIGHT, QPOS_QUAT, QPOS_XYZ, JetBotEnv, Layout, intrinsics
+from jetbot_mjx.runs import Checkpoint, JsonObject, read_text, versions
 
 FILE = "policy.json"
 
@@ -29,7 +23,7 @@ _VECTORS = ("position", "linear_velocity", "angular_velocity", "goal_position", 
 _COMPONENTS = {"quaternion": "wxyz", **dict.fromkeys(_VECTORS, "xyz")}
 
 
-def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> dict[str, Any]:
+def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) -> JsonObject:
     """Return the spec of a policy, which is the same for every export format.
 
     Args:
@@ -87,7 +81,7 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
     }
 
 
-def _wheel_speeds(policy: PortablePolicy, limit: float | None) -> dict[str, Any]:
+def _wheel_speeds(policy: PortablePolicy, limit: float | None) -> JsonObject:
     """Return how wheel speeds follow from an action; `limit` is that of training [rad/s]."""
     return {
         "order": ["left", "right"],
@@ -103,7 +97,7 @@ def _wheel_speeds(policy: PortablePolicy, limit: float | None) -> dict[str, Any]
     }
 
 
-def _sizes(encoder: Encoder) -> dict[str, Any]:
+def _sizes(encoder: Encoder) -> JsonObject:
     return {
         "convolutions": [
             {"channels": one.bias.size, "side": len(one.kernel), "stride": one.stride}
@@ -113,7 +107,7 @@ def _sizes(encoder: Encoder) -> dict[str, Any]:
     }
 
 
-def _image(camera: CameraConfig, period: float) -> dict[str, Any]:
+def _image(camera: CameraConfig, period: float) -> JsonObject:
     """Return the description of the image, and of the camera that takes it.
 
     Args:
@@ -147,7 +141,7 @@ def _image(camera: CameraConfig, period: float) -> dict[str, Any]:
     }
 
 
-def _observations(layout: Layout) -> list[dict[str, Any]]:
+def _observations(layout: Layout) -> list[JsonObject]:
     found, start = [], 0
     for field in layout:
         components = list(_COMPONENTS.get(field.name, "")[: field.size])
@@ -164,7 +158,7 @@ def _observations(layout: Layout) -> list[dict[str, Any]]:
     return found
 
 
-def _evaluation(checkpoint: Checkpoint) -> Mapping[str, Any] | None:
+def _evaluation(checkpoint: Checkpoint) -> JsonObject | None:
     """Return the summary of this checkpoint's report, if `evaluate` wrote one."""
     path = checkpoint.run_dir / "evaluations" / checkpoint.path.name / "report.json"
     try:

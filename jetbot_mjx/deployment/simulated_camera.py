@@ -5,23 +5,22 @@ picture, uint8, blue, green, red. It looks from a `SimulatedJetBot`, on that rob
 """
 
 import collections
-from collections.abc import Mapping
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import UInt8
 
 from jetbot_mjx.config import CameraConfig, PhysicsConfig
 from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
-from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
-from jetbot_mjx.envs.camera.scenery import SceneryKind
-from jetbot_mjx.envs.robot_model import REAL, make_mj_model
-from jetbot_mjx.envs.task import GOAL_HEIGHT
+from jetbot_mjx.envs import GOAL_HEIGHT, REAL, MujocoCamera, SceneryKind, make_mj_model
+from jetbot_mjx.runs import JsonObject
 
 SIDE = 224
 """Width and height of a picture [pixels], as of NVIDIA's camera."""
 
 _HIDDEN = (0.0, 0.0, -1.0)  # [m] below the floor
+
+_Picture = UInt8[np.ndarray, "h w 3"]
 
 Fault = Literal["frozen", "black", "missing"]
 
@@ -39,7 +38,7 @@ class CameraModel(NamedTuple):
     """Largest noise of a channel, from 0 to 255; every value up to it is equally likely."""
 
 
-def camera_config(image: Mapping[str, Any]) -> CameraConfig:
+def camera_config(image: JsonObject) -> CameraConfig:
     """Return the camera section of pictures as large as a robot's.
 
     Args:
@@ -99,15 +98,15 @@ class SimulatedCamera:
         self.goal = goal
         """Position (x, y) of the cube [m]; it may be moved."""
         self.fault: Fault | None = None
-        """What has broken."""
+        """The fault that the camera has now; None: it works."""
         self._scenery = scenery
         self._next = self._robot.now()
-        self._last: UInt8[np.ndarray, "h w 3"] | None = None
-        self._value: UInt8[np.ndarray, "h w 3"] | None = None
-        self._pending: collections.deque[tuple[float, Any]] = collections.deque()
+        self._last: _Picture | None = None
+        self._value: _Picture | None = None
+        self._pending: collections.deque[tuple[float, _Picture]] = collections.deque()
 
     @property
-    def value(self) -> UInt8[np.ndarray, "h w 3"] | None:
+    def value(self) -> _Picture | None:
         """Return the newest picture that has arrived; None: there was none."""
         while self._pending and self._pending[0][0] <= self._robot.now() + 1e-9:
             self._value = self._pending.popleft()[1]
@@ -123,7 +122,7 @@ class SimulatedCamera:
             return
         self._pending.append((now + self.model.latency, self._picture()))
 
-    def _picture(self) -> UInt8[np.ndarray, "h w 3"]:
+    def _picture(self) -> _Picture:
         if self.fault == "frozen" and self._last is not None:
             return self._last
         goal = _HIDDEN if self.goal is None else (*self.goal, GOAL_HEIGHT)

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jetbot_mjx.config import PhysicsConfig
-from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
+from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, REAL, make_mj_model
 
 ROLLING_RADIUS = 0.0321
 """Distance over the floor per radian of a wheel [m]: under load it sinks 0.4 mm into the floor."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jetbot_mjx.envs.robot_params import RobotParams
+from jetbot_mjx.config import RobotParams
 
 
 class ActuatorState(NamedTuple):

@@ -12,10 +12,9 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from brax.envs import Wrapper
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.config import RandomizationConfig
+from jetbot_mjx.config import QUANTITIES, LookParams, RandomizationConfig, RobotParams
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import ActuatorState, initial_actuator_state, step_actuators
 from jetbot_mjx.envs.camera.scene import GOAL
@@ -23,23 +22,16 @@ from jetbot_mjx.envs.camera.surroundings import draw_surroundings
 from jetbot_mjx.envs.camera.timing import CameraState, initial_camera_state, step_camera
 from jetbot_mjx.envs.camera.wrapper import seen_pose
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.look_params import MAX_CAMERA_DELAY, MAX_CLUTTER, LookParams
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, QPOS_QUAT, QPOS_XYZ
-from jetbot_mjx.envs.robot_params import (
-    MAX_ACTION_DELAY,
-    MAX_OBSERVATION_DELAY,
-    RobotParams,
-    vary_model,
-)
+from jetbot_mjx.envs.robot_params import vary_model
 from jetbot_mjx.envs.sensors import SensorState, add_offsets, initial_sensor_state, step_sensors
 from jetbot_mjx.envs.state import PhysicsState, State, robot_state
 from jetbot_mjx.errors import InvalidError
+from jetbot_mjx.mjx_import import Wrapper
 
-_INTEGERS = (
-    *("action_delay", "observation_delay", "camera_delay", "camera_interval"),
-    *("clutter", "floor_texture"),
-)
-"""Whole numbers: every one of the range is equally likely."""
+LARGEST_TRACED = {"action_delay": 9, "observation_delay": 6, "camera_delay": 9, "clutter": 4}
+"""Largest values of the quantities for which a program reserves memory, if they are traced: delays
+[control steps], 150 and 100 ms at the default `ctrl_dt`, and objects around."""
 
 _MODEL = ("friction", "mass", "com_x", "com_y", "com_z")
 _START = ("start_x", "start_y", "start_yaw")
@@ -73,7 +65,7 @@ def draw(ranges: RandomizationConfig, key: UInt32[Array, "2"]) -> Float[Array, "
     """
     spans = ranges.drawn
     low, high = np.asarray(list(spans.values()), np.float32).reshape(-1, 2).T
-    is_integer = np.asarray([name in _INTEGERS for name in spans], bool)
+    is_integer = np.asarray([QUANTITIES[name].bounds.whole for name in spans], bool)
     u = jax.random.uniform(key, (len(spans),))
     real = jnp.minimum(low + (high - low) * u, high)
     integer = jnp.minimum(jnp.floor(low + (high - low + 1.0) * u), high)
@@ -123,26 +115,17 @@ class DomainRandomizationWrapper(Wrapper):
                 f" {env.config.task.observation!r} sees none: leave it out"
             )
         self._sees_looks = bool(looks)
-        self._max_action_delay = self._highest("action_delay", MAX_ACTION_DELAY)
-        self._max_observation_delay = self._highest("observation_delay", MAX_OBSERVATION_DELAY)
-        self._max_camera_delay = self._highest("camera_delay", MAX_CAMERA_DELAY)
-        self._max_clutter = self._highest("clutter", MAX_CLUTTER)
+        self._largest = {name: self._largest_value(name) for name in LARGEST_TRACED}
         limit = env.robot.max_wheel_speed
         self._limit = math.inf if limit is None else limit
         self._full_speed = limit or env.config.task.max_speed / CONTROLLER_WHEEL_RADIUS
 
-    def _highest(self, name: str, traced: int) -> int:
-        """Return the largest value of a whole number that the program must support.
-
-        Args:
-          name: the parameter.
-          traced: the limit if it is a traced value.
-        """
+    def _largest_value(self, name: str) -> int:
+        """Return the largest value of a whole number that the program must support."""
         if name in self._ranges.drawn:
             return round(self._ranges.drawn[name][1])
-        constant = self._constant if name in RobotParams._fields else self._constant_looks
-        value = getattr(constant, name)
-        return round(value) if isinstance(value, int | float) else traced
+        value = (self._constant._asdict() | self._constant_looks._asdict())[name]
+        return round(value) if isinstance(value, int | float) else LARGEST_TRACED[name]
 
     def robot_params(self, state: State) -> RobotParams:
         """Return the robot parameters of this episode.
@@ -173,9 +156,10 @@ class DomainRandomizationWrapper(Wrapper):
         key, image_key = jax.random.split(jax.random.fold_in(rng, _KEY_SALT + 2))
         start = seen_pose(self.env.task, state)
         surroundings = draw_surroundings(
-            key, params, self._max_clutter, self.camera.scene, start.markers.get(GOAL)
+            key, params, self._largest["clutter"], self.camera.scene, start.markers.get(GOAL)
         )
-        return initial_camera_state(start, image_key, params, surroundings, self._max_camera_delay)
+        longest = self._largest["camera_delay"]
+        return initial_camera_state(start, image_key, params, surroundings, longest)
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
         """Begin an episode with newly drawn robot parameters; the goal is that of `env.reset`.
@@ -189,8 +173,9 @@ class DomainRandomizationWrapper(Wrapper):
         physics = _at_start_pose(state.pipeline_state, robot_params)
         robot = robot_state(physics)
         noise_key = jax.random.fold_in(rng, _KEY_SALT + 1)
-        sensors = initial_sensor_state(robot, noise_key, robot_params, self._max_observation_delay)
-        motors = initial_actuator_state(robot_params, self._max_action_delay)
+        longest = self._largest["observation_delay"]
+        sensors = initial_sensor_state(robot, noise_key, robot_params, longest)
+        motors = initial_actuator_state(robot_params, self._largest["action_delay"])
         state = state.replace(
             pipeline_state=physics,
             obs=self.env.observe(add_offsets(robot, robot_params), state.goal),

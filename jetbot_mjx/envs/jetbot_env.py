@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import brax.envs
 import jax
 import jax.numpy as jnp
 import mujoco
@@ -41,6 +40,7 @@ from jetbot_mjx.envs.task import (
     min_std,
 )
 from jetbot_mjx.errors import InvalidError, UserError
+from jetbot_mjx.mjx_import import Env
 
 
 class TaskStep(NamedTuple):
@@ -49,7 +49,7 @@ class TaskStep(NamedTuple):
     It does not depend on which simulator moved the robot.
     """
 
-    obs: Any
+    obs: object
     """Observation after the step, as of `JetBotEnv.observe`."""
     reward: Float[Array, ""]
     """Reward of the step."""
@@ -63,7 +63,7 @@ class TaskStep(NamedTuple):
     """Goal after the step."""
 
 
-class JetBotEnv(brax.envs.Env):
+class JetBotEnv(Env):
     """An environment of one JetBot and its task.
 
     Action: two numbers, clipped to [-1, 1]. They command the speed v = (a₀ + 1)/2 · `max_speed`
@@ -75,7 +75,7 @@ class JetBotEnv(brax.envs.Env):
     `done` means termination only; `EpisodeWrapper` adds the time limit.
     """
 
-    def __init__(self, config: Config, task_class: type[Any] | None = None) -> None:
+    def __init__(self, config: Config, task_class: type[object] | None = None) -> None:
         """Build the task and its models.
 
         Args:
@@ -124,9 +124,7 @@ class JetBotEnv(brax.envs.Env):
 
         Wrappers of a single robot take it, and `with_camera` renders outside of them.
         """
-        env = copy.copy(self)
-        env.camera = None
-        return env
+        return self._with(camera=None)
 
     def with_camera(self, camera: Camera) -> "JetBotEnv":
         """Return a copy of this environment that sees through another camera.
@@ -134,9 +132,7 @@ class JetBotEnv(brax.envs.Env):
         Args:
           camera: a camera whose images have the same shape.
         """
-        env = copy.copy(self)
-        env.camera = camera
-        return env
+        return self._with(camera=camera)
 
     @property
     def mjx_model(self) -> mjx.Model:
@@ -157,8 +153,12 @@ class JetBotEnv(brax.envs.Env):
         Args:
           physics: the physics of the same robot and scene.
         """
+        return self._with(physics=physics)
+
+    def _with(self, **changed: Camera | Physics | None) -> "JetBotEnv":
+        """Return a copy of this environment with other attributes."""
         env = copy.copy(self)
-        env.physics = physics
+        vars(env).update(changed)
         return env
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
@@ -270,7 +270,7 @@ class JetBotEnv(brax.envs.Env):
         obs = self.observe(after, goal)
         return TaskStep(obs, reward, terms, terminated, success, goal)
 
-    def observe(self, robot: RobotState, goal: Goal) -> Any:
+    def observe(self, robot: RobotState, goal: Goal) -> object:
         """Return the task's observation: a vector, or an empty dictionary if its layout is empty.
 
         Args:
@@ -376,7 +376,7 @@ class JetBotEnv(brax.envs.Env):
         return self.config.physics.ctrl_dt
 
 
-def _check_one(name: str, array: Any, shape: tuple[int, ...], method: str) -> None:
+def _check_one(name: str, array: object, shape: tuple[int, ...], method: str) -> None:
     """Check that an argument of a method is that of one robot.
 
     Raises:
@@ -398,7 +398,7 @@ def make_env(
     config: str | Path | Config,
     overrides: Overrides = (),
     *,
-    task_class: type[Any] | None = None,
+    task_class: type[object] | None = None,
 ) -> JetBotEnv:
     """Build the environment that a configuration describes.
 

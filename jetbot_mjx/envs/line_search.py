@@ -15,15 +15,15 @@ from unittest import mock
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
-from mujoco.mjx import ConeType, Data, Model
-from mujoco.mjx._src import solver
+
+from jetbot_mjx.envs.mjx import ConeType, Data, Model, solver
 
 _library = solver._linesearch, solver._LSPoint.create
 _lock = threading.RLock()
 
 
 class _Thread(threading.local):
-    """What holds for the present thread alone: others may trace MJX meanwhile."""
+    """Hold what is true for the present thread alone: others may trace MJX meanwhile."""
 
     in_context = False
     is_relative = False

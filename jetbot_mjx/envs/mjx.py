@@ -9,12 +9,24 @@ from typing import Any
 import jax
 import mujoco
 import numpy as np
+
+from jetbot_mjx import mjx_import  # noqa: F401
+from jetbot_mjx.devices import default_device_cpu
+
+# isort: split
 from mujoco import mjx
-from mujoco.mjx import Data, Model, step
+from mujoco.mjx import ConeType, Data, Model, step
+from mujoco.mjx._src import solver
 
-from jetbot_mjx.compiler.xla_options import default_device_cpu
-
-__all__ = ["Data", "Model", "make_data", "put_model", "step"]
+__all__ = [
+    "ConeType",
+    "Data",
+    "Model",
+    "make_data",
+    "put_model",
+    "solver",
+    "step",
+]
 
 
 def put_model(model: mujoco.MjModel) -> Model:

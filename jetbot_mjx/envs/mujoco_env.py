@@ -15,8 +15,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt32
 
-from jetbot_mjx.compiler.xla_options import default_device_cpu
 from jetbot_mjx.config import Config
+from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, see
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION

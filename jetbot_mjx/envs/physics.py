@@ -3,11 +3,8 @@
 Both ways run the same arithmetic, that of `mjx.step`.
 """
 
-import contextlib
 import copy
 import functools
-import threading
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,21 +12,14 @@ import mujoco
 from jax.core import Tracer
 from jaxtyping import Array, Float
 
-from jetbot_mjx.compiler import kernel, llvm_codegen
-from jetbot_mjx.compiler.backends import (
-    available_backends,
-    default_backend,
-    obstacle,
-    require_backend,
-    require_float32,
-)
-from jetbot_mjx.compiler.lower_jaxpr import scalarize
-from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.config import PhysicsConfig
-from jetbot_mjx.envs import cholesky, line_search, mjx
+from jetbot_mjx.devices import require_float32
+from jetbot_mjx.envs import line_search, mjx
+from jetbot_mjx.envs.kernel_impl import KernelImpl
+from jetbot_mjx.envs.robot_model import mocap_ids
 from jetbot_mjx.envs.state import PhysicsState
-from jetbot_mjx.errors import UserError
-from jetbot_mjx.fallbacks import Fallback, report
+from onekernel import Kernel, scalarize
+from onekernel.build import unroll_linear_algebra
 
 
 class Physics:
@@ -50,9 +40,8 @@ class Physics:
         self._config = config
         self._traced_leaves: tuple[int, ...] = ()
         """Indices of the model's leaves that are traced: they may differ from robot to robot."""
-        self._lock = threading.Lock()
-        self._kernel: kernel.Step | UnsupportedError | None = None
-        require_backend(config.impl, "physics.impl")
+        self.kernel_impl = KernelImpl("physics.impl", config.impl)
+        self.kernel_impl.require()
 
     @functools.cached_property
     def model(self) -> mjx.Model:
@@ -75,29 +64,24 @@ class Physics:
         other.model = model
         leaves = jax.tree.leaves(model)
         other._traced_leaves = tuple(i for i, x in enumerate(leaves) if isinstance(x, Tracer))
-        other._lock = threading.Lock()
-        other._kernel = None
+        other.kernel_impl = KernelImpl("physics.impl", self._config.impl)
         return other
 
     @property
     def impl(self) -> str:
         """Implementation that JAX's default device runs: `physics.impl`, with `auto` resolved."""
-        backend = default_backend(self._config.impl)
+        backend = self.kernel_impl.backend
         return "xla" if backend is None or self._kernel_step() is None else backend.IMPL
 
     @property
     def may_be_kernel(self) -> bool:
         """Return whether a step may be one kernel: there is a back end, and nothing has failed."""
-        failed = isinstance(self._kernel, UnsupportedError)
-        return bool(available_backends(self._config.impl)) and not failed
+        return self.kernel_impl.may_be_kernel
 
     @functools.cached_property
     def mocap_names(self) -> tuple[str, ...]:
         """Return the names of the solid mocap bodies, which a task places, in MuJoCo's order."""
-        model = self.mj_model
-        bodies = [model.body(i) for i in range(model.nbody)]
-        mocap = sorted((body for body in bodies if body.mocapid[0] >= 0), key=lambda b: b.mocapid)
-        return tuple(body.name for body in mocap)
+        return tuple(mocap_ids(self.mj_model))
 
     def step(
         self,
@@ -122,12 +106,16 @@ class Physics:
             positions = self._data.mocap_pos if mocap_pos is None else mocap_pos
             arrays.append(jnp.asarray(positions, self._data.mocap_pos.dtype))
         consts = jnp.asarray(ctrl, state.qpos.dtype), arrays
-        return (self._kernel_step() or self._xla_step)(state, consts)
+        kernel = self._kernel_step()
+        return (self._xla_step if kernel is None else kernel.as_step())(state, consts)
 
     def _xla_step(self, state: PhysicsState, consts: tuple[Array, list[Array]]) -> PhysicsState:
         """Integrate one environment step with a loop that XLA compiles."""
+        substep = self.substep
+        if self._config.cholesky == "unrolled":
+            substep = unroll_linear_algebra(substep)
         state, _ = jax.lax.scan(
-            lambda state, _: (self.substep(state, consts), None),
+            lambda state, _: (substep(state, consts), None),
             state,
             length=self._config.n_substeps,
         )
@@ -162,66 +150,36 @@ class Physics:
         )
         if mocap_pos:
             data = data.replace(mocap_pos=mocap_pos[0])
-        factorise = (
-            contextlib.nullcontext if self._config.cholesky == "library" else cholesky.unrolled
-        )
         # By default GPUs multiply float32 matrices in TF32, with which the contact solver diverges.
         # Only physics requires full precision; networks choose their own.
-        with (
-            jax.default_matmul_precision("highest"),
-            line_search.relative_costs(),
-            factorise(),
-        ):
+        with jax.default_matmul_precision("highest"), line_search.relative_costs():
             data = mjx.step(jax.tree.unflatten(treedef, leaves), data)
         return PhysicsState(data.qpos, data.qvel, data.qacc_warmstart, data.time)
 
-    def _kernel_step(self) -> kernel.Step | None:
+    def _kernel_step(self) -> Kernel | None:
         """Return an environment step as one kernel; None: XLA compiles it on all platforms."""
-        if not available_backends(self._config.impl):
-            if reason := obstacle(self._config.impl):
-                report(Fallback("physics.impl", reason))
-            return None
-        # Programs are traced in several threads; only one of them lowers the kernel.
-        with self._lock:
-            if self._kernel is None:
-                try:
-                    self._kernel = kernel.as_step(self._lower())
-                except UnsupportedError as error:
-                    self._kernel = error
-        if not isinstance(self._kernel, UnsupportedError):
-            return self._kernel
-        reason = f"one kernel cannot do {self._kernel}"
-        if self._config.impl != "auto":
-            raise UserError(f"physics.impl = {self._config.impl}: {reason}; choose xla or auto")
-        report(
-            Fallback("physics.impl", f"{reason}: try the versions that its constraints.txt names")
-        )
-        return None
+        return self.kernel_impl.find_kernel("step", self._lower)
 
-    def _lower(self) -> kernel.Kernel:
+    def _lower(self) -> Kernel:
         """Lower one physics step to a kernel that repeats it `n_substeps` times."""
+        model, leaves = self.mj_model, jax.tree.leaves(self.model)
+
+        def example() -> tuple[PhysicsState, tuple[Array, list[Array]]]:
+            traced = [jnp.zeros(leaves[i].shape, leaves[i].dtype) for i in self._traced_leaves]
+            traced += [jnp.zeros((model.nmocap, 3))] if model.nmocap else []
+            qpos, qvel = jnp.zeros(model.nq), jnp.zeros(model.nv)
+            return PhysicsState(qpos, qvel, qvel, jnp.zeros(())), (jnp.zeros(model.nu), traced)
 
         # Shapes only: arrays made here would become part of the program that is being traced.
-        def array(*shape: int) -> Any:
-            return jax.ShapeDtypeStruct(shape, jnp.float32)
-
-        model = self.mj_model
-        state = PhysicsState(array(model.nq), array(model.nv), array(model.nv), array())
-        leaves = jax.tree.leaves(self.model)
-        traced = [
-            jax.ShapeDtypeStruct(leaves[i].shape, leaves[i].dtype) for i in self._traced_leaves
-        ]
-        traced += [array(model.nmocap, 3)] if model.nmocap else []
-        arguments = state, (array(model.nu), traced)
+        arguments = jax.eval_shape(example)
+        state, _ = arguments
         program = scalarize(self.substep, *arguments)
-        llvm_codegen.require(program)
         structure = jax.tree.structure(arguments)
-        return kernel.Kernel(
+        return self.kernel_impl.kernel_class(
             program,
             carried=len(jax.tree.leaves(state)),
             steps=self._config.n_substeps,
             fallback=lambda *leaves: jax.tree.leaves(
                 self._xla_step(*jax.tree.unflatten(structure, leaves))
             ),
-            impl=self._config.impl,
         )

@@ -1,8 +1,9 @@
 """Compute the cache key of a configuration's compiled programs.
 
-A traced program depends on the configuration, the model, this package's source and the installed
-libraries. With all of these in the key, a command loads its programs without tracing them. This
-holds only for the tasks of this package, because the dependencies of any other task are unknown.
+A traced program depends on the configuration, the model, the source of this package and of its
+compiler and the installed libraries. With all of these in the key, a command loads its programs
+without tracing them. This holds only for the tasks of this package, because the dependencies of any
+other task are unknown.
 """
 
 import functools
@@ -15,15 +16,16 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jetbot_mjx.compiler.program_cache import ProgramCache, processor
-from jetbot_mjx.compiler.xla_options import compiler_options
+import onekernel
+from jetbot_mjx import fallbacks
 from jetbot_mjx.config import Config
-from jetbot_mjx.imports import LIBRARIES, installed_version
+from jetbot_mjx.devices import compiler_options
+from jetbot_mjx.envs.versions import LIBRARIES, installed_version
 
-_ROOT = Path(__file__).parents[1]
-"""Folder of the package, whose complete source is part of the key."""
+_ROOTS = Path(__file__).parents[1], Path(str(onekernel.__file__)).parent
+"""Folders of the packages whose complete source is part of the key."""
 
-TRUSTED = frozenset({f"{_ROOT.name}:GoalTask"})
+BUILT_IN_TASKS = frozenset({f"{_ROOTS[0].name}:GoalTask"})
 """Tasks whose source is part of the package, and so of the key."""
 
 _NOT_IN_PROGRAMS = {
@@ -39,43 +41,51 @@ _NOT_IN_PROGRAMS = {
 }
 """Settings that no program depends on: when a training ends, and what it reads and writes."""
 
-SOURCES = {".ll", ".py", ".xml"}
-"""Suffixes of the files from which programs are made."""
+SOURCES = {".ll", ".py", ".pyi", ".xml"}
+"""Suffixes of the files from which programs are made; a `.pyi` says what a face exports."""
 
 
-def open_program_cache(config: Config) -> ProgramCache:
-    """Open the cache of a configuration's programs in JAX's folder of compiled programs.
+def open_program_cache(config: Config, *, keep: bool = True) -> onekernel.ProgramCache:
+    """Open the cache of a configuration's programs.
 
     Args:
       config: the configuration of the run.
+      keep: whether to keep the programs in JAX's folder of compiled programs.
 
     Returns:
-      The cache. It is in memory only if there is no such folder, for other tasks than this
+      The cache. It is in memory anyway if there is no such folder, for other tasks than this
       package's, and if several processes train together.
     """
-    options = compiler_options(config)
     folder = jax.config.values["jax_compilation_cache_dir"]
-    if folder is None or config.task.name not in TRUSTED or jax.process_count() > 1:
-        return ProgramCache(options)
+    kept = keep and folder and config.task.name in BUILT_IN_TASKS and jax.process_count() == 1
+    return onekernel.ProgramCache(
+        compiler_options(config.deterministic),
+        Path(folder) if kept else None,
+        _key(config) if kept else "",
+        fallbacks,
+    )
+
+
+def _key(config: Config) -> str:
+    """Return all that the programs of a configuration depend on, but for the compiler's options."""
     devices = jax.devices()
     settings = {
         name: repr(value)
         for name, value in jax.config.values.items()
         if not name.startswith(("jax_compilation_cache", "jax_persistent_cache", "jax_log"))
     }
-    cache_key = [
+    parts = [
         config.model_dump(mode="json", exclude=_NOT_IN_PROGRAMS),
-        _own_source(),
+        _own_source(*_ROOTS),
         _model(config),
         sys.version,
         [installed_version(name) for name in LIBRARIES],
         settings,
         os.environ.get("XLA_FLAGS"),
-        processor(),
         devices[0].client.platform_version,
         [device.device_kind for device in devices],
     ]
-    return ProgramCache(options, Path(folder), json.dumps(cache_key, sort_keys=True))
+    return json.dumps(parts, sort_keys=True)
 
 
 def _model(config: Config) -> str:
@@ -94,10 +104,11 @@ def _model(config: Config) -> str:
 
 
 @functools.cache
-def _own_source() -> str:
-    """Return a hash of all source files of this package."""
+def _own_source(*roots: Path) -> str:
+    """Return a hash of all source files in the folders of packages."""
     digest = hashlib.sha256()
-    for path in sorted(_ROOT.rglob("*")):
-        if path.suffix in SOURCES:
-            digest.update(str(path.relative_to(_ROOT)).encode() + path.read_bytes())
+    for root in roots:
+        for path in sorted(root.rglob("*")):
+            if path.suffix in SOURCES:
+                digest.update(str(path.relative_to(root.parent)).encode() + path.read_bytes())
     return digest.hexdigest()

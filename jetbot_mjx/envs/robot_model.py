@@ -169,6 +169,12 @@ def make_mj_model(
     return spec.compile()
 
 
+def mocap_ids(model: mujoco.MjModel) -> dict[str, int]:
+    """Return the indices of a model's mocap bodies, which a task places, by name, in order."""
+    bodies = np.argsort(model.body_mocapid)[model.nbody - model.nmocap :].tolist()
+    return {model.body(body).name: index for index, body in enumerate(bodies)}
+
+
 def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
     """Check the stability of explicit Euler: timestep * motor_gain / wheel inertia < 2."""
     limit = 2.0 * (robot.wheel_inertia[1] + robot.armature) / robot.motor_gain

@@ -1,12 +1,9 @@
-"""Define robot parameters, and make the physics model of a robot that differs from its preset.
+"""Make the physics model of a robot that differs from its preset.
 
-Parameters are data: one compiled program serves all values of a traced parameter, and `jax.vmap`
-gives each robot its own. Friction and masses enter the physics model here; wheels and motors enter
-in `actuators`, and measurement errors in `sensors`.
+One compiled program serves all values of a traced parameter, and `jax.vmap` gives each robot its
+own. Friction and masses enter the physics model here; wheels and motors enter in `actuators`, and
+measurement errors in `sensors`.
 """
-
-from collections.abc import Iterable
-from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import mujoco
@@ -14,97 +11,11 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from jetbot_mjx.config import RobotParams
 from jetbot_mjx.envs import mjx
-
-MAX_ACTION_DELAY = 9
-"""Longest `action_delay` [control steps] of a traced delay: 150 ms at the default `ctrl_dt`."""
-
-MAX_OBSERVATION_DELAY = 6
-"""Longest `observation_delay` [control steps] if the delay is traced: 100 ms."""
 
 _CHASSIS = "jetbot"
 _SIDES = ("left", "right")
-
-Quantity = Float[ArrayLike, ""]
-
-
-def differs(params: Any, names: Iterable[str]) -> bool:
-    """Return whether any of some parameters may differ from its default.
-
-    Args:
-      params: a `NamedTuple` of parameters with defaults.
-      names: the parameters; a traced one may always differ.
-    """
-    values = {name: getattr(params, name) for name in names}
-    return any(
-        not (isinstance(value, int | float) and value == params._field_defaults[name])
-        for name, value in values.items()
-    )
-
-
-class RobotParams(NamedTuple):
-    """A `RobotParams` holds the differences of one robot from its preset.
-
-    The defaults are the preset. A parameter at its default costs nothing: programs omit its code.
-    """
-
-    friction: Quantity = 1.0
-    """Factor on the Coulomb friction coefficient between wheels and floor."""
-    mass: Quantity = 1.0
-    """Factor on mass and inertia of the chassis; the wheels stay the same."""
-    com_x: Quantity = 0.0
-    """Shift of the chassis's centre of mass forward [m], body frame."""
-    com_y: Quantity = 0.0
-    """Shift of the chassis's centre of mass to the left [m], body frame."""
-    com_z: Quantity = 0.0
-    """Shift of the chassis's centre of mass up [m], body frame."""
-    wheel_radius: Quantity = 1.0
-    """Factor on the radius of both wheels."""
-    wheel_radius_mismatch: Quantity = 0.0
-    """Difference of the wheel radii, (left - right) / mean."""
-    wheel_separation: Quantity = 1.0
-    """Factor on the distance between the wheels."""
-    motor_gain: Quantity = 1.0
-    """Factor on the wheel speeds that the motors reach for a command, and on their limit."""
-    motor_gain_mismatch: Quantity = 0.0
-    """Difference of the motor gains, (left - right) / mean."""
-    supply_voltage: Quantity = 1.0
-    """Factor on motor voltage and thus on wheel speed; a low one also widens the dead-band."""
-    dead_band: Quantity = 0.0
-    """Fraction of full voltage below which a wheel stands still."""
-    motor_lag: Quantity = 0.0
-    """Time constant of a first-order lag of the command [s], in addition to the motor dynamics."""
-    action_delay: Quantity = 0.0
-    """Delay from command to motor [control steps], rounded; until the first command arrives, the
-    motors hold the robot still."""
-    position_noise: Quantity = 0.0
-    """Standard deviation of the measured position (x, y) [m]."""
-    yaw_noise: Quantity = 0.0
-    """Standard deviation of the measured heading [rad]."""
-    speed_noise: Quantity = 0.0
-    """Standard deviation of the measured velocity (x, y) [m/s]."""
-    yaw_rate_noise: Quantity = 0.0
-    """Standard deviation of the measured yaw rate [rad/s]."""
-    observation_delay: Quantity = 0.0
-    """Delay of the measured robot state [control steps], rounded; the goal has no delay."""
-    height_offset: Quantity = 0.0
-    """Offset of the measured height [m], constant over an episode."""
-    pitch_offset: Quantity = 0.0
-    """Offset of the measured pitch [rad], constant over an episode; positive lowers the nose."""
-    start_x: Quantity = 0.0
-    """Start position along the world's x axis [m]."""
-    start_y: Quantity = 0.0
-    """Start position along the world's y axis [m]."""
-    start_yaw: Quantity = 0.0
-    """Heading at the start [rad], counter-clockwise."""
-
-    def differs(self, *names: str) -> bool:
-        """Return whether any of some parameters may differ from the preset.
-
-        Args:
-          *names: the parameters; a traced one may always differ.
-        """
-        return differs(self, names)
 
 
 def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams) -> mjx.Model:

@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
+from jetbot_mjx.config import RobotParams
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.task import RobotState
 
 _NOISE = ("position_noise", "yaw_noise", "speed_noise", "yaw_rate_noise")

@@ -18,10 +18,9 @@ import jax.numpy as jnp
 import mujoco
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
-from jetbot_mjx.config import TaskConfig
+from jetbot_mjx.config import TaskConfig, find_task_here
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.errors import InvalidError, MissingPackageError, UserError
-from jetbot_mjx.imports import find_task_here
 
 Goal = PyTree
 """Arrays in any pytree that a task draws for an episode; `GoalTask` draws a position [m], world
@@ -341,7 +340,7 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     return task
 
 
-def _import_class(name: str) -> Any:
+def _import_class(name: str) -> object:
     """Import what a name `package.module:Class` refers to, which may not be a class."""
     module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
@@ -373,7 +372,7 @@ def _import_class(name: str) -> Any:
             f"task.name = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
             f" {error.msg}"
         ) from None
-    task_class: Any = getattr(module, class_name, None)
+    task_class: object = getattr(module, class_name, None)
     if task_class is None:
         close = difflib.get_close_matches(class_name, dir(module), n=1)
         hint = f": did you mean {close[0]!r}?" if close else ""

@@ -14,19 +14,17 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-from brax.envs import Env, Wrapper
 from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
-from jetbot_mjx.compiler.kernel import Kernel
-from jetbot_mjx.compiler.one_kernel import OneKernel
-from jetbot_mjx.compiler.packed import Packed, pack
-from jetbot_mjx.compiler.scalar_ir import UnsupportedError
 from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.camera.wrapper import with_camera
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
 from jetbot_mjx.envs.state import State
 from jetbot_mjx.fallbacks import Fallback, report
+from jetbot_mjx.mjx_import import Env, Wrapper
+from jetbot_mjx.packed import Packed, PackedStep, pack
+from onekernel import Kernel, OneKernel, UnsupportedError
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 """A function from one model to (batch of models, their `in_axes` for `jax.vmap`), as in Brax."""
@@ -282,7 +280,13 @@ class KernelWrapper(Wrapper):
 
         # Pyright would want the names of the methods' arguments.
         def compiled(function: Callable[..., Any]) -> Any:
-            return OneKernel(function, lambda: physics.may_be_kernel, report_unsupported)
+            return OneKernel(
+                function,
+                lambda: physics.may_be_kernel,
+                report_unsupported,
+                physics.kernel_impl.explain,
+                physics.kernel_impl.report_fallback,
+            )
 
         self.reset = compiled(env.reset)
         self.step = compiled(env.step)
@@ -316,27 +320,17 @@ class BatchWrapper(Wrapper):
         """
         return jax.vmap(self.env.step)(state, action)
 
-    def step_packed(self, packed: Packed, action: Float[Array, "n 2"]) -> Packed:
-        """Step every environment, with few arrays for XLA to pass on.
+    @property
+    def step_packed(self) -> PackedStep:
+        """Return the step of every environment, with few arrays for XLA to pass on.
 
-        Args:
-          packed: the batch of states.
-          action: one action per environment, in [-1, 1]².
+        It takes the batch of states, and one action per environment, in [-1, 1]².
         """
-        return jax.vmap(self.env.step_packed)(packed, action)
+        return PackedStep(jax.vmap(self.env.step_packed), self._packed_kernel)
 
-    def packed_kernel(self, packed: Packed) -> Kernel | None:
-        """Return the kernel that `step_packed` launches, without compiling it.
-
-        Args:
-          packed: a batch of states.
-
-        Returns:
-          The kernel of one environment, from the words of its state and an action to the words of
-          the next state; None: a step is more than one kernel, or the next state is laid out
-          differently.
-        """
-        step = getattr(self.env, "step_packed", None)
+    def _packed_kernel(self, packed: Packed) -> Kernel | None:
+        """Return the kernel of a step, as `PackedStep.kernel`."""
+        step = self.env.step_packed
         if packed.others or not isinstance(step, OneKernel):
             return None
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), packed)
@@ -374,11 +368,7 @@ class RandomizedBatchWrapper(BatchWrapper):
         Args:
           rng: one random key per environment.
         """
-
-        def reset(model: mjx.Model, rng: UInt32[Array, "2"]) -> State:
-            return self._wrap_one(self.env.with_model(model)).reset(rng)
-
-        return jax.vmap(reset, in_axes=(self._axes, 0))(self._models, rng)
+        return self._call("reset", rng)
 
     def step(self, state: State, action: Float[Array, "n 2"]) -> State:
         """Step every environment.
@@ -387,20 +377,23 @@ class RandomizedBatchWrapper(BatchWrapper):
           state: the batch of states.
           action: one action per environment, in [-1, 1]².
         """
+        return self._call("step", state, action)
 
-        def step(model: mjx.Model, state: State, action: Float[Array, "2"]) -> State:
-            return self._wrap_one(self.env.with_model(model)).step(state, action)
+    def _call(self, method: str, *batch: PyTree) -> State:
+        """Call a method of every environment, each with its own model."""
 
-        return jax.vmap(step, in_axes=(self._axes, 0, 0))(self._models, state, action)
+        def call(model: mjx.Model, *given: PyTree) -> State:
+            return getattr(self._wrap_one(self.env.with_model(model)), method)(*given)
 
-    def step_packed(self, packed: Packed, action: Float[Array, "n 2"]) -> Packed:
-        """Step every environment.
+        return jax.vmap(call, in_axes=(self._axes, *[0] * len(batch)))(self._models, *batch)
 
-        Args:
-          packed: the batch of states.
-          action: one action per environment, in [-1, 1]².
-        """
-        return pack(self.step(packed.unpack(), action), batch_axes=1)
+    @property
+    def step_packed(self) -> PackedStep:
+        """Return the step of every environment, which is more than one kernel."""
+        return PackedStep(
+            lambda packed, action: pack(self.step(packed.unpack(), action), batch_axes=1),
+            lambda packed: None,
+        )
 
 
 def _episode_fields(state: State) -> tuple[PyTree, ...]:

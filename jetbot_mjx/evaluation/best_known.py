@@ -8,7 +8,6 @@ times for any other task, robot or time step.
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
@@ -16,6 +15,7 @@ from jaxtyping import Float
 from jetbot_mjx.config import Config
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs import JsonObject
 
 FILE = Path(__file__).parents[1] / "assets" / "best_known.json"
 
@@ -38,7 +38,7 @@ SETTINGS = (
 _GOAL_TOLERANCE = 1.5e-3  # [m] The file holds whole millimetres.
 
 
-def settings_of(config: Config) -> dict[str, Any]:
+def settings_of(config: Config) -> JsonObject:
     """Return the settings of a configuration that the times depend on, by key."""
     flat = config.flat()
     return {name: flat[name] for name in SETTINGS}

@@ -10,7 +10,7 @@ that comparison holds only for these policies, not for other trainings.
 import itertools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 import scipy.stats
@@ -18,19 +18,12 @@ from jaxtyping import Bool, Float
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.bootstrap import (
-    Estimate,
-    bootstrap,
-    bootstrap_interval,
-    interquartile_mean,
-    mean_difference,
-    median_estimate,
-    probability_of_improvement,
-)
+from jetbot_mjx.evaluation import bootstrap_intervals as intervals
+from jetbot_mjx.evaluation.bootstrap_intervals import Estimate, bootstrap
 from jetbot_mjx.evaluation.evaluator import Summary, json_values
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import CurvePoint, Report
-from jetbot_mjx.runs.run_dir import shortened
+from jetbot_mjx.runs import JsonObject, shortened
 
 
 class Aggregate(NamedTuple):
@@ -97,28 +90,28 @@ class Comparison(NamedTuple):
     folder: Path
     """Folder of the comparison's files."""
     episodes: int
-    settings: Mapping[str, Any]
+    settings: JsonObject
     """Settings of task, robot and time step, which all runs share."""
     runs: tuple[Run, ...]
     pairs: tuple[Pair, ...]
-    differences: Mapping[str, Sequence[Any]]
+    differences: Mapping[str, Sequence[object]]
     """Values of each run, by key, for the settings in which runs differ besides the seed."""
     baselines: Mapping[str, Summary]
-    versions: Mapping[str, Any]
+    versions: JsonObject
 
     def __repr__(self) -> str:
         """Return the mean success rate of each run and the folder in one line."""
         rates = {run.name: f"{run.success_rate.mean.value:.1%}" for run in self.runs}
         return f"Comparison(success={rates}, folder={str(shortened(self.folder))!r})"
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return everything except the episodes as JSON values."""
         values = {name: value for name, value in self._asdict().items() if name != "folder"}
         values["runs"] = [_run_json(run) for run in self.runs]
         return json_values({"goal_set_version": GOAL_SET_VERSION, **values})
 
 
-def _run_json(run: Run) -> dict[str, Any]:
+def _run_json(run: Run) -> JsonObject:
     seeds = [
         {
             "name": name,
@@ -153,7 +146,7 @@ def check_comparable(configs: Mapping[str, Config]) -> None:
                 )
 
 
-def _task_settings(config: Config) -> dict[str, Any]:
+def _task_settings(config: Config) -> JsonObject:
     """Return the settings of task, robot and time step, which compared runs must share."""
     return {
         key: value
@@ -162,7 +155,7 @@ def _task_settings(config: Config) -> dict[str, Any]:
     }
 
 
-def _differences(configs: Sequence[Config]) -> dict[str, list[Any]]:
+def _differences(configs: Sequence[Config]) -> dict[str, Sequence[object]]:
     """Return the values of each run, by key, for the settings in which runs differ."""
     flat = [config.flat() for config in configs]
     keys = dict.fromkeys(key for one in flat for key in one if key not in ("seed", "seeds"))
@@ -232,7 +225,7 @@ def _of_one_seed(report: Report) -> tuple[Aggregate, Aggregate]:
     policy, episodes = report.policy, report.episodes
     success = Estimate(policy.success_rate, policy.success_low, policy.success_high)
     steps = np.asarray(episodes.steps)[np.asarray(episodes.success) > 0]
-    time = median_estimate(steps * report.config.physics.ctrl_dt)
+    time = intervals.median_estimate(steps * report.config.physics.ctrl_dt)
     return (
         Aggregate("episodes", policy.episodes, success, Estimate(None)),
         Aggregate("episodes", policy.successes, time, Estimate(None)),
@@ -241,7 +234,10 @@ def _of_one_seed(report: Report) -> tuple[Aggregate, Aggregate]:
 
 def _over_seeds(values: Sequence[float]) -> Aggregate:
     return Aggregate(
-        "seeds", len(values), bootstrap(np.mean, values), bootstrap(interquartile_mean, values)
+        "seeds",
+        len(values),
+        bootstrap(np.mean, values),
+        bootstrap(intervals.interquartile_mean, values),
     )
 
 
@@ -254,7 +250,7 @@ def _band(curves: Sequence[Sequence[CurvePoint]]) -> tuple[CurvePoint, ...]:
     if not common:
         return ()
     rates = np.array([[curve[step] for step in common] for curve in by_steps])
-    lows, highs = bootstrap_interval(np.mean, [rates], axis=0)
+    lows, highs = intervals.bootstrap_interval(np.mean, [rates], axis=0)
     columns = (common, rates.mean(axis=0), lows, highs)
     return tuple(
         CurvePoint(int(step), float(mean), float(low), float(high), None)
@@ -307,9 +303,11 @@ def _compare_pairwise(
     several = len(a) > 1 and len(b) > 1
     order = (b, a) if less_is_better else (a, b)
     return PairwiseResult(
-        difference=bootstrap(mean_difference, a, b),
+        difference=bootstrap(intervals.mean_difference, a, b),
         # With a single seed the comparison says nothing about other seeds.
-        improvement=bootstrap(probability_of_improvement, *order) if several else Estimate(None),
+        improvement=bootstrap(intervals.probability_of_improvement, *order)
+        if several
+        else Estimate(None),
         wins=wins,
         losses=losses,
         ties=better.size - wins - losses,

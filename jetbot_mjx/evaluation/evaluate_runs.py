@@ -2,16 +2,12 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, get_args
 
 import jax
 
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import RandomizationConfig, load_config
-from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics
+from jetbot_mjx.envs import OTHER_NUMERICS, DomainRandomizationWrapper, Numerics
 from jetbot_mjx.errors import InvalidError, UserError
 from jetbot_mjx.evaluation.comparison import Comparison, check_comparable, compare
 from jetbot_mjx.evaluation.evaluator import BASELINES, Evaluator, report_keys, summarize
@@ -27,10 +23,20 @@ from jetbot_mjx.evaluation.report import (
 )
 from jetbot_mjx.evaluation.result_names import find_report, name_with_count, report_folder
 from jetbot_mjx.evaluation.robustness import SWEEP_GOALS, MujocoEvaluator, MujocoResult, Sweeper
-from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.runs.metrics import METRICS, read_history
-from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import check_writable, seed_folders, shortened, versions
+from jetbot_mjx.runs import (
+    METRICS,
+    Checkpoint,
+    JsonObject,
+    Setup,
+    Which,
+    check_writable,
+    load_checkpoint,
+    read_history,
+    seed_folders,
+    shortened,
+    versions,
+)
+from jetbot_mjx.terminal import stage
 
 Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
@@ -71,7 +77,7 @@ def evaluate_run(
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     check_writable(Path(output or checkpoint.results_dir / _FOLDER))
     reporter = _Reporter(episodes, robustness, ranges, simulator)
-    return reporter.write(checkpoint, checkpoint.make_env(), output)
+    return reporter.write(checkpoint, checkpoint.make_setup(), output)
 
 
 def evaluate_in_mujoco(
@@ -102,8 +108,7 @@ def evaluate_in_mujoco(
     """
     checkpoint = load_checkpoint(run_or_checkpoint, which)
     robots = _read_ranges(ranges) or checkpoint.config.randomization
-    env = checkpoint.make_env()
-    evaluator = MujocoEvaluator(env, checkpoint.networks, robots, numerics, pictures=True)
+    evaluator = MujocoEvaluator(checkpoint.make_setup(), robots, numerics, pictures=True)
     return evaluator.run(checkpoint.params, report_keys(episodes))
 
 
@@ -146,7 +151,7 @@ def compare_runs(
     folder = first / _FOLDER / name if output is None else Path(output)
     # Build all environments first, so that an unsuitable policy is rejected before any writing.
     policies = [
-        (name, seed, checkpoint, checkpoint.make_env())
+        (name, seed, checkpoint, checkpoint.make_setup())
         for name, entry in entries.items()
         for seed, checkpoint in entry.seeds.items()
     ]
@@ -156,8 +161,8 @@ def compare_runs(
     reporter = _Reporter(episodes, robustness, ranges, simulator)
     by_run: dict[str, dict[str, Report]] = {name: {} for name in entries}
     with stage("policies", len(policies)) as advance:
-        for name, seed, checkpoint, env in policies:
-            report = reporter.write(checkpoint, env, again=False)
+        for name, seed, checkpoint, setup in policies:
+            report = reporter.write(checkpoint, setup, again=False)
             # Drop the trajectories, which are large and already plotted.
             by_run[name][seed] = report._replace(episodes=report.episodes._replace(qpos=None))
             advance(1)
@@ -249,11 +254,12 @@ class _Reporter:
         self._robustness, self._in_mujoco = robustness, robustness or simulator is not None
         self._pictures = simulator is not None
         self._ranges, self._ranges_file = _read_ranges(ranges), ranges
-        self._built_for: tuple[Any, ...] = ()
+        self._built_for: tuple[object, ...] = ()
 
-    def _build(self, checkpoint: Checkpoint, env: JetBotEnv, ranges: RandomizationConfig) -> None:
+    def _build(self, checkpoint: Checkpoint, setup: Setup, ranges: RandomizationConfig) -> None:
         """Build the evaluators and evaluate the baselines, unless those that there are fit."""
-        config, params, networks = checkpoint.config, checkpoint.params, checkpoint.networks
+        config, params = checkpoint.config, checkpoint.params
+        env, networks, programs = setup.env, setup.networks, setup.programs
         # The parts of a configuration that the compiled episodes depend on.
         parts = (
             config.task,
@@ -267,7 +273,6 @@ class _Reporter:
         )
         if parts == self._built_for:
             return
-        programs = ProgramCache(compiler_options(config))
         self._nominal = Evaluator(env, networks, programs, baselines=True, record=True)
         self._baselines = {
             name: summarize(self._nominal.run(params, self._keys, name), env.dt)
@@ -280,17 +285,27 @@ class _Reporter:
         self._moments = MomentFinder(env, networks, programs) if env.camera else None
         self._mujoco = None
         if self._in_mujoco:
-            self._mujoco = MujocoEvaluator(env, networks, ranges, pictures=self._pictures)
+            self._mujoco = MujocoEvaluator(setup, ranges, pictures=self._pictures)
         self._built_for = parts
 
-    def _on_other_robots(self, checkpoint: Checkpoint, env: JetBotEnv) -> dict[str, Any]:
+    def _parts(self, setup: Setup, ranges: RandomizationConfig) -> frozenset[str]:
+        """Return the names of the parts that a report has beside the fixed goals."""
+        has = {
+            "robustness": self._robustness,
+            "mujoco": self._in_mujoco,
+            "rendered": self._pictures and setup.env.camera is not None,
+            "randomized": bool(ranges.drawn),
+        }
+        return frozenset(name for name, wanted in has.items() if wanted)
+
+    def _on_other_robots(self, checkpoint: Checkpoint, setup: Setup) -> JsonObject:
         """Return the fields of a report about other robots and another simulator."""
         params, keys, found = checkpoint.params, self._keys, {}
         if self._robustness:
-            sweeper = Sweeper(env, checkpoint.networks, keys[:SWEEP_GOALS])
+            sweeper = Sweeper(setup, keys[:SWEEP_GOALS])
             found["robustness"] = sweeper.run(params)
         if self._randomized:
-            found["randomized"] = summarize(self._randomized.run(params, keys), env.dt)
+            found["randomized"] = summarize(self._randomized.run(params, keys), setup.env.dt)
         if self._mujoco:
             found["mujoco"] = self._mujoco.run(params, keys)
         return found
@@ -298,7 +313,7 @@ class _Reporter:
     def write(
         self,
         checkpoint: Checkpoint,
-        env: JetBotEnv,
+        setup: Setup,
         output: str | Path | None = None,
         *,
         again: bool = True,
@@ -307,23 +322,18 @@ class _Reporter:
 
         Args:
           checkpoint: the policy.
-          env: its environment.
+          setup: its environment, networks and programs.
           output: the folder of the report; None: the one that `report_folder` chooses.
           again: whether to write a report also where there is one that is at least as full.
         """
         config, ranges = checkpoint.config, self._ranges or checkpoint.config.randomization
+        env = setup.env
         # Choose the folder of the report.
-        parts = {
-            "robustness": self._robustness,
-            "mujoco": self._in_mujoco,
-            "rendered": self._pictures and env.camera is not None,
-            "randomized": bool(ranges.drawn),
-        }
-        has = frozenset(name for name, wanted in parts.items() if wanted)
-        wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, len(self._keys), has
+        parts = self._parts(setup, ranges)
+        wanted = checkpoint.results_dir / _FOLDER, checkpoint.path.name, len(self._keys), parts
         fuller = None if again else find_report(*wanted)
         # Run the fixed goals, which most parts of the report are computed from.
-        self._build(checkpoint, env, ranges)
+        self._build(checkpoint, setup, ranges)
         finished = jax.device_get(self._nominal.run(checkpoint.params, self._keys))
         best_known, missing = compare_with_best_known(config, finished)
         run_dir = shortened(checkpoint.run_dir)
@@ -349,7 +359,7 @@ class _Reporter:
             seen=self._moments.find(checkpoint.params, self._keys, finished)
             if self._moments
             else (),
-            **self._on_other_robots(checkpoint, env),
+            **self._on_other_robots(checkpoint, setup),
         )
         if fuller is None:
             with stage("writing the report"):

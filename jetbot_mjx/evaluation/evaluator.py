@@ -12,18 +12,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Bool, Float, PyTree, UInt32
 
-from jetbot_mjx.agents.networks import Networks, PolicyParams, make_policy
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.state import State, robot_state
+from jetbot_mjx import envs
+from jetbot_mjx.agents import Networks, PolicyParams, by_kernel, make_policy, raw_key
+from jetbot_mjx.envs import DomainRandomizationWrapper, JetBotEnv, State
 from jetbot_mjx.errors import check_count
 from jetbot_mjx.evaluation.goal_set import MOST_GOALS
 from jetbot_mjx.evaluation.rollout import Controller, Episodes, rollout_fn
-from jetbot_mjx.runs.progress import stage
+from jetbot_mjx.runs import JsonObject
+from jetbot_mjx.terminal import stage
+from onekernel import ProgramCache
+
+_NORMAL_QUANTILE = 1.959963984540054
+"""Quantile of the normal distribution at 97.5 %."""
 
 _REPORT_SEED = 20_251
 _TRAINING_SEED = 20_252
@@ -45,8 +47,8 @@ def training_keys(episodes: int) -> UInt32[Array, "n 2"]:
 
 
 def _fixed_keys(seed: int, episodes: int) -> UInt32[Array, "n 2"]:
-    key = jax.random.PRNGKey(seed)
-    return jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(episodes))
+    key = by_kernel(jax.random.PRNGKey(seed))
+    return raw_key(jax.vmap(jax.random.fold_in, in_axes=(None, 0))(key, jnp.arange(episodes)))
 
 
 class Summary(NamedTuple):
@@ -98,9 +100,7 @@ def summarize(episodes: Episodes, ctrl_dt: float) -> Summary:
     )
 
 
-def success_and_time(
-    won: Bool[np.ndarray, " n"], seconds: Float[np.ndarray, " n"]
-) -> dict[str, Any]:
+def success_and_time(won: Bool[np.ndarray, " n"], seconds: Float[np.ndarray, " n"]) -> JsonObject:
     """Compute the fields that a `Summary` shares with the results in a range of goals.
 
     Args:
@@ -150,26 +150,30 @@ def final_distances(episodes: Episodes) -> Float[np.ndarray, " n"]:
     return np.linalg.norm(episodes.goal_w[:, :2] - episodes.end_w, axis=-1)
 
 
-def wilson_interval(successes: int, trials: int, z: float = 1.959964) -> tuple[float, float]:
-    """Compute Wilson's score interval of a proportion.
+def wilson_interval(successes: int, trials: int) -> tuple[float, float]:
+    """Compute Wilson's score interval of a proportion, at 95 %.
 
         (p̂ + z²/2n ± z √(p̂(1-p̂)/n + z²/4n²)) / (1 + z²/n)
+
+    It is that of `scipy.stats.binomtest`, which every training would take half a second to import.
 
     Args:
       successes: number of successes.
       trials: number of trials, at least 1.
-      z: quantile of the normal distribution; the default gives a 95 % interval.
 
     Returns:
       The lower and the upper end, within [0, 1].
 
     Source: E. B. Wilson, JASA 22 (1927), 209-212, doi:10.1080/01621459.1927.10502953.
     """
-    p, n = successes / trials, trials
+    p, n, z = successes / trials, trials, _NORMAL_QUANTILE
     centre = p + z * z / (2 * n)
     spread = z * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     scale = 1 + z * z / n
-    return max(0.0, (centre - spread) / scale), min(1.0, (centre + spread) / scale)
+    # At the ends the sum is exactly 0 or 1, but for rounding.
+    low = (centre - spread) / scale if successes > 0 else 0.0
+    high = (centre + spread) / scale if successes < trials else 1.0
+    return low, high
 
 
 def policy_controller(networks: Networks) -> Controller:
@@ -279,15 +283,15 @@ def _turn_then_go(env: JetBotEnv | DomainRandomizationWrapper) -> Controller:
     damping = 0.3  # reduction of the yaw rate per yaw rate, against oscillation by motor lag
     cone = 0.6  # [rad] heading error within which it drives
 
-    def act(params: Any, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
-        robot = robot_state(state.pipeline_state)
+    def act(params: PyTree, state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
+        robot = envs.robot_state(state.pipeline_state)
         offset_w = env.task.goal_position(state.goal)[:2] - robot.position_w[:2]
-        goal_b = kinematics.to_body(kinematics.yaw(robot.quat), offset_w)
+        goal_b = envs.to_body(envs.yaw(robot.quat), offset_w)
         error = jnp.arctan2(goal_b[1], goal_b[0])
         aligned = (jnp.cos(error) - math.cos(cone)) / (1.0 - math.cos(cone))
         speed = env.config.task.max_speed * jnp.maximum(aligned, 0.0)
         yaw_rate = steering * error - damping * robot.angular_velocity_w[2]
-        return kinematics.action_from_twist(
+        return envs.action_from_twist(
             jnp.stack([speed, yaw_rate]),
             max_speed=env.config.task.max_speed,
             max_yaw_rate=env.config.task.max_yaw_rate,

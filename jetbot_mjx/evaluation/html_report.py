@@ -19,7 +19,7 @@ from jetbot_mjx.evaluation import learning_curves, plots
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.moments import plot_moments
 from jetbot_mjx.evaluation.report import Report, replay_command
-from jetbot_mjx.runs.run_dir import make_folder, write_bytes, write_json, write_text, writing_to
+from jetbot_mjx.runs import JsonObject, make_folder, write_bytes, write_json, write_text, writing_to
 
 LISTED_FAILURES = 50
 """Largest number of failures on a page; the JSON file lists all of them."""
@@ -134,9 +134,9 @@ def write_comparison(comparison: Comparison) -> Path:
 def _write(
     folder: Path,
     name: str,
-    values: Mapping[str, Any],
+    values: JsonObject,
     figures: Mapping[str, Callable[[], Figure]],
-    more: Mapping[str, Any],
+    more: JsonObject,
 ) -> Path:
     """Draw all figures and render all pages, then write the files, the HTML page last."""
     drawn = {figure: _draw(draw) for figure, draw in figures.items()}
@@ -176,7 +176,7 @@ def _data_uri(png: bytes) -> str:
     return f"data:image/png;base64,{base64.b64encode(png).decode()}"
 
 
-def _numbers(values: Mapping[str, Any], suffix: str) -> Callable[[str, str], str]:
+def _numbers(values: JsonObject, suffix: str) -> Callable[[str, str], str]:
     """Return a function that formats a JSON value by its path, such as `policy.success_rate`."""
 
     def number(place: str, form: str) -> str:

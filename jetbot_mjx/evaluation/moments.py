@@ -9,19 +9,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int, UInt8, UInt32
+from jaxtyping import Array, Float, Int, PyTree, UInt8, UInt32
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jetbot_mjx.agents.networks import Networks, PolicyParams, make_policy
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.envs.camera.wrapper import PIXELS, with_camera
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.state import State
-from jetbot_mjx.envs.wrappers import EpisodeWrapper
+from jetbot_mjx.agents import Networks, PolicyParams, make_policy
+from jetbot_mjx.envs import PIXELS, EpisodeWrapper, JetBotEnv, State, with_camera
 from jetbot_mjx.evaluation.occlusion import occlusion_map, overlay_heat
 from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs.progress import stage
+from jetbot_mjx.runs import JsonObject
+from jetbot_mjx.terminal import stage
+from onekernel import ProgramCache
 
 MOMENTS = ("start", "middle", "end")
 
@@ -119,7 +117,7 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> Any:
     ) -> tuple[UInt8[Array, "n moments h w c"], Float[Array, "n moments h w"]]:
         policy = make_policy(networks, params)
 
-        def advance(carry: tuple[Any, Any, Any]) -> tuple[Any, Any, Any]:
+        def advance(carry: tuple[Array, State, PyTree]) -> tuple[Array, State, PyTree]:
             time, state, seen = carry
             state = jax.vmap(step)(state, policy(state.obs))
             now = times == time + 1
@@ -141,7 +139,7 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> Any:
     return run
 
 
-def moments_as_json(episodes: Sequence[SeenEpisode]) -> dict[str, Any]:
+def moments_as_json(episodes: Sequence[SeenEpisode]) -> JsonObject:
     """Return what a report says of the images as JSON values."""
     return {
         "goals": [one.goal for one in episodes],

@@ -8,14 +8,13 @@ Source: M. D. Zeiler and R. Fergus, Visualizing and understanding convolutional 
 """
 
 from collections.abc import Mapping
-from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8
 
-from jetbot_mjx.agents.networks import Policy
-from jetbot_mjx.envs.camera.wrapper import PIXELS
+from jetbot_mjx.agents import Policy
+from jetbot_mjx.envs import PIXELS
 from jetbot_mjx.errors import InvalidError
 
 _GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
@@ -27,7 +26,7 @@ _SQUARES = 8  # squares side by side on the shorter side of an image, by default
 
 def occlusion_map(
     policy: Policy,
-    obs: Mapping[str, Any],
+    obs: Mapping[str, Array | np.ndarray],
     *,
     side: int | None = None,
     stride: int | None = None,

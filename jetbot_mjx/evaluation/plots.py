@@ -15,11 +15,13 @@ from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
+from matplotlib.projections.polar import PolarAxes
 from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter, PercentFormatter
+from matplotlib.typing import ColorType
 
-from jetbot_mjx.evaluation.evaluator import final_distances, path_efficiencies
-from jetbot_mjx.evaluation.report import SECTORS, GoalBin, Report
+from jetbot_mjx.evaluation.evaluator import Summary, final_distances, path_efficiencies
+from jetbot_mjx.evaluation.report import SECTORS, CurvePoint, GoalBin, Report
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, SweepResult
 from jetbot_mjx.evaluation.rollout import Episodes
 
@@ -170,7 +172,7 @@ def plot_by_goal(goal_bins: Sequence[GoalBin]) -> Figure:
 
 
 def _polar(
-    axes: Any,
+    axes: PolarAxes,
     goal_bins: Sequence[GoalBin],
     values: Sequence[float | None],
     labels: Sequence[str],
@@ -213,7 +215,7 @@ def _polar(
     axes.plot(0, 0, marker="^", color=ink, markersize=9)
 
 
-def _contrast(one: Any, other: Any) -> float:
+def _contrast(one: ColorType, other: ColorType) -> float:
     """Return the difference in perceived brightness between two colours."""
     low, high = sorted(float(np.dot(to_rgb(c), (0.299, 0.587, 0.114))) for c in (one, other))
     return high - low
@@ -315,7 +317,7 @@ def plot_robustness(results: Sequence[SweepResult]) -> Figure:
 def plot_rates(
     axes: Axes,
     x: Sequence[float],
-    points: Sequence[Any],
+    points: Sequence[Summary] | Sequence[CurvePoint],
     *,
     color: str,
     label: str,

@@ -8,7 +8,7 @@ import math
 import shlex
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,7 +20,7 @@ from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
 from jetbot_mjx.evaluation.moments import SeenEpisode, moments_as_json
 from jetbot_mjx.evaluation.robustness import MujocoResult, SweepResult, as_json
 from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs.run_dir import shortened
+from jetbot_mjx.runs import JsonObject, MetricValues, shortened
 
 TIME_LIMIT = "time limit"
 ENDED_BY_TASK = "ended by the task"
@@ -138,9 +138,9 @@ class Report(NamedTuple):
     """Evaluations during the training; empty if the run folder holds no metrics."""
     episodes: Episodes
     """The policy's episodes, with arrays on the host."""
-    versions: Mapping[str, Any]
+    versions: JsonObject
     fallbacks: Sequence[tuple[str, str]] = ()
-    """What of the training ran slower than it could, each with the reason."""
+    """The parts of the training that ran slower than they could, each with the reason."""
     robustness: tuple[SweepResult, ...] = ()
     """Results on robots that differ from the preset; empty if they were not requested."""
     randomized: Summary | None = None
@@ -156,7 +156,7 @@ class Report(NamedTuple):
     best_known_missing: str | None = None
     """Why there are no best-known times."""
     seen: tuple[SeenEpisode, ...] = ()
-    """What the policy saw in some episodes; empty if it does not see."""
+    """The images that the policy saw in some episodes; empty if it does not see."""
 
     def __repr__(self) -> str:
         """Return the headline and the folder in one line."""
@@ -189,7 +189,7 @@ class Report(NamedTuple):
         found = self.mujoco
         return found is not None and (found.rendered is not None or not self.robustness)
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return everything except the episodes and images as JSON values."""
         apart = ("folder", "config", "goal_bins", "episodes", "ranges_file")
         fields = {name: value for name, value in self._asdict().items() if name not in apart}
@@ -342,7 +342,7 @@ def replay_command(run: Path, env_steps: int, goals: Sequence[int]) -> str | Non
     return f"jetbot-mjx render {shlex.quote(str(run))} --checkpoint {env_steps} --goals {which}"
 
 
-def learning_curve(history: Iterable[tuple[int, Mapping[str, Any]]]) -> tuple[CurvePoint, ...]:
+def learning_curve(history: Iterable[tuple[int, MetricValues]]) -> tuple[CurvePoint, ...]:
     """Extract the evaluations from the metrics of a training.
 
     Args:

@@ -4,7 +4,7 @@ import json
 from pathlib import Path
 
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION, REPORT_GOALS
-from jetbot_mjx.runs.run_dir import read_text
+from jetbot_mjx.runs import read_text
 
 PARTS = ("robustness", "randomized", "mujoco", "rendered")
 """Parts of a report that are written on request or if the run has ranges; keys of its JSON file,

@@ -4,38 +4,27 @@ A sweep changes one parameter at a time from the preset's value. Goals, rules an
 of the report. One compiled program evaluates all robots, with the policy and with the scripted
 controller. A policy that sees is also evaluated with changed looks, which the scripted controller
 does not see. The evaluation in C MuJoCo uses the same robot with numerics that no training uses.
-
-Sources of the ranges in `assets/robustness.yaml`, by tag; BOM, EST and SIM are those of
-`envs/robot_model.py`:
-  CAD         the space for the battery and the clearance of the casters in the CAD model
-  CSE276A     gassajor000/cse276a_jetbot: calibration of a JetBot's motors
-  DUCKIETOWN  gym-duckietown: simulator of a robot with the same motors
-  ISAACRL     KhaledSharif/isaac-sim-jetbot-rl: domain randomization of Isaac's JetBot
-  IMX219      Sony's sensor with 160° lens modules; drivers tint them until they are calibrated
-  PICOBOT     uni-obuda picobot: system identification of a robot with the same motors
-  TT          measurements of the same motors: newscrewdriver.com, SunFounder's data
-  WHEELEDLAB  WheeledLab: domain randomization of a drifting car
 """
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int, UInt32
 
-from jetbot_mjx.agents.networks import Networks, PolicyParams
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.compiler.xla_options import compiler_options, default_device_cpu
-from jetbot_mjx.config import RandomizationConfig, read_yaml
-from jetbot_mjx.envs.camera.mujoco_camera import MujocoCamera
-from jetbot_mjx.envs.camera.scenery import SceneryKind
-from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.look_params import LookParams
-from jetbot_mjx.envs.mujoco_simulator import OTHER_NUMERICS, Numerics, in_mujoco
-from jetbot_mjx.envs.robot_params import RobotParams
+from jetbot_mjx.agents import PolicyParams
+from jetbot_mjx.config import QUANTITIES, LookParams, RandomizationConfig, RobotParams
+from jetbot_mjx.devices import default_device_cpu
+from jetbot_mjx.envs import (
+    OTHER_NUMERICS,
+    DomainRandomizationWrapper,
+    JetBotEnv,
+    MujocoCamera,
+    Numerics,
+    SceneryKind,
+    in_mujoco,
+)
 from jetbot_mjx.evaluation.evaluator import (
     BASELINES,
     Evaluator,
@@ -46,7 +35,8 @@ from jetbot_mjx.evaluation.evaluator import (
 )
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
-from jetbot_mjx.runs.progress import stage
+from jetbot_mjx.runs import JsonObject, Setup
+from jetbot_mjx.terminal import stage
 
 SWEEP_GOALS = 128
 """Number of the report's fixed goals that a sweep uses for each robot."""
@@ -79,9 +69,7 @@ class Sweep(NamedTuple):
     @property
     def nominal(self) -> float:
         """Return the preset's value."""
-        return getattr(
-            RobotParams() if self.name in RobotParams._fields else LookParams(), self.name
-        )
+        return QUANTITIES[self.name].nominal
 
     @property
     def is_look(self) -> bool:
@@ -101,8 +89,7 @@ class Sweep(NamedTuple):
 
 
 SWEEPS = tuple(
-    Sweep(name, **{**one, "values": tuple(one["values"])})
-    for name, one in read_yaml(Path(__file__).parents[1] / "assets" / "robustness.yaml").items()
+    Sweep(one.name, *one.evaluated, source=one.bounds.source) for one in QUANTITIES.values()
 )
 """All parameters."""
 
@@ -121,19 +108,18 @@ class Sweeper:
 
     def __init__(
         self,
-        env: JetBotEnv,
-        networks: Networks,
+        setup: Setup,
         keys: UInt32[Array, "n 2"],
         sweeps: Sequence[Sweep] = SWEEPS,
     ) -> None:
         """Prepare the program, which compiles at its first use.
 
         Args:
-          env: one unwrapped environment with its preset's robot.
-          networks: the networks of the policies.
+          setup: the environment with its preset's robot, and the networks of the policies.
           keys: one reset key for each episode, such as `report_keys(128)`.
           sweeps: the parameters with their values; without a camera, those of looks are left out.
         """
+        env, networks = setup.env, setup.networks
         sees = env.camera is not None
         self._env, self._keys = env, keys
         self._sweeps = tuple(one for one in sweeps if sees or not one.is_look)
@@ -161,7 +147,7 @@ class Sweeper:
 
             return jax.vmap(one)(variants)
 
-        self._run_episodes = jax.jit(run_episodes, compiler_options=compiler_options(env.config))
+        self._run_episodes = jax.jit(run_episodes, compiler_options=setup.programs.options)
         self._scripted: dict[Variant, Summary] = {}
 
     def run(self, params: PolicyParams) -> tuple[SweepResult, ...]:
@@ -225,8 +211,7 @@ class MujocoEvaluator:
 
     def __init__(
         self,
-        env: JetBotEnv,
-        networks: Networks,
+        setup: Setup,
         ranges: RandomizationConfig | None = None,
         numerics: Numerics = OTHER_NUMERICS,
         *,
@@ -235,8 +220,7 @@ class MujocoEvaluator:
         """Build the simulator, whose programs compile at their first use.
 
         Args:
-          env: one unwrapped environment with its preset's robot.
-          networks: the networks of the policies.
+          setup: the environment with its preset's robot, and the networks of the policies.
           ranges: ranges from which a robot is sampled for each goal, in addition to the
             evaluation with the preset's robot; None: no sampled robots.
           numerics: numerical settings of C MuJoCo.
@@ -247,9 +231,9 @@ class MujocoEvaluator:
           UserError: JAX is configured without a CPU, or pictures are asked for on a machine
             without OpenGL.
         """
+        env, networks, programs = setup.env, setup.networks, setup.programs
         self._numerics, self._dt = numerics, env.dt
         simulator = in_mujoco(env, numerics)
-        programs = ProgramCache(compiler_options(env.config))
         envs: list[JetBotEnv | DomainRandomizationWrapper] = [simulator]
         if ranges is not None and ranges.drawn:
             envs.append(DomainRandomizationWrapper(simulator, ranges=ranges))
@@ -301,7 +285,7 @@ def robust_range(result: SweepResult) -> tuple[float, float] | None:
     return values[low], values[high]
 
 
-def as_json(results: Sequence[SweepResult]) -> dict[str, Any]:
+def as_json(results: Sequence[SweepResult]) -> JsonObject:
     """Return the results as JSON values for a report's file.
 
     Args:

@@ -10,17 +10,13 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from brax.envs import Wrapper
-from jaxtyping import Array, Bool, Float, Int, UInt32
+from jaxtyping import Array, Bool, Float, Int, PyTree, UInt32
 
-from jetbot_mjx.compiler.packed import Packed, pack
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.camera.wrapper import with_camera
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
-from jetbot_mjx.envs.state import State
-from jetbot_mjx.envs.task import Goal
-from jetbot_mjx.envs.wrappers import BatchWrapper, EpisodeWrapper, KernelWrapper
+from jetbot_mjx import envs
+from jetbot_mjx.agents import by_kernel, raw_key
+from jetbot_mjx.envs import QPOS_XYZ, JetBotEnv, State
+from jetbot_mjx.mjx_import import Wrapper
+from jetbot_mjx.packed import Packed, pack
 
 # Separates the actions' random numbers from those that the first reset, the robot and later
 # episodes draw from the same key.
@@ -29,7 +25,7 @@ _ACTION_DRAWS = 0x61637473
 _TALLY = "tally"
 """Key of the episode's statistics in the state's `info`."""
 
-Controller = Callable[[Any, State, UInt32[Array, "2"]], Float[Array, "2"]]
+Controller = Callable[[PyTree, State, UInt32[Array, "2"]], Float[Array, "2"]]
 
 
 class Episodes(NamedTuple):
@@ -55,14 +51,14 @@ class Episodes(NamedTuple):
     """Final position of the robot [m], world frame."""
     goal_w: Float[Array, "n 3"]
     """Position of the goal [m], world frame."""
-    goal: Goal
+    goal: envs.Goal
     """The complete goal that the task sampled."""
     qpos: Float[Array, "n time nq"] | None
     """Trajectory with the first state, constant after the end of the episode. None: not recorded.
     """
 
 
-Rollout = Callable[[int | Int[Array, ""], Any, UInt32[Array, "n 2"]], Episodes]
+Rollout = Callable[[int | Int[Array, ""], PyTree, UInt32[Array, "n 2"]], Episodes]
 """A function of (index of the controller, its parameters, reset keys)."""
 
 
@@ -99,7 +95,7 @@ class _OneEpisodeWrapper(Wrapper):
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
         """Make one step and add to the statistics, unless the episode has ended."""
-        nstate: Any = self.env.step(state, action)
+        nstate: PyTree = self.env.step(state, action)
         tally: _Tally = state.info[_TALLY]
         moved = jnp.linalg.norm(
             nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
@@ -141,12 +137,14 @@ def rollout_fn(
       randomness.
     """
     blind = env.blind() if isinstance(env, JetBotEnv) else env
-    one = KernelWrapper(_OneEpisodeWrapper(EpisodeWrapper(blind, episode_length)))
-    batch = BatchWrapper(with_camera(one, env.camera))
+    one = envs.KernelWrapper(_OneEpisodeWrapper(envs.EpisodeWrapper(blind, episode_length)))
+    batch = envs.BatchWrapper(envs.with_camera(one, env.camera))
     # Fold in twice: `fold_in(key, 1)` alone equals `split(key)[1]`, from which the goal is drawn.
-    fold_in = jax.vmap(jax.random.fold_in, in_axes=(0, None))
+    fold_in = jax.vmap(
+        lambda key, data: raw_key(jax.random.fold_in(by_kernel(key), data)), (0, None)
+    )
 
-    def run(index: int | Int[Array, ""], params: Any, keys: UInt32[Array, "n 2"]) -> Episodes:
+    def run(index: int | Int[Array, ""], params: PyTree, keys: UInt32[Array, "n 2"]) -> Episodes:
         first = batch.reset(keys)
 
         def act(state: State, key: UInt32[Array, "2"]) -> Float[Array, "2"]:
@@ -189,7 +187,7 @@ def _to_episodes(env: JetBotEnv | Wrapper, first: State, end: _Carry) -> Episode
     return Episodes(
         **statistics,
         start_w=start[:, QPOS_XYZ][:, :2],
-        start_yaw=jax.vmap(kinematics.yaw)(start[:, QPOS_QUAT]),
+        start_yaw=jax.vmap(envs.yaw)(start[:, envs.QPOS_QUAT]),
         end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],
         goal_w=jax.vmap(env.task.goal_position)(first.goal),
         goal=first.goal,

@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping
 
-from jetbot_mjx.evaluation.bootstrap import Estimate
+from jetbot_mjx.evaluation.bootstrap_intervals import Estimate
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.goal_set import GOAL_SET_VERSION
 from jetbot_mjx.evaluation.report import Report
 from jetbot_mjx.evaluation.result_names import fuller_report
 from jetbot_mjx.evaluation.robustness import ROBUST_SUCCESS_RATE, robust_range
-from jetbot_mjx.runs.text_table import text_table
+from jetbot_mjx.terminal import text_table
 
 
 def summarize_report(report: Report) -> str:

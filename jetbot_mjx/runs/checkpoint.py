@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Annotated, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, UInt32
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from jetbot_mjx.agents.networks import (
+from jetbot_mjx.agents import (
+    Networks,
     Observation,
     Policy,
     PolicyParams,
@@ -18,23 +19,16 @@ from jetbot_mjx.agents.networks import (
     make_networks,
     make_policy,
 )
-from jetbot_mjx.compiler.backends import require_float32
 from jetbot_mjx.config import Config, parse_config
-from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
-from jetbot_mjx.envs.task import layout_data
-from jetbot_mjx.errors import InvalidError, UserError, shown
-from jetbot_mjx.runs.checkpoint_store import (
-    FOLDER,
-    CheckpointError,
-    CheckpointNotFoundError,
-    checkpoint_path,
-    checkpoint_steps,
-    read_about,
-    read_tree,
-    stored_success_rate,
-)
-from jetbot_mjx.runs.find_run import PRETRAINED as PRETRAINED
-from jetbot_mjx.runs.find_run import ROOT, find_run, list_runs, suggest_run
+from jetbot_mjx.devices import require_float32
+from jetbot_mjx.envs import JetBotEnv, layout_data
+from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
+from jetbot_mjx.runs import checkpoint_store
+from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
+from jetbot_mjx.runs.run_dir import JsonObject
+from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
+from jetbot_mjx.runs.run_finder import ROOT, find_run, list_runs, suggest_run
+from jetbot_mjx.runs.setup import Setup
 from jetbot_mjx.runs.task_code import stored_task_class
 
 Which = Literal["best", "last"] | int
@@ -45,6 +39,9 @@ POLICY = "policy"
 
 FORMAT = "jetbot_mjx/3"
 """Format of a checkpoint's content; checkpoints of other formats cannot be read."""
+
+LayoutData = Sequence[JsonObject]
+"""The fields of an observation, as checkpoints store them."""
 
 _Size = Annotated[int, Field(ge=1, lt=2**24)]
 
@@ -65,7 +62,7 @@ class _About(BaseModel):
 
     model_config = ConfigDict(strict=True)
 
-    config: dict[str, Any]
+    config: JsonObject
     layout: list[_LayoutField]
     observation_size: _Size | dict[str, list[_Size]]
     action_size: _Size
@@ -82,8 +79,8 @@ class Checkpoint(NamedTuple):
     env_steps: int
     config: Config
     params: PolicyParams
-    networks: Any
-    about: Mapping[str, Any]
+    networks: Networks
+    about: JsonObject
 
     def __repr__(self) -> str:
         """Return the folder and the configuration's repr, without the arrays."""
@@ -97,6 +94,10 @@ class Checkpoint(NamedTuple):
         return self.run_dir
 
     def make_env(self) -> JetBotEnv:
+        """Build the environment that the policy was trained in, for the available devices."""
+        return self.make_setup().env
+
+    def make_setup(self) -> Setup:
         """Build the environment that the policy was trained in, for the available devices.
 
         The code of a task of one's own is what the run stored, if that cannot be imported by name
@@ -107,22 +108,23 @@ class Checkpoint(NamedTuple):
           CheckpointError: its observation differs from the one that the policy was trained on.
         """
         task_class = stored_task_class(self.run_dir, self.config.task.name)
-        env = make_env(self.config.for_any_device(), task_class=task_class)
-        layout = layout_data(env.task.layout)
+        config = self.config.for_any_device()
+        setup = Setup(config, task_class=task_class, networks=self.networks)
+        layout = layout_data(setup.env.task.layout)
         if layout != self.about["layout"]:
             raise CheckpointError(
                 f"checkpoint {self.path} was trained on another observation than"
                 f" {self.config.task.name} gives: {_names(self.about['layout'])} then,"
                 f" {_names(layout)} here"
             )
-        return env
+        return setup
 
 
-def _names(layout: Sequence[Mapping[str, Any]]) -> str:
+def _names(layout: LayoutData) -> str:
     return " ".join(f"{field['name']}[{field['size']}]" for field in layout)
 
 
-def about_policy(config: Config, env: JetBotEnv) -> dict[str, Any]:
+def about_policy(config: Config, env: JetBotEnv) -> JsonObject:
     """Return the metadata that every checkpoint of a run carries, as JSON values."""
     return {
         "format": FORMAT,
@@ -177,13 +179,13 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
         run_dir=folder.parent.parent,
         env_steps=about["env_steps"],
         config=config,
-        params=read_tree(folder, POLICY, template),
+        params=checkpoint_store.read_tree(folder, POLICY, template),
         networks=networks,
         about=about,
     )
 
 
-def explanation(folder: Path) -> dict[str, Any]:
+def explanation(folder: Path) -> JsonObject:
     """Read the metadata of a checkpoint that this project wrote.
 
     Args:
@@ -195,7 +197,7 @@ def explanation(folder: Path) -> dict[str, Any]:
     Raises:
       CheckpointError: it was not written by jetbot_mjx, is incomplete, or has another format.
     """
-    about = read_about(folder, ("format", *_About.model_fields))
+    about = checkpoint_store.read_about(folder, ("format", *_About.model_fields))
     if about["format"] != FORMAT:
         raise CheckpointError(
             f"checkpoint {folder} has the format {shown(about['format'])}, and only {FORMAT!r} can"
@@ -241,7 +243,7 @@ def load_policy(run_or_checkpoint: str | Path, which: Which = "best") -> Policy:
     return checked_policy
 
 
-def _check_numbers(obs: Any, size: int, layout: Sequence[Mapping[str, Any]]) -> None:
+def _check_numbers(obs: Observation, size: int, layout: LayoutData) -> None:
     """Raise an error if an observation is no vector of a length, or a batch of such."""
     if isinstance(obs, Mapping):
         raise InvalidError(f"observation: expected {size} numbers; got {_parts(obs)}")
@@ -251,7 +253,7 @@ def _check_numbers(obs: Any, size: int, layout: Sequence[Mapping[str, Any]]) -> 
         raise InvalidError(f"observation: expected {size} numbers, {_names(layout)}; got {given}")
 
 
-def _check_parts(obs: Any, shapes: Mapping[str, Sequence[int]]) -> None:
+def _check_parts(obs: Observation, shapes: Mapping[str, Sequence[int]]) -> None:
     """Raise an error if an observation lacks parts of the given shapes, or a batch of such."""
     wanted = "{" + ", ".join(f"{name}: {list(shape)}" for name, shape in shapes.items()) + "}"
     if not isinstance(obs, Mapping):
@@ -270,7 +272,7 @@ def _check_parts(obs: Any, shapes: Mapping[str, Sequence[int]]) -> None:
         )
 
 
-def _parts(obs: Mapping[str, Any]) -> str:
+def _parts(obs: Mapping[str, Array | np.ndarray]) -> str:
     return "{" + ", ".join(f"{name}: {list(np.shape(x))}" for name, x in obs.items()) + "}"
 
 
@@ -288,12 +290,8 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
       CheckpointError: there is no such checkpoint.
     """
     path = find_run(path).absolute()
-    try:
+    with os_errors(f"no checkpoint at {path}", CheckpointError):
         return _find(path, which)
-    except CheckpointError:
-        raise
-    except OSError as error:
-        raise CheckpointError(f"no checkpoint at {path}: {error.strerror}") from None
 
 
 def _find(path: Path, which: Which) -> Path:
@@ -313,14 +311,14 @@ def _find(path: Path, which: Which) -> Path:
         raise missing(f"it holds {len(runs)} runs; name one of {names}")
     if not (path / FOLDER).is_dir():
         raise missing(f"it holds neither {FOLDER}/ nor {POLICY}/; {suggest_run(path)}")
-    steps = checkpoint_steps(path)
+    steps = checkpoint_store.checkpoint_steps(path)
     if not steps:
         raise CheckpointNotFoundError(f"no checkpoint in {path / FOLDER}: the run saved none")
     if which == "last":
         step = steps[-1]
     elif which == "best":
         # Prefer the later of equally good ones, because it was trained for longer.
-        step = max(steps, key=lambda step: (stored_success_rate(path, step), step))
+        step = max(steps, key=lambda step: (checkpoint_store.stored_success_rate(path, step), step))
     elif which in steps:
         step = which
     else:
@@ -328,4 +326,4 @@ def _find(path: Path, which: Which) -> Path:
         raise CheckpointNotFoundError(
             f"no checkpoint at {which} steps in {path}: there are {known}"
         )
-    return checkpoint_path(path, step)
+    return checkpoint_store.checkpoint_path(path, step)

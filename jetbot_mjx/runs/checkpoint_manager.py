@@ -5,12 +5,15 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers
 
+from jetbot_mjx.runs.run_dir import JsonObject
+
 
 def open_manager(
-    folder: Path, keep: int, success: Mapping[int, float], *, step_digits: int, deleted: str
+    folder: Path, keep: int, success: Mapping[int, float], step_digits: int, deleted: str
 ) -> ocp.CheckpointManager:
     """Open a folder of checkpoints and remove unfinished files of an earlier process.
 
@@ -38,8 +41,8 @@ def open_manager(
 def start_save(
     manager: ocp.CheckpointManager,
     env_steps: int,
-    trees: Mapping[str, Mapping[str, Any]],
-    objects: Mapping[str, Any],
+    trees: Mapping[str, Mapping[str, np.ndarray]],
+    objects: Mapping[str, JsonObject],
 ) -> bool:
     """Start to write a checkpoint in the background.
 
@@ -52,9 +55,9 @@ def start_save(
     Returns:
       Whether Orbax writes it: not if there is one after as many steps or more.
     """
-    items: dict[str, Any] = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
-    items |= {name: ocp.args.JsonSave(value) for name, value in objects.items()}
-    return manager.save(env_steps, args=ocp.args.Composite(**items))
+    arrays = {name: ocp.args.StandardSave(tree) for name, tree in trees.items()}
+    values = {name: ocp.args.JsonSave(value) for name, value in objects.items()}
+    return manager.save(env_steps, args=ocp.args.Composite(**arrays, **values))
 
 
 class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
@@ -76,7 +79,7 @@ class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
         return [index in (0, best) or index >= first_of_latest for index in range(len(checkpoints))]
 
 
-def _single_process_options() -> Any:
+def _single_process_options() -> ocp.options.MultiprocessingOptions:
     """Return options with which Orbax does not wait for other processes, which do not write."""
     me = jax.process_index()
     return ocp.options.MultiprocessingOptions(

@@ -38,14 +38,18 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Protocol, Self
 
 import jax
 import numpy as np
 import tensorstore as ts
+from jaxtyping import PyTree
 
-from jetbot_mjx.errors import NotFoundError, UserError, clipped, shown
-from jetbot_mjx.runs.run_dir import read_text
+from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, shown
+from jetbot_mjx.runs.run_dir import JsonObject, read_text, remove
+
+if TYPE_CHECKING:
+    import orbax.checkpoint as ocp
 
 FOLDER = "checkpoints"
 """Name of the folder of checkpoints in a run folder."""
@@ -66,6 +70,16 @@ of them. Metadata alone can ask for any amount of memory."""
 
 _SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
+
+
+class _Typed(Protocol):
+    """An array, or the description of one: of NumPy, JAX or TensorStore."""
+
+    @property
+    def shape(self) -> Sequence[int]: ...
+
+    @property
+    def dtype(self) -> Any: ...
 
 
 class CheckpointError(UserError):
@@ -97,39 +111,18 @@ class CheckpointStore:
             step: stored_success_rate(run_dir, step) for step in checkpoint_steps(run_dir)
         }
         self._keep = keep
-        self._opened: Any = None
+        self._manager: "ocp.CheckpointManager | None" = None
         self._log = contextlib.ExitStack()
         self._folder = (run_dir / FOLDER).absolute()
         self._clear_deleted()
         with self._writing():
             self._folder.mkdir(exist_ok=True)
 
-    @property
-    def _orbax(self) -> Any:
-        """The module that writes: imported with the first checkpoint, while a program compiles."""
-        from jetbot_mjx.runs import checkpoint_manager
-
-        return checkpoint_manager
-
-    @property
-    def _manager(self) -> Any:
-        """Orbax's manager, opened with the first checkpoint."""
-        if self._opened is None:
-            self._log.enter_context(_without_log())
-            self._opened = self._orbax.open_manager(
-                self._folder,
-                self._keep,
-                self._success,
-                step_digits=_STEP_DIGITS,
-                deleted=_DELETED,
-            )
-        return self._opened
-
     def save(
         self,
         env_steps: int,
-        trees: Mapping[str, Any],
-        about: Mapping[str, Any],
+        trees: Mapping[str, PyTree],
+        about: JsonObject,
         success_rate: float | None,
         joined: Collection[str] = (),
     ) -> None:
@@ -162,8 +155,15 @@ class CheckpointStore:
         # Hand over to Orbax, which writes in the background.
         self._success[env_steps] = -1.0 if success_rate is None else success_rate
         with self._writing():
-            manager = self._manager
-            if not self._orbax.start_save(manager, env_steps, arrays, {_ABOUT: about}):
+            # Orbax is imported with the first checkpoint, while a program compiles.
+            from jetbot_mjx.runs.checkpoint_manager import open_manager, start_save
+
+            if self._manager is None:
+                self._log.enter_context(_without_log())
+                self._manager = open_manager(
+                    self._folder, self._keep, self._success, _STEP_DIGITS, _DELETED
+                )
+            if not start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
 
     def wait(self) -> None:
@@ -172,7 +172,7 @@ class CheckpointStore:
         Raises:
           CheckpointError: a checkpoint could not be written.
         """
-        if self._opened is not None:
+        if self._manager is not None:
             with self._writing():
                 self._manager.wait_until_finished()
 
@@ -182,15 +182,19 @@ class CheckpointStore:
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all checkpoints are on disk, and close the store."""
-        if self._opened is not None:
+        if self._manager is not None:
             with self._log, self._writing():
                 self._manager.close()
-        shutil.rmtree(self._folder / _DELETED, ignore_errors=True)
+        remove(self._folder / _DELETED)
 
     def _clear_deleted(self) -> None:
+        deleted = self._folder / _DELETED
+        if not deleted.is_dir():
+            # Orbax would fail to move a checkpoint into it.
+            remove(deleted)
         # Keep the folder itself, because Orbax may be about to move the next checkpoint into it.
-        for path in (self._folder / _DELETED).glob("*"):
-            shutil.rmtree(path, ignore_errors=True)
+        for path in deleted.glob("*"):
+            remove(path)
 
     def _check_space(self, size: int) -> None:
         """Raise a `CheckpointError` if the disk has no room for a checkpoint of this size [bytes].
@@ -271,17 +275,13 @@ def set_aside(path: Path) -> Path:
       CheckpointError: it cannot be moved.
     """
     folder = path.parent.parent / "set_aside"
-    try:
+    with os_errors(f"checkpoint {path} cannot be moved into {folder}", CheckpointError):
         folder.mkdir(exist_ok=True)
         numbers = (folder / f"{path.name}.{number}" for number in itertools.count())
         return path.rename(next(free for free in numbers if not os.path.lexists(free)))
-    except OSError as error:
-        raise CheckpointError(
-            f"checkpoint {path} cannot be moved into {folder}: {error.strerror}"
-        ) from None
 
 
-def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
+def read_about(path: Path, required: Sequence[str] = ()) -> JsonObject:
     """Read the metadata of a checkpoint and verify its digest.
 
     Args:
@@ -321,7 +321,7 @@ def read_about(path: Path, required: Sequence[str] = ()) -> dict[str, Any]:
     return about
 
 
-def read_tree(path: Path, name: str, template: Any) -> Any:
+def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
     """Read one tree of arrays and verify its digest.
 
     Args:
@@ -364,7 +364,7 @@ def read_tree(path: Path, name: str, template: Any) -> Any:
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
 
 
-def flatten(tree: Any) -> dict[str, Any]:
+def flatten(tree: PyTree) -> dict[str, Any]:
     """Return the leaves of a tree by their path, such as `params.policy.hidden_0.bias`."""
     return {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
@@ -372,7 +372,7 @@ def flatten(tree: Any) -> dict[str, Any]:
     }
 
 
-def digest(tree: Any) -> str:
+def digest(tree: PyTree) -> str:
     """Return the SHA-256 of names, dtypes, shapes and bytes of a tree's leaves, in hexadecimal."""
     total = hashlib.sha256()
     for name, leaf in sorted(flatten(tree).items()):
@@ -391,12 +391,12 @@ def stored_success_rate(run_dir: Path, env_steps: int) -> float:
     return rate if isinstance(rate, int | float) and 0 <= rate <= 1 else -1.0
 
 
-def _digest_json(values: Mapping[str, Any]) -> str:
+def _digest_json(values: JsonObject) -> str:
     text = json.dumps(values, sort_keys=True, allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def _read_arrays(folder: Path, wanted: Mapping[str, Any]) -> dict[str, np.ndarray]:
+def _read_arrays(folder: Path, wanted: Mapping[str, _Typed]) -> dict[str, np.ndarray]:
     """Read the arrays that Orbax wrote, one after the other, and raise at the first wrong one.
 
     Orbax itself reads in threads. If one of them fails, the others print tracebacks that the
@@ -450,7 +450,7 @@ def _count_bytes(folder: Path) -> int:
     return total
 
 
-def _compare(folder: Path, wanted: Mapping[str, Any], stored: Mapping[str, Any]) -> None:
+def _compare(folder: Path, wanted: Mapping[str, _Typed], stored: Mapping[str, _Typed]) -> None:
     """Compare names, shapes and dtypes of arrays before anything is read."""
     for name in sorted(wanted.keys() | stored.keys()):
         ours, theirs = (_describe(arrays.get(name)) for arrays in (wanted, stored))
@@ -469,7 +469,7 @@ def _table(arrays: Mapping[str, np.ndarray]) -> _Table:
     return [(name, str(x.dtype), list(x.shape)) for name, x in arrays.items()]
 
 
-def _shapes(table: _Table) -> dict[str, Any]:
+def _shapes(table: _Table) -> dict[str, jax.ShapeDtypeStruct]:
     return {name: jax.ShapeDtypeStruct(shape, dtype) for name, dtype, shape in table}
 
 
@@ -492,7 +492,7 @@ def _split(folder: Path, table: _Table) -> dict[str, np.ndarray]:
 
 
 def _reason(error: Exception) -> str:
-    """Return the reason of an error in one line of at most 305 characters.
+    """Return the reason for an error in one line of at most 305 characters.
 
     Locations in the source of other libraries are left out.
     """
@@ -502,7 +502,7 @@ def _reason(error: Exception) -> str:
     return clipped(lines[0])
 
 
-def _describe(array: Any) -> str:
+def _describe(array: _Typed | None) -> str:
     if array is None:
         return "missing"
     dtype = getattr(array.dtype, "numpy_dtype", array.dtype)

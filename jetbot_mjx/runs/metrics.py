@@ -38,19 +38,14 @@ from pathlib import Path
 from typing import Any, NamedTuple, Protocol, Self
 
 import jax
+from tensorboardX import summary as tensorboard_summary
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2, summary_pb2
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.imports import standing_in
 from jetbot_mjx.runs.run_dir import read_bytes, write_text
 from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
-
-# Where PyTorch is installed, tensorboardX would load it to draw network graphs, which takes seconds
-# and is not needed here.
-with standing_in("torch", None):
-    from tensorboardX import summary as tensorboard_summary
-    from tensorboardX.event_file_writer import EventsWriter
-    from tensorboardX.proto import event_pb2, summary_pb2
 
 METRICS = "metrics.jsonl"
 """Name of the file of metrics in a run folder."""
@@ -362,32 +357,3 @@ class CompileClock:
         """Unregister the listeners."""
         jax.monitoring.unregister_event_duration_listener(self._listen)
         jax.monitoring.unregister_event_listener(self._count)
-
-
-_IMPORTED = time.perf_counter()
-_origin = 0.0
-"""Time of the process at which `process_seconds` is 0 [s]."""
-
-
-def process_seconds() -> float:
-    """Return the time since this process started [s]: the clock of all times that are shown.
-
-    In a program that imports the package it counts from the beginning of the last training. If the
-    system does not tell when the process started, it counts from the import of this module.
-    """
-    return _process_seconds() - _origin
-
-
-def restart_clock() -> None:
-    """Let `process_seconds` count from now on, because a program begins a training."""
-    global _origin
-    _origin = _process_seconds()
-
-
-def _process_seconds() -> float:
-    try:
-        after_name = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-        began = int(after_name[19]) / os.sysconf("SC_CLK_TCK")
-        return time.clock_gettime(time.CLOCK_BOOTTIME) - began
-    except (OSError, AttributeError, ValueError, IndexError):
-        return time.perf_counter() - _IMPORTED

@@ -5,22 +5,19 @@ import json
 import math
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jetbot_mjx.agents.ppo import NanDump
+from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import Config, ConfigError, parse_config
-from jetbot_mjx.envs.domain_randomization import maybe_randomize
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.kinematics import yaw
-from jetbot_mjx.envs.state import State, robot_state
-from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx import envs
+from jetbot_mjx.envs import JetBotEnv, State, Task
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError, shown
 from jetbot_mjx.runs.checkpoint_store import flatten
-from jetbot_mjx.runs.run_dir import read_bytes
+from jetbot_mjx.runs.run_dir import read_bytes, write_bytes
 from jetbot_mjx.runs.task_code import stored_task_class
 
 FOLDER = "nan_dumps"
@@ -31,7 +28,7 @@ MAX_DUMPS = 20
 
 _FORMAT = "jetbot_mjx.nan_dump/1"
 
-HEADER = (
+NAN_DUMP_HEADER = (
     f"{'step':>4}  {'action':>15}  {'x [m]':>8} {'y [m]':>8} {'z [m]':>8}  {'yaw':>8}"
     f"  {'max |qvel|':>10}  not finite"
 )
@@ -45,7 +42,7 @@ class StoredNanDump(NamedTuple):
     env_steps: int
     """Environment steps of the training at the end of the call that found the non-finite state."""
     nan_dump: NanDump
-    task_class: type[Any] | None = None
+    task_class: type[Task] | None = None
     """The class of the task, if its code is stored in the run; None: it is imported by name."""
 
 
@@ -70,10 +67,10 @@ def save_nan_dump(run_dir: Path, config: Config, env_steps: int, nan_dump: NanDu
     if len(list(folder.glob("*.npz"))) >= MAX_DUMPS and not path.exists():
         return None
     about = {"format": _FORMAT, "config": config.model_dump(mode="json"), "env_steps": env_steps}
-    unfinished = path.with_suffix(".unfinished")
-    with unfinished.open("wb") as file:
-        np.savez(file, about=np.array(json.dumps(about)), **flatten(nan_dump))
-    return unfinished.replace(path)
+    content = io.BytesIO()
+    np.savez(content, about=np.array(json.dumps(about)), **flatten(nan_dump))
+    write_bytes(path, content.getvalue())
+    return path
 
 
 def load_nan_dump(path: Path) -> StoredNanDump:
@@ -127,10 +124,10 @@ def load_nan_dump(path: Path) -> StoredNanDump:
         ) from None
 
 
-def _template(config: Config, task_class: type[Any] | None) -> NanDump:
+def _template(config: Config, task_class: type[Task] | None) -> NanDump:
     """Return the shapes and dtypes of a dump of this configuration."""
-    env = wrap_for_training(JetBotEnv(config, task_class), config.task.episode_length)
-    batched: Any = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
+    env = envs.wrap_for_training(JetBotEnv(config, task_class), config.task.episode_length)
+    batched = jax.eval_shape(env.reset, jax.ShapeDtypeStruct((1, 2), np.uint32))
     state: State = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), batched)
     return NanDump(
         found=np.bool_(True),  # pyright: ignore[reportArgumentType]
@@ -160,9 +157,9 @@ def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv) -> Iterator[ReplaySte
     Yields:
       Every step up to the one with the non-finite state.
     """
-    wrapped = wrap_for_training(env, stored.config.task.episode_length)
-    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(maybe_randomize(env).step))
-    state: Any = jax.tree.map(lambda x: jnp.asarray(x)[None], stored.nan_dump.env_state)
+    wrapped = envs.wrap_for_training(env, stored.config.task.episode_length)
+    step, raw_step = jax.jit(wrapped.step), jax.jit(jax.vmap(envs.maybe_randomize(env).step))
+    state: State = jax.tree.map(lambda x: jnp.asarray(x)[None], stored.nan_dump.env_state)
     for action in stored.nan_dump.actions[: int(stored.nan_dump.step) + 1]:
         after = jax.device_get(jax.tree.map(lambda x: x[0], raw_step(state, action[None])))
         seen = {"pipeline_state": after.pipeline_state, "obs": after.obs, "reward": after.reward}
@@ -173,11 +170,11 @@ def replay_nan_dump(stored: StoredNanDump, env: JetBotEnv) -> Iterator[ReplaySte
 
 def format_step(index: int, step: ReplayStep) -> str:
     """Return one step as a line of the table."""
-    robot = robot_state(jax.tree.map(jnp.asarray, step.state.pipeline_state))
+    robot = envs.robot_state(jax.tree.map(jnp.asarray, step.state.pipeline_state))
     x, y, z = np.asarray(robot.position_w)
     fastest = np.abs(step.state.pipeline_state.qvel).max()
     return (
         f"{index:4d}  {step.action[0]:+7.3f} {step.action[1]:+7.3f}  {x:+8.3f} {y:+8.3f}"
-        f" {z:+8.4f}  {math.degrees(float(yaw(robot.quat))):+7.1f}°  {fastest:10.3g}"
+        f" {z:+8.4f}  {math.degrees(float(envs.yaw(robot.quat))):+7.1f}°  {fastest:10.3g}"
         f"  {', '.join(step.nonfinite)}"
     )

@@ -16,20 +16,23 @@ import shutil
 import stat
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import jax
 
 from jetbot_mjx.config import Config, ConfigError, parse_config, parse_yaml
-from jetbot_mjx.errors import UserError, clipped
-from jetbot_mjx.imports import LIBRARIES, installed_version
+from jetbot_mjx.envs import LIBRARIES, installed_version
+from jetbot_mjx.errors import UserError, clipped, os_errors
 
 try:
     import fcntl
 except ModuleNotFoundError:  # on Windows
     fcntl = None
+
+JsonObject = dict[str, Any]
+"""A JSON object, whose values are checked where they are read."""
 
 CONFIG = "config.yaml"
 """Name of the file in a run folder that holds the resolved configuration."""
@@ -77,10 +80,8 @@ def seed_folders(run_dir: Path) -> list[Path]:
     Raises:
       UserError: the folder cannot be read.
     """
-    try:
+    with os_errors(f"{run_dir} cannot be read"):
         found = [path for path in run_dir.glob("seed-*") if (path / CONFIG).is_file()]
-    except OSError as error:
-        raise UserError(f"{run_dir} cannot be read: {error.strerror}") from None
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
 
@@ -128,19 +129,14 @@ def stored_config(run_dir: Path) -> Config | None:
       DamagedRunError: as for `read_config`.
       UserError: the path holds something else, or cannot be read.
     """
-    try:
+    with os_errors(f"--run-dir {run_dir} cannot be used"):
+        if not run_dir.exists():
+            return None
         if run_dir.is_dir() and os.path.lexists(run_dir / CONFIG):
             return read_config(run_dir)
         if run_dir.is_dir() and all(path.name.startswith(".") for path in run_dir.iterdir()):
             return None
-        in_use = run_dir.exists()
-    except OSError as error:
-        raise UserError(f"--run-dir {run_dir} cannot be used: {error.strerror}") from None
-    if in_use:
-        raise UserError(
-            f"--run-dir {run_dir} exists and holds no run (no {CONFIG}): name a new folder"
-        )
-    return None
+    raise UserError(f"--run-dir {run_dir} exists and holds no run (no {CONFIG}): name a new folder")
 
 
 @contextlib.contextmanager
@@ -182,7 +178,7 @@ def occupied(run_dir: Path) -> Iterator[None]:
         yield
 
 
-def write_run(run_dir: Path, config: Config, made_with: Mapping[str, Any]) -> None:
+def write_run(run_dir: Path, config: Config, made_with: JsonObject) -> None:
     """Write the configuration and the versions, which are known before training.
 
     Args:
@@ -217,17 +213,9 @@ def changed_versions(run_dir: Path) -> list[str]:
     return found
 
 
-@contextlib.contextmanager
-def writing_to(path: Path) -> Iterator[None]:
-    """Convert an `OSError` to a one-line `UserError`.
-
-    Raises:
-      UserError: an `OSError` was raised inside the context.
-    """
-    try:
-        yield
-    except OSError as error:
-        raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
+def writing_to(path: Path) -> contextlib.AbstractContextManager[None]:
+    """Convert an `OSError` inside the context to a one-line `UserError`."""
+    return os_errors(f"{path} cannot be written")
 
 
 def check_writable(path: Path) -> None:
@@ -256,8 +244,8 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
     unfinished = folder.with_name(f".{folder.name}.unfinished")
     earlier = folder.with_name(f".{folder.name}.earlier")
     with writing_to(folder):
-        for leftover in (unfinished, earlier):
-            shutil.rmtree(leftover, ignore_errors=True)
+        remove(unfinished)
+        remove(earlier)
         unfinished.mkdir(parents=True)
         try:
             yield unfinished
@@ -265,8 +253,18 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
                 folder.rename(earlier)
             unfinished.rename(folder)
         finally:
-            for leftover in (unfinished, earlier):
-                shutil.rmtree(leftover, ignore_errors=True)
+            remove(unfinished)
+            remove(earlier)
+
+
+def remove(path: Path) -> None:
+    """Remove a leftover of an earlier process, whatever it is, if there is one and it can be."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+        return
+    # `rmtree` would wait for the writer of a named pipe.
+    with contextlib.suppress(OSError):
+        path.unlink()
 
 
 def make_folder(path: Path) -> None:
@@ -285,7 +283,7 @@ def shortened(path: Path) -> Path:
     return path.relative_to(here) if path.is_relative_to(here) else path
 
 
-def versions() -> dict[str, Any]:
+def versions() -> JsonObject:
     """Return the versions of packages and Python, the machine, the devices and the git state."""
     devices = jax.devices()
     packages = ("jetbot_mjx", *LIBRARIES, "orbax-checkpoint")
@@ -330,7 +328,7 @@ def _open_at_once(path: str, flags: int) -> int:
     return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
 
 
-def write_json(path: Path, values: Any) -> None:
+def write_json(path: Path, values: object) -> None:
     """Write readable JSON, indented and with a final newline."""
     write_text(path, json.dumps(values, indent=2, allow_nan=False) + "\n")
 
@@ -343,6 +341,8 @@ def write_text(path: Path, text: str) -> None:
 def write_bytes(path: Path, content: bytes) -> None:
     """Write a file atomically: it is complete or unchanged whenever the process ends."""
     unfinished = path.with_name(f".{path.name}.unfinished")
+    # A named pipe in its place would wait for a reader.
+    unfinished.unlink(missing_ok=True)
     try:
         unfinished.write_bytes(content)
         unfinished.replace(path)
@@ -350,7 +350,7 @@ def write_bytes(path: Path, content: bytes) -> None:
         unfinished.unlink(missing_ok=True)
 
 
-def _git_state() -> dict[str, Any] | None:
+def _git_state() -> JsonObject | None:
     """Return the commit of the package's source and whether it was changed.
 
     Return None outside of a git checkout.

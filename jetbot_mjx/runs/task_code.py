@@ -5,27 +5,27 @@ of the task's module and those of the modules that it imports from the same fold
 `task/` in the run folder, each with its SHA-256. Later commands import the stored files if the
 module cannot be found, or if its files differ from the stored ones. Tasks of this package and of
 installed packages are not stored, because their versions are.
+
+For the time of the import, the stored folder comes first in `sys.path`; afterwards its modules
+leave `sys.modules`, so that runs with different sources of one name can be used in one process. So
+the modules must import each other when they are imported, not later in a function.
 """
 
 import ast
-import builtins
 import contextlib
 import hashlib
 import importlib
-import importlib.abc
 import importlib.util
 import json
 import sys
 import threading
-from collections.abc import Iterator
-from importlib.machinery import ModuleSpec
+from collections.abc import Iterable, Iterator
 from pathlib import Path, PurePosixPath
 from types import ModuleType
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-from jetbot_mjx.config import shipped_folder
+from jetbot_mjx.config import find_task_here, import_root, shipped_folder, source_file
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.imports import find_task_here, import_root, source_file
 from jetbot_mjx.runs.run_dir import (
     read_bytes,
     read_text,
@@ -34,6 +34,9 @@ from jetbot_mjx.runs.run_dir import (
     write_json,
     writing_to,
 )
+
+if TYPE_CHECKING:
+    from jetbot_mjx.envs import Task
 
 FOLDER = "task"
 """Name of the folder in a run folder that holds the source of the task."""
@@ -65,7 +68,8 @@ def collect_task_code(name: str) -> TaskCode | None:
     Returns:
       The file of the module and those of the modules that it imports from the same folder, directly
       or not. None if there is nothing to store: the module has no source file, belongs to this or
-      to an installed package, or all files together are larger than `MAX_BYTES`.
+      to an installed package, all files together are larger than `MAX_BYTES`, or one of them
+      imports another inside a function.
     """
     module = name.partition(":")[0]
     find_task_here(module)
@@ -73,24 +77,35 @@ def collect_task_code(name: str) -> TaskCode | None:
     if root is None or _is_installed(root, module):
         return None
     files: dict[str, bytes] = {}
+    late: list[str] = []
     names, seen = [module], set()
+    # Follow the imports, the parent packages included.
     while names:
         one = names.pop()
         if one in seen or import_root(one) != root or _is_installed(root, one):
             continue
         seen.add(one)
-        if "." in one:
-            names.append(one.rpartition(".")[0])
+        parent = one.rpartition(".")[0]
+        names += [parent] if parent else []
         file = source_file(root, one)
-        if file is not None:
-            content = file.read_bytes()
-            files[file.relative_to(root).as_posix()] = content
-            names += _imported_names(content, one, is_package=file.name == "__init__.py")
+        if file is None:
+            continue
+        content = file.read_bytes()
+        files[file.relative_to(root).as_posix()] = content
+        for other, line, is_late in _imports(content, one if file.stem == "__init__" else parent):
+            names.append(other)
+            if is_late and source_file(root, other) and import_root(other) == root:
+                late.append(f"{shortened(file)}, line {line}: imports {other} inside a function")
+    # Store all of them, or nothing.
     if source_file(root, module) is None:
         return None
     if sum(map(len, files.values())) > MAX_BYTES:
+        _say(f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run")
+        return None
+    if late:
         _say(
-            f"the source of {name} is larger than {MAX_BYTES:,} bytes and is not stored in the run"
+            f"{late[0]}, so that the source of {name} is not stored in the run: move the import to"
+            " the top of the file"
         )
         return None
     return TaskCode(module, tuple(sorted(files.items())))
@@ -154,11 +169,10 @@ def read_task_code(run_dir: Path) -> TaskCode | None:
     return TaskCode(module, tuple(sorted(files)))
 
 
-def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type[Any] | None:
+def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> "type[Task] | None":
     """Import the class of a task from the source that its run stored.
 
-    A line on stderr says so, once for each source, unless `silent`. The modules are not left in
-    `sys.modules`, so that runs with different sources of one name can be used in one process.
+    A line on stderr says so, once for each source, unless `silent`.
 
     Args:
       run_dir: the run folder.
@@ -196,8 +210,7 @@ def stored_task_class(run_dir: Path, name: str, *, silent: bool = False) -> type
     else:
         _say(f"running the task's code stored in {shortened(main)}", code)
     try:
-        importer = _importers.setdefault(code, _StoredModules(run_dir / FOLDER, code))
-        found = importer.load(module)
+        found = _import_stored((run_dir / FOLDER).absolute(), code)
     except ModuleNotFoundError as error:
         raise UserError(
             f"{shortened(main)} cannot be imported: no module named {error.name!r}: install it"
@@ -216,23 +229,35 @@ def _is_installed(root: Path, module: str) -> bool:
     return bool({"site-packages", "dist-packages"} & {*root.parts}) and not is_example
 
 
-def _imported_names(source: bytes, module: str, *, is_package: bool) -> list[str]:
-    """Return the full names of all that a source file may import, wherever it does."""
+def _imports(source: bytes, package: str) -> list[tuple[str, int, bool]]:
+    """Find all that a source file may import, wherever it does.
+
+    Args:
+      source: the content of the file.
+      package: the package that relative imports start from.
+
+    Returns:
+      Full name of each import, its line, and whether it is made inside a function.
+    """
     try:
         tree = ast.parse(source)
     except (SyntaxError, ValueError):
         return []
-    package = module if is_package else module.rpartition(".")[0]
+    functions = ast.FunctionDef | ast.AsyncFunctionDef
+    late = {x for node in ast.walk(tree) if isinstance(node, functions) for x in ast.walk(node)}
     found = []
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
+            names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             base = node.module or ""
             if node.level:
                 with contextlib.suppress(ImportError):
                     base = importlib.util.resolve_name("." * node.level + base, package)
-            found += [base, *(f"{base}.{alias.name}" for alias in node.names)] if base else []
+            names = [base, *(f"{base}.{alias.name}" for alias in node.names)] if base else []
+        else:
+            continue
+        found += [(name, node.lineno, node in late) for name in names]
     return found
 
 
@@ -243,105 +268,52 @@ def _holds(path: Path, content: bytes) -> bool:
         return False
 
 
-_said: set[Any] = set()
+_said: set[str | TaskCode] = set()
 
 
-def _say(line: str, about: Any = None) -> None:
+def _say(line: str, about: TaskCode | None = None) -> None:
     """Print a line on stderr, once for each subject."""
     if (about or line) not in _said:
         _said.add(about or line)
         print(line, file=sys.stderr, flush=True)
 
 
-class _StoredModules(importlib.abc.MetaPathFinder):
-    """A `_StoredModules` imports stored source files under their own names.
+_modules: dict[TaskCode, ModuleType] = {}
+"""The imported module of each source; runs that stored the same source share it."""
 
-    Its modules are in `sys.modules` only while one of them is imported, or imports something.
+_lock = threading.Lock()
+
+
+def _import_stored(folder: Path, code: TaskCode) -> ModuleType:
+    """Import the module of a task from the folder that its source is stored in."""
+    with _lock:
+        if code not in _modules:
+            names = {path.partition("/")[0].removesuffix(".py") for path, _ in code.files}
+            with _importing_from(folder, names):
+                _modules[code] = importlib.import_module(code.module)
+        return _modules[code]
+
+
+@contextlib.contextmanager
+def _importing_from(folder: Path, names: Iterable[str]) -> Iterator[None]:
+    """Import top-level modules of the given names from a folder, and no other ones.
+
+    Other modules of these names return to `sys.modules` afterwards.
     """
-
-    def __init__(self, folder: Path, code: TaskCode) -> None:
-        self._folder = folder
-        self._sources: dict[str, tuple[str, bytes]] = {}
-        for path, content in code.files:
-            parts = PurePosixPath(path).with_suffix("").parts
-            parts = parts[:-1] if parts[-1] == "__init__" else parts
-            self._sources[".".join(parts)] = path, content
-        self._names = {
-            ".".join(name.split(".")[:length])
-            for name in self._sources
-            for length in range(1, name.count(".") + 2)
-        }
-        self._modules: dict[str, ModuleType] = {}
-        self._lock = threading.RLock()
-
-    def load(self, name: str) -> ModuleType:
-        """Import a stored module."""
-        with self._active():
-            return importlib.import_module(name)
-
-    def import_(self, *arguments: Any, **keywords: Any) -> Any:
-        """Stand in for `__import__` in the stored modules, so that late imports find them too."""
-        with self._active():
-            return builtins.__import__(*arguments, **keywords)
-
-    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> ModuleSpec | None:
-        """Return the spec of a stored module or of a folder of such modules."""
-        if fullname not in self._names:
-            return None
-        folder = str(self._folder.joinpath(*fullname.split(".")))
-        if fullname not in self._sources:
-            spec = ModuleSpec(fullname, None, is_package=True)
-            spec.submodule_search_locations = [folder]
-            return spec
-        file, content = self._sources[fullname]
-        path = str(self._folder / file)
-        return importlib.util.spec_from_file_location(
-            fullname,
-            path,
-            loader=_StoredLoader(path, content, self.import_),
-            submodule_search_locations=[folder] if file.endswith("__init__.py") else None,
-        )
-
-    @contextlib.contextmanager
-    def _active(self) -> Iterator[None]:
-        """Replace other modules of the stored names by the stored ones, and restore them."""
-        with self._lock:
-            if self in sys.meta_path:
-                # A module that is being imported imports another one.
-                yield
-                return
-            others = {name: sys.modules.pop(name, None) for name in self._names}
-            sys.modules.update(self._modules)
-            sys.meta_path.insert(0, self)
-            try:
-                yield
-            finally:
-                sys.meta_path.remove(self)
-                for name, other in others.items():
-                    if name in sys.modules:
-                        self._modules[name] = sys.modules.pop(name)
-                    if other is not None:
-                        sys.modules[name] = other
+    others, writes_no_bytecode = _pop_modules(names), sys.dont_write_bytecode
+    sys.path.insert(0, str(folder))
+    sys.dont_write_bytecode = True
+    importlib.invalidate_caches()
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))
+        sys.dont_write_bytecode = writes_no_bytecode
+        _pop_modules(names)
+        sys.modules.update(others)
 
 
-class _StoredLoader(importlib.abc.SourceLoader):
-    """A `_StoredLoader` runs source that was read and checked before, and writes no bytecode."""
-
-    def __init__(self, path: str, content: bytes, import_: Any) -> None:
-        self._path, self._content, self._import = path, content, import_
-
-    def get_filename(self, fullname: str) -> str:
-        return self._path
-
-    def get_data(self, path: str) -> bytes:
-        if path != self._path:
-            raise FileNotFoundError(path)
-        return self._content
-
-    def exec_module(self, module: ModuleType) -> None:
-        module.__dict__["__builtins__"] = {**vars(builtins), "__import__": self._import}
-        super().exec_module(module)
-
-
-_importers: dict[TaskCode, _StoredModules] = {}
-"""The importer of each source; runs that stored the same source share it."""
+def _pop_modules(names: Iterable[str]) -> dict[str, ModuleType]:
+    """Remove modules and the modules in them from `sys.modules`, and return them by name."""
+    found = [name for name in sys.modules if name.partition(".")[0] in names]
+    return {name: sys.modules.pop(name) for name in found}

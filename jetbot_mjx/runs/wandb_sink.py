@@ -16,9 +16,8 @@ from typing import Any
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import MissingPackageError
 from jetbot_mjx.runs.metrics import VIDEO_TAG, History, MetricValues
-from jetbot_mjx.runs.run_dir import read_text, write_json
+from jetbot_mjx.runs.run_dir import JsonObject, read_text, write_json
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
-
 _FILE = "wandb.json"
 _INIT_SECONDS = 30.0
 _FINISH_SHARE_OF_NOTICE = 0.3
@@ -143,7 +142,7 @@ class WandbSink:
             self._say(f"Weights & Biases: {reason}; the training continues without it")
 
 
-def _read(path: Path, project: str | None) -> dict[str, Any]:
+def _read(path: Path, project: str | None) -> JsonObject:
     """Return the id and last step of this project's run, or those of a new run if there is none."""
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError, RecursionError):
         progress = json.loads(read_text(path))

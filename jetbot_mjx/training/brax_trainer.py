@@ -14,14 +14,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from brax.training.agents.ppo import train as brax_train
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.typing import ArrayLike
+from jaxtyping import PyTree
 
-from jetbot_mjx.agents.networks import PolicyParams, make_networks
-from jetbot_mjx.agents.ppo import LOSSES
-from jetbot_mjx.config import Config, PPOConfig
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.agents import LOSSES, PolicyParams
+from jetbot_mjx.config import PPOConfig
+from jetbot_mjx.envs import wrap_for_training
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 
 
@@ -46,7 +46,7 @@ class _LinearRate(float):
         )
         return rate
 
-    def __call__(self, count: Any) -> Any:
+    def __call__(self, count: ArrayLike) -> ArrayLike:
         """Return the step size after a number of gradient steps."""
         return self._schedule(count)
 
@@ -56,37 +56,37 @@ class _LinearRate(float):
         return float(rate)
 
 
-def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
+def train(setup: Setup, recorder: TrainerCallback) -> None:
     """Train until the end, or until the callback asks to stop.
 
     Args:
-      config: the configuration of the run, which has passed `check_devices`.
-      env: the environment, unwrapped.
+      setup: environment and networks, of a configuration that has passed `check_devices`.
       recorder: the callback, which is invoked before the first step and after every interval.
     """
+    config = setup.config
     ppo = config.ppo.model_dump(exclude={"network", "normalizer", "update"})
     rate = None
     if config.ppo.learning_rate_schedule == "LINEAR":
         rate = ppo["learning_rate"] = _LinearRate(config.ppo.learning_rate, config.ppo)
         ppo["learning_rate_schedule"] = "NONE"
-    num_intervals = max(1, round(config.ppo.num_timesteps / config.checkpoint_interval))
-    latest: dict[str, Any] = {}
+    latest: PolicyParams | None = None
     # Brax annotates it as a function of the environment alone, but passes four arguments.
     wrap_env_fn: Any = wrap_for_training
     clock = time.perf_counter()
 
     # Brax calls back twice in an epoch: first with the parameters, then with the metrics.
-    def on_params(env_steps: int, make_policy: object, params: tuple[Any, Any, Any]) -> None:
-        latest["params"] = PolicyParams(*params)
+    def on_params(env_steps: int, make_policy: object, params: Sequence[PyTree]) -> None:
+        nonlocal latest
+        latest = PolicyParams(*params)
         if env_steps == 0:
             report(0, {}, 0.0)
 
     def on_metrics(env_steps: int, metrics: Mapping[str, Any]) -> None:
         report(env_steps, metrics, time.perf_counter() - clock)
 
-    def report(env_steps: int, metrics: Mapping[str, Any], seconds: float) -> None:
+    def report(env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
         nonlocal clock
-        params = jax.device_get(latest["params"])
+        params = jax.device_get(latest)
         named = rename_metrics(metrics, config.ppo.entropy_cost)
         if rate is not None and metrics:
             named["policy/learning_rate"] = rate.at(env_steps)
@@ -94,24 +94,21 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
             raise _StopTraining
         clock = time.perf_counter()
 
-    def networks(observation_size: Any, action_size: int, **_: Any) -> Any:
-        # Brax gives the shape of a vector, or the shapes of the parts of an observation.
-        size = observation_size if isinstance(observation_size, Mapping) else observation_size[0]
-        return make_networks(config.ppo, size, action_size)
+    def network_factory(*_: Any, **__: Any) -> Any:
+        return setup.networks
 
-    # Brax annotates more than it calls.
-    any_networks: Any = networks
+    from brax.training.agents.ppo import train as brax_train
 
     # Run Brax's trainer without its own evaluations.
     with device_put_replicated(), contextlib.suppress(_StopTraining):
         brax_train.train(
-            environment=env,
+            environment=setup.env,
             episode_length=config.task.episode_length,
             wrap_env_fn=wrap_env_fn,
-            network_factory=any_networks,
+            network_factory=network_factory,
             seed=config.seed,
             # Report at the beginning and after every interval; the recorder evaluates.
-            num_evals=num_intervals + 1,
+            num_evals=1 + max(1, round(config.ppo.num_timesteps / config.checkpoint_interval)),
             run_evals=False,
             # Brax resets an evaluation batch of this size even without evaluations.
             num_eval_envs=1,
@@ -121,7 +118,7 @@ def train(config: Config, env: JetBotEnv, recorder: TrainerCallback) -> None:
         )
 
 
-def rename_metrics(metrics: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+def rename_metrics(metrics: Mapping[str, float], entropy_cost: float) -> dict[str, float]:
     """Return Brax's metrics under this project's names."""
     brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
     metrics = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
@@ -141,7 +138,7 @@ def device_put_replicated() -> Iterator[None]:
         yield
         return
 
-    def device_put_replicated(tree: Any, devices: Sequence[Any]) -> Any:
+    def device_put_replicated(tree: PyTree, devices: Sequence[object]) -> PyTree:
         sharding = NamedSharding(Mesh(np.array(devices), ("i",)), PartitionSpec("i"))
         return jax.tree.map(
             lambda x: jax.device_put(jnp.stack([jnp.asarray(x)] * len(devices)), sharding), tree

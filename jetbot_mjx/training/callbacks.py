@@ -3,8 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jetbot_mjx.agents.networks import PolicyParams
-from jetbot_mjx.agents.ppo import NanDump, TrainState
+from jetbot_mjx.agents import NanDump, PolicyParams, TrainState
 
 
 class Progress(NamedTuple):

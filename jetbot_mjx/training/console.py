@@ -6,9 +6,9 @@ import time
 from collections.abc import Sequence
 from typing import Literal, TextIO
 
-from jetbot_mjx.errors import printable_lines
-from jetbot_mjx.runs.metrics import MetricValues, mean_of, process_seconds
-from jetbot_mjx.runs.output import write_error
+from jetbot_mjx.errors import printable_lines, write_error
+from jetbot_mjx.runs import MetricValues, mean_of
+from jetbot_mjx.terminal import process_seconds
 
 Phase = Literal["compiling", "training", "evaluating", "saving", "rendering"]
 

@@ -11,6 +11,7 @@ import io
 import os
 import statistics
 import sys
+import textwrap
 import threading
 import time
 from collections.abc import Sequence
@@ -29,8 +30,8 @@ from rich.table import Table
 from rich.text import Text
 
 from jetbot_mjx.errors import printable_lines
-from jetbot_mjx.runs.metrics import History, MetricValues, mean_of, process_seconds
-from jetbot_mjx.runs.progress import in_foreground
+from jetbot_mjx.runs import History, MetricValues, mean_of
+from jetbot_mjx.terminal import in_foreground, process_seconds
 from jetbot_mjx.training.console import Phase, Terminal
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
@@ -49,7 +50,7 @@ _UPDATE = {
 """Metrics of the line on the last update, by their label."""
 _SECONDS_BETWEEN_DRAWINGS = 0.5
 _PATIENCE_SECONDS = 1.0
-"""How long a caller waits for the terminal at most, at a flush and at the end [s]."""
+"""Longest time that a caller waits for the terminal, at a flush and at the end [s]."""
 _SPEED_SECONDS = 3600.0
 """Time over which the speed for the remaining time is averaged [s]."""
 
@@ -146,7 +147,11 @@ class Dashboard(Terminal):
             self._advance(env_steps, env_steps_per_second)
 
     def say(self, text: str) -> None:
-        """Print a message above the dashboard; do not fail if the terminal is gone."""
+        """Print a message above the dashboard, or as it is before the dashboard is drawn.
+
+        What is printed before, such as the headline, breaks between words. Messages above the
+        dashboard may be commands to copy, and the terminal itself breaks them.
+        """
         text = printable_lines(text)
         with self._lock:
             if self._drawing:
@@ -154,8 +159,12 @@ class Dashboard(Terminal):
                 self._idle.clear()
                 self._wake.set()
                 return
+        # A terminal that is gone is no reason to fail.
         with contextlib.suppress(OSError):
-            print(text, file=self._console.file, flush=True)
+            fill = textwrap.TextWrapper(
+                self._console.width, break_long_words=False, break_on_hyphens=False
+            ).fill
+            print(*map(fill, text.split("\n")), sep="\n", file=self._console.file, flush=True)
 
     def wait(self) -> None:
         """Wait until all messages are printed, but not for long."""

@@ -29,7 +29,7 @@ _FAILED = -1
 _USER_ERROR = 2
 
 
-def check(config: Config) -> None:
+def check_processes(config: Config) -> None:
     """Raise an error if several processes cannot train a configuration.
 
     Args:
@@ -48,7 +48,7 @@ def check(config: Config) -> None:
         )
 
 
-def join() -> None:
+def join_processes() -> None:
     """Connect to the other processes, before JAX is asked for a device.
 
     Under Slurm and Open MPI, JAX finds its place among the processes itself. Elsewhere three
@@ -78,7 +78,7 @@ def join() -> None:
         timeout.cancel()
 
 
-def leave() -> None:
+def leave_processes() -> None:
     """Wait until every process has called this, and disconnect; do nothing in a single process."""
     jax.distributed.shutdown()
 

@@ -10,17 +10,15 @@ The factor and the constant were measured on one NVIDIA H200.
 """
 
 import os
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import PyTree
 
-from jetbot_mjx.agents.cnn_sizes import activation_bytes
-from jetbot_mjx.agents.ppo import PPO
+from jetbot_mjx.agents import PPO, activation_bytes
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import mjx
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs import JetBotEnv, make_data
 
 GIB = 2**30
 
@@ -56,9 +54,9 @@ class Sizes(NamedTuple):
     layers: int
     """The activations of both networks and of their convolutions for one sample."""
     gradient: int
-    """What a gradient stores of one sample; nothing if the update is fused."""
+    """What a gradient stores of one sample; nothing if activations stay within a kernel."""
     noise: int
-    """The noise that estimates the entropy of one sample in all passes, if the update is fused."""
+    """The noise that estimates the entropy of one sample in all passes, if it is drawn ahead."""
     parameters: int
     """One copy of the networks, Adam's moments, the normaliser and the sums of metrics."""
 
@@ -86,6 +84,11 @@ class Footprint(NamedTuple):
         """Return the largest memory of all arrays at one time."""
         most = max(self.collecting, self.learning, self.evaluation)
         return self.parameters + self.environments + most
+
+    @property
+    def settings(self) -> str:
+        """Return the arguments that set this number of environments."""
+        return f"--set ppo.num_envs={self.num_envs} --set ppo.batch_size={self.batch_size}"
 
     @property
     def total(self) -> int:
@@ -126,8 +129,8 @@ def sizes(ppo: PPO, env: JetBotEnv) -> Sizes:
         learned=learned // samples,
         unroll=ends // unrolls,
         layers=_FLOAT * units + encoded,
-        gradient=0 if ppo.is_fused else int(_LAYERS * (_FLOAT * units + encoded)),
-        noise=_FLOAT * config.num_updates_per_batch * env.action_size if ppo.is_fused else 0,
+        gradient=ppo.learner.keeps_activations * int(_LAYERS * (_FLOAT * units + encoded)),
+        noise=ppo.learner.draws_ahead * _FLOAT * config.num_updates_per_batch * env.action_size,
         parameters=_bytes(state) - environments,
     )
 
@@ -137,146 +140,117 @@ def _physics(env: JetBotEnv) -> int:
     if env.physics.impl != "xla":
         # A single kernel stores its input and output only, no intermediate results.
         return 2 * _bytes(jax.eval_shape(env.reset, _KEY).pipeline_state)
-    return _bytes(mjx.make_data(env.physics.mj_model))
+    return _bytes(make_data(env.physics.mj_model))
 
 
-def footprint(config: Config, each: Sizes, device_count: int) -> Footprint:
-    """Compute the memory that a training takes on each device.
+class MemoryModel(NamedTuple):
+    """A `MemoryModel` predicts the memory of a training and of larger and smaller ones."""
 
-    Args:
-      config: the configuration of the run; its `num_envs` and `batch_size` may differ from those
-        that `each` was computed with.
-      each: the memory of one environment, one sample and so on, from `sizes`.
-      device_count: number of devices over all processes.
+    config: Config
+    """The configuration of the run."""
+    each: Sizes
+    """The memory of one environment, one sample and so on, from `sizes`."""
+    device_count: int
+    """Number of devices over all processes."""
 
-    Returns:
-      The memory, part by part.
-    """
-    # Divide environments and samples among the devices, rounded up.
-    ppo = config.ppo
-    minibatch = -(-ppo.batch_size // device_count) * ppo.unroll_length
-    unrolls = -(-ppo.batch_size * ppo.num_minibatches // device_count)
-    samples = unrolls * ppo.unroll_length
-    environments = -(-ppo.num_envs // device_count)
-    # Add up the parts; every seed takes all of them but the evaluation.
-    stepped = environments * each.environment
-    # An environment is stepped after its action is known, not at the same time.
-    working = max(each.physics, each.layers)
-    collected = samples * each.sample + unrolls * each.unroll
-    shuffled = samples * each.learned + unrolls * each.unroll
-    return Footprint(
-        num_envs=ppo.num_envs,
-        batch_size=ppo.batch_size,
-        parameters=config.seeds * each.parameters,
-        environments=config.seeds * stepped,
-        collecting=config.seeds * (collected + stepped + environments * working),
-        learning=config.seeds
-        * (
-            collected
-            + shuffled
-            # The states before the unroll, as rows, and their copy.
-            + 2 * stepped
-            + each.parameters
-            + minibatch * each.gradient
-            + samples * each.noise
-        ),
-        evaluation=config.evaluation.episodes * (2 * each.environment + working),
-    )
+    def footprint(self) -> Footprint:
+        """Compute the memory that the training takes on each device."""
+        # Divide environments and samples among the devices, rounded up.
+        config, each, ppo = self.config, self.each, self.config.ppo
+        minibatch = -(-ppo.batch_size // self.device_count) * ppo.unroll_length
+        unrolls = -(-ppo.batch_size * ppo.num_minibatches // self.device_count)
+        samples = unrolls * ppo.unroll_length
+        environments = -(-ppo.num_envs // self.device_count)
+        # Add up the parts; every seed takes all of them but the evaluation.
+        stepped = environments * each.environment
+        # An environment is stepped after its action is known, not at the same time.
+        working = max(each.physics, each.layers)
+        collected = samples * each.sample + unrolls * each.unroll
+        shuffled = samples * each.learned + unrolls * each.unroll
+        # The states before the unroll, as rows, and their copy.
+        rows = 2 * stepped
+        gradient = each.parameters + minibatch * each.gradient + samples * each.noise
+        return Footprint(
+            num_envs=ppo.num_envs,
+            batch_size=ppo.batch_size,
+            parameters=config.seeds * each.parameters,
+            environments=config.seeds * stepped,
+            collecting=config.seeds * (collected + stepped + environments * working),
+            learning=config.seeds * (collected + shuffled + rows + gradient),
+            evaluation=config.evaluation.episodes * (2 * each.environment + working),
+        )
 
+    def resized(self, factor: float) -> Footprint | None:
+        """Return the footprint with `ppo.num_envs` and `ppo.batch_size` multiplied by a factor.
 
-def resized(config: Config, each: Sizes, device_count: int, factor: float) -> Footprint | None:
-    """Return the footprint with `ppo.num_envs` and `ppo.batch_size` multiplied by a factor.
+        Returns:
+          The footprint; None if the products are not whole numbers, or if the devices cannot share
+          the environments and minibatches evenly.
+        """
+        ppo = self.config.ppo
+        changed = {name: getattr(ppo, name) * factor for name in ("num_envs", "batch_size")}
+        if any(value % self.device_count for value in changed.values()):
+            return None
+        ppo = ppo.model_copy(update={name: int(value) for name, value in changed.items()})
+        return self._replace(config=self.config.model_copy(update={"ppo": ppo})).footprint()
 
-    Args:
-      config: the configuration of the run.
-      each: the memory of one environment, one sample and so on, from `sizes`.
-      device_count: number of devices over all processes.
-      factor: the factor.
+    def ladder(self, limit: int) -> list[Footprint]:
+        """Return footprints by factors of two, from a quarter up to the first that does not fit.
 
-    Returns:
-      The footprint; None if the products are not whole numbers, or if the devices cannot share the
-      environments and minibatches evenly.
-    """
-    changed = {name: getattr(config.ppo, name) * factor for name in ("num_envs", "batch_size")}
-    if any(value % device_count for value in changed.values()):
+        Args:
+          limit: memory of a device [bytes].
+
+        Returns:
+          The footprints in ascending order, always including that of the configured size.
+        """
+        found = []
+        power = -2
+        while power <= 0 or (found[-1].total <= limit and found[-1].num_envs < _MOST_ENVS):
+            if one := self.resized(2.0**power):
+                found.append(one)
+            power += 1
+        return found
+
+    def next_that_fits(self, limit: int | None) -> Footprint | None:
+        """Return the largest training that fits and is smaller by a power of two.
+
+        Args:
+          limit: memory of a device [bytes]; None: not known, and everything fits.
+
+        Returns:
+          Its footprint; None if none fits.
+        """
+        power = -1
+        while found := self.resized(2.0**power):
+            if limit is None or found.total <= limit:
+                return found
+            power -= 1
         return None
-    ppo = config.ppo.model_copy(update={name: int(value) for name, value in changed.items()})
-    return footprint(config.model_copy(update={"ppo": ppo}), each, device_count)
 
+    def advice(self, limit: int | None) -> str:
+        """Return the error message for a training that ran out of memory.
 
-def ladder(config: Config, each: Sizes, device_count: int, limit: int) -> list[Footprint]:
-    """Return footprints by factors of two, from a quarter up to the first that does not fit.
+        Args:
+          limit: memory of a device [bytes]; None: not known.
 
-    Args:
-      config: the configuration of the run.
-      each: the memory of one environment, one sample and so on, from `sizes`.
-      device_count: number of devices over all processes.
-      limit: memory of a device [bytes].
-
-    Returns:
-      The footprints in ascending order, always including that of the configured size.
-    """
-    found = []
-    power = -2
-    while power <= 0 or (found[-1].total <= limit and found[-1].num_envs < _MOST_ENVS):
-        if one := resized(config, each, device_count, 2.0**power):
-            found.append(one)
-        power += 1
-    return found
-
-
-def next_that_fits(
-    config: Config, each: Sizes, device_count: int, limit: int | None
-) -> Footprint | None:
-    """Return the largest training that fits and is smaller by a power of two.
-
-    Args:
-      config: the configuration of the run.
-      each: the memory of one environment, one sample and so on, from `sizes`.
-      device_count: number of devices over all processes.
-      limit: memory of a device [bytes]; None: not known, and everything fits.
-
-    Returns:
-      Its footprint; None if none fits.
-    """
-    power = -1
-    while found := resized(config, each, device_count, 2.0**power):
-        if limit is None or found.total <= limit:
-            return found
-        power -= 1
-    return None
-
-
-def advice(config: Config, each: Sizes, device_count: int, limit: int | None) -> str:
-    """Return the error message for a training that ran out of memory.
-
-    Args:
-      config: the configuration of the run.
-      each: the memory of one environment, one sample and so on, from `sizes`.
-      device_count: number of devices over all processes.
-      limit: memory of a device [bytes]; None: not known.
-
-    Returns:
-      One line that names the next smaller size that fits.
-    """
-    wanted = footprint(config, each, device_count)
-    fits = next_that_fits(config, each, device_count, limit)
-    available = "" if limit is None else f" ({limit / GIB:.2f} GiB)"
-    problem = (
-        f"the device's memory{available} is too small for ppo.num_envs = {wanted.num_envs},"
-        f" which takes about {wanted.total / GIB:.2f} GiB: "
-    )
-    if fits is None:
-        return f"{problem}choose smaller networks, ppo.unroll_length or evaluation.episodes"
-    return (
-        f"{problem}--set ppo.num_envs={fits.num_envs} --set ppo.batch_size={fits.batch_size} takes"
-        f" {fits.total / GIB:.2f} GiB; jetbot-mjx plan lists other sizes"
-    )
+        Returns:
+          One line that names the next smaller size that fits.
+        """
+        wanted, fits = self.footprint(), self.next_that_fits(limit)
+        available = "" if limit is None else f" ({limit / GIB:.2f} GiB)"
+        problem = (
+            f"the device's memory{available} is too small for ppo.num_envs = {wanted.num_envs},"
+            f" which takes about {wanted.total / GIB:.2f} GiB: "
+        )
+        if fits is None:
+            return f"{problem}choose smaller networks, ppo.unroll_length or evaluation.episodes"
+        size = f"{fits.total / GIB:.2f} GiB"
+        return f"{problem}{fits.settings} takes {size}; jetbot-mjx plan lists other sizes"
 
 
 def device_memory() -> int | None:
     """Return the memory of this process's first device [bytes]; None if it does not report it."""
-    device: Any = jax.local_devices()[0]
+    device = jax.local_devices()[0]
     if device.platform != "cpu":
         stats = device.memory_stats() or {}
         return stats.get("bytes_limit")

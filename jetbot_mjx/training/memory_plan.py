@@ -5,10 +5,10 @@ from typing import NamedTuple
 import jax
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.text_table import text_table
-from jetbot_mjx.training.memory import GIB, Footprint, device_memory, ladder, sizes
+from jetbot_mjx.runs import Setup
+from jetbot_mjx.terminal import text_table
+from jetbot_mjx.training.memory import GIB, Footprint, MemoryModel, device_memory, sizes
 from jetbot_mjx.training.ppo_trainer import build_ppo
 
 
@@ -52,9 +52,9 @@ def plan_memory(config: Config, memory: float | None = None) -> MemoryPlan:
     limit = device_memory() if memory is None else int(memory * GIB)
     if limit is None:
         raise UserError("this device does not report its memory: give --memory GIB")
-    env = make_env(config)
-    each = sizes(build_ppo(config, env), env)
-    return MemoryPlan(config, device_count, limit, ladder(config, each, device_count, limit))
+    setup = Setup(config)
+    model = MemoryModel(config, sizes(build_ppo(setup), setup.env), device_count)
+    return MemoryPlan(config, device_count, limit, model.ladder(limit))
 
 
 def memory_table(plan: MemoryPlan) -> str:
@@ -74,8 +74,7 @@ def memory_table(plan: MemoryPlan) -> str:
     ]
     remedy = "none of them fits: try a smaller network or evaluation.episodes"
     if best := plan.largest:
-        settings = f"--set ppo.num_envs={best.num_envs} --set ppo.batch_size={best.batch_size}"
-        remedy = f"the largest of these that fits: {settings}"
+        remedy = f"the largest of these that fits: {best.settings}"
     return (
         f"GiB on each of {plan.device_count} x {jax.devices()[0].device_kind},"
         f" which has {plan.limit / GIB:.1f}; > marks the configuration\n"

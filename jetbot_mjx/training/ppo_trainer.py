@@ -19,6 +19,7 @@ Protocol:
 """
 
 import contextlib
+import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Self
@@ -28,17 +29,13 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, UInt32
 
-from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.agents.ppo import LOSSES, PPO, NanDump, TrainState
-from jetbot_mjx.compiler.background import in_background
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.config import Config
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.wrappers import wrap_for_training
+from jetbot_mjx.agents import LOSSES, PPO, DeviceAxis, NanDump, TrainState
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training import distributed
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.preemption import StopRequest
+from onekernel import ProgramCache
+from onekernel.build import in_background
 
 _AXIS = "devices"
 _MAX_CALL_SECONDS = 1.0
@@ -49,19 +46,14 @@ Advance = Callable[[TrainState, int, bool], tuple[TrainState, NanDump]]
 """The compiled training step: (state, training steps, whether to restart the sums)."""
 
 
-def build_ppo(config: Config, env: JetBotEnv) -> PPO:
-    """Build PPO over all devices, with its networks and the wrapped environment.
+def build_ppo(setup: Setup) -> PPO:
+    """Build PPO over all devices.
 
     Args:
-      config: the configuration of the run, which has passed `check_devices`.
-      env: the environment, unwrapped.
-
-    Returns:
-      PPO; its `networks` are the only ones of the training.
+      setup: environment and networks, of a configuration that has passed `check_devices`.
     """
-    networks = make_networks(config.ppo, env.observation_size, env.action_size)
-    wrapped = wrap_for_training(env, config.task.episode_length)
-    return PPO(config.ppo, wrapped, networks, axis_name=_AXIS, device_count=jax.device_count())
+    devices = DeviceAxis(jax.device_count(), _AXIS)
+    return PPO(setup.config.ppo, setup.training_env, setup.networks, devices)
 
 
 class CompiledTrainer:
@@ -97,18 +89,10 @@ class CompiledTrainer:
         self._replicated = NamedSharding(self._mesh, PartitionSpec())
 
     @classmethod
-    def from_config(cls, config: Config, env: JetBotEnv) -> Self:
-        """Build the trainer of a configuration, without a cache of programs on disk.
-
-        Args:
-          config: the configuration of the run.
-          env: the environment, unwrapped.
-
-        Returns:
-          The trainer; nothing is compiled yet.
-        """
-        seeds = [one.seed for one in config.of_each_seed()]
-        return cls(build_ppo(config, env), seeds, ProgramCache(compiler_options(config)))
+    def from_setup(cls, setup: Setup) -> Self:
+        """Build the trainer of a setup; nothing is compiled yet."""
+        seeds = [one.seed for one in setup.config.of_each_seed()]
+        return cls(build_ppo(setup), seeds, setup.programs)
 
     def template(self) -> TrainState:
         """Return the shapes and dtypes of one seed's state."""
@@ -125,8 +109,9 @@ class CompiledTrainer:
         if found is not None:
             return lambda: found(self._seeds)
         jitted = jax.jit(self._init, in_shardings=self._replicated, out_shardings=self._shardings)
-        with _random_bits_by_kernel():
-            program = self._programs.compile_later("init", lambda: jitted.trace(self._seeds))
+        program = self._programs.compile_later(
+            "init", lambda: jitted.trace(self._seeds), inside=_random_bits_by_kernel()
+        )
         return lambda: program()(self._seeds)
 
     def _init(self, seeds: UInt32[Array, " seeds"]) -> TrainState:
@@ -169,19 +154,32 @@ class CompiledTrainer:
           A function of (state, training steps, whether to restart the sums). It donates the memory
           of the state to its result. The dumps that it returns have the axes (devices, seeds).
         """
-        program = self._programs.compile("advance", self.trace, self.ppo.check, tune=True)
+        program = self._programs.compile("advance", self.trace, self._check, tune=True)
 
         def call(state: TrainState, steps: int, restart: bool) -> tuple[TrainState, NanDump]:
             return program(state, np.int32(steps), np.bool_(restart))
 
         return call
 
+    @functools.cached_property
+    def _launchable(self) -> PPO:
+        # Not before a program is traced: the back end's check takes a while.
+        return self.ppo.launchable()
+
     def trace(self) -> jax.stages.Traced:
         """Trace the training step for all devices, without compiling it."""
-        self.ppo.prepare(len(self._seeds))
-        if jax.default_backend() == "gpu" and jax.process_count() == 1:
-            in_background(_load_blas)
+        # Check the back end first: LLVM does one thing at a time, and physics waits for this.
+        ppo = self._launchable
+        ppo.learner.prepare(len(self._seeds))
+        return self._trace(ppo)
 
+    def _check(self) -> Callable[[], jax.stages.Traced] | None:
+        """Return None if this machine computes what was traced, or what traces XLA's update."""
+        failure = self._launchable.learner.failure()
+        return None if failure is None else lambda: self._trace(self._launchable.with_xla(failure))
+
+    def _trace(self, ppo: PPO) -> jax.stages.Traced:
+        """Trace the training step of `ppo` for all devices."""
         # CPUs multiply the matrices of a batch faster.
         alone = len(self._seeds) == 1 and jax.default_backend() == "gpu"
 
@@ -189,10 +187,10 @@ class CompiledTrainer:
             if alone:
                 # A batch of one would be traced a second time, as a batch.
                 one = jax.tree.map(lambda x: x[0], state)
-                result = self.ppo.advance(one, steps, restart)
+                result = ppo.advance(one, steps, restart)
                 state, nan_dump = jax.tree.map(lambda x: x[None], result)
             else:
-                state, nan_dump = jax.vmap(self.ppo.advance, in_axes=(0, None, None))(
+                state, nan_dump = jax.vmap(ppo.advance, in_axes=(0, None, None))(
                     state, steps, restart
                 )
             return state, jax.tree.map(lambda x: x[None], nan_dump)
@@ -221,8 +219,8 @@ def _random_bits_by_kernel() -> Iterator[None]:
     """Lower draws of random bits on GPUs to JAX's kernel inside the context, with the same result.
 
     As JAX does it by default, a draw is a hundred operations, which XLA fuses with those around
-    them. That is faster, but a program that runs once takes a second longer to compile. No other
-    thread may lower programs meanwhile.
+    them. That is faster, but a program that runs once takes a second longer to compile. Caches of
+    programs lower no other program meanwhile.
     """
     option = "jax_threefry_gpu_kernel_lowering"
     before = jax.config.values.get(option)
@@ -235,11 +233,6 @@ def _random_bits_by_kernel() -> Iterator[None]:
         yield
     finally:
         jax.config.update(option, before)
-
-
-def _load_blas() -> None:
-    """Have XLA load the libraries for matrix products, which takes it half a second."""
-    jax.jit(lambda x: x @ x).trace(jax.ShapeDtypeStruct((128, 128), np.float32)).lower().compile()
 
 
 def train(

@@ -24,6 +24,9 @@ STOPPED = 75
 
 # A terminal that is closed sends SIGHUP, which Windows does not have.
 _SIGNALS = (signal.SIGTERM, signal.SIGINT, *([signal.SIGHUP] if hasattr(signal, "SIGHUP") else []))
+_Handler = Callable[[int, FrameType | None], object] | int | None
+"""A handler of a signal, as the module `signal` returns it."""
+
 _SHARE_OF_NOTICE = 0.8
 """Share of the notice after which the process exits without saving."""
 _COMPILING_SECONDS = 1.0
@@ -44,7 +47,8 @@ class StopRequest:
         """
         self.notice = notice
         self._requested = threading.Event()
-        self._compiling: Callable[[], str] | None = None
+        self._compiling: Callable[[], None] | None = None
+        self._former: dict[int, _Handler] = {}
 
     @property
     def requested(self) -> bool:
@@ -55,16 +59,16 @@ class StopRequest:
         """Wait for a request for some seconds, and return whether there is one."""
         return self._requested.wait(seconds)
 
-    def begin_compiling(self, say: Callable[[], str]) -> None:
-        """Tell that the training compiles, so that there is nothing to save yet.
+    def begin_compiling(self, say: Callable[[], None]) -> None:
+        """Record that the training compiles, so that there is nothing to save yet.
 
         Args:
-          say: returns what a process says that ends meanwhile.
+          say: prints the last message of a process that ends meanwhile.
         """
         self._compiling = say
 
     def begin_training(self) -> None:
-        """Tell that the training has compiled: from now on it saves when it is asked to stop."""
+        """Record that the training has compiled: it saves from now on when it is asked to stop."""
         self._compiling = None
 
     def __enter__(self) -> Self:
@@ -72,7 +76,21 @@ class StopRequest:
         return self
 
     def __exit__(self, *exception: object) -> None:
-        """Do nothing."""
+        """Restore the former handlers."""
+        self._restore()
+
+    def _handle(self, handler: Callable[[int, FrameType | None], None]) -> None:
+        """Handle the signals from now on; do nothing outside the main thread, as Python does."""
+        if threading.current_thread() is threading.main_thread():
+            for number in _SIGNALS:
+                # A shell makes its background jobs ignore Ctrl-C; keep it so. None: not Python's.
+                if signal.getsignal(number) not in (signal.SIG_IGN, None):
+                    self._former[number] = signal.signal(number, handler)
+
+    def _restore(self) -> None:
+        for number, handler in self._former.items():
+            signal.signal(number, handler)
+        self._former = {}
 
 
 class DeferredSignals(StopRequest):
@@ -84,13 +102,9 @@ class DeferredSignals(StopRequest):
     """
 
     def __enter__(self) -> Self:
-        """Begin to listen; do nothing outside the main thread, where Python allows no handlers."""
-        self._former, self._deferred = {}, None
-        if threading.current_thread() is threading.main_thread():
-            for number in _SIGNALS:
-                # Leave an ignored signal ignored, and a handler that is not Python's in its place.
-                if signal.getsignal(number) not in (signal.SIG_IGN, None):
-                    self._former[number] = signal.signal(number, self._defer)
+        """Begin to listen."""
+        self._deferred: int | None = None
+        self._handle(self._defer)
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -104,11 +118,6 @@ class DeferredSignals(StopRequest):
         self._deferred = number
         self._restore()
         self._requested.set()
-
-    def _restore(self) -> None:
-        for number, handler in self._former.items():
-            signal.signal(number, handler)
-        self._former = {}
 
 
 class Preemption(StopRequest):
@@ -126,24 +135,17 @@ class Preemption(StopRequest):
         self._listener: SignalListener | None = None
 
     def __enter__(self) -> Self:
-        """Begin to listen; do nothing outside the main thread, where Python allows no handlers."""
-        self._former = {}
-        if threading.current_thread() is not threading.main_thread():
-            return self
-        self._listener = SignalListener(self._receive).__enter__()
-        for number in _SIGNALS:
-            # A shell makes its background jobs ignore Ctrl-C; keep it so.
-            if signal.getsignal(number) is not signal.SIG_IGN:
-                self._former[number] = signal.signal(number, _ignore)
+        """Begin to listen; do nothing outside the main thread, which alone may do so."""
+        if threading.current_thread() is threading.main_thread():
+            self._listener = SignalListener(self._receive).__enter__()
+        self._handle(_ignore)
         return self
 
     def __exit__(self, *exception: object) -> None:
         """Stop listening and restore the former handlers."""
-        if self._listener is None:
-            return
-        for number, handler in self._former.items():
-            signal.signal(number, handler)
-        self._listener.__exit__(*exception)
+        self._restore()
+        if self._listener is not None:
+            self._listener.__exit__(*exception)
         if self._timer is not None:
             self._timer.cancel()
 
@@ -160,7 +162,7 @@ class Preemption(StopRequest):
             limit = min(_SHARE_OF_NOTICE * self.notice, threading.TIMEOUT_MAX)
             if compiling:
                 limit = min(limit, _COMPILING_SECONDS)
-            say = compiling or (lambda: f"{limit:.0f} s after {name}: {_WITHOUT_SAVING}")
+            say = compiling or (lambda: tell(f"{limit:.0f} s after {name}: {_WITHOUT_SAVING}"))
             self._timer = threading.Timer(limit, _exit, [say])
             self._timer.daemon = True
             self._timer.start()
@@ -168,13 +170,13 @@ class Preemption(StopRequest):
             tell(f"\n{name}: {'ending' if compiling else saving}")
         # Ignore a repetition: schedulers and terminals also signal the whole process group.
         elif time.monotonic() - self._began > 0.5:
-            _exit(compiling or (lambda: f"second {name}: {_WITHOUT_SAVING}"))
+            _exit(compiling or (lambda: tell(f"second {name}: {_WITHOUT_SAVING}")))
 
 
-def _exit(say: Callable[[], str]) -> None:
+def _exit(say: Callable[[], None]) -> None:
     """End this process at once, whatever its threads do and whoever reads its output."""
     try:
-        tell(say())
+        say()
     finally:
         os._exit(STOPPED)
 

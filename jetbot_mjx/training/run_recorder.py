@@ -6,47 +6,32 @@ import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Annotated, Self
 
-from jetbot_mjx.agents.networks import PolicyParams
-from jetbot_mjx.agents.ppo import NanDump
+from pydantic import Field, TypeAdapter, ValidationError
+
+from jetbot_mjx import runs
+from jetbot_mjx.agents import NanDump, PolicyParams
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.opengl import find_backend
+from jetbot_mjx.envs import find_backend
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.evaluator import Summary
+from jetbot_mjx.evaluation import Summary
 from jetbot_mjx.interrupts import tell
-from jetbot_mjx.runs.checkpoint import POLICY
-from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_path, digest
-from jetbot_mjx.runs.metrics import (
-    EVALUATION_VIDEO,
-    METRICS,
-    CompileClock,
-    History,
-    JsonlSink,
-    MetricValues,
-    Sink,
-    TensorBoardSink,
-    process_seconds,
-)
-from jetbot_mjx.runs.nan_dump import save_nan_dump
-from jetbot_mjx.runs.resume import to_trees
-from jetbot_mjx.runs.run_dir import make_folder, writing_to
-from jetbot_mjx.runs.sb3_tags import aliases
-from jetbot_mjx.runs.train_log import TRAIN_LOG
-from jetbot_mjx.runs.wandb_sink import WandbSink
+from jetbot_mjx.runs import CheckpointStore, JsonObject, MetricValues
+from jetbot_mjx.terminal import process_seconds
 from jetbot_mjx.training.callbacks import Progress, TrainerCallback
 from jetbot_mjx.training.console import Phase, Terminal
 
 if TYPE_CHECKING:
-    from jetbot_mjx.viewers.video import EvaluationVideo
+    from jetbot_mjx.viewers import EvaluationVideo
 
 
 @dataclasses.dataclass
 class Standing:
-    """A `Standing` holds how far one seed has come; its checkpoints store it."""
+    """A `Standing` holds the progress of one seed; its checkpoints store it."""
 
-    env_steps: int = 0
-    best_steps: int = 0
+    env_steps: Annotated[int, Field(ge=0)] = 0
+    best_steps: Annotated[int, Field(ge=0)] = 0
     best: Summary | None = None
     """The best evaluation; of equal ones the latest."""
     last: Summary | None = None
@@ -54,30 +39,35 @@ class Standing:
     wall_seconds: float = 0.0
     """Time spent on the training so far, in all processes [s]."""
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self) -> JsonObject:
         """Return JSON values."""
-        return {
-            **vars(self),
-            "best": self.best._asdict() if self.best else None,
-            "last": self.last._asdict() if self.last else None,
-        }
+        summaries = {"best": self.best, "last": self.last}
+        return {**vars(self), **{key: one and one._asdict() for key, one in summaries.items()}}
 
     @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> "Standing":
-        """Return the object whose JSON values are given."""
-        summaries = {
-            name: Summary(**values[name]) if values.get(name) else None for name in ("best", "last")
-        }
-        return cls(**{**values, **summaries})
+    def from_json(cls, values: object, run_dir: Path) -> "Standing":
+        """Return the object whose JSON values a checkpoint of a run stores.
+
+        Raises:
+          UserError: no training has written these values.
+        """
+        try:
+            return TypeAdapter(cls).validate_python(values)
+        except ValidationError as error:
+            key = ".".join(map(str, ("progress", *error.errors()[0]["loc"])))
+            raise UserError(
+                f"{run_dir}: the last checkpoint has unusable metadata: {key} is wrong: move it to"
+                " another folder, and the training continues from the one before"
+            ) from None
 
 
 def open_sinks(
     config: Config,
     run_dir: Path,
-    history: Sequence[History],
+    history: Sequence[runs.History],
     say: Callable[[str], None],
     seeds: int,
-) -> list[Sink]:
+) -> list[runs.Sink]:
     """Open the logs of one seed.
 
     Args:
@@ -93,13 +83,13 @@ def open_sinks(
     Raises:
       UserError: the folder cannot be written.
     """
-    with writing_to(run_dir):
-        sinks: list[Sink] = [JsonlSink(run_dir / METRICS, history)]
+    with runs.writing_to(run_dir):
+        sinks: list[runs.Sink] = [runs.JsonlSink(run_dir / runs.METRICS, history)]
         if config.tensorboard:
             folder = run_dir / "tensorboard"
-            sinks.append(TensorBoardSink(folder, history, aliases(config.ppo), config))
+            sinks.append(runs.TensorBoardSink(folder, history, runs.aliases(config.ppo), config))
         if config.wandb is not None:
-            sinks.append(WandbSink(config, run_dir, history, say, seeds))
+            sinks.append(runs.WandbSink(config, run_dir, history, say, seeds))
     return sinks
 
 
@@ -123,7 +113,7 @@ class RunRecorder(TrainerCallback):
     video: "EvaluationVideo | None"
     terminal: Terminal
     say: Callable[[str], None]
-    clock: CompileClock
+    clock: runs.CompileClock
 
     def __post_init__(self) -> None:
         """Begin to measure."""
@@ -137,7 +127,7 @@ class RunRecorder(TrainerCallback):
 
     @property
     def standings(self) -> list[Standing]:
-        """Return how far each seed has come."""
+        """Return the progress of each seed."""
         return [seed.standing for seed in self.seeds]
 
     @property
@@ -221,8 +211,8 @@ class RunRecorder(TrainerCallback):
     def on_nan_dump(self, seed_index: int, env_steps: int, nan_dump: NanDump) -> None:
         """Save the dump for replay, and print the command that replays it."""
         seed = self.seeds[seed_index]
-        with writing_to(seed.run_dir):
-            path = save_nan_dump(seed.run_dir, seed.config, env_steps, nan_dump)
+        with runs.writing_to(seed.run_dir):
+            path = runs.save_nan_dump(seed.run_dir, seed.config, env_steps, nan_dump)
         if path is not None:
             self.say(
                 f"a state became non-finite before step {env_steps:,}, and its environment was"
@@ -278,7 +268,7 @@ class RunRecorder(TrainerCallback):
         self._unread = True
         text = (
             "standard output cannot be written: the training goes on, and its messages are in"
-            f" {TRAIN_LOG} in the run folder"
+            f" {runs.TRAIN_LOG} in the run folder"
         )
         self.say(text)
         tell(text)
@@ -311,14 +301,14 @@ class SeedRecorder:
       run_dir: the run folder of this seed.
       sinks: the logs of this seed.
       about: the metadata that every checkpoint carries, as JSON values.
-      standing: how far this seed has come.
+      standing: the progress of this seed.
       fingerprint: the SHA-256 of its parameters; empty if there are none yet.
     """
 
     config: Config
     run_dir: Path
-    sinks: Sequence[Sink]
-    about: Mapping[str, Any]
+    sinks: Sequence[runs.Sink]
+    about: JsonObject
     standing: Standing
     fingerprint: str
 
@@ -341,13 +331,13 @@ class SeedRecorder:
         standing.env_steps, standing.last = progress.env_steps, summary
         if standing.best is None or summary.success_rate >= standing.best.success_rate:
             standing.best_steps, standing.best = progress.env_steps, summary
-        with writing_to(self.run_dir):
+        with runs.writing_to(self.run_dir):
             for sink in self.sinks:
                 sink.write(progress.env_steps, metrics)
         self.save(progress, summary._asdict(), wall_seconds)
-        self.fingerprint = digest(progress.params)
+        self.fingerprint = runs.digest(progress.params)
 
-    def save(self, progress: Progress, evaluation: Mapping[str, Any], wall_seconds: float) -> None:
+    def save(self, progress: Progress, evaluation: MetricValues, wall_seconds: float) -> None:
         """Begin to write a checkpoint.
 
         Args:
@@ -356,7 +346,7 @@ class SeedRecorder:
           wall_seconds: time of all processes that worked on the run [s].
         """
         self.standing.wall_seconds = wall_seconds
-        trees = to_trees(progress.state) if progress.state else {POLICY: progress.params}
+        trees = runs.to_trees(progress.state) if progress.state else {runs.POLICY: progress.params}
         about = {
             **self.about,
             "metrics": dict(evaluation),
@@ -364,15 +354,15 @@ class SeedRecorder:
         }
         success = evaluation.get("success_rate")
         # Other programs may read the policy, array by array, but not the rest.
-        joined = trees.keys() - {POLICY}
+        joined = trees.keys() - {runs.POLICY}
         self._store.save(progress.env_steps, trees, about, success, joined)
 
     def render(self, video: "EvaluationVideo", progress: Progress) -> None:
         """Render a video of the policy into the run folder, and log it."""
-        name = checkpoint_path(self.run_dir, progress.env_steps).name
-        path = self.run_dir / "videos" / name / EVALUATION_VIDEO
-        make_folder(path.parent)
-        with writing_to(path):
+        name = runs.checkpoint_path(self.run_dir, progress.env_steps).name
+        path = self.run_dir / "videos" / name / runs.EVALUATION_VIDEO
+        runs.make_folder(path.parent)
+        with runs.writing_to(path):
             video.write(path, progress.params, progress.env_steps)
             for sink in self.sinks:
                 sink.write_video(progress.env_steps, path)
@@ -380,7 +370,7 @@ class SeedRecorder:
     def close(self) -> None:
         """Wait until the logs and checkpoints are written."""
         with contextlib.ExitStack() as stack:
-            stack.enter_context(writing_to(self.run_dir))
+            stack.enter_context(runs.writing_to(self.run_dir))
             for sink in self.sinks:
                 stack.callback(sink.close)
             stack.enter_context(self._store)

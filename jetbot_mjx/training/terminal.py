@@ -4,8 +4,8 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from jetbot_mjx.runs.metrics import History
-from jetbot_mjx.runs.progress import is_watched
+from jetbot_mjx.runs import History
+from jetbot_mjx.terminal import is_watched
 from jetbot_mjx.training.console import Terminal
 
 

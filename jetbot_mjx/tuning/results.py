@@ -2,19 +2,19 @@
 
 import csv
 import io
+import json
 import statistics
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import matplotlib.pyplot as plt
 
 from jetbot_mjx.config import Config, load_config
 from jetbot_mjx.errors import requires_extra
-from jetbot_mjx.runs.metrics import process_seconds
-from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import write_text, writing_to
+from jetbot_mjx.runs import write_text, writing_to
+from jetbot_mjx.terminal import process_seconds, stage
 from jetbot_mjx.tuning.search import (
     CONFIRM_SEEDS,
     Entrant,
@@ -23,7 +23,7 @@ from jetbot_mjx.tuning.search import (
     quiet,
     ranked_trials,
 )
-from jetbot_mjx.tuning.space import Parameter, with_values
+from jetbot_mjx.tuning.space import Parameter, Values, with_values
 
 with requires_extra("tune", "tune"):
     import optuna
@@ -40,7 +40,7 @@ class TuningResult(NamedTuple):
     """The file with the best configuration, `best.yaml`."""
     config: Config
     """The best configuration."""
-    values: Mapping[str, Any]
+    values: Values
     """Values of the settings that differ from the given configuration in the best one."""
     entrants: tuple[Entrant, ...]
     """The final trainings: of the given configuration, then of the best trials."""
@@ -104,7 +104,7 @@ def best_entrant(entrants: Sequence[Entrant]) -> Entrant:
     return max(entrants, key=lambda one: statistics.fmean(one.areas))
 
 
-def best_values(search: Search, entrants: Sequence[Entrant]) -> Mapping[str, Any]:
+def best_values(search: Search, entrants: Sequence[Entrant]) -> Values:
     """Return the values of the best entrant, or if there is none, of the trial with the best score.
 
     Args:
@@ -172,7 +172,7 @@ def _trials_table(study: optuna.Study) -> str:
         "|" + "---|" * (4 + len(names)),
     ]
     for trial in ranked_trials(study):
-        values = " | ".join(_short(trial.params.get(name)) for name in names)
+        values = " | ".join(_short(trial.params.get(name, "-")) for name in names)
         lines.append(
             f"| {trial.number} | {trial.value:.2%} | {100 * trial.user_attrs['success_rate']:.2f}"
             f" | {trial.user_attrs['mean_seconds']:.3f} | {values} |"
@@ -202,7 +202,7 @@ def _plot(folder: Path, study: optuna.Study) -> None:
             with warnings.catch_warnings(), plt.ioff(), plt.rc_context():
                 warnings.simplefilter("ignore")
                 draw = getattr(optuna.visualization.matplotlib, f"plot_{name}")
-                more: dict[str, Any] = {}
+                more: dict[str, optuna.importance.BaseImportanceEvaluator] = {}
                 if name == "param_importances":
                     # Optuna's default evaluator needs scikit-learn.
                     more["evaluator"] = optuna.importance.PedAnovaImportanceEvaluator()
@@ -214,7 +214,8 @@ def _plot(folder: Path, study: optuna.Study) -> None:
             advance(1)
 
 
-def _short(value: Any) -> str:
-    if isinstance(value, tuple):
-        return str(list(value))
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+def _short(value: object) -> str:
+    """Return a value of a setting as YAML writes it, in few digits."""
+    if isinstance(value, float):
+        return f"{value:.4g}"
+    return json.dumps(value) if value is None or isinstance(value, bool | tuple) else str(value)

@@ -15,39 +15,38 @@ import functools
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 
 from jetbot_mjx.config import Config, ConfigError
 from jetbot_mjx.errors import UserError, ran_out, requires_extra
-from jetbot_mjx.evaluation.evaluator import report_keys
-from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
-from jetbot_mjx.runs.checkpoint import load_checkpoint
-from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.runs.run_dir import make_folder
-from jetbot_mjx.tuning.space import TRACED, Parameter, with_values
+from jetbot_mjx.evaluation import REPORT_GOALS, report_keys
+from jetbot_mjx.runs import load_checkpoint, make_folder
+from jetbot_mjx.terminal import stage
+from jetbot_mjx.tuning.space import TRACED, Parameter, Value, Values, with_values
 from jetbot_mjx.tuning.trials import Outcome, Trials, mean_seconds
 
 with requires_extra("tune", "tune"):
     import optuna
     import sqlalchemy
     import sqlalchemy.exc
+    from optuna.trial import FrozenTrial
 
 _BEAT_SECONDS = 5
-"""How often a worker renews its heartbeat [s]."""
+"""Time between two heartbeats of a worker [s]."""
 _STALE_SECONDS = 30
-"""After how long without a heartbeat a worker counts as dead [s]."""
+"""Time without a heartbeat after which a worker counts as dead [s]."""
 _POLL_SECONDS = 2.0
 CONFIRM_SEEDS = 5
 """Number of new seeds with which the best trials are retrained."""
 _LOCKED_SECONDS = 60
-"""How long a worker waits for others to write to SQLite [s]."""
+"""Time that a worker waits for others to write to SQLite [s]."""
 _OPENINGS = 3
-"""How often a worker tries to open the database, a second apart."""
+"""Number of times that a worker tries to open the database, a second apart."""
 _CONFIRM_SEED = 1_000_000
 """Distance of the first seed of the final trainings from the first one of the search."""
 
@@ -56,7 +55,7 @@ _STORAGE_ERRORS = optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlch
 _OPENING_ERRORS = ImportError, ValueError, RuntimeError
 """For a driver that is not installed, a port that is not a number, or another Optuna's database."""
 
-_Static = tuple[tuple[str, Any], ...]
+_Static = tuple[tuple[str, Value], ...]
 """Names and values of the static settings of trials that one program trains."""
 
 
@@ -64,7 +63,7 @@ class Entrant(NamedTuple):
     """An `Entrant` holds the final trainings of one set of values."""
 
     name: str
-    values: Mapping[str, Any]
+    values: Values
     areas: tuple[float, ...]
     """Mean success over the training, for each seed, on the goals of training."""
     success_rates: tuple[float, ...]
@@ -125,7 +124,7 @@ class Search:
         self._given = {one.name: _frozen(flat[one.name]) for one in space if one.name in flat}
         self._evaluations = evaluations
         self._say = say
-        self._batches: dict[tuple[Any, ...], Trials] = {}
+        self._batches: dict[_Static, Trials] = {}
         folder = folder.resolve()
         new = not folder.exists()
         make_folder(folder)
@@ -203,7 +202,7 @@ class Search:
         reason = failed[0].user_attrs["error"] if failed else ""
         if len(failed) == count:
             raise UserError(f"none of the last {count} trials could be trained, such as: {reason}")
-        best = max((one.value for one in completed_trials(self.study)), default=float("nan"))
+        best = max((one.value or 0.0 for one in completed_trials(self.study)), default=float("nan"))
         self._say(
             f"{len(completed_trials(self.study))} of {trials} trials, best mean success {best:.2%};"
             f" this round of {count} took {time.perf_counter() - began:.1f} s"
@@ -226,7 +225,7 @@ class Search:
         """
         if count == 0:
             return []
-        chosen: dict[str, Mapping[str, Any]] = {"as given": {}}
+        chosen: dict[str, Values] = {"as given": {}}
         for trial in ranked_trials(self.study):
             values = self.values_of(trial)
             if len(chosen) <= count and values not in (self._given, *chosen.values()):
@@ -257,12 +256,12 @@ class Search:
             for name, found in done.items()
         ]
 
-    def values_of(self, trial: Any) -> dict[str, Any]:
+    def values_of(self, trial: FrozenTrial) -> dict[str, Value]:
         """Return the values of a trial that is stored."""
         return {one.name: one.from_optuna(trial.params[one.name]) for one in self._space}
 
     def _final(
-        self, work: Sequence[tuple[str, Mapping[str, Any], int]], key: _Static
+        self, work: Sequence[tuple[str, Values, int]], key: _Static
     ) -> list[tuple[Outcome, float, float]]:
         """Train values with seeds; return the outcomes, and success and time on the report."""
         batch = self._batch(key)
@@ -310,7 +309,7 @@ class Search:
             reason = next(iter(str(error.__cause__ or error).splitlines()), type(error).__name__)
             raise UserError(f"--storage {self._url} cannot be used: {reason}") from None
 
-    def _stored(self, asked: Sequence[Any]) -> list[Any]:
+    def _stored(self, asked: Sequence[optuna.Trial]) -> list[FrozenTrial]:
         """Return trials as the storage has them."""
         numbers = {trial.number for trial in asked}
         return [one for one in self.study.get_trials(deepcopy=False) if one.number in numbers]
@@ -343,12 +342,12 @@ class Search:
         return None if missing <= 0 and running else max(missing, 0)
 
     @contextlib.contextmanager
-    def _alive(self) -> Iterator[list[Any]]:
+    def _alive(self) -> Iterator[list[optuna.Trial]]:
         """Tell the storage that the trials of a list are alive, from a thread.
 
         After an error or Ctrl-C, those that are not finished are enqueued again.
         """
-        asked: list[Any] = []
+        asked: list[optuna.Trial] = []
         finished = threading.Event()
 
         def beat() -> None:
@@ -374,7 +373,7 @@ class Search:
             finished.set()
             thread.join()
 
-    def _train(self, asked: Sequence[Any], drawn: Sequence[Mapping[str, Any]]) -> None:
+    def _train(self, asked: Sequence[optuna.Trial], drawn: Sequence[Values]) -> None:
         """Train a round of trials, and tell the study of each group as soon as it is done."""
         valid = []
         for trial, values in zip(asked, drawn, strict=True):
@@ -400,7 +399,7 @@ class Search:
                     self._tell(trial, outcome)
                     advance(1)
 
-    def _tell(self, trial: Any, outcome: Outcome) -> None:
+    def _tell(self, trial: optuna.Trial, outcome: Outcome) -> None:
         # Another worker may have taken this one for dead, after Ctrl-Z for example.
         if self._is_running(trial):
             trial.set_user_attr("success_rate", outcome.success_rates[-1])
@@ -409,16 +408,16 @@ class Search:
                 trial.report(rate, step)
             self.study.tell(trial, outcome.area)
 
-    def _fail(self, trial: Any, error: UserError) -> None:
+    def _fail(self, trial: optuna.Trial, error: UserError) -> None:
         if self._is_running(trial):
             trial.set_user_attr("error", str(error))
             self.study.tell(trial, state=_STATES.FAIL)
 
-    def _is_running(self, trial: Any) -> bool:
+    def _is_running(self, trial: optuna.Trial) -> bool:
         return self._storage.get_trial(trial._trial_id).state == _STATES.RUNNING
 
     def _outcomes(
-        self, batch: Trials, drawn: Sequence[Mapping[str, Any]], seeds: Sequence[int]
+        self, batch: Trials, drawn: Sequence[Values], seeds: Sequence[int]
     ) -> list[Outcome]:
         """Train trials of one group at once."""
         values = [{**self._given, **one} for one in drawn]
@@ -433,7 +432,7 @@ class Search:
                 " choose a smaller --round"
             ) from None
 
-    def _groups(self, drawn: Sequence[Mapping[str, Any]]) -> dict[_Static, list[int]]:
+    def _groups(self, drawn: Sequence[Values]) -> dict[_Static, list[int]]:
         """Return the indices of the trials that one program trains, by their static settings.
 
         A setting that is null is static: a program without it differs from one that has it.
@@ -462,12 +461,12 @@ class Search:
         return self._batches[key]
 
 
-def completed_trials(study: optuna.Study) -> list[Any]:
+def completed_trials(study: optuna.Study) -> list[FrozenTrial]:
     """Return the trials that were trained to their end."""
     return study.get_trials(deepcopy=False, states=(_STATES.COMPLETE,))
 
 
-def ranked_trials(study: optuna.Study) -> list[Any]:
+def ranked_trials(study: optuna.Study) -> list[FrozenTrial]:
     """Return the trials that were trained to their end, the best first."""
     return sorted(completed_trials(study), key=lambda trial: -(trial.value or 0.0))
 
@@ -492,5 +491,5 @@ def _check_config(config: Config) -> None:
         load_checkpoint(config.init_from)
 
 
-def _frozen(value: Any) -> Any:
+def _frozen(value: Value | list[Value]) -> Value:
     return tuple(value) if isinstance(value, list) else value

@@ -12,7 +12,7 @@ import difflib
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, TypeGuard
+from typing import TYPE_CHECKING, NamedTuple, TypeGuard
 
 from jetbot_mjx.config import (
     ALL_KEYS,
@@ -23,6 +23,15 @@ from jetbot_mjx.config import (
     read_yaml,
 )
 from jetbot_mjx.errors import clipped, shown
+
+if TYPE_CHECKING:
+    import optuna
+
+Value = bool | int | float | str | tuple["Value", ...] | None
+"""A value of a setting; a list is a tuple."""
+
+Values = Mapping[str, Value]
+"""Values by the name of their setting, such as `ppo.learning_rate`."""
 
 TRACED = (
     "ppo.learning_rate",
@@ -55,14 +64,14 @@ class Parameter(NamedTuple):
     high: float | int | None = None
     log: bool = False
     """Whether the logarithm is drawn uniformly."""
-    choices: tuple[Any, ...] = ()
+    choices: tuple[Value, ...] = ()
 
     @property
     def whole(self) -> bool:
         """Return whether the range holds whole numbers only."""
         return isinstance(self.low, int)
 
-    def contains(self, value: Any) -> bool:
+    def contains(self, value: Value) -> bool:
         """Return whether the setting may take this value."""
         if self.choices:
             return value in self.choices
@@ -71,25 +80,28 @@ class Parameter(NamedTuple):
             return False
         return low <= value <= high
 
-    def suggest(self, trial: Any) -> Any:
+    def suggest(self, trial: "optuna.Trial") -> Value:
         """Ask an Optuna trial for a value."""
         if self.choices:
             names = [self.to_optuna(choice) for choice in self.choices]
             return self.from_optuna(trial.suggest_categorical(self.name, names))
-        suggest = trial.suggest_int if self.whole else trial.suggest_float
-        return suggest(self.name, self.low, self.high, log=self.log)
+        if isinstance(self.low, int) and isinstance(self.high, int):
+            return trial.suggest_int(self.name, self.low, self.high, log=self.log)
+        assert self.low is not None
+        assert self.high is not None
+        return trial.suggest_float(self.name, self.low, self.high, log=self.log)
 
-    def to_optuna(self, value: Any) -> Any:
+    def to_optuna(self, value: Value) -> bool | int | float | str | None:
         """Return a value as Optuna stores it: a list as text."""
         return str(list(value)) if isinstance(value, tuple) else value
 
-    def from_optuna(self, stored: Any) -> Any:
+    def from_optuna(self, stored: Value) -> Value:
         """Return the value that Optuna has stored."""
         found = [choice for choice in self.choices if self.to_optuna(choice) == stored]
         return found[0] if found else stored
 
 
-def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Parameter]:
+def read_space(space: str | Path | Mapping[str, object], config: Config) -> list[Parameter]:
     """Read what a search may change.
 
     Args:
@@ -105,6 +117,11 @@ def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Pa
         end of its range or one of its choices.
     """
     name, values = "space", space
+    if not isinstance(space, str | Path | Mapping):
+        raise ConfigError(
+            f"space = {shown(space)} is wrong: give a YAML file, its content, or the name of a"
+            " space that comes with the package, such as 'ppo'"
+        )
     if not isinstance(values, Mapping):
         name, values = str(space), read_yaml(find_config(str(space), SHIPPED, "--space"), "--space")
     if not values:
@@ -114,7 +131,7 @@ def read_space(space: str | Path | Mapping[str, Any], config: Config) -> list[Pa
     return [_parameter(key, entry, name, config) for key, entry in values.items()]
 
 
-def _parameter(name: Any, entry: Any, path: str, config: Config) -> Parameter:
+def _parameter(name: object, entry: object, path: str, config: Config) -> Parameter:
     where = f"{path}: {clipped(str(name))}"
     if not isinstance(entry, Mapping):
         raise ConfigError(
@@ -142,7 +159,7 @@ def _parameter(name: Any, entry: Any, path: str, config: Config) -> Parameter:
     return _typed(found, config)
 
 
-def _list(name: str, entry: Mapping[str, Any], where: str) -> Parameter:
+def _list(name: str, entry: Mapping[str, object], where: str) -> Parameter:
     choices = entry["choices"]
     if not isinstance(choices, list | tuple) or not choices or len(entry) > 1:
         raise ConfigError(f"{where} is wrong: choices should be a list, without other keys")
@@ -159,7 +176,7 @@ def _list(name: str, entry: Mapping[str, Any], where: str) -> Parameter:
     )
 
 
-def _range(name: str, entry: Mapping[str, Any], where: str) -> Parameter:
+def _range(name: str, entry: Mapping[str, object], where: str) -> Parameter:
     low, high, log = entry.get("low"), entry.get("high"), entry.get("log", False)
     if not (_is_number(low) and _is_number(high) and low < high):
         raise ConfigError(f"{where} is wrong: low and high should be numbers, low the smaller")
@@ -182,13 +199,11 @@ def _typed(found: Parameter, config: Config) -> Parameter:
     return found._replace(low=kind(low), high=kind(high))
 
 
-def _is_number(value: Any) -> TypeGuard[int | float]:
+def _is_number(value: object) -> TypeGuard[int | float]:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def with_values(
-    config: Config, values: Mapping[str, Any], *, source: str, alone: bool = False
-) -> Config:
+def with_values(config: Config, values: Values, *, source: str, alone: bool = False) -> Config:
     """Return a configuration with some settings changed.
 
     Args:

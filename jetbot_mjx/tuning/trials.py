@@ -8,28 +8,25 @@ run one group after the other.
 
 import functools
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PyTree, UInt32
+from jaxtyping import Array, Float, Int32, PyTree, UInt32
 
-from jetbot_mjx.agents.networks import make_networks
-from jetbot_mjx.agents.ppo import PPO, TrainState
-from jetbot_mjx.compiler.xla_options import compiler_options
+from jetbot_mjx.agents import PPO, TrainState
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.domain_randomization import maybe_randomize
-from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.wrappers import wrap_for_training
-from jetbot_mjx.evaluation.evaluator import policy_controller, training_keys
-from jetbot_mjx.evaluation.rollout import Episodes, rollout_fn
-from jetbot_mjx.runs.checkpoint import load_checkpoint
-from jetbot_mjx.runs.progress import stage
-from jetbot_mjx.training.warm_start import make_warm_start
-from jetbot_mjx.tuning.space import TRACED
+from jetbot_mjx.envs import maybe_randomize
+from jetbot_mjx.evaluation import Episodes, policy_controller, rollout_fn, training_keys
+from jetbot_mjx.runs import Setup, load_checkpoint, make_warm_start
+from jetbot_mjx.terminal import stage
+from jetbot_mjx.tuning.space import TRACED, Values
 
 SECTION = "ppo."
+
+Traced = Mapping[str, Float[Array, "*trials"]]
+"""Values of settings of PPO by name, with an axis of trials or without."""
 
 
 class Outcome(NamedTuple):
@@ -65,36 +62,36 @@ class Trials:
         assert set(names) <= set(TRACED), names
         self.config = config
         self._names = tuple(names)
-        env = make_env(config)
-        self._env = wrap_for_training(env, config.task.episode_length)
-        self._networks = make_networks(config.ppo, env.observation_size, env.action_size)
-        ppo = PPO(config.ppo, self._env, self._networks)
-        ppo.try_backend()
-        if not ppo.is_fused:
-            unfused = config.ppo.model_copy(update={"update": "xla"})
-            self.config = config.model_copy(update={"ppo": unfused})
+        setup = Setup(config)
+        self._env, self._networks = setup.training_env, setup.networks
+        # Choose and report the learner once, and not with every program.
+        learner = PPO(config.ppo, self._env, self._networks).launchable().learner
+        chosen = config.ppo.model_copy(update={"update": learner.name})
+        self.config = config.model_copy(update={"ppo": chosen})
         self._warm_start = None
         if config.init_from is not None:
-            self._warm_start = make_warm_start(load_checkpoint(config.init_from), config, env)
+            self._warm_start = make_warm_start(load_checkpoint(config.init_from), setup)
         episodes = rollout_fn(
-            maybe_randomize(env), [policy_controller(self._networks)], config.task.episode_length
+            maybe_randomize(setup.env),
+            [policy_controller(self._networks)],
+            config.task.episode_length,
         )
         steps = np.linspace(0, config.ppo.training_steps, evaluations + 1).round().astype(np.int32)
         self._steps = np.diff(steps)
         init = jax.vmap(lambda traced, seed: self._ppo(traced).init(jax.random.PRNGKey(seed)))
 
-        def advance(traced: Any, state: TrainState, steps: Any) -> TrainState:
+        def advance(traced: Traced, state: TrainState, steps: Int32[Array, ""]) -> TrainState:
             ppo = self._ppo(traced)
             return ppo.unpacked(ppo.advance(ppo.packed(state), steps, jnp.ones((), bool))[0])
 
         # `jax.jit` compiles again for each number of trials.
         self._compiled: set[int] = set()
-        jit = functools.partial(jax.jit, compiler_options=compiler_options(config))
+        jit = functools.partial(jax.jit, compiler_options=setup.programs.options)
         self._init = jit(init)
         self._advance = jit(jax.vmap(advance, in_axes=(0, 0, None)), donate_argnums=1)
         self._episodes = jit(jax.vmap(episodes, in_axes=(None, 0, None)))
 
-    def run(self, values: Sequence[Mapping[str, float]], seeds: Sequence[int]) -> list[Outcome]:
+    def run(self, values: Sequence[Values], seeds: Sequence[int]) -> list[Outcome]:
         """Train one policy for each trial, all at once.
 
         Args:
@@ -152,7 +149,7 @@ class Trials:
         """
         return self._episodes(0, params, keys)
 
-    def _begin(self, traced: Mapping[str, Array], seeds: UInt32[Array, " n"]) -> TrainState:
+    def _begin(self, traced: Traced, seeds: UInt32[Array, " n"]) -> TrainState:
         """Return the stacked states before the first step."""
         state = self._init(traced, seeds)
         if self._warm_start is None:
@@ -160,7 +157,7 @@ class Trials:
         each = [jax.tree.map(lambda x, i=i: x[i], state) for i in range(len(seeds))]
         return jax.tree.map(lambda *x: jnp.stack(x), *map(self._warm_start.apply, each))
 
-    def _ppo(self, traced: Mapping[str, Float[Array, ""]]) -> PPO:
+    def _ppo(self, traced: Traced) -> PPO:
         # `model_copy` does not validate, so that traced values pass.
         return PPO(self.config.ppo.model_copy(update=dict(traced)), self._env, self._networks)
 

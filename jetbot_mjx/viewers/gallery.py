@@ -9,19 +9,10 @@ import jax
 import numpy as np
 from PIL import Image
 
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx import evaluation, runs
+from jetbot_mjx.envs import JetBotEnv
 from jetbot_mjx.errors import UserError, check_count
-from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
-from jetbot_mjx.evaluation.goal_set import REPORT_GOALS, check_goals, format_goals
-from jetbot_mjx.evaluation.plots import plot_trajectories, theme, to_png
-from jetbot_mjx.evaluation.result_names import name_with_count
-from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs.checkpoint import Checkpoint, Which, find_checkpoint, load_checkpoint
-from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
-from jetbot_mjx.runs.progress import Advance, stage
-from jetbot_mjx.runs.run_dir import make_folder, shortened, writing_to
+from jetbot_mjx.terminal import Advance, stage
 from jetbot_mjx.viewers.video import (
     GIF_STRIDE,
     Frame,
@@ -32,7 +23,7 @@ from jetbot_mjx.viewers.video import (
     write_mp4,
 )
 
-EPISODES, GALLERY_EPISODES = 20, 4
+VIDEO_EPISODES, GALLERY_EPISODES = 20, 4
 """Default number of goals of the videos of one policy, and of a gallery."""
 
 _GIF_EPISODES = 8  # about 1 MB: what a README or a chat still shows
@@ -54,7 +45,7 @@ class Rendered(NamedTuple):
     def __repr__(self) -> str:
         """Return the goals reached by steps, and the files, in one line."""
         reached = {step: f"{count}/{self.episodes}" for step, count in self.successes.items()}
-        files = {what: str(shortened(path)) for what, path in self.files.items()}
+        files = {what: str(runs.shortened(path)) for what, path in self.files.items()}
         return f"Rendered(reached={reached}, files={files})"
 
     def describe(self) -> str:
@@ -69,16 +60,16 @@ class Rendered(NamedTuple):
 
 def video_files(folder: Path, name: str) -> dict[str, Path]:
     """Make a folder, and return the paths of a video and a GIF in it."""
-    make_folder(folder)
+    runs.make_folder(folder)
     return {"video": folder / f"{name}.mp4", "gif": folder / f"{name}.gif"}
 
 
 def render_run(
     run_or_checkpoint: str | Path,
     *,
-    episodes: int = EPISODES,
+    episodes: int = VIDEO_EPISODES,
     goals: Sequence[int] | None = None,
-    which: Which = "best",
+    which: runs.Which = "best",
 ) -> Rendered:
     """Render deterministic episodes of one policy on some of the report's fixed goals.
 
@@ -97,20 +88,24 @@ def render_run(
     """
     # Choose the goals and the names of the files.
     if goals is None:
-        check_count("episodes", episodes, REPORT_GOALS)
+        check_count("episodes", episodes, evaluation.REPORT_GOALS)
         goals = range(episodes)
-        names = [name_with_count(name, episodes, EPISODES) for name in ("episodes", "trajectories")]
+        names = [
+            evaluation.name_with_count(name, episodes, VIDEO_EPISODES)
+            for name in ("episodes", "trajectories")
+        ]
     else:
-        check_goals(goals)
-        names = (f"goals-{format_goals(goals)}",) * 2
+        evaluation.check_goals(goals)
+        names = (f"goals-{evaluation.format_goals(goals)}",) * 2
     # Run the episodes.
-    checkpoint = load_checkpoint(run_or_checkpoint, which)
-    env = checkpoint.make_env()
-    rolled_out = run_episodes([checkpoint], env, goals)[0]
+    checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
+    setup = checkpoint.make_setup()
+    env = setup.env
+    rolled_out = run_episodes([checkpoint], setup, goals)[0]
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     files = video_files(folder, names[0]) | {"plot": folder / f"{names[1]}.png"}
     # Plot the trajectories and render the videos.
-    with writing_to(files["plot"]):
+    with runs.writing_to(files["plot"]):
         _trajectory_plot(checkpoint, env, rolled_out, goals).save(files["plot"])
     with VideoRenderer(env) as renderer:
         drives = split_trajectories(env, rolled_out, goals)
@@ -137,22 +132,22 @@ def render_gallery(run_dir: str | Path, *, episodes: int = GALLERY_EPISODES) -> 
     Raises:
       UserError: there is no usable checkpoint, no OpenGL, or no space on the disk.
     """
-    check_count("episodes", episodes, REPORT_GOALS)
+    check_count("episodes", episodes, evaluation.REPORT_GOALS)
     path = run_folder(run_dir, "--gallery")
     # Run all chosen checkpoints on the same goals.
-    chosen = early_middle_final(checkpoint_steps(path))
-    checkpoints = [load_checkpoint(path, one) for one in chosen]
-    env = checkpoints[0].make_env()
-    goals = range(episodes)
-    rolled_out = run_episodes(checkpoints, env, goals)
-    name = name_with_count("gallery", episodes, GALLERY_EPISODES)
+    chosen = early_middle_final(runs.checkpoint_steps(path))
+    checkpoints = [runs.load_checkpoint(path, one) for one in chosen]
+    setup = checkpoints[0].make_setup()
+    env, goals = setup.env, range(episodes)
+    rolled_out = run_episodes(checkpoints, setup, goals)
+    name = evaluation.name_with_count("gallery", episodes, GALLERY_EPISODES)
     files = video_files(path / "videos", name) | {"plots": path / "videos" / f"{name}.png"}
     # Plot the trajectories side by side.
     plots = [
         np.asarray(_trajectory_plot(checkpoint, env, each, goals))
         for checkpoint, each in zip(checkpoints, rolled_out, strict=True)
     ]
-    with writing_to(files["plots"]):
+    with runs.writing_to(files["plots"]):
         Image.fromarray(np.hstack(plots)).save(files["plots"])
     # Render the videos side by side, one goal after the other.
     headings = [f"{step:,} steps" for step in chosen]
@@ -188,7 +183,7 @@ def run_folder(run_dir: str | Path, option: str) -> Path:
       UserError: `run_dir` is not a run folder but, for example, one checkpoint.
     """
     path = Path(run_dir).absolute()
-    if find_checkpoint(path, "last") == path:
+    if runs.find_checkpoint(path, "last") == path:
         raise UserError(
             f"{option} {run_dir} is one checkpoint: give the run folder that contains it"
         )
@@ -196,26 +191,25 @@ def run_folder(run_dir: str | Path, option: str) -> Path:
 
 
 def run_episodes(
-    checkpoints: Sequence[Checkpoint], env: JetBotEnv, goals: Sequence[int]
-) -> list[Episodes]:
+    checkpoints: Sequence[runs.Checkpoint], setup: runs.Setup, goals: Sequence[int]
+) -> list[evaluation.Episodes]:
     """Run recorded episodes of several policies of one run with one compiled program.
 
     Args:
       checkpoints: The policies.
-      env: The environment of the run.
+      setup: The environment and networks of the run.
       goals: Indices of the report's fixed goals.
 
     Returns:
       The episodes of each policy, on the host.
     """
-    programs = ProgramCache(compiler_options(env.config))
-    evaluator = Evaluator(env, checkpoints[0].networks, programs, record=True)
-    keys = report_keys(max(goals) + 1)[np.asarray(goals)]
+    evaluator = evaluation.Evaluator(setup.env, setup.networks, setup.programs, record=True)
+    keys = evaluation.report_keys(max(goals) + 1)[np.asarray(goals)]
     return [jax.device_get(evaluator.run(each.params, keys)) for each in checkpoints]
 
 
 def _trajectory_plot(
-    checkpoint: Checkpoint, env: JetBotEnv, episodes: Episodes, goals: Sequence[int]
+    checkpoint: runs.Checkpoint, env: JetBotEnv, episodes: evaluation.Episodes, goals: Sequence[int]
 ) -> Image.Image:
     """Plot the trajectories from above, with the index of each goal."""
     markers = jax.vmap(env.task.markers)(episodes.goal)
@@ -224,13 +218,13 @@ def _trajectory_plot(
         f"{int(episodes.success.sum()):,} of {len(goals):,} goals reached,"
         f" policy after {checkpoint.env_steps:,} steps"
     )
-    with theme("light"):
-        figure = plot_trajectories(episodes, title, others)
+    with evaluation.theme("light"):
+        figure = evaluation.plot_trajectories(episodes, title, others)
         for number, goal_w in zip(goals, episodes.goal_w, strict=True):
             figure.axes[0].annotate(
                 str(number), goal_w[:2], ha="center", va="center", fontsize="small"
             )
-        return Image.open(io.BytesIO(to_png(figure))).convert("RGB")
+        return Image.open(io.BytesIO(evaluation.to_png(figure))).convert("RGB")
 
 
 def _write_videos(
@@ -254,7 +248,7 @@ def _write_videos(
                 yield frame
                 advance(1)
 
-    with stage("frames", total) as advance, writing_to(files["video"]):
+    with stage("frames", total) as advance, runs.writing_to(files["video"]):
         write_mp4(files["video"], frames(advance))
-    with stage("writing the gif"), writing_to(files["gif"]):
+    with stage("writing the gif"), runs.writing_to(files["gif"]):
         write_gif(files["gif"], gif_frames)

@@ -14,16 +14,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float
 
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.viewers.offscreen import (
-    add_lines,
-    goal_geoms,
-    open_renderer,
-    overview,
-    paint_reached,
-    reduce_image,
-)
+from jetbot_mjx.envs import QPOS_XYZ, JetBotEnv
+from jetbot_mjx.viewers import offscreen
 from jetbot_mjx.viewers.pose import set_pose
 from jetbot_mjx.viewers.robot_grid import WIDEST_CELL, RobotGrid
 from jetbot_mjx.viewers.video import Frame
@@ -77,7 +69,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
         model = copy.copy(env.mj_model)
         floor = model.geom_type == mujoco.mjtGeom.mjGEOM_PLANE
         model.geom_size[floor, :2] = 10 + 4 * WIDEST_CELL * math.sqrt(robots)
-        self._model, self._renderer = open_renderer(model, width, height, most)
+        self._model, self._renderer = offscreen.open_renderer(model, width, height, most)
         self._data = mujoco.MjData(self._model)
         self._size, self._trail_width = (width, height), trail_width
         model = self._model
@@ -88,7 +80,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
         volume = np.where(robot, model.geom_aabb[:, 3:].prod(axis=1), 0.0)
         is_far = mocap.copy()
         is_far[np.argsort(volume)[-_LARGEST_GEOMS:]] = True
-        self._goal_geoms = goal_geoms(model)
+        self._goal_geoms = offscreen.goal_geoms(model)
         self._length = _length(model, robot)
         # Pixels of a metre below which a geom is drawn enlarged.
         self._smallest = np.where(
@@ -145,7 +137,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
                 detailed=bool(detailed[index]),
                 reached=bool(reached[index]),
             )
-        return reduce_image(self._renderer.render())
+        return offscreen.reduce_image(self._renderer.render())
 
     def _add_robot(
         self, robot_w: Float[np.ndarray, "3"], pixels: float, *, detailed: bool, reached: bool
@@ -164,7 +156,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
         perturbation = mujoco.MjvPerturb()
         mujoco.mjv_addGeoms(self._model, self._data, option, perturbation, everything, scene)
         if reached:
-            paint_reached(scene, self._goal_geoms, first)
+            offscreen.paint_reached(scene, self._goal_geoms, first)
         for geom in (scene.geoms[index] for index in range(first, scene.ngeom)):
             if not detailed:
                 mocap_id = self._mocap_ids[geom.objid]
@@ -183,7 +175,7 @@ class GridRenderer(contextlib.AbstractContextManager["GridRenderer"]):
         points = np.full((-(-last // self._steps) + 1, 3), _TRAIL_HEIGHT)
         points[:-1, :2], points[-1, :2] = path_w[: last : self._steps], path_w[last]
         width = self._trail_width * self._renderer.height / self._size[1]
-        add_lines(self._renderer.scene, points, width, _TRAIL)
+        offscreen.add_lines(self._renderer.scene, points, width, _TRAIL)
 
     def __exit__(self, *exception: object) -> None:
         """Free the OpenGL context."""
@@ -234,7 +226,7 @@ def pull_back_camera(
     Returns:
       A free camera.
     """
-    camera = overview(grid.corners_w, fovy, sides=0.97 * aspect, above=0.97, below=0.97)
+    camera = offscreen.overview(grid.corners_w, fovy, sides=0.97 * aspect, above=0.97, below=0.97)
     share = min(max(progress, 0.0), 1.0)
     share = share * share * (3 - 2 * share)
     # The camera looks at the middle between the first robot and its goal, at first.

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Literal
 
 from jetbot_mjx.errors import UserError, requires_extra
-from jetbot_mjx.runs.checkpoint import Which, find_checkpoint
+from jetbot_mjx.runs import Which, find_checkpoint
 from jetbot_mjx.viewers import mujoco_window
 from jetbot_mjx.viewers.player import Player
 

@@ -6,15 +6,12 @@ The episodes are recorded in one batch, placed on a `RobotGrid`, and drawn by a 
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
+from jetbot_mjx import runs
 from jetbot_mjx.errors import UserError, check_count
-from jetbot_mjx.runs.checkpoint import Which, load_checkpoint
-from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, stored_success_rate
-from jetbot_mjx.runs.run_dir import make_folder, writing_to
 from jetbot_mjx.viewers.gallery import Rendered, run_episodes, run_folder, video_files
 from jetbot_mjx.viewers.grid_renderer import GridRenderer, camera_above, pull_back_camera
 from jetbot_mjx.viewers.robot_grid import RobotGrid, place_on_grid
@@ -41,7 +38,7 @@ _CLOSE = 0.15  # difference of success rates up to which the closest policy is c
 
 
 def render_many(
-    run_or_checkpoint: str | Path, *, robots: int = 1024, which: Which = "best"
+    run_or_checkpoint: str | Path, *, robots: int = 1024, which: runs.Which = "best"
 ) -> Rendered:
     """Render many robots with one policy that drive to the report's first goals in one scene.
 
@@ -61,17 +58,18 @@ def render_many(
     """
     check_count("robots", robots, MOST_ROBOTS)
     # Run the episodes.
-    checkpoint = load_checkpoint(run_or_checkpoint, which)
-    env = checkpoint.make_env()
-    grid = place_on_grid(env, run_episodes([checkpoint], env, range(robots))[0])
+    checkpoint = runs.load_checkpoint(run_or_checkpoint, which)
+    setup = checkpoint.make_setup()
+    env = setup.env
+    grid = place_on_grid(env, run_episodes([checkpoint], setup, range(robots))[0])
     folder = checkpoint.results_dir / "videos" / checkpoint.path.name
     files = video_files(folder, f"many-{robots}")
     # Render the frames, and write the animation in the largest size that fits.
     with GridRenderer(env, robots, *_SIZE) as renderer:
         frames = list(_video_frames(grid, renderer))
-    with writing_to(files["video"]):
+    with runs.writing_to(files["video"]):
         write_mp4(files["video"], frames)
-    with writing_to(files["gif"]):
+    with runs.writing_to(files["gif"]):
         for scale in _GIF_SCALES:
             write_gif(files["gif"], [resize_frame(frame, scale) for frame in frames[::GIF_STRIDE]])
             if files["gif"].stat().st_size <= MAX_GIF_BYTES:
@@ -99,13 +97,14 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
     check_count("robots", robots, MOST_ROBOTS)
     # Choose the checkpoints and run them on the same goals.
     path = run_folder(run_dir, "--strip")
-    rates = {step: stored_success_rate(path, step) for step in checkpoint_steps(path)}
+    rates = {step: runs.stored_success_rate(path, step) for step in runs.checkpoint_steps(path)}
     chosen = untrained_early_trained(rates)
-    checkpoints = [load_checkpoint(path, step) for step in chosen.values()]
-    env = checkpoints[0].make_env()
+    checkpoints = [runs.load_checkpoint(path, step) for step in chosen.values()]
+    setup = checkpoints[0].make_setup()
+    env = setup.env
     grids = [
         place_on_grid(env, each, aspect=1.0, spacing=_STRIP_SPACING)
-        for each in run_episodes(checkpoints, env, range(robots))
+        for each in run_episodes(checkpoints, setup, range(robots))
     ]
     # Render the ends from above, side by side.
     with GridRenderer(
@@ -125,9 +124,9 @@ def render_training_strip(run_dir: str | Path, *, robots: int = 16) -> Rendered:
             for (name, step), grid in zip(chosen.items(), grids, strict=True)
         ]
     folder = path / "videos"
-    make_folder(folder)
+    runs.make_folder(folder)
     png = folder / "training.png"
-    with writing_to(png):
+    with runs.writing_to(png):
         Image.fromarray(np.hstack(panels)).save(png)
     successes = {
         step: int(grid.reached.sum()) for step, grid in zip(chosen.values(), grids, strict=True)
@@ -151,7 +150,7 @@ def _with_label(frame: Frame, lines: Sequence[str]) -> Frame:
     """Write lines of white text on a dark ground into the upper left corner of a frame."""
     image = Image.fromarray(frame)
     draw = ImageDraw.Draw(image, "RGBA")
-    font: Any = ImageFont.load_default(_TEXT)
+    font: object = ImageFont.load_default(_TEXT)
     text, margin = "\n".join(lines), _TEXT / 2
     right, lower = draw.multiline_textbbox((margin, margin), text, font, spacing=_TEXT / 4)[2:]
     draw.rectangle((0, 0, right + margin, lower + margin), (10, 14, 20, 190))
@@ -164,7 +163,7 @@ def _below_heading(frame: Frame, lines: Sequence[str]) -> Frame:
     border, height = 4, round(1.5 * _TEXT) * len(lines)
     widths = ((height, border), (border, border), (0, 0))
     image = Image.fromarray(np.pad(frame, widths, constant_values=255))
-    font: Any = ImageFont.load_default(_TEXT)
+    font: object = ImageFont.load_default(_TEXT)
     ImageDraw.Draw(image).multiline_text((border, 2), "\n".join(lines), "black", font)
     return np.asarray(image)
 

@@ -5,12 +5,12 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import mujoco
-import numpy as np
 import trimesh
+
+from jetbot_mjx.envs import geom_rgba
 
 _VISIBLE_GROUPS = (0, 1, 2)  # as in MuJoCo's viewer; collision geoms are in group 3
 _ROUND = (mujoco.mjtGeom.mjGEOM_SPHERE, mujoco.mjtGeom.mjGEOM_ELLIPSOID)
-_DEFAULT_RGBA = (0.5, 0.5, 0.5, 1.0)  # MuJoCo's default colour of a geom
 
 
 class Geom(NamedTuple):
@@ -41,7 +41,7 @@ def visible_geoms(model: mujoco.MjModel, sections: int = 48) -> Iterator[Geom]:
     for index in range(model.ngeom):
         geom = model.geom(index)
         mesh = _mesh(model, index, sections)
-        rgba = _rgba(model, index)
+        rgba = geom_rgba(model, index)
         if mesh is None or geom.group[0] not in _VISIBLE_GROUPS or rgba[3] == 0:
             continue
         pose_b = trimesh.transformations.quaternion_matrix(geom.quat)
@@ -81,12 +81,3 @@ def _mesh(model: mujoco.MjModel, index: int, sections: int) -> trimesh.Trimesh |
 def _fineness(sections: int) -> int:
     """Return the subdivisions of an icosahedron with about so many faces around it."""
     return round(math.log2(sections / 6))
-
-
-def _rgba(model: mujoco.MjModel, index: int) -> tuple[float, float, float, float]:
-    """Return the colour that MuJoCo draws: that of the geom if it is set, else its material's."""
-    own, material = model.geom_rgba[index], model.geom_matid[index]
-    if material >= 0 and np.allclose(own, _DEFAULT_RGBA):
-        own = model.mat_rgba[material]
-    red, green, blue, alpha = map(float, own)
-    return red, green, blue, alpha

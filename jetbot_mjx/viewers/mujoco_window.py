@@ -7,7 +7,6 @@ import time
 import types
 import warnings
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -86,7 +85,7 @@ class Window(contextlib.AbstractContextManager["Window"]):
     def show(
         self,
         qpos: Float[np.ndarray, " nq"],
-        markers: Mapping[str, Any],
+        markers: Mapping[str, object],
         texts: tuple[str, str] | None = None,
     ) -> None:
         """Show one pose.

@@ -5,16 +5,13 @@ import copy
 import itertools
 import math
 from collections.abc import Mapping
-from typing import Any
-from unittest import mock
 
 import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
-from mujoco.rendering.classic import gl_context
 from PIL import Image
 
-from jetbot_mjx.envs.opengl import context_class
+from jetbot_mjx.envs import SceneRenderer
 from jetbot_mjx.viewers.camera import camera_axes, eye_that_sees
 from jetbot_mjx.viewers.pose import set_pose
 
@@ -55,7 +52,7 @@ class Renderer(contextlib.AbstractContextManager["Renderer"]):
     def frame(
         self,
         qpos: Float[np.ndarray, " nq"],
-        markers: Mapping[str, Any],
+        markers: Mapping[str, object],
         camera: str | mujoco.MjvCamera,
         *,
         shadows: bool = True,
@@ -130,7 +127,7 @@ def add_lines(
 
 def open_renderer(
     mj_model: mujoco.MjModel, width: int, height: int, max_geoms: int = 10_000
-) -> tuple[mujoco.MjModel, mujoco.Renderer]:
+) -> tuple[mujoco.MjModel, SceneRenderer]:
     """Open an OpenGL context for images that are rendered larger and then reduced.
 
     Args:
@@ -152,9 +149,7 @@ def open_renderer(
     model.vis.quality.shadowsize = _SHADOW_SIZE
     model.vis.global_.offwidth = width
     model.vis.global_.offheight = height
-    # MuJoCo's renderer has no other way to set a back end after import.
-    with mock.patch.object(gl_context, "GLContext", context_class(), create=True):
-        return model, mujoco.Renderer(model, height, width, max_geoms)
+    return model, SceneRenderer(model, max_geoms)
 
 
 def reduce_image(image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "height width 3"]:

@@ -15,12 +15,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.compiler.xla_options import host_cpu
-from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.envs.state import State
+from jetbot_mjx.devices import host_cpu
+from jetbot_mjx.envs import QPOS_XYZ, State
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.checkpoint import Checkpoint, Which, load_checkpoint
-from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
+from jetbot_mjx.runs import Checkpoint, Which, checkpoint_steps, load_checkpoint
 from jetbot_mjx.viewers.realtime import Clock, Rate
 from jetbot_mjx.viewers.step_fns import AGENTS, Inputs, Snapshot, make_viewer_fns, move_goal_error
 
@@ -196,7 +194,7 @@ class Player:
 
     @property
     def snapshot(self) -> Snapshot:
-        """What a viewer shows of the last step of the chosen robot, on the host."""
+        """Return what a viewer shows of the last step of the chosen robot, on the host."""
         return jax.tree.map(operator.itemgetter(self.robot), self.crowd)
 
     @property

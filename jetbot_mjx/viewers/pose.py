@@ -1,7 +1,6 @@
 """Write a pose into MuJoCo's simulation data, for all viewers."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -12,7 +11,7 @@ def set_pose(
     model: mujoco.MjModel,
     data: mujoco.MjData,
     qpos: Float[np.ndarray, " nq"],
-    markers: Mapping[str, Any],
+    markers: Mapping[str, object],
 ) -> None:
     """Set the pose of the robot and of the task's mocap bodies, and update the body frames.
 

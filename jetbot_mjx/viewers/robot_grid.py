@@ -11,9 +11,8 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_XYZ
-from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.envs import QPOS_XYZ, JetBotEnv
+from jetbot_mjx.evaluation import Episodes
 
 WIDEST_CELL = 2.5
 """Largest distance between neighbouring cells [m]."""

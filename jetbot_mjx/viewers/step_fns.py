@@ -9,16 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, UInt8, UInt32
 
-from jetbot_mjx.agents.networks import Networks, PolicyParams, make_policy
-from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.camera.wrapper import PIXELS, see, with_camera
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.state import State, robot_state
-from jetbot_mjx.envs.task import MovesGoal
-from jetbot_mjx.envs.wrappers import EpisodeWrapper
-from jetbot_mjx.evaluation.evaluator import BASELINES, policy_controller
-from jetbot_mjx.evaluation.occlusion import occlusion_map
+from jetbot_mjx import envs
+from jetbot_mjx.agents import Networks, PolicyParams, make_policy
+from jetbot_mjx.devices import compiler_options
+from jetbot_mjx.evaluation import BASELINES, occlusion_map, policy_controller
 
 _REWARD = "reward/"  # prefix of the reward's terms in a state's metrics
 
@@ -73,24 +67,28 @@ class Snapshot(NamedTuple):
     """Their sums over the episode, by name."""
 
 
+Stepped = tuple[envs.State, Snapshot]
+"""States and snapshots of all robots."""
+
+
 class ViewerFns(NamedTuple):
     """A `ViewerFns` holds compiled functions of all robots, which return states and snapshots."""
 
-    reset: Callable[[UInt32[Array, "robots 2"]], tuple[State, Snapshot]]
+    reset: Callable[[UInt32[Array, "robots 2"]], Stepped]
     """Begin an episode of each robot from its random key."""
-    restart: Callable[[State, Bool[np.ndarray, " robots"]], tuple[State, Snapshot]]
+    restart: Callable[[envs.State, Bool[np.ndarray, " robots"]], Stepped]
     """Begin the next episode of some robots, from the keys that their states carry."""
-    step: Callable[[State, Inputs], tuple[State, Snapshot]]
+    step: Callable[[envs.State, Inputs], Stepped]
     """Make one environment step, with the episode statistics of `EpisodeWrapper`."""
-    move: Callable[[State, np.int32, Float[np.ndarray, "3"]], tuple[State, Snapshot]]
+    move: Callable[[envs.State, np.int32, Float[np.ndarray, "3"]], Stepped]
     """Move one robot's goal to a position [m], world frame, and restart its time limit."""
-    see: Callable[[State, np.int32], UInt8[Array, "h w c"]]
+    see: Callable[[envs.State, np.int32], UInt8[Array, "h w c"]]
     """Return the newest image of one robot's camera."""
-    occlusion: Callable[[State, np.int32, PolicyParams], Float[Array, "h w"]]
+    occlusion: Callable[[envs.State, np.int32, PolicyParams], Float[Array, "h w"]]
     """Return the occlusion map of a policy for what one robot's camera sees."""
 
 
-def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
+def make_viewer_fns(env: envs.JetBotEnv, networks: Networks) -> ViewerFns:
     """Build the functions of a player; each one is compiled at its first use.
 
     Args:
@@ -101,68 +99,68 @@ def make_viewer_fns(env: JetBotEnv, networks: Networks) -> ViewerFns:
       The functions; `move` may only be called if `move_goal_error` returns an empty string, `see`
       and `occlusion` only if the environment has a camera.
     """
-    episodes = EpisodeWrapper(env.blind(), env.config.task.episode_length)
-    episode_env = with_camera(episodes, env.camera)
+    episodes = envs.EpisodeWrapper(env.blind(), env.config.task.episode_length)
+    episode_env = envs.with_camera(episodes, env.camera)
     controllers = [policy_controller(networks), *(make(env) for make in BASELINES.values())]
     limits = {"max_speed": env.config.task.max_speed, "max_yaw_rate": env.config.task.max_yaw_rate}
 
-    def step_one(state: State, robot: Int[Array, ""], inputs: Inputs) -> State:
+    def step_one(state: envs.State, robot: Int[Array, ""], inputs: Inputs) -> envs.State:
         key = jax.random.fold_in(jax.random.fold_in(inputs.key, inputs.count), robot)
         branches = [
             *(lambda act=act: act(inputs.params, state, key) for act in controllers),
-            lambda: kinematics.action_from_twist(jnp.asarray(inputs.twist_b), **limits),
+            lambda: envs.action_from_twist(jnp.asarray(inputs.twist_b), **limits),
         ]
         return episode_env.step(state, jax.lax.switch(inputs.agent, branches))
 
-    def reset(keys: UInt32[Array, "robots 2"]) -> tuple[State, Snapshot]:
+    def reset(keys: UInt32[Array, "robots 2"]) -> Stepped:
         states = jax.vmap(episode_env.reset)(keys)
         return states, _snapshot(env, states)
 
-    def restart(states: State, restarted: Bool[Array, " robots"]) -> tuple[State, Snapshot]:
+    def restart(states: envs.State, restarted: Bool[Array, " robots"]) -> Stepped:
         states = _where(restarted, jax.vmap(episode_env.reset)(states.key), states)
         return states, _snapshot(env, states)
 
-    def step(states: State, inputs: Inputs) -> tuple[State, Snapshot]:
+    def step(states: envs.State, inputs: Inputs) -> Stepped:
         robots = jnp.arange(len(inputs.standing))
         stepped = jax.vmap(step_one, in_axes=(0, 0, None))(states, robots, inputs)
         states = _where(jnp.asarray(inputs.standing), states, stepped)
         return states, _snapshot(env, states)
 
-    def move(
-        states: State, robot: Int[Array, ""], position_w: Float[Array, "3"]
-    ) -> tuple[State, Snapshot]:
+    def move(states: envs.State, robot: Int[Array, ""], position_w: Float[Array, "3"]) -> Stepped:
         moved = jax.vmap(lambda state: _move_goal(env, state, position_w))(states)
         states = _where(jnp.arange(len(states.done)) == robot, moved, states)
         return states, _snapshot(env, states)
 
-    def see_one(states: State, robot: Int[Array, ""]) -> UInt8[Array, "h w c"]:
+    def see_one(states: envs.State, robot: Int[Array, ""]) -> UInt8[Array, "h w c"]:
         assert env.camera is not None
-        return states.obs[PIXELS][robot, ..., -env.camera.shape[2] :]
+        return states.obs[envs.PIXELS][robot, ..., -env.camera.shape[2] :]
 
     def occlusion(
-        states: State, robot: Int[Array, ""], params: PolicyParams
+        states: envs.State, robot: Int[Array, ""], params: PolicyParams
     ) -> Float[Array, "h w"]:
         obs = jax.tree.map(lambda part: part[robot], states.obs)
         return occlusion_map(make_policy(networks, params), obs)
 
-    compiled = functools.partial(jax.jit, compiler_options=compiler_options(env.config))
+    compiled = functools.partial(
+        jax.jit, compiler_options=compiler_options(env.config.deterministic)
+    )
     return ViewerFns(*map(compiled, (reset, restart, step, move, see_one, occlusion)))
 
 
-def _move_goal(env: JetBotEnv, state: State, position_w: Float[Array, "3"]) -> State:
+def _move_goal(env: envs.JetBotEnv, state: envs.State, position_w: Float[Array, "3"]) -> envs.State:
     """Return the state of a robot whose goal is moved; its episode's time begins anew."""
-    assert isinstance(env.task, MovesGoal)
+    assert isinstance(env.task, envs.MovesGoal)
     goal = env.task.move_goal(state.goal, position_w)
-    obs = env.blind().observe(robot_state(state.pipeline_state), goal)
+    obs = env.blind().observe(envs.robot_state(state.pipeline_state), goal)
     info = {**state.info, "steps": jnp.zeros(())}
     seen, state = state.obs, state.replace(goal=goal, obs=obs, info=info, done=jnp.zeros(()))
     if env.camera is None:
         return state
     # The episode goes on, so the images before stay in the stack.
-    return see(env.camera, env.task, state, seen[PIXELS], begins=False)
+    return envs.see(env.camera, env.task, state, seen[envs.PIXELS], begins=False)
 
 
-def _snapshot(env: JetBotEnv, states: State) -> Snapshot:
+def _snapshot(env: envs.JetBotEnv, states: envs.State) -> Snapshot:
     """Return the snapshot of all robots."""
 
     def terms(metrics: Mapping[str, Any]) -> dict[str, Any]:
@@ -183,7 +181,7 @@ def _snapshot(env: JetBotEnv, states: State) -> Snapshot:
     )
 
 
-def _where(robots: Bool[Array, " robots"], chosen: State, others: State) -> State:
+def _where(robots: Bool[Array, " robots"], chosen: envs.State, others: envs.State) -> envs.State:
     """Return the states `chosen` of some robots, and the states `others` of all others."""
 
     def select(one: Array, other: Array) -> Array:
@@ -192,7 +190,7 @@ def _where(robots: Bool[Array, " robots"], chosen: State, others: State) -> Stat
     return jax.tree.map(select, chosen, others)
 
 
-def move_goal_error(env: JetBotEnv, state: State) -> str:
+def move_goal_error(env: envs.JetBotEnv, state: envs.State) -> str:
     """Check whether the goals of a task can be moved, without moving one.
 
     Args:
@@ -203,7 +201,7 @@ def move_goal_error(env: JetBotEnv, state: State) -> str:
       The reason why goals cannot be moved, in one line; empty if they can.
     """
     stays = f"the goal stays where it was drawn: {env.config.task.name}"
-    if not isinstance(env.task, MovesGoal):
+    if not isinstance(env.task, envs.MovesGoal):
         return f"{stays} has no move_goal"
     try:
         moved = jax.eval_shape(env.task.move_goal, state.goal, jnp.zeros(3))
@@ -215,6 +213,6 @@ def move_goal_error(env: JetBotEnv, state: State) -> str:
     return ""
 
 
-def _shapes(tree: Any) -> Any:
+def _shapes(tree: object) -> object:
     leaves, structure = jax.tree.flatten(tree)
     return structure, [(leaf.shape, leaf.dtype) for leaf in leaves]

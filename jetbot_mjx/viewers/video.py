@@ -19,13 +19,10 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont, ImageOps
 
-from jetbot_mjx.agents.networks import Networks, PolicyParams
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
-from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
-from jetbot_mjx.evaluation.rollout import Episodes
-from jetbot_mjx.runs.run_dir import write_bytes
+from jetbot_mjx.agents import PolicyParams
+from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ, JetBotEnv
+from jetbot_mjx.evaluation import Episodes, Evaluator, report_keys
+from jetbot_mjx.runs import Setup, write_bytes
 from jetbot_mjx.viewers.offscreen import Renderer, overview
 from jetbot_mjx.viewers.policy_view import resize_nearest
 
@@ -189,13 +186,8 @@ class VideoRenderer(contextlib.ExitStack):
             yield np.hstack([draw(step) for draw, step in zip(draws, steps, strict=True)])
 
     def _episode_frame(self, trajectory: Trajectory, step: int) -> Frame:
-        chase = self._view.frame(
-            trajectory.qpos[step],
-            trajectory.markers,
-            "chase",
-            reached=trajectory.reached_at(step),
-        )
-        top = self._frame_with_trail(trajectory, step, "top")
+        chase = self._view_frame(trajectory, step, "chase", trail=False)
+        top = self._view_frame(trajectory, step, "top")
         inset = self._inset_image(trajectory, step, _SEEN)
         # In the lower corner the inset hides a goal only while the robot drives away from it.
         sees = self._policy_image is not None
@@ -208,22 +200,28 @@ class VideoRenderer(contextlib.ExitStack):
         longest = max(trajectory.steps * trajectory.dt for trajectory in trajectories)
         return math.ceil(longest * self._fps) + round(_HOLD_SECONDS * self._fps) + 1
 
-    def _frame_with_trail(
-        self, trajectory: Trajectory, step: int, camera: str | mujoco.MjvCamera
+    def _view_frame(
+        self,
+        trajectory: Trajectory,
+        step: int,
+        camera: str | mujoco.MjvCamera,
+        *,
+        trail: bool = True,
     ) -> Frame:
+        """Render one state with a trail, or else with shadows."""
         return self._view.frame(
             trajectory.qpos[step],
             trajectory.markers,
             camera,
-            shadows=False,
+            shadows=not trail,
             reached=trajectory.reached_at(step),
-            trail_w=trajectory.trail_w(step),
+            trail_w=trajectory.trail_w(step) if trail else None,
         )
 
     def _episode_view(
         self, heading: str, trajectory: Trajectory, step: int, camera: mujoco.MjvCamera
     ) -> Frame:
-        view = self._frame_with_trail(trajectory, step, camera)
+        view = self._view_frame(trajectory, step, camera)
         # A white line between neighbouring views.
         view = np.pad(view[:, :-1], ((0, 0), (0, 1), (0, 0)), constant_values=255)
         inset = self._inset_image(trajectory, step, _SEEN_OF_MANY)
@@ -314,16 +312,14 @@ class EvaluationVideo:
 
     _SIDE, _FPS = 256, FPS / GIF_STRIDE  # small, so that training waits only briefly
 
-    def __init__(self, env: JetBotEnv, networks: Networks, programs: ProgramCache) -> None:
+    def __init__(self, setup: Setup) -> None:
         """Prepare the program, which compiles at its first use.
 
         Args:
-          env: one environment, unwrapped.
-          networks: the networks of the policies.
-          programs: the cache of compiled programs of the environment's configuration.
+          setup: the environment, networks and programs of the training.
         """
-        self._env = env
-        self._evaluator = Evaluator(env, networks, programs, record=True)
+        self._env = setup.env
+        self._evaluator = Evaluator(setup.env, setup.networks, setup.programs, record=True)
 
     def write(self, path: Path, params: PolicyParams, env_steps: int) -> None:
         """Run the episodes and write their video, and a GIF of the same name.

@@ -6,7 +6,7 @@ import numpy as np
 import viser
 from jaxtyping import UInt8
 
-from jetbot_mjx.evaluation.occlusion import overlay_heat
+from jetbot_mjx.evaluation import overlay_heat
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.policy_view import resize_nearest
 from jetbot_mjx.viewers.realtime import Clock

@@ -19,7 +19,7 @@ from trimesh.exchange import gltf
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ
+from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ
 from jetbot_mjx.viewers.meshes import Geom, visible_geoms
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.pose import set_pose
@@ -175,9 +175,9 @@ class Scene:
 
     def point(
         self,
-        origin: Any,
-        direction: Any,
-        grabbed: Any = (0.0, 0.0, 0.0),
+        origin: object,
+        direction: object,
+        grabbed: object = (0.0, 0.0, 0.0),
         robot: int | None = None,
     ) -> None:
         """Move a goal to where a ray meets a horizontal plane, if that is on the floor.
@@ -288,7 +288,7 @@ class Scene:
         self.point(eye, np.subtract(event.end_position, eye), self._grabbed_w, robot)
 
 
-def _page_rgb(rgb: Any) -> UInt8[np.ndarray, "3"]:
+def _page_rgb(rgb: object) -> UInt8[np.ndarray, "3"]:
     """Convert a colour in [0, 255] from sRGB to linear light, which pages expect in arrays."""
     share = np.asarray(rgb) / 255
     linear = np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)

@@ -87,7 +87,7 @@ class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
             self.close()
             raise UserError(f"--port {port} has just been taken by another program: try again")
         self._player = player
-        self._requests: queue.SimpleQueue[Callable[[], Any]] = queue.SimpleQueue()
+        self._requests: queue.SimpleQueue[Callable[[], object]] = queue.SimpleQueue()
         self.scene = Scene(self.server, player, self._ask)
         self.panel = ControlPanel(self.server, player, self.scene, self._ask)
         self._scene_clock = Clock(1 / FPS, time.monotonic())
@@ -120,7 +120,7 @@ class ViserViewer(contextlib.AbstractContextManager["ViserViewer"]):
         """Stop the server."""
         self.close()
 
-    def _ask(self, function: Callable[..., Any], *arguments: Any) -> None:
+    def _ask(self, function: Callable[..., object], *arguments: object) -> None:
         """Queue a call for the player's thread."""
         self._requests.put(lambda: function(*arguments))
 
@@ -145,7 +145,12 @@ class _OriginCheck:
 
     @contextlib.contextmanager
     def install(self) -> Iterator[None]:
-        """Add the check to a server that viser starts inside; viser has no option for this."""
+        """Add the check to a server that viser starts inside.
+
+        viser 1.1 takes neither origins nor a function that checks requests for its websocket
+        server, although `websockets.asyncio.server.serve` does. So its call is replaced while it
+        starts, and `installed` says whether that has worked.
+        """
         serve = websockets.asyncio.server.serve
 
         def serve_with_check(*arguments: Any, process_request: Any, **options: Any) -> Any:
@@ -232,6 +237,12 @@ def free_port(host: str, port: int | None) -> int:
     raise UserError(f"{which} {reason} at --host {host}: choose another port")
 
 
-def _quiet() -> contextlib.AbstractContextManager[Any]:
-    """Suppress the messages that viser prints when it starts and stops."""
-    return mock.patch.object(rich.get_console(), "quiet", True)
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """Suppress the messages that viser prints to rich's console when it starts and stops."""
+    console = rich.get_console()
+    before, console.quiet = console.quiet, True
+    try:
+        yield
+    finally:
+        console.quiet = before

@@ -2,30 +2,39 @@
 
 import contextlib
 import functools
-import json
 import os
 import subprocess
 import sys
 from pathlib import Path
 
-import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
-from brax.training.acme import running_statistics, specs
 from brax.training.agents.ppo import losses
-from brax.training.types import Transition
-from command_modules import evaluate
-from gliding import Gliding
 
-from jetbot_mjx.agents.ppo import LOSSES, PPO, make_optimizer
+from helpers import gliding
+from helpers.command_modules import evaluate
+from helpers.gliding import Gliding
+from helpers.small_ppo import (
+    SIZE,
+    TINY,
+    beginning,
+    furthest,
+    lines,
+    made_up,
+    with_ppo,
+)
+from jetbot_mjx.agents import loss
+from jetbot_mjx.agents.ppo import PPO
+from jetbot_mjx.agents.train_state import LOSSES
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.task import EGOCENTRIC, LAYOUTS, Field, GoalTask
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.checkpoint_store import flatten
 from jetbot_mjx.runs.nan_dump import load_nan_dump
@@ -34,7 +43,6 @@ from jetbot_mjx.training.ppo_trainer import build_ppo
 from jetbot_mjx.training.run_recorder import RunRecorder
 
 STEPS = 4
-SIZE = 4096  # environment steps in one training step of configs/smoke.yaml
 
 
 @pytest.fixture(scope="module")
@@ -62,16 +70,9 @@ def glide():
         yield
 
 
-def with_ppo(config, **changes):
-    top = {name: changes.pop(name) for name in list(changes) if name in type(config).model_fields}
-    values = config.model_dump(mode="json") | top
-    values["ppo"] |= changes
-    return parse_config(values)
-
-
 def on_one_device(config, env):
     """`PPO` that needs no mesh of devices."""
-    networks = build_ppo(config, env).networks
+    networks = build_ppo(Setup(config, env=env)).networks
     return PPO(config.ppo, wrap_for_training(env, config.task.episode_length), networks)
 
 
@@ -106,12 +107,6 @@ def assert_same_bits(one, other):
     assert one.keys() == other.keys()
     for name, leaf in one.items():
         np.testing.assert_array_equal(leaf, other[name], err_msg=name)
-
-
-def furthest(one, other):
-    """The largest difference between two trees."""
-    differences = jax.tree.map(lambda a, b: np.max(np.abs(np.asarray(a) - b)), one, other)
-    return max(jax.tree.leaves(differences))
 
 
 # Stock Brax and this package's step, side by side.
@@ -174,7 +169,7 @@ def side_by_side(request, smoke, ours):
     reports = Reports()
     config = smoke.model_copy(update={"checkpoint_interval": SIZE, "ppo": ppo})
     with jax.default_matmul_precision("highest"):
-        brax_trainer.train(config, env, reports)
+        brax_trainer.train(Setup(config, env=env), reports)
     state, keys = one.init(jax.random.PRNGKey(smoke.seed)), epoch_keys(smoke.seed)
     states = [state]
     for _ in range(STEPS):
@@ -236,7 +231,7 @@ def test_the_keys_go_on_as_within_an_epoch_of_brax(smoke, ours):
     reports = Reports()
     config = smoke.model_copy(update={"checkpoint_interval": STEPS * SIZE, "ppo": ppo})
     with jax.default_matmul_precision("highest"):
-        brax_trainer.train(config, env, reports)
+        brax_trainer.train(Setup(config, env=env), reports)
     state, _ = one.advance(one.init(jax.random.PRNGKey(smoke.seed)), STEPS)
     assert furthest(state.policy_params[1:], reports.all[-1].params[1:]) < 5e-3
     assert int(jax.device_get(state.normalizer.count).to_numpy()) == STEPS * SIZE
@@ -316,16 +311,6 @@ def test_a_unit_without_a_scale_is_refused_before_anything_is_written(smoke, mon
 
 # Gradients that are not finite.
 
-TINY = {
-    "num_envs": 8,
-    "unroll_length": 4,
-    "batch_size": 8,
-    "num_minibatches": 4,
-    "num_updates_per_batch": 1,
-    "network": {"policy_hidden_layer_sizes": [8], "value_hidden_layer_sizes": [8]},
-}
-OBS, ACTIONS = 7, 2
-
 
 @functools.cache
 def tiny(schedule="NONE", passes=1):
@@ -342,43 +327,6 @@ def tiny(schedule="NONE", passes=1):
     return jitted.ppo, update
 
 
-def beginning(ppo):
-    policy_key, value_key = jax.random.split(jax.random.PRNGKey(0))
-    params = losses.PPONetworkParams(
-        policy=ppo.networks.policy_network.init(policy_key),
-        value=ppo.networks.value_network.init(value_key),
-    )
-    normalizer = running_statistics.init_state(specs.Array((OBS,), jnp.dtype("float32")))
-    return params, make_optimizer(ppo.config).init(params), normalizer
-
-
-def made_up(ppo, spoiled=()):
-    """Data of one collection; the rewards of the spoiled unrolls are not numbers."""
-    unrolls = ppo.config.batch_size * ppo.config.num_minibatches
-    shape = (unrolls, ppo.config.unroll_length)
-    rng = np.random.default_rng(0)
-
-    def draw(*size):
-        return jnp.asarray(rng.normal(size=size), jnp.float32)
-
-    reward = draw(*shape)
-    return Transition(
-        observation=draw(*shape, OBS),
-        action=jnp.tanh(draw(*shape, ACTIONS)),
-        reward=reward.at[jnp.array(spoiled, int)].set(jnp.nan) if spoiled else reward,
-        discount=jnp.ones(shape),
-        next_observation=draw(unrolls, 1, OBS),
-        extras={
-            "policy_extras": {
-                "log_prob": draw(*shape),
-                "raw_action": draw(*shape, ACTIONS),
-                "distribution_params": draw(*shape, 2 * ACTIONS),
-            },
-            "state_extras": {"truncation": jnp.zeros(shape)},
-        },
-    )
-
-
 def by_hand(ppo, params, normalizer, data, key):
     """One pass, written out: plain Adam, and minibatches with a bad reward left out."""
     config = ppo.config
@@ -386,7 +334,7 @@ def by_hand(ppo, params, normalizer, data, key):
     moments = adam.init(params)
     _, shuffle_key, key = jax.random.split(key, 3)
     order = jax.random.permutation(shuffle_key, config.batch_size * config.num_minibatches)
-    loss = functools.partial(
+    brax_loss = functools.partial(
         losses.compute_ppo_loss,
         ppo_network=ppo.networks,
         entropy_cost=config.entropy_cost,
@@ -396,7 +344,7 @@ def by_hand(ppo, params, normalizer, data, key):
         clipping_epsilon=config.clipping_epsilon,
         vf_coefficient=config.vf_loss_coefficient,
     )
-    differentiate = jax.jit(jax.grad(loss, has_aux=True))
+    differentiate = jax.jit(jax.grad(brax_loss, has_aux=True))
     seen, skipped = [], 0
     for chosen in order.reshape(config.num_minibatches, -1):
         key, loss_key = jax.random.split(key)
@@ -585,20 +533,16 @@ class Doomed(GoalTask):
         return jnp.where(doomed & off, jnp.nan, reward), terms
 
 
-def lines(run_dir):
-    return [json.loads(line) for line in (run_dir / "metrics.jsonl").read_text().splitlines()]
-
-
 def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, monkeypatch):
     config = with_ppo(smoke, num_timesteps=131_072, checkpoint_interval=32_768)
-    sound = losses.compute_ppo_loss
+    sound = loss.ppo_loss
 
     def now_and_then(params, normalizer, data, key, **settings):
-        loss, metrics = sound(params, normalizer, data, key, **settings)
+        value, metrics = sound(params, normalizer, data, key, **settings)
         bad = jax.random.bernoulli(jax.random.fold_in(key, 1), BAD_UPDATES)
-        return loss * jnp.where(bad, jnp.nan, 1.0), metrics
+        return value * jnp.where(bad, jnp.nan, 1.0), metrics
 
-    monkeypatch.setattr(losses, "compute_ppo_loss", now_and_then)
+    monkeypatch.setattr(loss, "ppo_loss", now_and_then)
     task = smoke.task.model_copy(update={"name": f"{__name__}:Doomed"})
     spoiled = session.run(config.model_copy(update={"task": task}), tmp_path / "spoiled")
 
@@ -617,7 +561,7 @@ def test_training_bears_blown_worlds_and_bad_gradients(smoke, glide, tmp_path, m
     assert stored.config.task.name == task.name
     found = replayed(Gliding(stored.config), stored.config, stored.nan_dump)
     assert found.index(1.0) == int(stored.nan_dump.step)
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1] / "helpers"), prepend=os.pathsep)
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parents[1]), prepend=os.pathsep)
     again = subprocess.run(
         [sys.executable, *gliding.program("replay"), str(files[0])],
         capture_output=True,

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from brax.envs import Wrapper
 
-from jetbot_mjx.compiler import llvm_backend
-from jetbot_mjx.compiler.packed import pack
-from jetbot_mjx.compiler.update import launch
-from jetbot_mjx.compiler.update.cpu_unroll import Unroll
+from jetbot_mjx.agents.fused import launch
+from jetbot_mjx.agents.fused.cpu_unroll import Unroll
 from jetbot_mjx.config import load_config
-from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.packed import pack
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import build_ppo
+from onekernel import cpu
 
 pytestmark = pytest.mark.cpu
 
@@ -25,7 +25,7 @@ def built(root, name="jetbot", *overrides, envs=40):
     sizes += [f"ppo.unroll_length={LENGTH}", "task.episode_length=7"]
     hidden = [f"ppo.network.{x}_hidden_layer_sizes=[32, 32]" for x in ("policy", "value")]
     settings = load_config(root / "configs" / f"{name}.yaml", [*sizes, *hidden, *overrides])
-    return build_ppo(settings, make_env(settings))
+    return build_ppo(Setup(settings))
 
 
 def collected(ppo, monkeypatch, states, keys, *, at_once):
@@ -93,20 +93,19 @@ def test_an_unroll_is_its_steps_one_by_one(root, monkeypatch, case):
 def test_where_a_step_is_no_kernel_actions_and_steps_take_turns(root):
     ppo = built(root)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
-    assert ppo._env.packed_kernel(state.env_state) is not None
+    assert ppo._env.step_packed.kernel(state.env_state) is not None
     with jax.disable_jit():
-        assert ppo._env.packed_kernel(state.env_state) is None
+        assert ppo._env.step_packed.kernel(state.env_state) is None
     many = built(root, "jetbot", "physics.impl=xla")
-    assert many.is_fused
-    assert many._env.packed_kernel(state.env_state) is None
+    assert many.learner.name == "fused"
+    assert many._env.step_packed.kernel(state.env_state) is None
     assert "ppo_actions" in str(jax.make_jaxpr(many.collect)(state, jax.random.PRNGKey(0)))
 
 
 def test_an_observation_of_other_numbers_is_not_read_as_floats(root, monkeypatch):
     ppo = built(root)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
-    given = state.params, state.normalizer, lambda state: state.obs
-    assert ppo._fused.unroll(ppo._env, state.env_state, *given)
+    assert ppo.learner.unroll_spec(ppo._env, state.env_state) is not None
     env = ppo._env.env.env
     step = env.step
 
@@ -118,8 +117,8 @@ def test_an_observation_of_other_numbers_is_not_read_as_floats(root, monkeypatch
     packed = jax.eval_shape(
         lambda x: pack(in_whole_numbers(x.unpack()), batch_axes=1), state.env_state
     )
-    assert ppo._env.packed_kernel(packed) is not None
-    assert ppo._fused.unroll(ppo._env, packed, *given) is None
+    assert ppo._env.step_packed.kernel(packed) is not None
+    assert ppo.learner.unroll_spec(ppo._env, packed) is None
 
 
 @pytest.mark.parametrize("change", ["dtype", "size"])
@@ -137,7 +136,7 @@ def test_a_state_that_a_step_lays_out_differently_is_refused(root, monkeypatch, 
     monkeypatch.setattr(env, "step", changed)
     ppo._env.env.__init__(env)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
-    assert ppo._env.packed_kernel(state.env_state) is None
+    assert ppo._env.step_packed.kernel(state.env_state) is None
     with pytest.raises(TypeError, match="carry"):
         jax.eval_shape(ppo.collect, state, jax.random.PRNGKey(0))
 
@@ -158,11 +157,11 @@ def test_a_wrapper_with_a_step_of_its_own_is_stepped(root, monkeypatch):
 
 def test_asking_for_the_kernel_compiles_nothing(root, monkeypatch):
     begun = []
-    monkeypatch.setattr(llvm_backend, "prepare", begun.append)
+    monkeypatch.setattr(cpu, "prepare", begun.append)
     ppo = built(root)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
     before = len(begun)
-    assert ppo._env.packed_kernel(state.env_state) is not None
+    assert ppo._env.step_packed.kernel(state.env_state) is not None
     assert len(begun) == before
 
 
@@ -170,8 +169,8 @@ def test_asking_for_the_kernel_compiles_nothing(root, monkeypatch):
 def test_an_unroll_of_other_shapes_is_refused(root, wrong):
     ppo = built(root)
     state = jax.eval_shape(lambda: ppo.packed(ppo.init(jax.random.PRNGKey(0))))
-    shape, words = ppo._fused._shape, state.env_state.words.shape
-    spec = Unroll(shape, ppo._env.packed_kernel(state.env_state), 0, (3, 4, 1))
+    shape, words = ppo.learner.shape, state.env_state.words.shape
+    spec = Unroll(shape, ppo._env.step_packed.kernel(state.env_state), 0, (3, 4, 1))
     sizes = [(shape.size,), (16,), (16,), words, (LENGTH, words[0], 2)]
     arrays = [jax.ShapeDtypeStruct(size, np.float32) for size in sizes]
     jax.eval_shape(lambda *x: launch.unroll(spec, *x), *arrays)

@@ -162,7 +162,7 @@ def as_brax(params):
 
 
 def gradients_of(ppo, params, batch, normalizer):
-    loss = jax.value_and_grad(ppo._loss, has_aux=True)
+    loss = jax.value_and_grad(ppo.learner.loss, has_aux=True)
     return jax.jit(loss)(params, normalizer, batch, jax.random.PRNGKey(9))
 
 
@@ -229,8 +229,8 @@ def test_the_loss_of_separate_encoders_is_that_of_brax_s_networks(separate):
     )
     # float32: sums of thousands of products in another order.
     assert float(loss) == pytest.approx(float(wanted), rel=1e-5)
-    for name, value in their_metrics.items():
-        assert float(metrics[name]) == pytest.approx(float(value), rel=1e-4, abs=1e-6), name
+    for name, value in metrics.items():
+        assert float(value) == pytest.approx(float(their_metrics[name]), rel=1e-4, abs=1e-6), name
     assert_close(as_brax(gradient.policy), their_gradient.policy)
     assert_close(as_brax(gradient.value), their_gradient.value)
 
@@ -299,7 +299,7 @@ def test_pixels_stay_bytes_until_the_encoder(monkeypatch):
         return original(self, pixels)
 
     monkeypatch.setattr(Encoder, "__call__", call)
-    jax.eval_shape(ppo._loss, params, init_normalizer(MIXED), batch, jax.random.PRNGKey(0))
+    jax.eval_shape(ppo.learner.loss, params, init_normalizer(MIXED), batch, jax.random.PRNGKey(0))
     # Once for policy and value function, with the last next observation.
     assert given == [((UNROLLS, TIME + 1, *MIXED[PIXELS]), jnp.uint8)]
 

@@ -1,4 +1,4 @@
-"""Further mistakes that must cost one line: found by probing, each once a traceback or worse."""
+"""Mistakes of users that were once tracebacks: each is one line now."""
 
 import os
 import re
@@ -10,16 +10,15 @@ from pathlib import Path
 
 import jax
 import pytest
-from command_modules import evaluate, render, train
-from test_cli import COMMANDS, SMOKE, damage_about, damaged, here, refused, trained
-from test_config import refusal, write
-from test_metrics import read_events
 
-from jetbot_mjx import cli
-from jetbot_mjx.compiler import program_cache
+from helpers.command_modules import COMMANDS, SMOKE, evaluate, render
+from helpers.damage import damage_about
+from helpers.tensorboard_files import read_events
+from jetbot_mjx import cli, devices
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.metrics import TensorBoardSink
 from jetbot_mjx.runs.run_dir import stored_config
 from jetbot_mjx.training import ppo_trainer
@@ -152,12 +151,12 @@ def test_a_checkpoint_of_more_digits_than_python_reads_is_refused(refused):
 
 def test_a_seed_of_32_bits_trains(root):
     config = load_config(root / "configs" / "smoke.yaml", ["seed=3000000000", "seeds=2"])
-    seeds = ppo_trainer.CompiledTrainer.from_config(config, make_env(config))._seeds
+    seeds = ppo_trainer.CompiledTrainer.from_setup(Setup(config))._seeds
     keys = [jax.random.PRNGKey(seed) for seed in (3_000_000_000, 3_000_000_001)]
     assert jax.vmap(jax.random.PRNGKey)(seeds).tolist() == [key.tolist() for key in keys]
 
 
-def test_a_terminal_without_letters_is_told_all_the_same(tmp_path):
+def test_a_terminal_without_utf8_gets_plain_characters(tmp_path):
     done = subprocess.run(
         [
             sys.executable,
@@ -257,7 +256,7 @@ def test_a_forbidden_path_costs_one_line(monkeypatch, method, use):
 
     monkeypatch.setattr(Path, method, deny)
     # Denied its folder, JAX would do without one in all later tests.
-    monkeypatch.setattr(program_cache, "use_compilation_cache", lambda: None)
+    monkeypatch.setattr(devices, "use_compilation_cache", lambda: None)
     with pytest.raises(UserError, match="Permission denied"):
         use()
 

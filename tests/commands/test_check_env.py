@@ -1,40 +1,39 @@
-"""The command: what it prints, its exit codes, and what it says of a user's mistake."""
+"""The command `check_env`: its output, its exit codes and its answers to mistakes."""
 
-import gliding
 import pytest
 
-from jetbot_mjx import check_env
-from jetbot_mjx.envs.checks import runner
+from helpers import gliding
+from jetbot_mjx import check_env, envs
 from jetbot_mjx.errors import UserError
 
 
 def test_a_sound_task_is_clean(capsys):
     with gliding.everywhere():
-        assert check_env.main(["broken_tasks:Sound"]) == 0
+        assert check_env.main(["helpers.broken_tasks:Sound"]) == 0
     printed = capsys.readouterr().out
     assert printed.count("ok ") == 11
-    assert printed.splitlines()[-1] == "broken_tasks:Sound: no errors"
+    assert printed.splitlines()[-1] == "helpers.broken_tasks:Sound: no errors"
 
 
-def test_a_fault_is_told_in_one_line_and_in_the_exit_code(capsys):
-    assert check_env.main(["broken_tasks:Raises"]) == 1
+def test_a_finding_is_one_line_and_gives_exit_code_1(capsys):
+    assert check_env.main(["helpers.broken_tasks:Raises"]) == 1
     lines = capsys.readouterr().out.splitlines()
     assert lines[1].startswith("wrong  purity")
     assert lines[2].startswith("       - observe raises KeyError: 'lidar' (broken_tasks.py:")
     assert lines[3].startswith("not checked until that is corrected: types, draws")
-    assert lines[4] == "broken_tasks:Raises: 1 error"
+    assert lines[4] == "helpers.broken_tasks:Raises: 1 error"
 
 
 def test_a_built_in_task_goes_by_its_class(capsys, monkeypatch):
     asked = []
-    monkeypatch.setattr(runner, "check_task", lambda config: asked.append(config.task) or iter(()))
+    monkeypatch.setattr(envs, "check_task", lambda config: asked.append(config.task) or iter(()))
     check_env.main(["GoalTask", "--set", "task.observation=egocentric"])
     assert (asked[0].name, asked[0].observation) == ("jetbot_mjx:GoalTask", "egocentric")
 
 
 def test_a_configuration_names_its_task(root, monkeypatch):
     asked = []
-    monkeypatch.setattr(runner, "check_task", lambda config: asked.append(config.task) or iter(()))
+    monkeypatch.setattr(envs, "check_task", lambda config: asked.append(config.task) or iter(()))
     check_env.main(["--config", str(root / "examples" / "gates.yaml")])
     assert (asked[0].name, asked[0].episode_length) == ("gates_task:GatesTask", 360)
 
@@ -43,10 +42,10 @@ def test_a_configuration_names_its_task(root, monkeypatch):
     ("arguments", "told"),
     [
         (["nowhere.at_all:Task"], "there is no nowhere/at_all.py beside"),
-        (["broken_tasks:Nobody"], "broken_tasks has no 'Nobody'"),
+        (["helpers.broken_tasks:Nobody"], "helpers.broken_tasks has no 'Nobody'"),
         (["Nobody"], "jetbot_mjx has no 'Nobody'"),
         (["GoalTask", "--set", "task.optoins.a=1"], "optoins"),
-        (["broken_tasks:Drawn"], "is not a task: it lacks sample"),
+        (["helpers.broken_tasks:Drawn"], "is not a task: it lacks sample"),
     ],
 )
 def test_a_users_mistake_is_one_line(arguments, told):

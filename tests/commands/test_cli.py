@@ -1,7 +1,5 @@
 """The command line: a user's mistake costs one line and exit code 2, and leaves nothing behind."""
 
-import json
-import os
 import re
 import shutil
 import subprocess
@@ -9,66 +7,20 @@ import sys
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 import pytest
-from brax.training.acme import running_statistics, specs
-from command_modules import evaluate, render, train
-from test_report import make_episodes, make_report
 
-from jetbot_mjx import cli, plan, replay
-from jetbot_mjx.agents.networks import PolicyParams, make_networks
-from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs.task import WORLD, layout_data
+from helpers.command_modules import COMMANDS, SMOKE, evaluate, render, train
+from helpers.damage import damage_about
+from helpers.reports import make_episodes, make_report
+from jetbot_mjx import cli, evaluation, training
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation import evaluate_runs
-from jetbot_mjx.runs import checkpoint_store, nan_dump
-from jetbot_mjx.runs.checkpoint import FORMAT
-from jetbot_mjx.training import session
 
 FILE_OR_NAME = (
     "give a file, or one of camera_gpu, camera_real, gpu, isaac_sb3, jetbot, jetbot_camera,"
     " jetbot_egocentric, real_jetbot, smoke, gates, obstacle, pillars"
 )
-SMOKE = str(Path(__file__).parents[2] / "configs" / "smoke.yaml")
-COMMANDS = {
-    "plan": plan,
-    "train": train,
-    "evaluate": evaluate,
-    "render": render,
-    "replay": replay,
-}
-
-
-@pytest.fixture
-def here(tmp_path, monkeypatch):
-    """An empty folder to stand in; what a command leaves behind is left here."""
-    folder = tmp_path / "here"
-    folder.mkdir()
-    monkeypatch.chdir(folder)
-    return folder
-
-
-@pytest.fixture
-def refused(here, capfd):
-    """Gives a command arguments that it must refuse; returns the one line that it says."""
-
-    def refused(command, *arguments):
-        before = sorted(here.rglob("*"))
-        with pytest.raises(SystemExit) as caught:
-            cli.run_command(lambda _: command.main([str(argument) for argument in arguments]))
-        out, err = capfd.readouterr()
-        assert caught.value.code == 2
-        assert out == ""
-        assert err.endswith("\n")
-        # Work that ended before the error is told with its seconds.
-        err = re.sub(r"^ *\d+\.\d s  .*\n", "", err, flags=re.MULTILINE)
-        assert len(err.splitlines()) == 1
-        assert sorted(here.rglob("*")) == before
-        return err
-
-    return refused
 
 
 @pytest.mark.parametrize(
@@ -144,6 +96,7 @@ def test_train_refuses_a_path_without_a_file(refused, path, said):
         ("checkpoints_to_keep=0", "checkpoints_to_keep = 0 is wrong"),
         ("preemption_notice=1", "preemption_notice = 1 is wrong: it should be greater than or eq"),
         ("stop_at_success=99", "stop_at_success = 99 is wrong: it should be less than or equal"),
+        ("wandb=true", "wandb: True is not a project name: write one, such as jetbot"),
         ("seeds=0", "seeds = 0 is wrong: it should be greater than or equal to 1"),
         ("trainer=stock", "trainer = 'stock' is wrong: it should be 'resumable' or 'brax'"),
         ("ppo.learning_rate_schedule=COSINE", "it should be 'NONE', 'LINEAR' or 'ADAPTIVE_KL'"),
@@ -181,7 +134,7 @@ def test_train_refuses_what_the_stock_trainer_cannot_do(refused, setting, said):
 
 
 @pytest.mark.parametrize("run", ["nothing", "empty"])
-def test_train_refuses_to_resume_where_there_is_no_run(refused, here, run):
+def test_train_refuses_to_resume_without_a_run(refused, here, run):
     (here / "empty").mkdir()
     remedy = "give a run folder"
     line = refused(train, "--resume", run)
@@ -219,42 +172,6 @@ def test_train_refuses_a_run_folder_that_cannot_be_written(refused, here, run_di
 # evaluate and render find their policy in the same way.
 
 
-@pytest.fixture(scope="module")
-def trained(tmp_path_factory):
-    """A run folder with two checkpoints, untrained."""
-    network = {"policy_hidden_layer_sizes": [4], "value_hidden_layer_sizes": [4]}
-    config = parse_config({"ppo": {"network": network}})
-    networks = make_networks(config.ppo, 16, 2)
-    key = jax.random.PRNGKey(0)
-    params = PolicyParams(
-        running_statistics.init_state(specs.Array((16,), np.dtype("float32"))),
-        networks.policy_network.init(key),
-        networks.value_network.init(key),
-    )
-    about = {
-        "format": FORMAT,
-        "config": config.model_dump(mode="json"),
-        "layout": layout_data(WORLD),
-        "observation_size": 16,
-        "action_size": 2,
-    }
-    folder = tmp_path_factory.mktemp("trained") / "run"
-    folder.mkdir()
-    params = jax.tree.map(lambda leaf: np.asarray(jnp.asarray(leaf)), params)
-    about["metrics"] = {"success_rate": 0.5}
-    with checkpoint_store.CheckpointStore(folder, keep=5) as checkpoints:
-        for env_steps in (0, 2048):
-            checkpoints.save(env_steps, {"policy": params}, about, 0.5)
-    return folder
-
-
-@pytest.fixture
-def damaged(trained, here):
-    """A copy of the run, and the folder of its last checkpoint, to be damaged."""
-    shutil.copytree(trained, here / "run")
-    return here / "run" / "checkpoints" / "000000002048"
-
-
 both = pytest.mark.parametrize("command", [evaluate, render], ids=["evaluate", "render"])
 
 
@@ -288,7 +205,7 @@ def test_a_mistaken_command_line_is_refused(refused, command, arguments, said):
         ("95%", "'95%' is not a number"),
     ],
 )
-def test_evaluate_refuses_a_success_rate_that_is_none(refused, value, said):
+def test_evaluate_refuses_an_invalid_success_rate(refused, value, said):
     line = refused(evaluate, "run", "--min-success", value)
     assert f"argument --min-success: {said}" in line
 
@@ -330,18 +247,6 @@ def test_a_foreign_checkpoint_is_refused(refused, here, command, item):
             writer.save(folder / item, {"kernel": np.ones(3)})
     line = refused(command, "run")
     assert "is not one of jetbot_mjx: about/metadata is missing or damaged" in line
-
-
-def damage_about(change):
-    def damage(checkpoint):
-        path = checkpoint / "about" / "metadata"
-        about = json.loads(path.read_text())
-        change(about)
-        del about["sha256"]["about"]
-        about["sha256"]["about"] = checkpoint_store._digest_json(about)
-        path.write_text(json.dumps(about))
-
-    return damage
 
 
 DAMAGES = {
@@ -405,7 +310,7 @@ def raising(error):
     ("error", "code", "said"),
     [(UserError("mend it"), 2, "error: mend it\n"), (KeyboardInterrupt(), 130, "interrupted\n")],
 )
-def test_what_a_user_causes_has_a_line_and_a_code(capfd, error, code, said):
+def test_an_error_of_the_user_has_one_line_and_an_exit_code(capfd, error, code, said):
     with pytest.raises(SystemExit) as caught:
         cli.run_command(raising(error))
     assert caught.value.code == code
@@ -432,7 +337,7 @@ def test_help_is_no_mistake(capfd, name):
 )
 def test_only_a_success_rate_below_the_target_gives_1(monkeypatch, capfd, arguments, code):
     report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]))
-    monkeypatch.setattr(evaluate_runs, "evaluate_run", lambda *args, **kwargs: report)
+    monkeypatch.setattr(evaluation, "evaluate_run", lambda *args, **kwargs: report)
     assert evaluate.main(["run", *arguments]) == code
     assert ("is below the 51.00% asked for" in capfd.readouterr().out) == (code == 1)
 
@@ -444,11 +349,11 @@ def asked(monkeypatch):
     def asked(*arguments):
         calls = []
 
-        def run(config, run_dir, programs):
+        def run(config, run_dir, *objects, verbose):
             calls.append((config, run_dir))
             raise UserError("no training here")
 
-        monkeypatch.setattr(session, "train", run)
+        monkeypatch.setattr(training, "run", run)
         with pytest.raises(UserError):
             train.main(arguments)
         return calls[0]
@@ -470,38 +375,6 @@ def test_train_takes_settings_in_order_and_the_seed_last(asked):
 
 def test_train_takes_seeds(asked):
     assert asked("--config", SMOKE, "--seeds", "4")[0].seeds == 4
-
-
-def test_replay_refuses_what_is_no_fault(refused, here, tmp_path):
-    assert "nothing.npz does not exist: give a file of a run's nan_dumps/" in refused(
-        replay, here / "nothing.npz"
-    )
-    for name, write in {
-        "text.npz": lambda path: path.write_text("no archive"),
-        "other.npz": lambda path: np.savez(path, a=np.ones(3)),
-        "empty.npz": lambda path: path.touch(),
-    }.items():
-        write(tmp_path / name)
-        said = refused(replay, tmp_path / name)
-        assert f"{name} is not a NaN dump of a training: give a file of a run's nan_dumps/" in said
-
-
-@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo], ids=["folder", "pipe"])
-def test_replay_refuses_what_is_no_file(refused, tmp_path, make):
-    make(tmp_path / "dump.npz")
-    assert "dump.npz is not a NaN dump of a training" in refused(replay, tmp_path / "dump.npz")
-
-
-@pytest.mark.parametrize("value", [np.zeros((10**4, 3)), np.array("x")], ids=["shape", "dtype"])
-def test_replay_refuses_arrays_of_another_kind(refused, tmp_path, value):
-    config = parse_config({})
-    arrays = nan_dump.flatten(nan_dump._template(config, None))
-    arrays = {name: np.zeros(np.shape(leaf), np.float32) for name, leaf in arrays.items()}
-    about = {"format": nan_dump._FORMAT, "config": config.model_dump(mode="json"), "env_steps": 1}
-    arrays |= {"actions": value, "about": np.array(json.dumps(about))}
-    np.savez(tmp_path / "dump.npz", **arrays)
-    line = refused(replay, tmp_path / "dump.npz")
-    assert "dump.npz does not fit its task: actions is " in line
 
 
 def test_train_names_its_run_folder_after_the_configuration(asked):

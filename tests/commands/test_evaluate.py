@@ -1,4 +1,4 @@
-"""Judging a trained run: the same files each time, and pages that say what the JSON file says."""
+"""The command `evaluate`: its files are the same each time, and its pages agree with the JSON."""
 
 import contextlib
 import io
@@ -10,11 +10,12 @@ from html.parser import HTMLParser
 import jax
 import numpy as np
 import pytest
-from command_modules import evaluate
 from PIL import Image
-from unpainted import unpainted
 
-from jetbot_mjx import cli
+from helpers import gliding
+from helpers.command_modules import evaluate
+from helpers.unpainted import unpainted
+from jetbot_mjx import cli, evaluation
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import (
     compare_runs,
@@ -95,9 +96,16 @@ def check_numbers(page, values):
     return {place for place, _, _ in numbers}
 
 
+@pytest.fixture(scope="module", autouse=True)
+def glide(smoke_run):
+    """All robots of these tests glide, after the run was trained with those that do not."""
+    with gliding.everywhere():
+        yield
+
+
 @pytest.fixture(scope="module")
 def judged(smoke_run, tmp_path_factory):
-    """A run judged twice: its report's folder, what both evaluations left, and what they said."""
+    """A run evaluated twice: its folder, the report's, and both evaluations' files and output."""
     run_dir = shutil.copytree(smoke_run, tmp_path_factory.mktemp("judged") / "run")
     texts, left = [], []
     for _ in range(2):
@@ -173,7 +181,7 @@ def test_the_markdown_shows_the_figures_beside_it(judged):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_a_sweep_is_told_with_its_numbers_and_its_figure(judged, tmp_path, monkeypatch):
+def test_a_sweep_is_reported_with_a_table_and_a_figure(judged, tmp_path, monkeypatch):
     run_dir, _, (first, _), _ = judged
 
     def run(sweeper, params):
@@ -247,7 +255,7 @@ def test_another_simulator_that_there_is_not_is_refused(judged, capfd):
 
 
 @pytest.mark.usefixtures("blank_figures")
-def test_ranges_of_a_file_are_judged_beside_the_preset(judged, tmp_path):
+def test_ranges_of_a_file_are_evaluated_beside_the_preset(judged, tmp_path):
     run_dir, _, (first, _), _ = judged
     ranges = tmp_path / "ranges.yaml"
     ranges.write_text("randomization: {motor_gain: [0.1, 0.11]}")
@@ -428,7 +436,7 @@ def test_seeds_of_one_run_are_a_comparison_without_a_pair(several, tmp_path, mon
     before = files(tmp_path)
     html_report.write_comparison(comparison)
     assert files(tmp_path) == before
-    monkeypatch.setattr(evaluate_runs, "compare_runs", lambda *args, **kwargs: comparison)
+    monkeypatch.setattr(evaluation, "compare_runs", lambda *args, **kwargs: comparison)
     mean = values["runs"][0]["success_rate"]["mean"]["value"]
     code, said = judge(run, "--min-success", mean)
     assert code == 0

@@ -5,7 +5,6 @@ import functools
 import json
 import os
 import shutil
-import subprocess
 import sys
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers.bare_python import NUMPY, alone, site_with
 from jetbot_mjx import export
 from jetbot_mjx.agents.networks import PolicyParams, init_normalizer, make_networks
 from jetbot_mjx.config import load_config, parse_config
@@ -244,30 +244,6 @@ def test_a_recording_runs_into_solid_pillars(record_example):
 # Without the package.
 
 
-def site_with(tmp_path, names):
-    """A folder in which these packages of this environment can be imported, and no others."""
-    site = tmp_path / "site"
-    site.mkdir()
-    home = Path(np.__file__).parents[1]
-    for name in names:
-        (site / name).symlink_to(home / name)
-    return site
-
-
-def alone(site, source):
-    """Runs a program with the standard library and what a site holds."""
-    program = (
-        f"import sys; sys.dont_write_bytecode = True; sys.path.append({str(site)!r})\n{source}"
-    )
-    # Neither the environment's packages nor the user's, nor this checkout.
-    return subprocess.run(
-        [sys.executable, "-I", "-S", "-c", program], capture_output=True, text=True, cwd=site
-    )
-
-
-NUMPY = [path.name for path in Path(np.__file__).parents[1].glob("numpy*")]
-
-
 def test_the_numpy_file_needs_numpy_alone(exported, tmp_path):
     site = site_with(tmp_path, NUMPY)
     path = exported / "policy.py"
@@ -460,7 +436,7 @@ def test_the_caller_stacks_images_as_the_environment_does(tmp_path):
         ((np.zeros((32, 32, 3), np.uint8), np.zeros(7)), "give image$"),
     ],
 )
-def test_what_is_no_image_is_refused(inputs, said, seeing):
+def test_an_invalid_image_is_refused(inputs, said, seeing):
     with pytest.raises(ValueError, match=said):
         FORMATS["numpy"].read(seeing / "policy.py")(*inputs)
 

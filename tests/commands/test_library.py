@@ -1,4 +1,4 @@
-"""The functions for other programs: they do what the commands do, and leave the process alone."""
+"""The functions for other programs do what the commands do, and leave the process unchanged."""
 
 import asyncio
 import inspect
@@ -13,18 +13,26 @@ import time
 import warnings
 from pathlib import Path
 
-import gliding
 import matplotlib.pyplot as plt
 import pytest
 
 import jetbot_mjx
-from jetbot_mjx import evaluate, load_config, load_policy, make_env, render, train, tune
+from helpers import gliding
+from jetbot_mjx import (
+    evaluate,
+    load_config,
+    load_policy,
+    make_env,
+    render,
+    train,
+    training,
+    tune,
+)
 from jetbot_mjx.errors import InvalidError, NotFoundError, UserError
 from jetbot_mjx.evaluation.comparison import Comparison
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
 from jetbot_mjx.evaluation.report import Report
 from jetbot_mjx.runs.checkpoint import load_checkpoint
-from jetbot_mjx.training import session
 from jetbot_mjx.training.preemption import DeferredSignals
 from jetbot_mjx.viewers import gallery
 
@@ -127,7 +135,7 @@ def test_a_configuration_object_gets_a_folder_of_its_own(tmp_path, monkeypatch):
     config = load_config("smoke", {"seed": 3})
     folders = []
     monkeypatch.setattr(
-        session, "run", lambda config, run_dir, **more: folders.append((config, run_dir.name))
+        training, "run", lambda config, run_dir, **more: folders.append((config, run_dir.name))
     )
     train(config)
     train("smoke", ["seed=3"])
@@ -165,7 +173,7 @@ def test_a_run_is_rendered(trained, with_opengl, monkeypatch, capfd):
 
 def test_hyperparameters_are_searched(tmp_path, monkeypatch, blank_figures, capfd):
     optuna = pytest.importorskip("optuna")
-    from test_search import Quick
+    from helpers.quick_trials import Quick
 
     monkeypatch.setattr("jetbot_mjx.tuning.search.Trials", Quick)
     figure, style = plt.figure(), dict(plt.rcParams)
@@ -187,7 +195,7 @@ def test_hyperparameters_are_searched(tmp_path, monkeypatch, blank_figures, capf
 
 def test_a_search_without_final_trainings_returns_the_best_trial(tmp_path, monkeypatch):
     optuna = pytest.importorskip("optuna")
-    from test_search import Quick
+    from helpers.quick_trials import Quick
 
     monkeypatch.setattr("jetbot_mjx.tuning.search.Trials", Quick)
     level, filters = optuna.logging.get_verbosity(), list(warnings.filters)
@@ -216,7 +224,7 @@ def test_a_loaded_checkpoint_has_a_short_repr(trained):
 
 def test_a_default_is_that_of_the_commands():
     assert inspect.signature(evaluate).parameters["episodes"].default == REPORT_GOALS
-    assert (gallery.EPISODES, gallery.GALLERY_EPISODES) == (20, 4)
+    assert (gallery.VIDEO_EPISODES, gallery.GALLERY_EPISODES) == (20, 4)
 
 
 # What they refuse.
@@ -340,7 +348,8 @@ def state():
         "figures": plt.get_fignums(),
     }
 
-import gliding, orbax.checkpoint, unpainted
+import orbax.checkpoint
+from helpers import gliding, unpainted
 from jetbot_mjx import evaluate, train
 
 for handler in list(logging.root.handlers):
@@ -355,7 +364,7 @@ print([name for name in before if before[name] != after[name]])
 """
 
 
-def test_the_process_is_as_it_was(tmp_path):
+def test_the_functions_leave_the_process_unchanged(tmp_path):
     code = STATE.replace("SETTINGS", repr(SMALL))
     told = fresh(code, str(tmp_path / "run")).splitlines()
     assert told[-1] == "[]"

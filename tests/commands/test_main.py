@@ -1,12 +1,14 @@
+"""The overview of all commands."""
+
 import importlib
 import re
 import subprocess
 import sys
 
 import pytest
-from test_structure import COMMON, PACKAGE, ROOT
 
 import jetbot_mjx
+from helpers.source_tree import COMMON, PACKAGE, ROOT
 from jetbot_mjx import __main__ as overview
 
 
@@ -39,7 +41,7 @@ def test_it_is_printed_at_once():
     ("asked", "remedy"),
     [("evalute", ": did you mean evaluate?"), ("dance", ""), ("d" * 300, "")],
 )
-def test_what_is_no_command_is_one_line(asked, remedy, capsys):
+def test_an_unknown_command_is_refused_in_one_line(asked, remedy, capsys):
     with pytest.raises(SystemExit) as left:
         overview.main([asked, "--config", "x"])
     assert left.value.code == 2
@@ -47,6 +49,25 @@ def test_what_is_no_command_is_one_line(asked, remedy, capsys):
         f"jetbot-mjx: error: there is no command {asked!r}{remedy} (--help lists the arguments)\n"
     )
     assert capsys.readouterr().err == line
+
+
+@pytest.mark.parametrize(
+    ("words", "hint"),
+    [
+        (
+            ["train"],
+            "`jetbot-mjx configs` lists the configurations and `jetbot-mjx runs` lists the",
+        ),
+        (["evaluate", "x"], "--list: `jetbot-mjx runs` lists the runs (--help"),
+        (["tune", "smoke"], "--list: `jetbot-mjx configs` lists the configurations (--help"),
+        ([], "there is no command before '--list': did you mean configs or runs?"),
+    ],
+)
+def test_list_names_the_command_that_lists_what_this_one_takes(words, hint):
+    command = [sys.executable, "-m", "jetbot_mjx", *words, "--list"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert hint in done.stderr
 
 
 @pytest.mark.parametrize("words", [["jetbot_mjx.train"], ["jetbot_mjx", "train"]])
@@ -107,4 +128,4 @@ def test_a_command_changes_imports_and_signals_and_the_package_does_not():
     imported, command = done.stdout.splitlines()[-2:]
     assert "jetbot_mjx" not in imported
     assert imported.endswith(" True")
-    assert "jetbot_mjx.imports" in command
+    assert "jetbot_mjx.startup.lazy_imports" in command

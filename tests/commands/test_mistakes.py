@@ -1,4 +1,4 @@
-"""Natural mistakes, each with the line that it prints: the page `docs/mistakes.md` is the table."""
+"""Common mistakes, each with the line that it prints, as `docs/mistakes.md` lists them."""
 
 import functools
 import importlib

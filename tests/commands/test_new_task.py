@@ -1,8 +1,8 @@
 """The task that `new_task` writes passes the checks and trains, and no file is overwritten."""
 
-import gliding
 import pytest
 
+from helpers import gliding
 from jetbot_mjx import check_env, new_task
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs import write_task_template

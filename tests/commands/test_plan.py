@@ -49,7 +49,7 @@ def test_a_device_that_does_not_tell_its_memory_is_asked_about(smoke, monkeypatc
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1e308", "much"])
-def test_a_memory_that_is_none_is_refused(smoke, capsys, value):
+def test_an_invalid_memory_size_is_refused(smoke, capsys, value):
     with pytest.raises(SystemExit) as caught:
         plan.main(["--config", str(smoke), "--memory", value])
     assert caught.value.code == 2

@@ -1,3 +1,5 @@
+"""The command `play`."""
+
 import os
 import re
 import signal

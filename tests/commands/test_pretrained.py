@@ -1,17 +1,18 @@
+"""The policies that come with the package."""
+
 import json
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from command_modules import evaluate, train
 
-from jetbot_mjx import PRETRAINED, load_policy, play, pretrained
+from helpers.command_modules import evaluate, train
+from jetbot_mjx import PRETRAINED, load_policy, play, pretrained, viewers
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import copy_pretrained
 from jetbot_mjx.runs.checkpoint import load_checkpoint
-from jetbot_mjx.viewers import live
 
 NAMES = ("camera_real", "jetbot_camera", "jetbot_egocentric", "real_jetbot")
 CHANGED = {"jetbot_egocentric": {"ppo.num_timesteps": 2_621_440}}
@@ -49,7 +50,7 @@ def test_it_reaches_the_goals_of_the_report(name, episodes, runs):
     assert json.loads(report.read_text("utf-8"))["policy"]["episodes"] == episodes
 
 
-def test_it_acts():
+def test_its_policy_turns_towards_the_goal():
     # Turns towards a goal on its left, 1 m away.
     policy = load_policy(PRETRAINED / "jetbot_egocentric")
     left, right = (jnp.array([0.0, side, 0.0, side, 1.0, 0.3, 0.0]) for side in (1.0, -1.0))
@@ -98,7 +99,7 @@ def test_it_tells_where_the_runs_are(tmp_path, capsys):
 def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):
     given = []
     monkeypatch.setattr(
-        live,
+        viewers,
         "play_live",
         lambda run, **more: given.append((run, more["which"])) or (0, 0),
     )

@@ -1,3 +1,5 @@
+"""The command `render`."""
+
 import functools
 import inspect
 import os
@@ -9,18 +11,18 @@ import imageio.v3 as iio
 import jax
 import numpy as np
 import pytest
-from command_modules import render
 
-from jetbot_mjx.compiler.program_cache import ProgramCache
+from helpers.command_modules import render
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import evaluate_run, goal_set
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
 from jetbot_mjx.evaluation.goal_set import REPORT_GOALS
-from jetbot_mjx.runs import progress
 from jetbot_mjx.runs.checkpoint import load_checkpoint
+from jetbot_mjx.terminal import progress
 from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run
 from jetbot_mjx.viewers.video import VideoRenderer
+from onekernel.aot.program_cache import ProgramCache
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,9 @@ def evaluator(smoke_run):
     checkpoint = load_checkpoint(smoke_run)
     evaluator = Evaluator(checkpoint.make_env(), checkpoint.networks, ProgramCache({}), record=True)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(gallery, "Evaluator", lambda env, networks, programs, record: evaluator)
+        patch.setattr(
+            gallery.evaluation, "Evaluator", lambda env, networks, programs, record: evaluator
+        )
         yield evaluator
 
 
@@ -73,7 +77,7 @@ def coarse(monkeypatch):
 
 @pytest.fixture
 def filmed(monkeypatch):
-    """What would be filmed, instead of filming it."""
+    """The goals that would be rendered, without rendering them."""
     shots = []
 
     class Listener:
@@ -110,7 +114,7 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-def test_rendering_writes_a_film_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
+def test_rendering_writes_a_video_a_gif_and_a_plot(run_copy, needs_opengl, coarse, capsys):
     assert render.main([str(run_copy), "--episodes", "2"]) == 0
     (folder,) = (run_copy / "videos").iterdir()
     film = iio.imread(folder / "episodes-2.mp4", plugin="pyav")
@@ -124,7 +128,7 @@ def test_rendering_writes_a_film_a_gif_and_a_plot(run_copy, needs_opengl, coarse
         assert str(folder / name) in shown
 
 
-def test_goals_are_filmed_that_were_asked_for(run_copy, filmed):
+def test_the_requested_goals_are_rendered(run_copy, filmed):
     pictures = render_run(run_copy, goals=[3, 1])
     env = load_checkpoint(run_copy).make_env()
     goals_w = {drive.goal_number: drive.goal_w for ((_, drive),) in filmed}
@@ -175,7 +179,7 @@ def test_goals_are_written_as_indices_and_ranges(text, goals, name):
         (["--gallery", "--checkpoint", "last"], "--checkpoint: cannot be combined with --gallery"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_one_line(arguments, said, capsys):
+def test_an_invalid_range_is_refused_in_one_line(arguments, said, capsys):
     with pytest.raises(SystemExit) as left:
         render.main(["run", *arguments])
     assert left.value.code == 2
@@ -190,7 +194,7 @@ def test_goals_that_are_none_are_refused_from_python_too(goals):
         render_run("run", goals=goals)
 
 
-def test_a_report_takes_the_goals_that_can_be_filmed():
+def test_a_report_has_as_many_goals_as_can_be_rendered():
     assert inspect.signature(evaluate_run).parameters["episodes"].default == REPORT_GOALS
 
 
@@ -246,7 +250,7 @@ def test_a_gallery_has_the_same_goals_driven_by_each(run_copy, filmed, capsys, s
         assert str(run_copy / "videos" / f"gallery-2.{suffix}") in shown
 
 
-def test_a_gallery_is_a_film_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
+def test_a_gallery_has_a_video_an_animation_and_a_sheet(run_copy, needs_opengl, coarse):
     rendered = render_gallery(run_copy, episodes=2)
     film = iio.imread(rendered.files["video"], plugin="pyav")
     assert film.shape[1:] == (80, 240, 3)
@@ -303,8 +307,8 @@ def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
     monkeypatch.setenv("MUJOCO_GL", wanted)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)
     program = """
-from jetbot_mjx import errors, imports
-imports.install_lazy_imports()
+from jetbot_mjx import errors, startup
+startup.install_lazy_imports()
 import jetbot_mjx.envs.physics
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.viewers import gallery, offscreen, render_gallery, render_run

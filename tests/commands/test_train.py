@@ -7,10 +7,10 @@ import brax.training.agents.ppo.train as brax_ppo_train
 import jax
 import numpy as np
 import pytest
-from command_modules import train
-from gliding import Gliding
-from test_metrics import read_events
 
+from helpers.command_modules import train
+from helpers.gliding import Gliding
+from helpers.tensorboard_files import read_events
 from jetbot_mjx import load_config, wrap_for_training
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import evaluate_run

@@ -1,4 +1,4 @@
-"""A drive by camera: pictures are reduced, watched and logged; a SimulatedCamera rehearses it."""
+"""Driving by camera: images are resized, checked and logged, with a SimulatedCamera."""
 
 import json
 import math
@@ -189,7 +189,7 @@ def test_a_calibration_of_opencv_is_read_and_bends_as_the_package_unbends(tmp_pa
         ("cameraResolution: [0, 0]\n" + YAML.format(more="", count=1, numbers="0"), "0 x 0 pixels"),
     ],
 )
-def test_what_is_no_calibration_is_told_in_one_line(tmp_path, text, said):
+def test_an_invalid_calibration_is_refused_in_one_line(tmp_path, text, said):
     (tmp_path / "lens.yaml").write_text(text)
     with pytest.raises(motors.DriveError, match=said) as caught:
         undistort.read_lens(str(tmp_path / "lens.yaml"))

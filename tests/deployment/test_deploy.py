@@ -1,4 +1,4 @@
-"""The driver: a SimulatedJetBot reaches its goals, and its motors are at zero when they must."""
+"""The robot's program: it drives a SimulatedJetBot to its goals and stops the motors on errors."""
 
 import contextlib
 import functools
@@ -15,8 +15,8 @@ from pathlib import Path
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_export import NUMPY, alone, site_with
 
+from helpers.bare_python import NUMPY, alone, site_with
 from jetbot_mjx import export, sim2real
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.deployment import compare_drive, export_policy, policy_export
@@ -186,7 +186,7 @@ def failing(error):
 
 @pytest.mark.parametrize("where", ["clock", "poses", "policy", "log", "start"])
 @pytest.mark.parametrize("error", [ValueError("!"), KeyboardInterrupt(), SystemExit(143)])
-def test_whatever_goes_wrong_stops_the_motors(where, error, policy):
+def test_every_error_stops_the_motors(where, error, policy):
     robot = RecordingRobot(happens=failing(error) if where == "clock" else None)
     source = poses.Odometry(motors.default_calibration())
     count = iter(range(1000))
@@ -432,7 +432,7 @@ def mutated(rng, time):
 
 
 @pytest.mark.parametrize("signs", [False, True])
-def test_whatever_comes_a_pose_stays_finite(signs, key):
+def test_poses_stay_finite_under_random_datagrams(signs, key):
     """Send 20,000 datagrams, some of which are poses."""
     rng = np.random.default_rng(0)
     inbox = []
@@ -701,7 +701,7 @@ def test_a_mistake_is_one_line(arguments, message, exported, capsys):
     ("goal", "told"),
     [("nan", "nan is not at least"), ("1e9", "1e9 is more than 1000"), ("inf", "inf is more")],
 )
-def test_a_goal_that_is_none_is_told(goal, told, exported, capsys):
+def test_an_invalid_goal_is_refused(goal, told, exported, capsys):
     with pytest.raises(SystemExit) as left:
         drive.main([str(exported), "--goal", "1", goal])
     assert left.value.code == 2

@@ -1,3 +1,5 @@
+"""The simulated JetBot against formulas."""
+
 import math
 
 import numpy as np

@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from ruamel.yaml import YAML
-from test_docs import COMMANDS, PAGES, ROOT, blocks, commands, in_full, own_files
 
+from helpers.doc_pages import COMMANDS, PAGES, ROOT, blocks, commands, in_full, own_files
 from jetbot_mjx import plan
-from jetbot_mjx.agents.ppo import NanDump
+from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import load_config
 from jetbot_mjx.deployment.simulated_jetbot import SimulatedJetBot
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -180,7 +180,9 @@ def pillar(reader, monkeypatch):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.evaluate"))
-def test_a_documented_evaluation_judges(page, words, reader, pillar, monkeypatch, capsys):
+def test_a_documented_evaluation_writes_its_report(
+    page, words, reader, pillar, monkeypatch, capsys
+):
     words = words if "--episodes" in words else [*words, "--episodes", "3"]
     # Policies as small as these are below any target.
     assert execute(page, words, reader, monkeypatch) == int("--min-success" in words)
@@ -202,7 +204,7 @@ def test_a_documented_rendering_draws(page, words, reader, pillar, monkeypatch, 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("page", "words"), of_kind("python", "-m", "jetbot_mjx.replay"))
-def test_a_documented_replay_ends_where_the_world_did(page, words, reader, monkeypatch, capsys):
+def test_a_documented_replay_ends_at_the_non_finite_state(page, words, reader, monkeypatch, capsys):
     reader(page)
     config = load_config("runs/mine/config.yaml")
     env = wrap_for_training(make_env(config), config.task.episode_length)

@@ -1,14 +1,15 @@
-"""With what is installed, kernels compute whatever kernels can: on new versions before all."""
+"""The kernels are used with the installed versions of all libraries."""
 
 import jax
 import pytest
 
-from jetbot_mjx.compiler import llvm_backend, ptx_backend
-from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.config import load_config, shipped_configs
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.fallbacks import collect
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
+from onekernel import cpu, gpu
+from onekernel.aot.program_cache import ProgramCache
 
 IMAGES = "it takes observations without images"
 WITHOUT_FUSED_UPDATE = {
@@ -17,7 +18,7 @@ WITHOUT_FUSED_UPDATE = {
     "jetbot_camera": IMAGES,
     "isaac_sb3": "it takes two networks of the same hidden layers of one width",
 }
-BACKENDS = {"cpu": llvm_backend, "gpu": ptx_backend}
+BACKENDS = {"cpu": cpu, "gpu": gpu}
 
 
 def test_the_back_end_of_this_device_can_be_used():
@@ -36,9 +37,9 @@ def test_no_shipped_configuration_falls_back(name, capsys):
     config = load_config(name)
     with collect() as found:
         env = make_env(config)
-        ppo = build_ppo(config, env)
+        ppo = build_ppo(Setup(config, env=env))
         CompiledTrainer(ppo, [0], ProgramCache({})).trace()
     assert env.physics.impl == BACKENDS[jax.default_backend()].IMPL
     reason = WITHOUT_FUSED_UPDATE.get(name)
     assert found == ([("ppo.update", reason)] if reason else [])
-    assert ppo.is_fused == (reason is None)
+    assert ppo.learner.name == ("xla" if reason else "fused")

@@ -1,13 +1,13 @@
-"""A training that is killed again and again ends as if it had never been."""
+"""A training that is killed several times ends as one that was never killed."""
 
 import random
 from types import SimpleNamespace
 
-import gliding
 import pytest
 
 from benchmarks.reliability import torture
 from benchmarks.reliability.torture import SETTINGS, Aim
+from helpers import gliding
 from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
 
 # A robot that glides needs more steps for the kills to fall into.
@@ -59,7 +59,7 @@ def test_a_start_from_elsewhere_is_seen(said):
         torture.check_start(SimpleNamespace(stdout=said, stderr=""), [0, 8_192])
 
 
-def test_what_differs_at_the_end_is_seen(undisturbed):
+def test_a_difference_at_the_end_is_reported(undisturbed):
     assert set(undisturbed.digests) == {"policy", "training"}
     for name in torture.Outcome._fields:
         assert torture.differences(undisturbed, undisturbed._replace(**{name: []})) == [name]

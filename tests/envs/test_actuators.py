@@ -1,19 +1,22 @@
-"""What stands between command and wheel: each stage alone, against its formula."""
+"""The actuator model between command and wheel: each stage against its formula."""
 
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jetbot_mjx.config import RobotParams
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import initial_actuator_state, step_actuators
+from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED
 from jetbot_mjx.envs.robot_model import WHEEL_RADIUS, WHEEL_SEPARATION
-from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, RobotParams
+
+LONGEST = LARGEST_TRACED["action_delay"]
 
 FULL = 12.0
 RAMP = np.arange(1.0, 25.0).reshape(12, 2)
 
 
-def drive(robot_params, commands, longest_delay=MAX_ACTION_DELAY):
+def drive(robot_params, commands, longest_delay=LONGEST):
     motors, speeds = initial_actuator_state(robot_params, longest_delay), []
     for command in np.asarray(commands, np.float32):
         motors, speed = step_actuators(
@@ -23,7 +26,7 @@ def drive(robot_params, commands, longest_delay=MAX_ACTION_DELAY):
     return np.asarray(speeds)
 
 
-@pytest.mark.parametrize("delay", [0, 1, 3, MAX_ACTION_DELAY])
+@pytest.mark.parametrize("delay", [0, 1, 3, LONGEST])
 def test_until_the_first_command_arrives_the_motors_are_asked_to_stand(delay):
     speeds = drive(RobotParams(action_delay=delay), RAMP)
     np.testing.assert_array_equal(speeds[:delay], 0.0)
@@ -81,7 +84,7 @@ def test_wheels_of_another_size_and_distance_move_the_robot_as_kinematics_says(l
     np.testing.assert_allclose(as_entered, true, rtol=1e-5, atol=1e-7)
 
 
-def test_what_does_not_differ_leaves_every_bit_and_takes_no_place():
+def test_nominal_actuators_return_their_commands_unchanged():
     np.testing.assert_array_equal(drive(RobotParams(), RAMP, longest_delay=0), RAMP)
     traced = RobotParams(*(jnp.float32(value) for value in RobotParams()))
     np.testing.assert_array_equal(drive(traced, RAMP), RAMP)

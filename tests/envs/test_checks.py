@@ -1,9 +1,9 @@
-"""Every fault that a task can have is found, told in one line, and none where there is none."""
+"""Every error that a task can have is found and reported in one line."""
 
-import gliding
 import jax.numpy as jnp
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.checks.runner import check_task
 from jetbot_mjx.errors import UserError
@@ -68,18 +68,18 @@ def first_findings(config):
     ],
 )
 def test_every_fault_is_found_by_its_check(name, check, told):
-    found, messages = first_findings(config_of(f"broken_tasks:{name}"))
+    found, messages = first_findings(config_of(f"helpers.broken_tasks:{name}"))
     assert found == check
     assert any(told in message for message in messages)
     assert not any("\n" in message for message in messages)
 
 
-def test_a_world_that_blows_up_is_found_in_the_drive(monkeypatch):
+def test_a_non_finite_state_is_found_during_a_drive(monkeypatch):
     def blow_up(self, physics, ctrl, mocap_pos=None):
         return physics.replace(qvel=physics.qvel * jnp.nan)
 
     monkeypatch.setattr(gliding.Gliding, "step_physics", blow_up)
-    check, messages = first_findings(config_of("broken_tasks:Sound"))
+    check, messages = first_findings(config_of("helpers.broken_tasks:Sound"))
     assert check == "drive"
     assert "1024 of 1024 steps are not finite" in messages[0]
 
@@ -104,10 +104,10 @@ def test_nothing_is_wrong_with_what_is_shipped(root, monkeypatch, config):
 
 
 def test_a_check_that_the_rest_rests_on_ends_the_list():
-    names = [name for name, _ in check_task(config_of("broken_tasks:Raises"))]
+    names = [name for name, _ in check_task(config_of("helpers.broken_tasks:Raises"))]
     assert names == ["layout", "purity"]
 
 
 def test_a_task_that_is_not_there_is_the_users_mistake():
-    with pytest.raises(UserError, match="broken_tasks has no 'Nobody'"):
-        list(check_task(config_of("broken_tasks:Nobody")))
+    with pytest.raises(UserError, match=r"helpers\.broken_tasks has no 'Nobody'"):
+        list(check_task(config_of("helpers.broken_tasks:Nobody")))

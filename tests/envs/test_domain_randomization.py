@@ -1,22 +1,26 @@
-"""A robot drawn anew in every episode: each quantity, in its range, everywhere another one."""
+"""Robots drawn for every episode: each quantity within its range, and different everywhere."""
 
 import functools
 import shutil
 
-import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from command_modules import train
 
+from helpers import gliding
+from helpers.command_modules import train
 from jetbot_mjx import make_env
-from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
+from jetbot_mjx.config import (
+    LookParams,
+    RandomizationConfig,
+    RobotParams,
+    load_config,
+    parse_config,
+)
+from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper, draw, maybe_randomize
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
-from jetbot_mjx.envs.look_params import LookParams
-from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.evaluation.evaluator import report_keys
@@ -41,7 +45,7 @@ def ranges(config):
     return config.randomization
 
 
-def test_what_can_be_drawn_is_what_can_differ():
+def test_every_quantity_has_a_range_and_a_parameter():
     names = tuple(RandomizationConfig.model_fields)
     assert names == RobotParams._fields + LookParams._fields
     everything = {name: [1, 1] if name in WHOLE else [0.7, 0.7] for name in LookParams._fields}
@@ -78,7 +82,7 @@ def driven(config):
     """Robots through several episodes: what every step left, on the host."""
     batch = wrap_for_training(make_env(config), EPISODE_LENGTH)
 
-    @functools.partial(jax.jit, compiler_options=compiler_options(config))
+    @functools.partial(jax.jit, compiler_options=compiler_options(config.deterministic))
     def drive(keys):
         def step(state, _):
             nstate = batch.step(state, jnp.ones((ENVS, 2)))
@@ -220,15 +224,3 @@ def test_a_training_resumes_to_the_bit_with_everything_drawn(config, tmp_path):
     sums = [read_about(checkpoint_path(run_dir, 128))["sha256"] for run_dir in (whole, stopped)]
     assert sums[0] == sums[1]
     assert sums[0] != read_about(checkpoint_path(stopped, 64))["sha256"]
-
-
-@pytest.mark.parametrize("name", RobotParams._fields)
-def test_the_page_tells_what_the_preset_draws(root, ranges, name):
-    page = (root / "docs" / "randomization.md").read_text("utf-8")
-    (row,) = (line for line in page.splitlines() if line.startswith(f"| `{name}` |"))
-    if name in NOT_OBSERVED:
-        shown = "-"
-    else:
-        low, high = ranges.drawn[name]
-        shown = "-π, π" if name == "start_yaw" else f"{low:g}, {high:g}"
-    assert f"| {shown} |" in row

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from command_modules import train
 
-from jetbot_mjx import cli, load_policy
+from helpers.command_modules import train
+from jetbot_mjx import load_policy
 from jetbot_mjx.config import parse_config
+from jetbot_mjx.devices import require_device
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.envs.task import layout_size
@@ -192,15 +193,17 @@ def test_with_model_makes_a_new_environment_and_leaves_the_old(env):
 def test_a_scene_that_cannot_be_simulated_is_refused_before_a_run_begins(name, reason, tmp_path):
     arguments = ["--config", str(ROOT / "configs" / "smoke.yaml"), "--run-dir", str(tmp_path / "x")]
     with pytest.raises(UserError) as caught:
-        train.main([*arguments, "--set", f"task.name=broken_tasks:{name}"])
-    assert f"'broken_tasks:{name}': its scene cannot be simulated: {reason}" in str(caught.value)
+        train.main([*arguments, "--set", f"task.name=helpers.broken_tasks:{name}"])
+    assert f"'helpers.broken_tasks:{name}': its scene cannot be simulated: {reason}" in str(
+        caught.value
+    )
     assert "\n" not in str(caught.value)
     assert list(tmp_path.iterdir()) == []
 
 
 def test_64_bits_are_refused_by_commands_with_the_remedy():
     with jax.enable_x64(True), pytest.raises(UserError, match="JAX_ENABLE_X64 is set: unset it"):
-        cli.require_device()
+        require_device()
 
 
 def test_64_bits_are_refused_when_a_policy_is_loaded():

@@ -1,3 +1,5 @@
+"""Frames, angles and wheel speeds of a differential drive."""
+
 import math
 
 import jax
@@ -82,7 +84,7 @@ def test_yaw_ignores_the_sign_of_the_quaternion():
     np.testing.assert_allclose(kinematics.yaw(-quat), 0.8, rtol=1e-6)
 
 
-def test_what_lies_north_is_to_the_left_of_a_robot_that_heads_east():
+def test_a_goal_to_the_north_is_left_of_a_robot_heading_east():
     got = kinematics.to_body(jnp.float32(0.0), jnp.array([0.0, 1.0]))
     np.testing.assert_allclose(got, (0.0, 1.0), atol=1e-7)
     got = kinematics.to_body(jnp.float32(math.pi / 2), jnp.array([0.0, 1.0]))

@@ -1,4 +1,4 @@
-"""Steps from which MJX's line search makes none in float32, and costs relative to a beginning."""
+"""MJX's line search in float32: steps that it cannot resolve, and costs relative to the start."""
 
 import dataclasses
 import threading

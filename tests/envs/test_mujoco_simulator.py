@@ -1,4 +1,4 @@
-"""C MuJoCo in the place of MJX: the same robot, the same rules, and the same result every time."""
+"""C MuJoCo in the place of MJX: the same robot and rules, and deterministic results."""
 
 import dataclasses
 
@@ -8,19 +8,18 @@ import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx.compiler.program_cache import ProgramCache
-from jetbot_mjx.config import RandomizationConfig, load_config, parse_config
+from jetbot_mjx.config import RandomizationConfig, RobotParams, load_config, parse_config
 from jetbot_mjx.envs import mujoco_simulator
 from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.mujoco_simulator import in_mujoco, make_model, training_numerics
 from jetbot_mjx.envs.robot_model import make_mj_model
-from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.wrappers import EpisodeWrapper
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys, summarize
 from jetbot_mjx.evaluation.rollout import rollout_fn
 from jetbot_mjx.runs.checkpoint import PRETRAINED, load_checkpoint
+from onekernel.aot.program_cache import ProgramCache
 
 ROBOTS = 16
 STEPS = 128
@@ -111,7 +110,7 @@ def test_a_varied_robot_is_the_one_that_mujoco_compiles(preset_env, mass, shift)
     assert apart(driven, trajectories(simulator, actions)) > 100 * ROUNDING
 
 
-def test_what_mujoco_derives_from_masses_follows_them(preset_env):
+def test_derived_model_values_follow_the_masses(preset_env):
     heavy = dataclasses.replace(preset_env.robot, chassis_mass=1.3 * preset_env.robot.chassis_mass)
     compiled = make_mj_model(heavy, preset_env.config.physics, visual=False)
     preset = make_model(preset_env, training_numerics(preset_env.config.physics))
@@ -227,7 +226,7 @@ def test_an_episode_is_cut_off_where_its_time_is_out(world_env):
     np.testing.assert_array_equal(found.terminated + found.nonfinite, 0)
 
 
-def test_a_robot_that_is_not_finite_is_counted_and_bothers_nobody(
+def test_a_non_finite_robot_is_counted_and_changes_no_other(
     world_env, tmp_path, monkeypatch, capfd
 ):
     # MuJoCo would write a log into the working folder.

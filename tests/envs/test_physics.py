@@ -1,4 +1,4 @@
-"""Oracles: MJX against C MuJoCo and against closed form, and what must never happen."""
+"""MJX against C MuJoCo and closed-form solutions."""
 
 import copy
 import dataclasses
@@ -11,12 +11,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx.compiler import llvm_backend, ptx_backend
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState
+from onekernel import cpu, gpu
 
 STEPS = 256
 ROBOTS = 256  # under each kind of commands
@@ -230,7 +230,7 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
 
 
 @pytest.mark.skipif(
-    (ptx_backend if jax.default_backend() == "gpu" else llvm_backend).obstacle() is not None,
+    (gpu if jax.default_backend() == "gpu" else cpu).obstacle() is not None,
     reason="XLA takes no kernels here",
 )
 def test_another_solver_is_another_kernel():
@@ -243,7 +243,7 @@ def test_another_solver_is_another_kernel():
         here = env.with_model(env.mjx_model.replace(opt=option.replace(**changed)))
         lowered = jax.jit(here.step_physics).trace(state, jnp.zeros(2)).lower()
         # On a CPU it names machine code by a hash, on a GPU it holds the PTX.
-        calls = re.findall(r"custom_call @\S*(?:jetbot_mjx_|xla\.gpu\.ptx).*", lowered.as_text())
+        calls = re.findall(r"custom_call @\S*(?:onekernel_|xla\.gpu\.ptx).*", lowered.as_text())
         (call,) = calls
         return call
 

@@ -1,3 +1,5 @@
+"""The compiled robot model against the published numbers of each preset."""
+
 import dataclasses
 
 import mujoco
@@ -80,7 +82,7 @@ def test_cameras_cube_and_floor_are_in_the_scene(robot):
     assert not compiled.geom("goal").conaffinity
 
 
-def test_what_only_shows_changes_nothing(robot):
+def test_visual_geoms_change_no_physics(robot):
     shown, stripped = (
         make_mj_model(robot, PhysicsConfig(), visual=visual) for visual in (True, False)
     )

@@ -1,4 +1,4 @@
-"""Robots that differ: against C MuJoCo with the changed numbers, closed form, and the preset."""
+"""Robots with changed parameters against C MuJoCo, closed-form solutions, and the preset."""
 
 import dataclasses
 import math
@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from jetbot_mjx.compiler.xla_options import compiler_options
-from jetbot_mjx.config import parse_config
+from jetbot_mjx.config import RobotParams, parse_config
+from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs import kinematics, mjx, robot_model
-from jetbot_mjx.envs.domain_randomization import DomainRandomizationWrapper
+from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED, DomainRandomizationWrapper
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
@@ -20,7 +20,7 @@ from jetbot_mjx.envs.robot_model import (
     WHEEL_SEPARATION,
     make_mj_model,
 )
-from jetbot_mjx.envs.robot_params import MAX_ACTION_DELAY, RobotParams, vary_model
+from jetbot_mjx.envs.robot_params import vary_model
 
 ROBOTS = 16
 STEPS = 256
@@ -66,7 +66,7 @@ def driver(request):
 
         return jax.vmap(one)(robot_params, actions)
 
-    return env, jax.jit(drive, compiler_options=compiler_options(env.config))
+    return env, jax.jit(drive, compiler_options=compiler_options(env.config.deterministic))
 
 
 @pytest.fixture(scope="module")
@@ -207,7 +207,7 @@ def test_wheels_of_another_size_and_distance_drive_as_a_robot_built_so(driver, m
 
 def test_a_delay_shifts_the_response_by_its_steps(driver, actions):
     _, drive = driver
-    delays = np.resize(np.arange(MAX_ACTION_DELAY + 1), ROBOTS)
+    delays = np.resize(np.arange(LARGEST_TRACED["action_delay"] + 1), ROBOTS)
     # Wheel speeds, which hardly feel that the robot settles meanwhile.
     same = jnp.broadcast_to(actions[:1], actions.shape)
     late = np.asarray(drive(many(action_delay=delays), same)[0].qvel[:, :, 6:])

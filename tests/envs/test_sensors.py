@@ -1,4 +1,4 @@
-"""What a robot knows of itself: late by whole steps, inexact as far as asked, and no more."""
+"""The sensor model: delays of whole steps and noise of the configured size."""
 
 import functools
 
@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jetbot_mjx.config import RobotParams
 from jetbot_mjx.envs import kinematics
-from jetbot_mjx.envs.robot_params import RobotParams
 from jetbot_mjx.envs.sensors import initial_sensor_state, step_sensors
 from jetbot_mjx.envs.task import RobotState
 
@@ -21,7 +21,7 @@ def robot(x=0.0, heading=0.0):
     return RobotState(jnp.array([x, 0.0, 0.03]), quat, jnp.zeros(3), jnp.zeros(3))
 
 
-def test_a_robot_sees_itself_as_it_was():
+def test_a_delayed_observation_is_the_earlier_state():
     robot_params = RobotParams(observation_delay=jnp.float32(2.0))
     sensors = initial_sensor_state(robot(), KEY, robot_params, 4)
     seen = []

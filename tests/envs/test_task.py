@@ -1,3 +1,5 @@
+"""The goal task: observations, rewards, ends and goals."""
+
 import itertools
 import math
 

@@ -1,4 +1,4 @@
-"""Episodes end honestly and begin anew: with a stub that ends on demand, and with the robot."""
+"""Termination, truncation and resets: with a stub that ends on demand, and with the robot."""
 
 import brax.envs
 import jax
@@ -6,13 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jetbot_mjx.compiler.packed import pack
 from jetbot_mjx.config import parse_config
-from jetbot_mjx.envs import mjx, physics
+from jetbot_mjx.envs import mjx
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState, State
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
+from jetbot_mjx.packed import pack
+from onekernel import BACKENDS
 
 ENVS = 64
 EPISODES = 20
@@ -20,7 +21,7 @@ EPISODE_LENGTH = 4
 
 
 class Stub(brax.envs.Env):
-    """Does what the action says: [0] is the reward, [1] > 0.5 terminates, < -0.5 blows up."""
+    """Does what the action says: [0] is the reward, [1] > 0.5 terminates, < -0.5 is non-finite."""
 
     def reset(self, rng):
         key, goal_key = jax.random.split(rng)
@@ -80,7 +81,7 @@ def test_termination_is_not_truncation_even_in_the_last_step():
         assert float(last.info["truncation"]) == 0
 
 
-def test_the_next_episode_begins_with_a_new_goal_key_and_empty_books():
+def test_a_reset_draws_a_new_goal_and_key_and_clears_the_statistics():
     states = run(chain(), [GO, END, GO])
     first, ended, begun = states[1], states[2], states[3]
     assert not np.allclose(first.goal, ended.goal)
@@ -101,7 +102,7 @@ def test_obs_belongs_to_the_new_episode_and_final_obs_to_the_old():
     np.testing.assert_allclose(first.info["final_obs"], first.obs)
 
 
-def test_a_world_that_blows_up_is_cut_off_counted_and_replaced():
+def test_a_non_finite_state_ends_the_episode_is_counted_and_reset():
     before, blown, after = run(chain(), [GO, BLOW_UP, GO])[1:]
     assert float(blown.done) == float(blown.info["truncation"]) == 1
     assert float(blown.info["terminated"]) == 0
@@ -115,7 +116,7 @@ def test_a_world_that_blows_up_is_cut_off_counted_and_replaced():
     np.testing.assert_array_equal(after.pipeline_state.qpos, 1.0)
 
 
-def test_brax_masks_the_step_in_which_a_world_blew_up():
+def test_brax_masks_the_step_of_a_non_finite_state():
     from brax.training.agents.ppo.losses import compute_gae
 
     blown = run(chain(), [GO, BLOW_UP])[-1]
@@ -157,7 +158,7 @@ def test_action_repeat_stops_at_the_time_limit():
     np.testing.assert_allclose(last.info["final_obs"], first.goal + EPISODE_LENGTH)
 
 
-def test_a_world_that_blows_up_while_an_action_is_held_counts_for_nothing():
+def test_a_non_finite_state_during_action_repeat_adds_no_reward():
     before, blown = run(chain(action_repeat=2), [GO, BLOW_UP])[1:]
     assert float(blown.reward) == float(blown.metrics["reward/given"]) == 0
     assert float(blown.info["episode_metrics"]["reward/given"]) == 2
@@ -225,7 +226,7 @@ def test_each_environment_can_have_a_physics_model_of_its_own():
 
     batch = wrap_for_training(env, 256, randomization_fn=randomize)
     state = batch.reset(jnp.zeros((2, 2), jnp.uint32))
-    assert batch.packed_kernel(pack(state, batch_axes=1)) is None
+    assert batch.step_packed.kernel(pack(state, batch_axes=1)) is None
     step = jax.jit(batch.step)
     for _ in range(3):
         state = step(state, jnp.array([[-0.9, 0.0]] * 2))
@@ -240,11 +241,12 @@ def test_no_back_end_is_tried_before_a_step_is_traced(monkeypatch):
     # A program from the cache needs none, and a GPU's takes 0.3 s.
     asked = []
 
-    def none_yet(impl):
-        asked.append(impl)
-        return []
+    def none_yet():
+        asked.append(True)
+        return "there is none"
 
-    monkeypatch.setattr(physics, "available_backends", none_yet)
+    for backend in BACKENDS:
+        monkeypatch.setattr(backend, "obstacle", none_yet)
     batch = wrap_for_training(make_env(parse_config({})), 256)
     assert not asked
     batch.reset(jnp.zeros((2, 2), jnp.uint32))

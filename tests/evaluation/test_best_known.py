@@ -1,15 +1,15 @@
-"""The best-known times: counted as a policy's, told where they hold, and a policy's gap to them."""
+"""The best-known times: how they are found, where they hold, and a policy's gap to them."""
 
 import json
 
 import jax
 import numpy as np
 import pytest
-from gliding import Gliding
-from test_report import make_episodes, make_report, polar
 
 from benchmarks import ROOT
 from benchmarks.learning import best_known as benchmark
+from helpers.gliding import Gliding
+from helpers.reports import make_episodes, make_report, polar
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation import best_known
@@ -89,7 +89,7 @@ def test_elsewhere_the_reason_is_told(searched, settings, episodes, missing):
     assert missing in reason
 
 
-def test_what_a_policy_sees_and_how_it_learns_does_not_matter(searched):
+def test_runs_with_other_observations_and_hyperparameters_are_comparable(searched):
     searched()
     settings = {
         "task": {"observation": "egocentric", "episode_length": 300},

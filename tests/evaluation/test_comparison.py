@@ -1,40 +1,22 @@
-"""Runs against each other, from episodes made by hand."""
+"""Comparisons of runs, from episodes made by hand."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
 import scipy.stats
-from test_report import make_episodes, make_report
 
+from helpers.reports import TEN_GOALS, comparison_of, make_episodes, make_report, report_of, wins
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.evaluation.comparison import check_comparable, compare
+from jetbot_mjx.evaluation.comparison import check_comparable
 from jetbot_mjx.evaluation.evaluator import wilson_interval
 from jetbot_mjx.evaluation.report import CurvePoint
 from jetbot_mjx.evaluation.tables import pairs_table, policies_table, runs_table
 
-GOALS = np.stack([np.linspace(0.3, 1.0, 10), np.zeros(10)], axis=-1)
 
-
-def report(won, steps=60, **more):
-    return make_report(make_episodes(GOALS, won, steps), **more)
-
-
-def wins(count):
-    return np.arange(10) < count
-
-
-def comparison_of(**runs):
-    named = {
-        name: {f"seed-{i}": one for i, one in enumerate(seeds)} for name, seeds in runs.items()
-    }
-    return compare(Path("somewhere"), named)
-
-
-def test_several_seeds_are_judged_over_seeds():
-    seeds = [report(wins(count), 60 + 6 * count) for count in (2, 8, 9, 9, 10)]
+def test_several_seeds_are_evaluated_over_seeds():
+    seeds = [report_of(wins(count), 60 + 6 * count) for count in (2, 8, 9, 9, 10)]
     (run,) = comparison_of(a=seeds).runs
     assert (run.success_rate.over, run.success_rate.count) == ("seeds", 5)
     assert run.success_rate.mean.value == pytest.approx(0.76)
@@ -43,8 +25,8 @@ def test_several_seeds_are_judged_over_seeds():
     assert run.time_to_goal.mean.value == pytest.approx((60 + 6 * 7.6) / 60)
 
 
-def test_one_seed_is_judged_over_its_episodes():
-    (run,) = comparison_of(a=[report(wins(9), np.arange(10) * 6)]).runs
+def test_one_seed_is_evaluated_over_its_episodes():
+    (run,) = comparison_of(a=[report_of(wins(9), np.arange(10) * 6)]).runs
     assert run.success_rate.over == run.time_to_goal.over == "episodes"
     assert run.success_rate.mean[1:] == wilson_interval(9, 10)
     assert run.time_to_goal.mean.value == pytest.approx(0.4)
@@ -52,15 +34,15 @@ def test_one_seed_is_judged_over_its_episodes():
 
 
 def test_seeds_without_a_success_have_no_time_and_say_so():
-    run = comparison_of(a=[report(wins(0)), report(wins(5))]).runs[0]
+    run = comparison_of(a=[report_of(wins(0)), report_of(wins(5))]).runs[0]
     assert (run.time_to_goal.count, run.time_to_goal.mean.value) == (1, pytest.approx(1.0))
-    none = comparison_of(a=[report(wins(0)), report(wins(0))]).runs[0]
+    none = comparison_of(a=[report_of(wins(0)), report_of(wins(0))]).runs[0]
     assert none.time_to_goal.mean.value is None
 
 
 def test_goals_are_won_and_lost_as_in_mcnemars_test():
-    a = report([1, 1, 1, 1, 1, 1, 1, 0, 0, 0])
-    b = report([1, 1, 0, 0, 0, 0, 0, 1, 0, 0])
+    a = report_of([1, 1, 1, 1, 1, 1, 1, 0, 0, 0])
+    b = report_of([1, 1, 0, 0, 0, 0, 0, 1, 0, 0])
     (pair,) = comparison_of(a=[a], b=[b]).pairs
     duel = pair.success_rate
     assert (duel.wins, duel.losses, duel.ties) == (5, 1, 4)
@@ -71,12 +53,12 @@ def test_goals_are_won_and_lost_as_in_mcnemars_test():
 
 
 def test_times_are_compared_on_goals_that_both_reached_and_less_is_better():
-    a = report([1, 1, 1, 0, 1, 1, 1, 1, 1, 1], [30, 30, 60, 9, 60, 60, 60, 60, 60, 60])
-    b = report([1, 1, 1, 1, 0, 1, 1, 1, 1, 1], [60, 60, 30, 9, 60, 60, 60, 60, 60, 60])
+    a = report_of([1, 1, 1, 0, 1, 1, 1, 1, 1, 1], [30, 30, 60, 9, 60, 60, 60, 60, 60, 60])
+    b = report_of([1, 1, 1, 1, 0, 1, 1, 1, 1, 1], [60, 60, 30, 9, 60, 60, 60, 60, 60, 60])
     duel = comparison_of(a=[a], b=[b]).pairs[0].time_to_goal
     assert (duel.wins, duel.losses, duel.ties) == (2, 1, 5)
-    slow = [report(wins(10), steps) for steps in (90, 96)]
-    fast = [report(wins(10), steps) for steps in (60, 66)]
+    slow = [report_of(wins(10), steps) for steps in (90, 96)]
+    fast = [report_of(wins(10), steps) for steps in (60, 66)]
     duel = comparison_of(slow=slow, fast=fast).pairs[0].time_to_goal
     assert duel.improvement.value == 0.0
     assert duel.difference.value == pytest.approx(0.5)
@@ -84,7 +66,7 @@ def test_times_are_compared_on_goals_that_both_reached_and_less_is_better():
 
 
 def test_equal_runs_are_even():
-    seeds = [report(wins(8)), report(wins(9))]
+    seeds = [report_of(wins(8)), report_of(wins(9))]
     duel = comparison_of(a=seeds, b=seeds).pairs[0].success_rate
     assert (duel.wins, duel.losses, duel.ties, duel.p) == (0, 0, 10, 1.0)
     assert duel.improvement.value == 0.5
@@ -92,13 +74,13 @@ def test_equal_runs_are_even():
 
 def test_more_seeds_of_one_run_do_not_weigh_goal_by_goal():
     # Every seed misses one goal, another each time: three of them together miss three.
-    seeds = [report(np.arange(10) != missed) for missed in range(3)]
-    pair = comparison_of(a=seeds, b=[report(np.arange(10) != 5)]).pairs[0]
+    seeds = [report_of(np.arange(10) != missed) for missed in range(3)]
+    pair = comparison_of(a=seeds, b=[report_of(np.arange(10) != 5)]).pairs[0]
     assert (pair.seeds, pair.success_rate.wins, pair.success_rate.losses) == (1, 1, 1)
 
 
 def test_every_two_runs_meet():
-    runs = {name: [report(wins(5))] for name in "abcd"}
+    runs = {name: [report_of(wins(5))] for name in "abcd"}
     met = [(pair.a, pair.b) for pair in comparison_of(**runs).pairs]
     assert met == [(a, b) for a in "abcd" for b in "abcd" if a < b]
 
@@ -107,19 +89,22 @@ def test_a_curve_over_seeds_keeps_to_the_steps_they_share():
     def curve(*rates):
         return [CurvePoint(10 * i, rate, 0.0, 1.0, None) for i, rate in enumerate(rates)]
 
-    seeds = [report(wins(5), curve=curve(0.0, 0.2, 0.9)), report(wins(5), curve=curve(0.0, 0.6))]
+    seeds = [
+        report_of(wins(5), curve=curve(0.0, 0.2, 0.9)),
+        report_of(wins(5), curve=curve(0.0, 0.6)),
+    ]
     (run,) = comparison_of(a=seeds).runs
     assert [point.env_steps for point in run.learning_curve] == [0, 10]
     assert run.learning_curve[1][1:4] == pytest.approx((0.4, 0.2, 0.6))
     (alone,) = comparison_of(a=seeds[:1]).runs
     assert alone.learning_curve[2] == (20, 0.9, 0.0, 1.0, None)
-    (half,) = comparison_of(a=[seeds[0], report(wins(5))]).runs
+    (half,) = comparison_of(a=[seeds[0], report_of(wins(5))]).runs
     assert half.learning_curve == ()
 
 
 def test_settings_that_differ_are_told():
     settings = {"task": {"observation": "egocentric"}, "seed": 3}
-    runs = comparison_of(a=[report(wins(5))], b=[report(wins(5), settings=settings)])
+    runs = comparison_of(a=[report_of(wins(5))], b=[report_of(wins(5), settings=settings)])
     assert runs.differences == {"task.observation": ["world", "egocentric"]}
 
 
@@ -140,14 +125,14 @@ def test_runs_that_had_something_else_to_do_are_refused(settings, said):
 
 
 def test_runs_that_drove_to_other_goals_are_refused():
-    other = make_report(make_episodes(GOALS + 0.01, wins(5)))
+    other = make_report(make_episodes(TEN_GOALS + 0.01, wins(5)))
     with pytest.raises(
         UserError, match="b cannot be compared with a: its task sampled other goals"
     ):
-        comparison_of(a=[report(wins(5))], b=[other])
+        comparison_of(a=[report_of(wins(5))], b=[other])
 
 
-def test_what_a_policy_sees_and_how_it_was_trained_may_differ():
+def test_runs_with_other_observations_and_trainings_are_comparable():
     other = {"task": {"observation": "egocentric"}, "ppo": {"learning_rate": 1e-4}, "seed": 5}
     network = {"ppo": {"network": {"policy_hidden_layer_sizes": [8]}}}
     check_comparable({"a": parse_config({}), "b": parse_config(other), "c": parse_config(network)})
@@ -155,9 +140,9 @@ def test_what_a_policy_sees_and_how_it_was_trained_may_differ():
 
 def test_a_comparison_is_json_and_text():
     comparison = comparison_of(
-        a=[report(wins(8)), report(wins(9))],
-        b=[report(wins(0)), report(wins(0))],
-        c=[report(wins(1))],
+        a=[report_of(wins(8)), report_of(wins(9))],
+        b=[report_of(wins(0)), report_of(wins(0))],
+        c=[report_of(wins(1))],
     )
     values = json.loads(json.dumps(comparison.to_json(), allow_nan=False))
     assert [run["name"] for run in values["runs"]] == ["a", "b", "c"]

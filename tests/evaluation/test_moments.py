@@ -1,4 +1,4 @@
-"""What a report shows of a policy that sees: images of its episodes, and what it looked at."""
+"""The images in the report of a policy that sees, and what the policy looked at."""
 
 import json
 
@@ -6,10 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_report import make_episodes, polar
 
+from helpers.reports import make_episodes, polar
 from jetbot_mjx.agents.networks import make_policy
-from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.evaluation import evaluate_run
 from jetbot_mjx.evaluation.evaluator import Evaluator, report_keys
 from jetbot_mjx.evaluation.moments import (
@@ -21,6 +20,7 @@ from jetbot_mjx.evaluation.moments import (
 )
 from jetbot_mjx.evaluation.occlusion import occlusion_map
 from jetbot_mjx.runs.checkpoint import load_checkpoint
+from onekernel.aot.program_cache import ProgramCache
 
 GOALS = 12
 

@@ -1,4 +1,4 @@
-"""What a policy looks at, checked with policies whose looks are known."""
+"""Occlusion maps of policies for which they are known."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Metrics say what the report says; themes leave nothing behind."""
+"""Plots show the numbers of the report, and leave no settings of Matplotlib behind."""
 
 import io
 
@@ -6,10 +6,9 @@ import matplotlib
 import numpy as np
 import pytest
 from PIL import Image
-from test_comparison import comparison_of, wins
-from test_comparison import report as judged
-from test_report import CTRL_DT, make_episodes, make_report, polar
 
+from helpers.reports import CTRL_DT, comparison_of, make_episodes, make_report, polar, wins
+from helpers.reports import report_of as judged
 from jetbot_mjx.evaluation import plots
 from jetbot_mjx.evaluation.learning_curves import (
     plot_learning_curve,

@@ -1,4 +1,4 @@
-"""What a report says of a policy, from episodes made by hand."""
+"""The report of a policy, from episodes made by hand."""
 
 import json
 import math
@@ -8,73 +8,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from jetbot_mjx.config import parse_config
-from jetbot_mjx.evaluation.evaluator import summarize, wilson_interval
+from helpers.reports import CTRL_DT, make_episodes, make_report, polar
+from jetbot_mjx.evaluation.evaluator import wilson_interval
 from jetbot_mjx.evaluation.report import (
     ENDED_BY_TASK,
     NON_FINITE,
     SECTORS,
     TIME_LIMIT,
     CurvePoint,
-    Report,
     by_goal,
     find_failures,
     goal_positions,
     learning_curve,
 )
-from jetbot_mjx.evaluation.rollout import Episodes
-
-CTRL_DT = 1 / 60
 
 
-def make_episodes(goals_w, won, steps=60, **changed):
-    """Episodes from the origin that end on the goal, or 0.3 m before it."""
-    goals_w = np.column_stack([np.asarray(goals_w, np.float32), np.full(len(goals_w), 0.05)])
-    won = np.asarray(won, np.float32)
-    count = won.size
-    distance = np.linalg.norm(goals_w[:, :2], axis=-1, keepdims=True)
-    zeros = np.zeros(count, np.float32)
-    fields = {
-        "success": won,
-        "steps": np.broadcast_to(np.asarray(steps, np.float32), count),
-        "episode_return": zeros,
-        "terminated": won,
-        "nonfinite": zeros,
-        "path_length": distance[:, 0],
-        "start_w": np.zeros((count, 2), np.float32),
-        "start_yaw": zeros,
-        "end_w": np.where(won[:, None] > 0, 1.0, 1.0 - 0.3 / distance) * goals_w[:, :2],
-        "goal_w": goals_w,
-        "goal": None,
-        "qpos": None,
-    }
-    return Episodes(**{**fields, **changed})
-
-
-def make_report(episodes, run_dir="runs/a", curve=(), env_steps=2048, settings=None):
-    """A report of episodes made by hand, without baselines."""
-    return Report(
-        folder=Path(run_dir) / "evaluations" / "2048",
-        run=Path(run_dir),
-        checkpoint=Path(run_dir) / "checkpoints" / f"{env_steps:012d}",
-        env_steps=env_steps,
-        config=parse_config(settings or {}),
-        policy=summarize(episodes, CTRL_DT),
-        baselines={},
-        goal_bins=by_goal(episodes, CTRL_DT),
-        failures=find_failures(episodes, Path(run_dir), env_steps),
-        learning_curve=tuple(curve),
-        episodes=episodes,
-        versions={},
-    )
-
-
-def polar(distance, degrees):
-    angle = np.radians(degrees)
-    return np.stack([distance * np.cos(angle), distance * np.sin(angle)], axis=-1)
-
-
-def test_bearings_are_those_of_the_robot_as_it_starts():
+def test_bearings_are_relative_to_the_start_pose():
     goals = [[1, 0], [0, 1], [0, -1], [-1, 0]]
     distance, bearing = goal_positions(make_episodes(goals, np.ones(4)))
     np.testing.assert_allclose(bearing, [0, 90, -90, 180], atol=1e-4)
@@ -144,7 +93,7 @@ def test_a_replay_command_survives_the_shell():
     assert words[2:] == ["my runs/it's", "--checkpoint", "2048", "--goals", "1"]
 
 
-def test_goals_that_cannot_be_filmed_have_no_command(monkeypatch):
+def test_goals_that_cannot_be_rendered_have_no_replay_command(monkeypatch):
     monkeypatch.setattr("jetbot_mjx.evaluation.report.REPORT_GOALS", 1)
     found = find_failures(make_episodes([[1, 0], [0, 1]], [0, 0]), Path("runs/a"), 2048)
     assert found[0].replay.endswith("--goals 0")

@@ -1,4 +1,4 @@
-"""Where results are written: a quick look has a place of its own, and fuller results stay."""
+"""Names of result folders: a short evaluation replaces no fuller one."""
 
 import json
 
@@ -57,7 +57,7 @@ def test_a_report_on_few_goals_has_a_folder_of_its_own(tmp_path, goals, name):
         (16, ALL, f"{STEPS}-16-goals"),
     ],
 )
-def test_a_fuller_report_stays(tmp_path, goals, parts, name):
+def test_a_fuller_report_is_kept(tmp_path, goals, parts, name):
     write(tmp_path / STEPS, REPORT_GOALS, ALL)
     for _ in range(2):
         folder = report_folder(tmp_path, STEPS, goals, parts)
@@ -65,7 +65,7 @@ def test_a_fuller_report_stays(tmp_path, goals, parts, name):
         write(folder, goals, parts)
 
 
-def test_a_report_on_more_goals_stays(tmp_path):
+def test_a_report_on_more_goals_is_kept(tmp_path):
     write(tmp_path / STEPS, 4096, NONE)
     assert report_folder(tmp_path, STEPS, REPORT_GOALS, NONE).name == f"{STEPS}-nominal"
     assert report_folder(tmp_path, STEPS, 4096, NONE).name == STEPS
@@ -77,7 +77,7 @@ def test_reports_on_few_goals_keep_their_parts_too(tmp_path):
 
 
 @pytest.mark.parametrize("text", ["", "{", "[]", "3", "{}", '{"goal_set_version": 1}', "\udcff"])
-def test_what_is_no_report_is_replaced(tmp_path, text):
+def test_a_damaged_report_is_replaced(tmp_path, text):
     (tmp_path / STEPS).mkdir()
     (tmp_path / STEPS / "report.json").write_text(text, errors="surrogateescape")
     assert report_folder(tmp_path, STEPS, REPORT_GOALS, NONE).name == STEPS
@@ -105,7 +105,7 @@ def test_a_report_that_is_as_full_is_found(tmp_path):
     assert find_report(tmp_path, STEPS, 4096, NONE) is None
 
 
-def test_the_report_that_stays_is_named(tmp_path):
+def test_the_report_that_is_kept_is_named(tmp_path):
     full, few = tmp_path / STEPS, tmp_path / f"{STEPS}-16-goals"
     write(few, 16, NONE)
     assert fuller_report(few, STEPS) is None

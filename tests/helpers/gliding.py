@@ -51,17 +51,17 @@ def everywhere():
     """A context within which every robot of this process glides, and no program is kept."""
     with (
         mock.patch.object(JetBotEnv, "step_physics", Gliding.step_physics),
-        mock.patch.object(program_key, "TRUSTED", frozenset()),
+        mock.patch.object(program_key, "BUILT_IN_TASKS", frozenset()),
     ):
         yield
 
 
 def program(command):
     """Arguments of Python for one of the package's commands, on a robot that glides."""
-    return ["-c", f"{LAZILY}; import gliding; gliding.main()", command]
+    return ["-c", f"{LAZILY}; from helpers import gliding; gliding.main()", command]
 
 
-LAZILY = "from jetbot_mjx.imports import install_lazy_imports; install_lazy_imports()"
+LAZILY = "from jetbot_mjx.startup import install_lazy_imports; install_lazy_imports()"
 """What a process runs first, to import as little as the commands do, which takes half the time."""
 
 

@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from jetbot_mjx.compiler.scalar_ir import EVALUATE, convert_constant, is_constant
-from jetbot_mjx.compiler.schedule import PlacedBranch, PlacedLoop
+from onekernel.lower.scalar_ir import EVALUATE, convert_constant, is_constant
+from onekernel.lower.schedule import PlacedBranch, PlacedLoop
 
 
 def evaluate(program, leaves):

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
-from gliding import everywhere
 
 from benchmarks import RESULTS, ROOT, steps_per_second
 from benchmarks.harness import readme_table, results, timing
@@ -29,10 +28,11 @@ from benchmarks.throughput import (
     randomization_cost,
     rate_plots,
 )
-from jetbot_mjx.compiler import llvm_backend, ptx_backend
+from helpers.gliding import everywhere
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
+from onekernel import cpu, gpu
 
 SMALL = Sizes(repeats=2, unroll=4, training_steps=1)
 
@@ -257,7 +257,7 @@ def test_physics_stays_within_its_number_of_kernels_and_operations():
 
 
 @pytest.mark.skipif(
-    (ptx_backend if jax.default_backend() == "gpu" else llvm_backend).obstacle() is not None,
+    (gpu if jax.default_backend() == "gpu" else cpu).obstacle() is not None,
     reason="XLA takes no kernels here",
 )
 def test_physics_as_a_kernel_is_one_call():

@@ -2,11 +2,9 @@
 
 import argparse
 import contextlib
-import importlib.util
 import json
 import os
 import re
-import shlex
 import subprocess
 import sys
 import tomllib
@@ -15,46 +13,39 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 import pytest
-from command_modules import evaluate, render, train
 from ruamel.yaml import YAML
 
-from jetbot_mjx import (
-    check_env,
-    cli,
-    export,
-    new_task,
-    plan,
-    play,
-    pretrained,
-    replay,
-    sim2real,
+from helpers.doc_pages import (
+    ALL_PAGES,
+    COMMANDS,
+    DOCS,
+    GENERATED,
+    PAGES,
+    ROOT,
+    blocks,
+    commands,
+    in_full,
+    load,
+    own_files,
 )
-from jetbot_mjx.agents.ppo import LOSSES
-from jetbot_mjx.config import CHANGEABLE_ON_RESUME, Config, ConfigError, load_config, parse_config
+from jetbot_mjx import (
+    cli,
+)
+from jetbot_mjx.agents import LOSSES
+from jetbot_mjx.config import (
+    CHANGEABLE_ON_RESUME,
+    QUANTITIES,
+    Config,
+    ConfigError,
+    LookParams,
+    RobotParams,
+    load_config,
+    parse_config,
+)
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.evaluation.evaluator import Summary
-from jetbot_mjx.runs import command as runs_command
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.sb3_tags import aliases
-from jetbot_mjx.training import configs
-from jetbot_mjx.tuning import command as tune_command
-
-ROOT = Path(__file__).parents[2]
-DOCS = ROOT / "docs"
-PAGES = {str(path.relative_to(DOCS)): path.read_text("utf-8") for path in DOCS.rglob("*.md")}
-GENERATED = "configuration.md"
-
-
-def load(path):
-    """A module by its path, such as the one that writes the reference."""
-    spec = importlib.util.spec_from_file_location(path.stem, path)
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
-
-
-reference = load(DOCS / "reference.py")
-ALL_PAGES = {**PAGES, GENERATED: reference.page(), **reference.room_pages()}
 
 
 def nav():
@@ -72,14 +63,6 @@ def nav():
     return list(pages(YAML(typ="safe").load(ROOT / "mkdocs.yml")["nav"]))
 
 
-def blocks(text, language):
-    """Fenced blocks, those inside lists too, as they would be written at the margin."""
-    for indent, body in re.findall(
-        rf"^( *)```{language}\n(.*?)^ *```$", text, flags=re.DOTALL | re.MULTILINE
-    ):
-        yield "".join(line.removeprefix(indent) for line in body.splitlines(keepends=True))
-
-
 # Pages and links.
 
 
@@ -95,19 +78,23 @@ def test_every_page_is_linked_from_the_first():
 
 
 def test_every_module_has_its_place_in_the_reference():
-    told = re.findall(r"^::: jetbot_mjx\.([\w.]+)$", "\n".join(ALL_PAGES.values()), flags=re.M)
-    package = ROOT / "jetbot_mjx"
-    paths = [path.relative_to(package) for path in package.rglob("*.py")]
+    told = re.findall(r"^::: ([\w.]+)$", "\n".join(ALL_PAGES.values()), flags=re.M)
+    paths = [*(ROOT / "jetbot_mjx").rglob("*.py"), *(ROOT / "onekernel").rglob("*.py")]
     modules = {
-        ".".join(path.with_suffix("").parts)
+        ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__")
         for path in paths
-        if path.name != "__init__.py" and path.parts[0] != "assets"
+        if "assets" not in path.parts
     }
-    assert sorted(told) == sorted(modules)
+    # The docstring of a room is the text of its page.
+    rooms = {
+        ".".join(x.parent.relative_to(ROOT).parts) for x in ROOT.glob("jetbot_mjx/*/__init__.py")
+    }
+    rooms |= {"jetbot_mjx", "onekernel"}
+    assert sorted(told) == sorted(modules - rooms)
 
 
 def test_every_public_name_is_listed(root):
-    for name in re.findall(r" as (\w+)$", (root / "jetbot_mjx/__init__.py").read_text(), re.M):
+    for name in re.findall(r" as (\w+)$", (root / "jetbot_mjx/__init__.pyi").read_text(), re.M):
         if not name.startswith("_"):
             assert f"[`{name}`][jetbot_mjx." in PAGES["api/index.md"]
 
@@ -266,6 +253,42 @@ def test_the_shipped_files_are_told(root):
     assert told["ppo.entropy_cost"]["gpu"] == ""
 
 
+@pytest.mark.parametrize(
+    ("page", "names"),
+    [
+        ("randomization.md", RobotParams._fields),
+        ("camera.md", LookParams._fields),
+        ("robustness.md", tuple(QUANTITIES)),
+    ],
+)
+def test_every_quantity_has_its_row(page, names):
+    keys = [cells[0].strip("`") for cells in rows(PAGES[page])]
+    assert tuple(key for key in keys if key in QUANTITIES) == names
+
+
+@pytest.mark.parametrize(
+    ("page", "row"),
+    [
+        (
+            "randomization.md",
+            "| `start_yaw` | [rad] heading at the start, counter-clockwise. | -π, π |",
+        ),
+        (
+            "randomization.md",
+            "| `height_offset` | [m] offset of the observed height, constant over",
+        ),
+        ("camera.md", "| `camera_delay` | [control steps] delay of the images. | 0, 2 | EST 30 to"),
+        ("camera.md", "stays. | - | BOM cameras of 10 to 60 images a second |"),
+        (
+            "robustness.md",
+            "| `friction` | wheel-floor friction | × preset | 0.3, 0.4, 0.6, 0.8, 1, 1.2 |",
+        ),
+    ],
+)
+def test_a_row_tells_a_quantity_s_ranges_and_source(page, row):
+    assert row in PAGES[page]
+
+
 def table_after(page, heading):
     """Rows of the first table below some words."""
     return list(rows(PAGES[page].partition(heading)[2].partition("\n\n")[2].partition("\n\n")[0]))
@@ -373,54 +396,13 @@ class Parsed(Exception):
     """Raised in place of the work, with what was asked for."""
 
 
-KEYWORDS = {"until", "do", "done", "while", "if", "then", "fi"}
 PLAIN = {"[", "break", "tensorboard", "apt-get", "scp"}
 EXPORTED = "policy/policy.py"
 """Where an export lies, in a run folder or on a robot; it takes no arguments."""
 VARIABLES = {
-    *("JAX_DEFAULT_MATMUL_PRECISION", "WANDB_MODE"),
+    *("JAX_DEFAULT_MATMUL_PRECISION", "JETBOT_MJX_PLAIN_START", "WANDB_MODE"),
     *("JAX_COORDINATOR_ADDRESS", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID"),
 }
-COMMANDS = {
-    "new_task": new_task,
-    "check_env": check_env,
-    "plan": plan,
-    "train": train,
-    "evaluate": evaluate,
-    "render": render,
-    "replay": replay,
-    "play": play,
-    "export": export,
-    "sim2real": sim2real,
-    "pretrained": pretrained,
-    "configs": configs,
-    "runs": runs_command,
-    "tune": tune_command,
-}
-
-
-def commands(block):
-    """The simple commands of a block, as lists of words."""
-    for line in block.replace("\\\n", " ").splitlines():
-        words = []
-        lexer = shlex.shlex(line, posix=True, punctuation_chars=True)
-        lexer.wordchars += "$,:[]{}+"
-        for word in [*lexer, ";"]:
-            if set(word) <= set(";&|"):
-                if words:
-                    yield words
-                words = []
-            elif words or word not in KEYWORDS:
-                words.append(word)
-
-
-def in_full(words):
-    """A command with `jetbot-mjx train` written as `python -m jetbot_mjx.train`."""
-    if "jetbot-mjx" not in words:
-        return words
-    at = words.index("jetbot-mjx")
-    name, rest = [one.replace("-", "_") for one in words[at + 1 : at + 2]], words[at + 2 :]
-    return [*words[:at], "python", "-m", ".".join(["jetbot_mjx", *name]), *rest]
 
 
 SHELL = [
@@ -429,16 +411,6 @@ SHELL = [
     for block in blocks(text, "sh")
     for words in commands(block)
 ]
-
-
-def own_files(page):
-    """Files that a page has its reader write: blocks that begin with a file's name."""
-    found = {}
-    for language in ("python", "yaml"):
-        for block in blocks(PAGES[page], language):
-            if name := re.match(r"# ([\w-]+\.\w+)\n", block):
-                found[name[1]] = block
-    return found
 
 
 @pytest.fixture
@@ -563,7 +535,7 @@ def check_install(arguments):
         ("a.md", "rm -rf runs"),
     ],
 )
-def test_a_command_that_is_none_is_seen(page, block, reader, monkeypatch):
+def test_an_invalid_command_is_reported(page, block, reader, monkeypatch):
     monkeypatch.setitem(PAGES, "a.md", f"```sh\n{block}\n```\n")
     ((found,),) = [list(commands(one)) for one in blocks(PAGES[page], "sh")]
     with pytest.raises((AssertionError, ConfigError, FileNotFoundError, KeyError, SystemExit)):

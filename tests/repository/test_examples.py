@@ -1,14 +1,14 @@
-"""The example of a task of your own: it loads by name, behaves as described, and trains."""
+"""The example of a new task: it loads by name, behaves as described, and trains."""
 
 import json
 
-import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import jetbot_mjx
+from helpers import gliding
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state

@@ -1,11 +1,11 @@
-"""The example with a memory: how many gates are passed is part of the goal, and is counted."""
+"""The example with a memory: the number of passed gates is part of the goal."""
 
-import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import robot_state

@@ -63,14 +63,17 @@ def execute(root, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def gliding_profile(tmp_path_factory):
-    """A folder of IPython's from which every kernel begins with a robot that glides."""
+    """A folder of IPython's from which every kernel begins with a robot that glides, and with
+    small videos."""
     profile = tmp_path_factory.mktemp("gliding")
     startup = profile / "profile_default" / "startup" / "glide.py"
     startup.parent.mkdir(parents=True)
-    tests = str(Path(__file__).parents[1] / "helpers")
+    tests = str(Path(__file__).parents[1])
     startup.write_text(
-        f"import sys\nsys.path.append({tests!r})\nimport gliding\n"
+        f"import sys\nsys.path.append({tests!r})\nfrom helpers import gliding\n"
         "everywhere = gliding.everywhere()\neverywhere.__enter__()\n"
+        "import functools\nfrom jetbot_mjx.viewers import gallery, video\n"
+        "gallery.VideoRenderer = functools.partial(video.VideoRenderer, side=64, fps=2)\n"
     )
     return profile
 
@@ -125,7 +128,7 @@ def test_evaluation_notebook_shows_the_run_of_the_training_notebook(
 
 
 @pytest.mark.slow
-def test_a_task_of_ones_own_is_trained_from_a_blank_class(execute, gliding_profile):
+def test_the_notebook_of_a_new_task_trains_it_from_a_blank_class(execute, gliding_profile):
     notebook = execute("04_own_task", gliding_profile)
     assert images(notebook) == ["image/png", "image/gif"]
     assert "blank_task:BlankTask sees" in text(notebook)

@@ -1,4 +1,4 @@
-"""The example with solid obstacles: the robot really runs into them, wherever they were drawn."""
+"""The example with solid obstacles: the robot collides with them wherever they are drawn."""
 
 import copy
 
@@ -123,6 +123,6 @@ def test_a_solid_body_without_a_place_is_refused(env, monkeypatch):
         jax.eval_shape(env.step, state, jnp.zeros(2))
 
 
-def test_what_only_shows_has_no_place_in_physics(world_env, env):
+def test_visual_geoms_are_not_in_the_physics_model(world_env, env):
     assert world_env.physics.mocap_names == ()
     assert env.physics.mocap_names == ("pillar_0", "pillar_1", "pillar_2")

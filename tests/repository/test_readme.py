@@ -1,3 +1,5 @@
+"""The README: its size, its links and its example."""
+
 import re
 import subprocess
 import sys

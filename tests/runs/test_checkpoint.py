@@ -1,3 +1,5 @@
+"""Policies loaded from checkpoints, and errors for damaged ones."""
+
 import json
 import os
 import shutil
@@ -24,7 +26,7 @@ from jetbot_mjx.runs.checkpoint import (
     load_checkpoint,
 )
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore, checkpoint_steps, digest
-from jetbot_mjx.runs.resume import TRAINING
+from jetbot_mjx.runs.resumption import TRAINING
 
 
 @pytest.fixture
@@ -32,7 +34,7 @@ def run_copy(smoke_run, tmp_path):
     return shutil.copytree(smoke_run, tmp_path / "run")
 
 
-def test_a_checkpoint_explains_itself(smoke_run):
+def test_a_checkpoint_holds_its_metadata(smoke_run):
     checkpoint = load_checkpoint(smoke_run, "last")
     assert checkpoint.env_steps == 65_536
     assert checkpoint.config.task.observation == "egocentric"
@@ -82,13 +84,13 @@ def test_the_best_is_the_one_with_the_highest_success_and_of_equals_the_latest(t
     assert load_checkpoint(tmp_path / "run", 10).env_steps == 10
 
 
-def test_one_that_was_not_judged_is_not_the_best(write):
+def test_a_checkpoint_without_an_evaluation_is_not_the_best(write):
     run_dir = write((0, 0.0), (10, None))
     assert load_checkpoint(run_dir, "best").env_steps == 0
     assert load_checkpoint(run_dir, "last").env_steps == 10
 
 
-def test_what_is_read_is_what_was_written(smoke_run, write):
+def test_a_checkpoint_is_read_back_unchanged(smoke_run, write):
     checkpoint = load_checkpoint(smoke_run)
     again = load_checkpoint(write((1, 1.0))).params
     assert jax.tree.structure(again) == jax.tree.structure(checkpoint.params)
@@ -148,7 +150,7 @@ def test_an_observation_of_another_size_is_refused_with_what_is_expected(smoke_r
     assert str(caught.value).endswith(f"; {got}")
 
 
-def test_one_checkpoint_folder_stands_for_itself(smoke_run):
+def test_a_single_checkpoint_folder_can_be_loaded(smoke_run):
     folder = find_checkpoint(smoke_run, 16_384)
     assert load_checkpoint(folder).env_steps == 16_384
 
@@ -161,7 +163,7 @@ def refused(path, which="best"):
     return message
 
 
-def test_what_is_not_there_is_refused(smoke_run, tmp_path):
+def test_a_missing_checkpoint_is_refused(smoke_run, tmp_path):
     assert "no such folder" in refused(tmp_path / "nothing")
     assert "neither" in refused(tmp_path)
     (tmp_path / "run" / "checkpoints").mkdir(parents=True)
@@ -184,12 +186,12 @@ def test_another_shape_is_refused(smoke_run, write):
 
 
 @pytest.mark.parametrize("key", ["config", "observation_size", "format", "layout"])
-def test_an_incomplete_explanation_is_refused(write, key):
+def test_incomplete_metadata_is_refused(write, key):
     assert f"has unusable metadata: no {key}" in refused(write((1, 0.5), without=[key]), 1)
 
 
 @pytest.mark.parametrize("key", ["config", "layout", "env_steps"])
-def test_an_explanation_that_was_changed_is_refused(run_copy, key):
+def test_changed_metadata_is_refused(run_copy, key):
     folder = find_checkpoint(run_copy, "last")
     path = folder / "about" / "metadata"
     path.write_text(path.read_text().replace(f'"{key}"', f'"{key}s"', 1))
@@ -222,7 +224,7 @@ def test_a_policy_from_another_checkpoint_is_refused(run_copy):
     assert "policy changed after it was written" in refused(folder)
 
 
-def test_what_acting_does_not_need_may_be_damaged(run_copy):
+def test_a_policy_is_loaded_beside_a_damaged_training_state(run_copy):
     folder = find_checkpoint(run_copy, "best")
     before = load_checkpoint(folder)
     shutil.rmtree(folder / TRAINING)
@@ -346,7 +348,7 @@ def test_a_file_that_cannot_be_read_costs_one_line_and_no_time(run_copy, harm, f
 
 
 @pytest.mark.parametrize("rate", ["high", [1], {}, 2.0, float("1e300")])
-def test_a_success_rate_that_is_none_is_not_the_best(write, rate):
+def test_a_checkpoint_without_a_success_rate_is_not_the_best(write, rate):
     run_dir = write((0, 0.1), (10, 0.2))
     path = run_dir / "checkpoints" / f"{10:012}" / "about" / "metadata"
     about = json.loads(path.read_text())

@@ -1,4 +1,4 @@
-"""Checkpoints on disk: whole or absent, the right ones kept, and nothing else taken for one."""
+"""Checkpoints on disk: whole or absent, and the right ones kept."""
 
 import errno
 import json
@@ -64,7 +64,7 @@ joined_or_not = pytest.mark.parametrize("joined", [(), ("tree",)], ids=["arrays"
 
 
 @joined_or_not
-def test_what_is_read_is_what_was_written(run_dir, joined):
+def test_a_checkpoint_is_read_back_unchanged(run_dir, joined):
     save(run_dir, 3, joined=joined)
     again = read(run_dir, 3, jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), TREE))
     assert jax.tree.structure(again) == jax.tree.structure(TREE)
@@ -77,7 +77,7 @@ def test_what_is_read_is_what_was_written(run_dir, joined):
     assert about["env_steps"] == 3
 
 
-def test_what_is_written_later_does_not_change_what_is_being_written(run_dir):
+def test_arrays_changed_while_they_are_saved_are_saved_unchanged(run_dir):
     tree = {"weights": np.zeros(100_000)}
     with CheckpointStore(run_dir, keep=50) as store:
         store.save(1, {"tree": tree}, {}, None)
@@ -127,7 +127,7 @@ def test_a_joined_tree_is_one_array_on_disk_and_refused_if_it_is_shorter(run_dir
     assert f"bytes is uint8[16], and should be uint8[{size}]" in refused(read, run_dir, 1)
 
 
-def test_a_table_that_is_none_is_refused(run_dir):
+def test_an_invalid_table_is_refused(run_dir):
     with CheckpointStore(run_dir, 50) as store:
         store.save(1, {"tree": TREE}, {}, None)
     file = checkpoint_path(run_dir, 1) / "about" / "metadata"
@@ -173,13 +173,21 @@ def test_only_what_carries_the_name_of_a_checkpoint_is_one(run_dir):
     assert checkpoint_steps(run_dir) == [5, 1_000_000_000_000_000, 2_000_000_000_000_000]
 
 
-def test_what_an_earlier_process_left_unfinished_is_cleared_away(run_dir):
+def test_unfinished_checkpoints_of_an_earlier_process_are_deleted(run_dir):
     save(run_dir, 1)
     left = run_dir / FOLDER / "000000000002.orbax-checkpoint-tmp"
     (left / "tree.orbax-checkpoint-tmp").mkdir(parents=True)
     save(run_dir, 3)
     assert not left.exists()
     assert checkpoint_steps(run_dir) == [1, 3]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_in_the_place_of_deleted_checkpoints_holds_nothing_up(run_dir):
+    (run_dir / FOLDER).mkdir()
+    os.mkfifo(run_dir / FOLDER / ".deleted")
+    save(run_dir, *RATES, keep=1)
+    assert checkpoint_steps(run_dir) == [0, 20, 60]
 
 
 RATES = [(0, 0.1), (10, 0.9), (20, 0.9), (30, 0.2), (40, None), (50, 0.3), (60, 0.3)]
@@ -194,7 +202,7 @@ def test_the_latest_the_first_and_the_best_stay_and_of_equals_the_later(run_dir,
     assert checkpoint_steps(run_dir) == kept
 
 
-def test_where_old_ones_are_moved_to_is_not_taken_away_while_one_may_be_on_its_way(run_dir):
+def test_the_folder_of_old_checkpoints_is_kept_while_one_is_being_moved(run_dir):
     with CheckpointStore(run_dir, keep=1) as store:
         moved = run_dir / FOLDER / ".deleted"
         (moved / "1").mkdir(parents=True)
@@ -267,7 +275,7 @@ def test_a_write_that_fails_on_the_way_costs_one_line_and_no_other_checkpoint(
 
 
 @pytest.mark.parametrize("method", ["save", "wait_until_finished", "close"])
-def test_what_orbax_raises_while_writing_costs_one_line(run_dir, monkeypatch, method):
+def test_an_error_of_orbax_while_writing_is_one_line(run_dir, monkeypatch, method):
     def fail(*arguments, **keywords):
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
@@ -301,7 +309,7 @@ def test_a_folder_that_cannot_be_made_costs_one_line(tmp_path):
     assert "could not be written" in refused(save, tmp_path / "run", 1)
 
 
-def test_what_is_set_aside_is_kept_and_never_lands_on_another(run_dir):
+def test_a_checkpoint_that_is_moved_aside_replaces_no_other(run_dir):
     save(run_dir, 1)
     places = []
     for _ in range(3):
@@ -315,7 +323,7 @@ def test_what_is_set_aside_is_kept_and_never_lands_on_another(run_dir):
     assert {place.parent for place in places} == {run_dir / "set_aside"}
 
 
-def test_what_cannot_be_set_aside_stays_and_costs_one_line(run_dir):
+def test_a_checkpoint_that_cannot_be_moved_is_kept_and_reported(run_dir):
     save(run_dir, 1)
     (run_dir / "set_aside").write_text("a file where a folder should be")
     assert "cannot be moved into" in refused(set_aside, checkpoint_path(run_dir, 1))
@@ -345,7 +353,7 @@ def change_about(path, change):
     ],
     ids=["steps", "value", "more", "fewer", "hash of a tree", "hash of no tree", "own hash"],
 )
-def test_an_explanation_that_was_changed_is_refused(run_dir, change):
+def test_changed_metadata_is_refused(run_dir, change):
     save(run_dir, 1)
     change_about(checkpoint_path(run_dir, 1), change)
     assert "changed after it was written" in refused(read_about, checkpoint_path(run_dir, 1))
@@ -368,7 +376,7 @@ def test_an_explanation_that_was_changed_is_refused(run_dir, change):
         "\udcff",
     ],
 )
-def test_an_explanation_that_is_none_is_refused(run_dir, text):
+def test_invalid_metadata_is_refused(run_dir, text):
     save(run_dir, 1)
     path = checkpoint_path(run_dir, 1)
     metadata(path).write_text(text, errors="surrogateescape")

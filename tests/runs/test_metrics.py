@@ -1,4 +1,4 @@
-"""Where the metrics go: each sink says what it was told, and the clock counts compiling once."""
+"""The sinks of metrics, and the clock that counts compilation once."""
 
 import errno
 import json
@@ -27,10 +27,10 @@ from jetbot_mjx.runs.metrics import (
     JsonlSink,
     TensorBoardSink,
     mean_of,
-    process_seconds,
     read_history,
 )
 from jetbot_mjx.runs.sb3_tags import aliases
+from helpers.tensorboard_files import events, read_events
 
 
 def lines_of(path):
@@ -55,7 +55,7 @@ def test_jsonl_holds_one_object_a_line_readable_at_once(tmp_path):
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, None])
-def test_what_is_no_number_is_null_in_json(tmp_path, value):
+def test_a_non_finite_metric_is_null_in_json(tmp_path, value):
     sink = JsonlSink(tmp_path / "metrics.jsonl")
     sink.write(1, {"before": 1.0, "it": value, "after": 2.0})
     sink.close()
@@ -77,7 +77,7 @@ def test_a_line_is_on_the_disk_when_it_is_written(tmp_path, monkeypatch):
     assert [text.count("\n") for text in synced] == [1, 2]
 
 
-def test_jsonl_without_a_history_begins_anew(tmp_path):
+def test_jsonl_without_a_history_starts_an_empty_file(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"env_steps": 5, "timestamp": 1.0}\n')
     sink = JsonlSink(path)
@@ -102,7 +102,7 @@ def logged(tmp_path):
     return path
 
 
-def test_a_history_is_read_as_it_was_written(logged, tmp_path):
+def test_a_history_is_read_back_unchanged(logged, tmp_path):
     assert read_history(logged, 1024) == HISTORY
     assert read_history(logged, 1023) == HISTORY[:2]
     assert read_history(logged, 512) == HISTORY[:2]
@@ -166,29 +166,8 @@ def test_a_full_disk_is_not_hidden(tmp_path, monkeypatch):
     sink.close()
 
 
-def events(folder):
-    """The events of the one event file of a folder.
-
-    A record is its length (8 bytes), a checksum (4), the event, and a checksum (4).
-    """
-    (path,) = folder.iterdir()
-    data = path.read_bytes()
-    found = []
-    while data:
-        (length,) = struct.unpack("<Q", data[:8])
-        found.append(Event.FromString(data[12 : 12 + length]))
-        data = data[12 + length + 4 :]
-    return found
 
 
-def read_events(folder):
-    """(step, name, value) of every scalar in the one event file of a folder."""
-    return [
-        (event.step, value.tag, value.simple_value)
-        for event in events(folder)
-        for value in event.summary.value
-        if value.WhichOneof("value") == "simple_value"
-    ]
 
 
 def test_tensorboard_events_can_be_read_again(tmp_path):
@@ -403,7 +382,7 @@ def test_compiling_within_tracing_is_not_counted_twice(clock):
         ([(1.0, 1.0), (3.0, 1.0), (5.0, 1.0), (6.0, 4.5)], 5.5),
     ],
 )
-def test_a_span_stands_for_those_within_it(clock, monkeypatch, events, expected):
+def test_a_compilation_counts_once_with_those_inside_it(clock, monkeypatch, events, expected):
     for end, duration in events:
         monkeypatch.setattr(metrics, "time", types.SimpleNamespace(perf_counter=lambda t=end: t))
         jax.monitoring.record_event_duration_secs(CompileClock._EVENTS[0], duration)
@@ -411,7 +390,7 @@ def test_a_span_stands_for_those_within_it(clock, monkeypatch, events, expected)
     assert clock.lap() == pytest.approx(expected)
 
 
-def test_what_threads_compile_side_by_side_counts_once(clock):
+def test_compilations_in_parallel_threads_count_once(clock):
     barrier = threading.Barrier(2)
 
     def compile():
@@ -445,13 +424,7 @@ def test_a_clock_that_was_left_no_longer_listens():
     assert (clock.programs, clock.cached) == (0, 0)
 
 
-def test_a_process_knows_how_long_it_has_been_there():
-    before = process_seconds()
-    time.sleep(0.05)
-    assert 0.0 < before < process_seconds() < 24 * 3600
-
-
-def test_what_spans_two_laps_counts_once():
+def test_a_compilation_across_two_intervals_counts_once():
     event = "/jax/core/compile/backend_compile_duration"
     with CompileClock() as clock:
         began = time.perf_counter()

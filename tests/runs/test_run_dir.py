@@ -1,4 +1,4 @@
-"""The run folder: one training at a time, nothing but a run, every file whole."""
+"""The run folder: one training at a time, no foreign files, every file whole."""
 
 import json
 import os
@@ -12,6 +12,7 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs import run_dir
 from jetbot_mjx.runs.run_dir import (
+    atomic_folder,
     changed_versions,
     make_folder,
     occupied,
@@ -19,6 +20,7 @@ from jetbot_mjx.runs.run_dir import (
     seed_folders,
     stored_config,
     versions,
+    write_bytes,
     write_json,
     write_run,
     write_text,
@@ -172,7 +174,7 @@ def test_a_file_is_whole_or_as_it_was_whenever_the_process_ends(tmp_path, monkey
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_what_a_killed_process_left_half_written_does_not_make_a_folder_used(tmp_path, monkeypatch):
+def test_half_written_files_of_a_killed_process_do_not_occupy_a_folder(tmp_path, monkeypatch):
     def die(self, target):
         raise Killed
 
@@ -182,7 +184,7 @@ def test_what_a_killed_process_left_half_written_does_not_make_a_folder_used(tmp
     assert stored_config(tmp_path) is None
 
 
-def test_json_has_no_numbers_that_are_none(tmp_path):
+def test_json_has_no_non_finite_numbers(tmp_path):
     with pytest.raises(ValueError):
         write_json(tmp_path / "file.json", {"x": float("nan")})
     assert list(tmp_path.iterdir()) == []
@@ -217,7 +219,7 @@ def test_nothing_has_changed_where_all_is_as_it_was(tmp_path):
     ],
     ids=["other", "not there", "not told", "device", "device count"],
 )
-def test_what_has_changed_since_is_named(tmp_path, change, said):
+def test_versions_changed_since_the_training_are_named(tmp_path, change, said):
     store_versions(tmp_path, change)
     (found,) = changed_versions(tmp_path)
     assert found.startswith(said)
@@ -233,3 +235,14 @@ def test_versions_that_cannot_be_read_say_nothing(tmp_path, text):
 def test_versions_are_json(tmp_path):
     found = json.loads(json.dumps(versions()))
     assert {"python", "packages", "device", "device_count", "git"} <= found.keys()
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="this system has no named pipes")
+def test_a_pipe_in_the_place_of_an_unfinished_file_holds_nothing_up(tmp_path):
+    os.mkfifo(tmp_path / ".config.yaml.unfinished")
+    write_bytes(tmp_path / "config.yaml", b"seed: 1\n")
+    assert [path.name for path in tmp_path.iterdir()] == ["config.yaml"]
+    os.mkfifo(tmp_path / ".policy.unfinished")
+    with atomic_folder(tmp_path / "policy") as unfinished:
+        (unfinished / "file").touch()
+    assert {path.name for path in tmp_path.iterdir()} == {"config.yaml", "policy"}

@@ -1,4 +1,4 @@
-"""Who comes from Stable-Baselines3 finds its curves, in its units."""
+"""Stable-Baselines3's names of metrics, with their units."""
 
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
@@ -52,7 +52,7 @@ def test_figures_have_the_names_and_units_of_stable_baselines3_as_well():
     }
 
 
-def test_what_does_not_exist_has_no_other_name_either():
+def test_a_metric_without_a_value_has_no_alias():
     metrics = {"rollout/episode_return": None, "time/wall_seconds": 0.0}
     found = with_aliases(0, metrics, aliases(PPO))
     assert found == {

@@ -1,11 +1,11 @@
-"""The source of a task in its run: what is stored, which source runs, and what is said about it."""
+"""The source of a task in its run: what is stored, which source runs, and what is reported."""
 
 import importlib
 import json
 import sys
 import textwrap
 
-import gliding
+from helpers import gliding
 import pytest
 
 from jetbot_mjx.config import load_config, parse_config
@@ -13,7 +13,7 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.mujoco_env import MujocoJetBot
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs import task_code
+from jetbot_mjx.runs import Setup, task_code
 from jetbot_mjx.runs.checkpoint import load_checkpoint
 from jetbot_mjx.runs.task_code import (
     collect_task_code,
@@ -30,6 +30,7 @@ import os
 import jax
 import typing
 from jetbot_mjx.envs.task import GoalTask
+from kicking_words import WORD
 from kicking_tools import FACTOR
 
 class Kick(typing.NamedTuple):
@@ -38,19 +39,18 @@ class Kick(typing.NamedTuple):
 class Task(GoalTask):
     factor = FACTOR
 
-    def late(self):
-        from kicking_late import WORD
+    def word(self):
         return WORD
 """
 TOOLS = "import kicking_deep\nFACTOR = {}\n"
-FILES = {f"{NAME}.py", "kicking_tools.py", "kicking_late.py", "kicking_deep.py"}
+FILES = {f"{NAME}.py", "kicking_tools.py", "kicking_words.py", "kicking_deep.py"}
 
 
 @pytest.fixture(autouse=True)
 def forget(monkeypatch):
-    """Each test imports and says anew."""
+    """Each test imports its task, and gets its messages, for the first time."""
     monkeypatch.setattr(task_code, "_said", set())
-    monkeypatch.setattr(task_code, "_importers", {})
+    monkeypatch.setattr(task_code, "_modules", {})
 
 
 def own_modules():
@@ -61,7 +61,7 @@ def write_task(folder, factor=1):
     folder.mkdir(exist_ok=True)
     (folder / f"{NAME}.py").write_text(TASK)
     (folder / "kicking_tools.py").write_text(TOOLS.format(factor))
-    (folder / "kicking_late.py").write_text(f"WORD = 'late {factor}'\n")
+    (folder / "kicking_words.py").write_text(f"WORD = 'word {factor}'\n")
     (folder / "kicking_deep.py").write_text("import numpy\n")
     (folder / "kicking_other.py").write_text("raise AssertionError\n")
     return folder
@@ -126,15 +126,32 @@ def test_packages_are_stored_with_their_folders(tmp_path, monkeypatch, capsys):
     assert own_modules() == set()
 
 
-def test_what_is_too_large_is_not_stored_and_a_line_says_so(tmp_path, monkeypatch, capsys):
+def test_a_task_that_is_too_large_is_not_stored_and_a_line_says_so(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(write_task(tmp_path / "src"))
     monkeypatch.setattr(task_code, "MAX_BYTES", 100)
     assert collect_task_code(f"{NAME}:Task") is None
     assert "is larger than 100 bytes and is not stored" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("statement", ["import kicking_tools", "from kicking_tools import FACTOR"])
+def test_a_task_with_late_imports_is_not_stored_and_a_line_says_so(
+    tmp_path, monkeypatch, capsys, statement
+):
+    source = write_task(tmp_path / "src")
+    late = f"class Task:\n    def reward(self):\n        import numpy\n        {statement}\n"
+    (source / f"{NAME}.py").write_text(late)
+    monkeypatch.syspath_prepend(source)
+    monkeypatch.chdir(source)
+    assert collect_task_code(f"{NAME}:Task") is None
+    assert capsys.readouterr().err == (
+        f"{NAME}.py, line 4: imports kicking_tools inside a function, so that the source of"
+        f" {NAME}:Task is not stored in the run: move the import to the top of the file\n"
+    )
+
+
 def test_stored_source_runs_where_the_module_cannot_be_found(tmp_path, monkeypatch, capsys):
-    run_dir, path = store(tmp_path / "run", tmp_path / "src", 3), list(sys.path)
+    run_dir = store(tmp_path / "run", tmp_path / "src", 3)
+    before = list(sys.path), list(sys.meta_path), sys.dont_write_bytecode
     with pytest.raises(ModuleNotFoundError):
         importlib.import_module(NAME)
     monkeypatch.chdir(tmp_path)
@@ -143,11 +160,10 @@ def test_stored_source_runs_where_the_module_cannot_be_found(tmp_path, monkeypat
     assert (found.__module__, found.factor) == (NAME, 3)
     said = capsys.readouterr().err
     assert said == f"running the task's code stored in run/task/{NAME}.py\n"
-    # It leaves no trace, and finds its own modules later too.
-    assert (sys.path, own_modules()) == (path, set())
-    assert task_code._StoredModules not in map(type, sys.meta_path)
-    assert found.late(None) == "late 3"
+    # It leaves no trace.
+    assert (sys.path, sys.meta_path, sys.dont_write_bytecode) == before
     assert own_modules() == set()
+    assert found.word(None) == "word 3"
     assert not list(run_dir.rglob("*.pyc"))
     # The same class once more, without another line.
     assert stored_task_class(run_dir, f"{NAME}:Task") is found
@@ -169,17 +185,18 @@ def test_stored_source_runs_where_the_module_has_changed(tmp_path, monkeypatch, 
     elif change == "imported":
         write_task(tmp_path / "src", 4)
     else:
-        (tmp_path / "src" / "kicking_late.py").unlink()
+        (tmp_path / "src" / "kicking_words.py").unlink()
     monkeypatch.syspath_prepend(tmp_path / "src")
-    on_disk = importlib.import_module(NAME)
+    on_disk = None if change == "removed" else importlib.import_module(NAME)
     found = stored_task_class(run_dir, f"{NAME}:Task")
     assert found.factor == 3
-    assert found.late(None) == "late 3"
+    assert found.word(None) == "word 3"
     said = capsys.readouterr().err
     assert f"{NAME} on disk differs from the code this run was trained with: using the" in said
     assert said.count("\n") == 1
-    assert sys.modules[NAME] is on_disk
-    assert on_disk.Task.factor == {"module": 8, "imported": 4, "removed": 3}[change]
+    assert sys.modules.get(NAME) is on_disk
+    if on_disk:
+        assert on_disk.Task.factor == {"module": 8, "imported": 4}[change]
 
 
 def test_runs_with_different_sources_of_one_name_each_have_their_own(tmp_path):
@@ -187,7 +204,7 @@ def test_runs_with_different_sources_of_one_name_each_have_their_own(tmp_path):
     same = store(tmp_path / "run-3", tmp_path / "src-3", 2)
     one, two, three = (stored_task_class(run_dir, f"{NAME}:Task") for run_dir in [*runs, same])
     assert (one.factor, two.factor) == (1, 2)
-    assert (one.late(None), two.late(None)) == ("late 1", "late 2")
+    assert (one.word(None), two.word(None)) == ("word 1", "word 2")
     assert two is three
 
 
@@ -298,16 +315,18 @@ def test_a_run_is_whole_without_the_module_and_resumes_with_its_own_task(
     assert load_checkpoint(run_dir).make_env().task.factor == 3
     monkeypatch.setattr(task_code, "_said", set())
     capsys.readouterr()
-    env, code = session._make_env(config, [run_dir])
-    assert (env.task.factor, code) == (3, None)
+    task_class, code = session._find_task(config.task.name, [run_dir])
+    assert (task_class.factor, code) == (3, None)
     assert f"{NAME} on disk differs from the code this run was" in capsys.readouterr().err
     # A new run has the new one, in the folders of all of its seeds.
     two = parse_config({**config.model_dump(), "seeds": 2})
     run_dirs = [tmp_path / "two" / f"seed-{n}" for n in (0, 1)]
-    env, code = session._make_env(two, run_dirs)
-    assert env.task.factor == 4
+    task_class, code = session._find_task(config.task.name, run_dirs)
+    assert task_class is None
+    assert dict(code.files)["kicking_tools.py"] == TOOLS.format(4).encode()
     for folder in run_dirs:
         folder.mkdir(parents=True)
-    session._store_run(session.Training(two, tmp_path / "two", run_dirs, *[None] * 5, [], code))
+    folders = {"run_dir": tmp_path / "two", "run_dirs": run_dirs}
+    session._store_run(session.Training(setup=Setup(two), **folders, ppo=None, task_code=code))
     for folder in (tmp_path / "two", *run_dirs):
         assert read_task_code(folder) == code

@@ -12,6 +12,6 @@ def test_messages_are_appended_with_the_time(tmp_path):
     assert [line[21:] for line in lines] == ["one", "two", "three"]
 
 
-def test_a_pipe_in_its_place_holds_nobody_up(tmp_path):
+def test_a_named_pipe_in_its_place_does_not_block(tmp_path):
     os.mkfifo(tmp_path / TRAIN_LOG)
     log_message(tmp_path, "nobody reads this")

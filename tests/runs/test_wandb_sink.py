@@ -1,4 +1,4 @@
-"""Weights & Biases: never imported unasked, told no step twice, and never a reason to stop."""
+"""Weights & Biases: imported only if configured, each step once, and no error ends a training."""
 
 import importlib.machinery
 import importlib.util
@@ -11,64 +11,18 @@ import types
 from pathlib import Path
 
 import pytest
-from command_modules import train
+from helpers.command_modules import train
 
 from jetbot_mjx import load_config
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.metrics import History
 from jetbot_mjx.runs.wandb_sink import WandbSink, check_tracking
+from helpers.fake_wandb import FakeWandb
 
 
-class FakeWandb(types.ModuleType):
-    """Stands in for the package: remembers what it is told, fails where it is asked to."""
-
-    def __init__(self):
-        super().__init__("wandb")
-        self.__spec__ = importlib.machinery.ModuleSpec("wandb", None, origin="here")
-        self.runs = []
-        self.failing = set()
-
-    def Video(self, path, format):
-        return path, format
-
-    def Settings(self, **settings):
-        return settings
-
-    def init(self, **arguments):
-        if "init" in self.failing:
-            raise RuntimeError("no network\nand much more")
-        self.runs.append(FakeRun(self, arguments))
-        return self.runs[-1]
 
 
-class FakeRun:
-    """One run of it."""
-
-    offline = False
-    url = "https://example.com/run"
-
-    def __init__(self, wandb, arguments):
-        self.wandb = wandb
-        self.arguments = arguments
-        self.logged = {}
-        self.defined = {}
-        self.finished = False
-
-    def define_metric(self, name, **settings):
-        self.defined[name] = settings
-
-    def log(self, values, step):
-        if "log" in self.wandb.failing:
-            raise ValueError
-        assert step == max(self.logged, default=step) or step > max(self.logged)
-        assert not self.logged.get(step, {}).keys() & values.keys()
-        self.logged.setdefault(step, {}).update(values)
-
-    def finish(self):
-        if "finish" in self.wandb.failing:
-            raise TimeoutError("Timed out finishing run.")
-        self.finished = True
 
 
 @pytest.fixture
@@ -95,7 +49,7 @@ def track(tmp_path):
     return track
 
 
-def test_a_training_does_not_import_it_unasked(smoke_run):
+def test_a_training_does_not_import_wandb_unless_configured(smoke_run):
     assert load_config(smoke_run / "config.yaml").wandb is None
     assert "wandb" not in sys.modules
     assert not (smoke_run / "wandb.json").exists()
@@ -118,7 +72,7 @@ def test_without_the_package_nothing_is_written(tmp_path, monkeypatch, root, fou
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_run_is_told_what_it_is_and_all_that_tensorboard_is_told(wandb, track):
+def test_a_run_gets_its_configuration_and_every_metric(wandb, track):
     sink = track()
     sink.write(8192, {"policy/entropy": 0.5, "eval/time_to_goal_median": None})
     sink.close()
@@ -145,7 +99,7 @@ def test_a_run_is_told_what_it_is_and_all_that_tensorboard_is_told(wandb, track)
     assert track.said == ["Weights & Biases: https://example.com/run"]
 
 
-def test_it_goes_on_with_the_same_run_and_no_step_is_told_twice(wandb, track):
+def test_a_resumed_training_logs_to_the_same_run_and_no_step_twice(wandb, track):
     first = track()
     for step in (0, 10, 20):
         first.write(step, {"a": step})
@@ -158,7 +112,7 @@ def test_it_goes_on_with_the_same_run_and_no_step_is_told_twice(wandb, track):
     assert [list(run.logged) for run in wandb.runs] == [[0, 10, 20], [30]]
 
 
-def test_a_video_is_told_with_the_metrics_of_its_step_and_once(wandb, track):
+def test_a_video_is_logged_once_with_the_metrics_of_its_step(wandb, track):
     first = track()
     for step in (0, 10):
         first.write(step, {"a": step})
@@ -174,7 +128,7 @@ def test_a_video_is_told_with_the_metrics_of_its_step_and_once(wandb, track):
     assert other.logged == {}
 
 
-def test_what_was_logged_before_it_was_asked_for_is_told_first(wandb, track):
+def test_earlier_metrics_are_logged_first(wandb, track):
     sink = track([History(0, 1.0, {"a": 0.5}), History(10, 2.0, {"a": 1.5})])
     sink.write(20, {"a": 2.5})
     assert [(step, told["a"]) for step, told in wandb.runs[0].logged.items()] == [

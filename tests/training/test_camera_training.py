@@ -5,17 +5,17 @@ import os
 import subprocess
 import sys
 
-import gliding
 import jax
 import numpy as np
 import pytest
 
+from helpers import gliding
+
 pytest.importorskip("gymnasium")
 
-from command_modules import evaluate, train
-
+from helpers.command_modules import evaluate, train
 from jetbot_mjx import check_env, load_policy, make_env
-from jetbot_mjx.agents.ppo import NanDump
+from jetbot_mjx.agents import NanDump
 from jetbot_mjx.config import ConfigError, parse_config
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
 from jetbot_mjx.envs.wrappers import wrap_for_training

@@ -1,4 +1,4 @@
-"""Plain lines: how far, how good, how fast, and what is left to wait."""
+"""Plain lines of progress: steps, success, rate and time left."""
 
 import io
 import types

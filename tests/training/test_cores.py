@@ -5,8 +5,9 @@ import re
 import subprocess
 import sys
 
-import gliding
 import pytest
+
+from helpers import gliding
 
 pytestmark = [
     pytest.mark.cpu,

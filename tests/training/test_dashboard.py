@@ -1,26 +1,24 @@
-"""The dashboard disturbs neither training nor prints, and leaves the terminal in order."""
+"""The dashboard disturbs neither training nor output, and restores the terminal."""
 
 import io
 import os
 import re
 import subprocess
 import sys
-import threading
 import time
 
 import pytest
-from command_modules import train
 from rich.console import Console
-from test_preemption import LISTENER
 
-from jetbot_mjx.runs import metrics
-from jetbot_mjx.runs.metrics import History
+from helpers.command_modules import train
+from helpers.preemption_program import LISTENER
+from helpers.pseudo_terminal import PATIENCE, Screen
+from jetbot_mjx.runs.metrics import History, read_history
+from jetbot_mjx.terminal import restart_clock
 from jetbot_mjx.training import dashboard as dashboard_module
 from jetbot_mjx.training.console import Terminal
 from jetbot_mjx.training.dashboard import Dashboard, sparkline
 from jetbot_mjx.training.terminal import open_terminal
-
-PATIENCE = 60
 
 REPORT = {
     "eval/success_rate": 0.625,
@@ -38,43 +36,10 @@ REPORT = {
 }
 
 
-class Screen:
-    """A terminal as a pseudo-terminal: what is written to `stream` is in `text`."""
-
-    def __init__(self):
-        self._master, slave = os.openpty()
-        self.stream = os.fdopen(slave, "w", encoding="utf-8", newline="")
-        self._data = b""
-        self._thread = threading.Thread(target=self._read, daemon=True)
-        self._thread.start()
-
-    def _read(self):
-        while True:
-            try:
-                self._data += os.read(self._master, 4096)
-            except OSError:
-                return
-
-    @property
-    def text(self):
-        return self._data.decode("utf-8", "replace")
-
-    def until(self, text):
-        deadline = time.monotonic() + PATIENCE
-        while text not in self.text:
-            assert time.monotonic() < deadline, self.text
-            time.sleep(0.01)
-
-    def close(self):
-        self.stream.close()
-        self._thread.join()
-        os.close(self._master)
-
-
 @pytest.fixture(autouse=True)
 def clock():
     """The time of this process since the test began, as if it were a command's."""
-    metrics.restart_clock()
+    restart_clock()
 
 
 @pytest.fixture
@@ -148,7 +113,7 @@ def test_the_clock_moves_while_the_program_compiles(screen, opened):
     screen.until("compiling 0:01")
 
 
-def test_what_is_said_stands_above_and_the_last_figures_stay(screen, opened):
+def test_messages_are_printed_above_it_and_the_last_metrics_remain(screen, opened):
     dashboard = opened()
     dashboard.say("before")
     dashboard.begin()
@@ -178,6 +143,19 @@ def test_what_is_said_stands_above_and_the_last_figures_stay(screen, opened):
     assert screen.text.index("\x1b[?25h") < screen.text.index("╭")
 
 
+def test_the_headline_breaks_between_words_and_a_path_not_at_all(screen, opened, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    words = " ".join(f"word{number}" for number in range(40))
+    path = "/a/very/" + 20 * "long/" + "path"
+    opened().say(f"{words}\nrun folder: {path}")
+    screen.until("path")
+    lines = screen.text.splitlines()
+    assert len(lines) > 4
+    assert all(len(line) <= 60 for line in lines[:-1])
+    assert " ".join(line.strip() for line in lines) == f"{words} run folder: {path}"
+    assert lines[-1].strip() == path
+
+
 def test_nothing_is_drawn_before_it_begins(screen, opened):
     dashboard = opened()
     dashboard.phase("saving")
@@ -187,7 +165,7 @@ def test_nothing_is_drawn_before_it_begins(screen, opened):
     assert screen.text == "nothing else\r\n"
 
 
-def test_what_goes_to_a_file_goes_there_still(screen, opened, monkeypatch):
+def test_redirected_output_reaches_its_file(screen, opened, monkeypatch):
     file = io.StringIO()
     monkeypatch.setattr(sys, "stderr", file)
     opened().begin()
@@ -288,7 +266,7 @@ print('listening', flush=True)
 send(); time.sleep(1); send(); time.sleep(3600)"""
 
 
-def test_a_signal_is_answered_above_it_and_a_second_leaves_the_terminal_in_order(screen):
+def test_a_signal_is_reported_above_it_and_a_second_restores_the_terminal(screen):
     lines = ["with preemption.Preemption(300) as asked:", *STOPPED_UNDER_A_DASHBOARD.splitlines()]
     program = LISTENER + "\n    ".join(lines)
     command = [sys.executable, "-c", program]
@@ -314,13 +292,13 @@ def test_a_training_on_a_terminal_has_the_dashboard(screen, watch, root, tmp_pat
     assert sys.stdout is screen.stream
     screen.until("jetbot-mjx play")
     text = screen.text
-    for part in ("training jetbot_mjx:GoalTask", "run folder: ", "first training step done"):
+    for part in ("training jetbot_mjx:GoalTask", "run folder:", "first training step done"):
         assert part in text
-    assert text.index("run folder: ") < text.index("compiling 0:")
+    assert text.index("run folder:") < text.index("compiling 0:")
     end = on_screen(text)
     assert "100%  8,192 of 8,192" in end
     assert re.search(r"compiling \d:\d\d   training 0:\d\d   evaluating 0:\d\d   saving", end)
-    logged = metrics.read_history(tmp_path / "mine" / "metrics.jsonl", 8_192)[-1].metrics
+    logged = read_history(tmp_path / "mine" / "metrics.jsonl", 8_192)[-1].metrics
     assert f"{logged['time/env_steps_per_second']:,.0f} environment steps/s" in end
     assert end.index("╯") < end.index("best policy: ")
 
@@ -385,7 +363,7 @@ def test_the_last_report_and_what_is_known_since(now):
     assert table(one)[0][:3] == ["25.0%", "62.5%", "50.0%"]
 
 
-def test_it_shows_what_the_guide_shows(root):
+def test_the_dashboard_is_the_one_in_the_documentation(root):
     """The lines and columns of the guide's picture, and their labels, are those of the program."""
     guide = (root / "docs" / "getting-started.md").read_text(encoding="utf-8")
     picture = guide.split("```text\n╭")[1].split("```")[0]

@@ -3,24 +3,20 @@
 import json
 import os
 import re
-import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
-import gliding
 import jax
 import numpy as np
 import pytest
-from command_modules import train
 
-from jetbot_mjx import cli
+from helpers import gliding
+from helpers.command_modules import train
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.checkpoint_store import checkpoint_steps, digest
-from jetbot_mjx.training import distributed, ppo_trainer
-from jetbot_mjx.training.callbacks import TrainerCallback
+from jetbot_mjx.runs.checkpoint_store import checkpoint_steps
+from jetbot_mjx.training import distributed
 from jetbot_mjx.training.preemption import STOPPED
 
 ROOT = Path(__file__).parents[2]
@@ -50,34 +46,7 @@ class Sent(GoalTask):
 
 # The other processes: the training command, one training step a call, telling what it holds.
 
-TELLER = f"import sys; {gliding.LAZILY}; import test_distributed as t; t.tell(*sys.argv[1:])"
-
-
-def tell(interrupted, *arguments):
-    ppo_trainer.next_chunk = lambda steps, seconds, wanted: 1
-    report = ppo_trainer._report
-
-    def reported(trainer, recorder, state, seconds):
-        own = jax.tree.map(lambda x: np.asarray(x.addressable_data(0)), state)
-        worlds = own.env_state.unpack()
-        told = {
-            "parameters": digest(own.params),
-            "keys": worlds.key.reshape(-1, 2).tolist(),
-            "goals": worlds.goal.reshape(-1, 3).tolist(),
-            "devices": [jax.local_device_count(), jax.device_count()],
-        }
-        print("told:", json.dumps(told), flush=True)
-        return report(trainer, recorder, state, seconds)
-
-    def interrupt(self, env_steps, metrics, seconds):
-        os.kill(os.getpid(), signal.SIGTERM)
-        time.sleep(0.5)
-
-    ppo_trainer._report = reported
-    if interrupted == "interrupted":
-        TrainerCallback.on_progress = interrupt
-    with gliding.everywhere():
-        cli.run_command(lambda _: train.main(arguments))
+TELLER = f"{gliding.LAZILY}; from helpers import distributed_process; distributed_process.main()"
 
 
 def start(arguments, *, interrupted=False, **variables):
@@ -279,7 +248,7 @@ def test_the_others_do_what_the_first_came_to(monkeypatch):
     assert distributed.run_on_primary(lambda: pytest.fail("only the first does it")) == 1
 
 
-def test_where_the_first_fails_all_leave(monkeypatch):
+def test_all_processes_exit_when_the_first_fails(monkeypatch):
     told = heard(monkeypatch, 0)
     with pytest.raises(ZeroDivisionError):
         distributed.run_on_primary(lambda: 1 // 0)
@@ -325,7 +294,7 @@ def test_a_mistaken_variable_costs_one_line(monkeypatch, values, said):
         (STOCK, "--distributed is not supported by trainer = 'brax'"),
     ],
 )
-def test_what_several_processes_cannot_do_is_refused_before_they_meet(arguments, said):
+def test_unsupported_settings_of_several_processes_are_refused_before_they_connect(arguments, said):
     with pytest.raises(UserError, match=said):
         train.main(["--config", SMOKE, "--distributed", *arguments])
 
@@ -343,7 +312,9 @@ def test_without_a_launcher_the_variables_are_named(monkeypatch):
 
 
 def test_processes_that_do_not_come_are_not_waited_for_without_end(tmp_path, unused_port):
-    program = "from jetbot_mjx.training import distributed as d; d.JOIN_SECONDS = 1; d.join()"
+    program = (
+        "from jetbot_mjx.training import distributed as d; d.JOIN_SECONDS = 1; d.join_processes()"
+    )
     process = subprocess.run(
         [sys.executable, "-c", program],
         cwd=tmp_path,

@@ -1,4 +1,4 @@
-"""What a training takes is told from shapes, and is what XLA sets aside for it."""
+"""Predictions of the memory of a training, against what XLA allocates."""
 
 import json
 
@@ -6,12 +6,13 @@ import jax
 import numpy as np
 import pytest
 
-from jetbot_mjx.compiler.xla_options import compiler_options
 from jetbot_mjx.config import load_config, parse_config
+from jetbot_mjx.devices import compiler_options
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.training import memory, session
-from jetbot_mjx.training.memory import GIB, footprint, ladder, next_that_fits, resized, sizes
+from jetbot_mjx.training.memory import GIB, MemoryModel, sizes
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer, build_ppo
 
 
@@ -27,7 +28,7 @@ def env(config):
 
 @pytest.fixture(scope="module")
 def each(config, env):
-    return sizes(build_ppo(config, env), env)
+    return sizes(build_ppo(Setup(config, env=env)), env)
 
 
 MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
@@ -49,9 +50,11 @@ MANY = ["ppo.num_envs=2048", "ppo.num_minibatches=32", "ppo.unroll_length=4"]
 def test_xla_sets_aside_what_was_told(root, settings, fullest):
     config = load_config(root / "configs" / "smoke.yaml", settings)
     env = make_env(config)
-    told = footprint(config, sizes(build_ppo(config, env), env), 1)
-    program = CompiledTrainer.from_config(config, env)
-    stats = program.trace().lower().compile(compiler_options(config)).memory_analysis()
+    told = MemoryModel(config, sizes(build_ppo(Setup(config, env=env)), env), 1).footprint()
+    program = CompiledTrainer.from_setup(Setup(config, env=env))
+    stats = (
+        program.trace().lower().compile(compiler_options(config.deterministic)).memory_analysis()
+    )
     taken = (
         stats.argument_size_in_bytes
         + stats.output_size_in_bytes
@@ -64,23 +67,23 @@ def test_xla_sets_aside_what_was_told(root, settings, fullest):
     assert 0.9 * taken <= trained.counted <= 1.3 * taken
 
 
-def test_what_a_gpu_had_in_use_was_foretold(root):
+def test_the_predicted_memory_is_that_of_a_gpu(root):
     measured = json.loads((root / "benchmarks/results/nvidia-h200-sweep.json").read_text("utf-8"))
     # What was measured was XLA's update.
     values = measured["config"]
     config = parse_config({**values, "ppo": {**values["ppo"], "update": "xla"}})
     env = make_env(config)
-    each = sizes(build_ppo(config, env), env)
+    each = sizes(build_ppo(Setup(config, env=env)), env)
     for row in measured["results"]:
         if row["rate"] == "training":
             factor, had = row["num_envs"] / config.ppo.num_envs, row["peak_device_bytes"]
-            told = resized(config, each, 1, factor).total
+            told = MemoryModel(config, each, 1).resized(factor).total
             print(f"{row['num_envs']} environments: {told / had:.2f} of what was in use")
             assert had <= told <= 1.3 * had + 2**24
 
 
 def test_sizes_are_those_of_the_arrays(config, env, each):
-    state = CompiledTrainer.from_config(config, env).template()
+    state = CompiledTrainer.from_setup(Setup(config, env=env)).template()
     size = {
         name: sum(np.prod(x.shape, dtype=int) * x.dtype.itemsize for x in jax.tree.leaves(tree))
         for name, tree in {"all": state, "environments": state.env_state}.items()
@@ -90,7 +93,7 @@ def test_sizes_are_those_of_the_arrays(config, env, each):
 
 
 def test_devices_share_the_environments_and_not_the_parameters(config, each):
-    one, four = footprint(config, each, 1), footprint(config, each, 4)
+    one, four = MemoryModel(config, each, 1).footprint(), MemoryModel(config, each, 4).footprint()
     assert four.environments == one.environments / 4
     assert four.collecting == one.collecting / 4
     assert four.learning < one.learning / 2
@@ -100,29 +103,29 @@ def test_devices_share_the_environments_and_not_the_parameters(config, each):
 
 def test_seeds_take_their_memory_each(config, each):
     several = config.model_copy(update={"seeds": 3})
-    one, three = footprint(config, each, 1), footprint(several, each, 1)
+    one, three = MemoryModel(config, each, 1).footprint(), MemoryModel(several, each, 1).footprint()
     for part in ("parameters", "environments", "collecting", "learning"):
         assert getattr(three, part) == 3 * getattr(one, part)
 
 
 def test_the_ladder_ends_with_the_first_that_does_not_fit(config, each):
-    limit = resized(config, each, 1, 3.0).total
-    found = ladder(config, each, 1, limit)
+    limit = MemoryModel(config, each, 1).resized(3.0).total
+    found = MemoryModel(config, each, 1).ladder(limit)
     assert [one.num_envs for one in found[:4]] == [32, 64, 128, 256]
     assert [one.total <= limit for one in found] == [True] * (len(found) - 1) + [False]
     assert all(one.batch_size * 2 == one.num_envs for one in found)
 
 
 def test_the_next_size_is_smaller_and_fits(config, each):
-    whole = footprint(config, each, 1).total
-    assert next_that_fits(config, each, 1, None).num_envs == 64
-    assert next_that_fits(config, each, 1, 10 * whole).num_envs == 64
-    little = resized(config, each, 1, 0.25).total
-    assert next_that_fits(config, each, 1, little).num_envs == 32
-    assert next_that_fits(config, each, 1, 1000) is None
-    assert next_that_fits(config, each, 32, None).num_envs == 64
-    assert next_that_fits(config, each, 64, None) is None  # half a batch of 64 is 32
-    assert resized(config, each, 1, 1 / 128) is None
+    whole = MemoryModel(config, each, 1).footprint().total
+    assert MemoryModel(config, each, 1).next_that_fits(None).num_envs == 64
+    assert MemoryModel(config, each, 1).next_that_fits(10 * whole).num_envs == 64
+    little = MemoryModel(config, each, 1).resized(0.25).total
+    assert MemoryModel(config, each, 1).next_that_fits(little).num_envs == 32
+    assert MemoryModel(config, each, 1).next_that_fits(1000) is None
+    assert MemoryModel(config, each, 32).next_that_fits(None).num_envs == 64
+    assert MemoryModel(config, each, 64).next_that_fits(None) is None  # half a batch of 64 is 32
+    assert MemoryModel(config, each, 1).resized(1 / 128) is None
 
 
 def test_a_cpu_has_the_memory_of_its_machine():

@@ -1,4 +1,4 @@
-"""What the trainer does between two calls of its programs."""
+"""The trainer between two calls of its programs."""
 
 import types
 

@@ -1,4 +1,4 @@
-"""Asked to stop in any phase, a training saves in time, and the same command goes on."""
+"""A training that is asked to stop saves in time in every phase, and resumes."""
 
 import contextlib
 import os
@@ -11,12 +11,12 @@ import threading
 import time
 from pathlib import Path
 
-import gliding
 import pytest
 
 from benchmarks.reliability import torture
+from helpers import gliding
+from helpers.preemption_program import LISTENER
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps
-from jetbot_mjx.training import preemption
 from jetbot_mjx.training.preemption import STOPPED, Preemption
 
 LONG = 3_600
@@ -54,10 +54,11 @@ def dwell_in_calls(seconds):
 
 {before_imports}
 {lazily}
-import gliding
-from command_modules import train
+from helpers import gliding
+from helpers.command_modules import train
 from jetbot_mjx import cli
 from jetbot_mjx.training import session as training
+from jetbot_mjx.runs import setup
 from jetbot_mjx.evaluation.evaluator import Evaluator
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 from jetbot_mjx.runs.checkpoint_store import CheckpointStore
@@ -68,7 +69,7 @@ with gliding.everywhere():
 
 
 def driver(before_training="", before_imports=""):
-    program = DRIVER.replace("{tests}", repr(str(Path(__file__).parents[1] / "helpers")))
+    program = DRIVER.replace("{tests}", repr(str(Path(__file__).parents[1])))
     program = program.replace("{before_training}", before_training)
     program = program.replace("{lazily}", gliding.LAZILY)
     program = program.replace("{before_imports}", before_imports)
@@ -130,7 +131,7 @@ def test_while_importing_the_signal_ends_the_process_and_nothing_is_written(tmp_
 
 
 def test_before_there_is_a_folder_the_signal_ends_the_process(tmp_path):
-    with training(tmp_path / "run", f"dwell(training, 'make_env', {LONG})") as process:
+    with training(tmp_path / "run", f"dwell(setup, 'make_env', {LONG})") as process:
         assert stop(process, "make_env") == -signal.SIGTERM
     assert not (tmp_path / "run").exists()
 
@@ -187,7 +188,7 @@ def test_while_saving_it_finishes_that(begun):
     assert 2 * INTERVAL in checkpoint_steps(begun)
 
 
-def test_what_takes_longer_than_the_notice_is_cut_off(begun):
+def test_a_save_longer_than_the_notice_is_aborted(begun):
     notice = 10
     with training(begun, f"dwell(Evaluator, 'run', {LONG})", notice=notice) as process:
         process.until(lambda: "now: run\n" in process.stdout)
@@ -243,17 +244,6 @@ def test_ctrl_c_saves_where_the_reader_ends_by_it_too(begun):
 
 # What follows needs the module alone, and no training.
 
-LISTENER = f"""
-import hashlib, importlib.util, os, signal, time
-spec = importlib.util.spec_from_file_location("preemption", {preemption.__file__!r})
-preemption = importlib.util.module_from_spec(spec)
-spec.loader.exec_module(preemption)
-
-def send(number=signal.SIGTERM):
-    os.kill(os.getpid(), number)
-
-"""
-
 
 def listen(program, notice=300, stderr=subprocess.PIPE):
     """Runs lines of Python under `Preemption`; gives the exit code, the seconds and stderr."""
@@ -307,7 +297,7 @@ def test_it_leaves_in_time_where_stderr_cannot_be_written(second, unwritable):
 
 
 @pytest.mark.parametrize("first", ["SIGTERM", "SIGHUP"])  # the latter of a terminal that is closed
-def test_a_second_signal_leaves_at_once(first):
+def test_a_second_signal_exits_at_once(first):
     code, _, stderr = listen(
         f"print('listening', flush=True)\nsend(signal.{first})\n"
         f"time.sleep(1)\nsend()\ntime.sleep({LONG})"
@@ -341,7 +331,7 @@ hashlib.pbkdf2_hmac('sha256', b'', b'salt', 2**31 - 1)""",
     assert "4 s after SIGTERM: leaving" in stderr
 
 
-def test_a_notice_of_ages_is_no_error():
+def test_a_very_long_notice_is_accepted():
     code, _, stderr = listen(
         "print('listening', flush=True)\nsend()\nasked.wait(60)\ntime.sleep(0.5)\nos._exit(3)",
         notice=1e308,

@@ -1,4 +1,4 @@
-"""Films of the evaluations: what they must not touch, and what they must not cost."""
+"""Videos of the evaluations, which change nothing in a training."""
 
 import json
 import re
@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jetbot_mjx import load_config, make_env
+from jetbot_mjx import load_config, viewers
 from jetbot_mjx.agents.networks import PolicyParams
-from jetbot_mjx.compiler.program_cache import ProgramCache
 from jetbot_mjx.envs import opengl
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import Summary
 from jetbot_mjx.evaluation.rollout import Episodes
+from jetbot_mjx.runs import Setup
 from jetbot_mjx.runs.checkpoint_store import checkpoint_path, checkpoint_steps, read_about
 from jetbot_mjx.runs.metrics import CompileClock
 from jetbot_mjx.training import run_recorder, session
@@ -28,7 +28,7 @@ PARAMS = PolicyParams(normalizer=np.zeros(1), policy=np.ones(2), value=np.zeros(
 
 @pytest.fixture
 def recorder(root, tmp_path, monkeypatch):
-    """Makes recorders that judge by heart."""
+    """Makes recorders whose evaluations have fixed results."""
 
     class Evaluator:
         def __init__(self, env, networks, programs):
@@ -63,9 +63,9 @@ def recorder(root, tmp_path, monkeypatch):
         for folder in folders:
             folder.mkdir(exist_ok=True)
         clocks.append(CompileClock())
-        env, programs = make_env(config), ProgramCache({})
-        ppo = build_ppo(config, env)
-        parts = session.Training(config, tmp_path, folders, env, ppo, programs, None, {}, [])
+        setup = Setup(config)
+        ppo = build_ppo(setup)
+        parts = session.Training(setup=setup, run_dir=tmp_path, run_dirs=folders, ppo=ppo)
         return session.open_recorder(parts, clocks[-1], None)
 
     yield recorder
@@ -75,14 +75,14 @@ def recorder(root, tmp_path, monkeypatch):
 
 @pytest.fixture
 def events(monkeypatch, tmp_path):
-    """What is saved and what is filmed, in their order, and how long the log is then."""
+    """Saved checkpoints and rendered videos in their order, with the length of the log then."""
     found = []
 
     def lines(run_dir):
         return len((run_dir / "metrics.jsonl").read_text().splitlines())
 
     class Film:
-        def __init__(self, env, networks, programs):
+        def __init__(self, setup):
             pass
 
         def write(self, path, params, env_steps):
@@ -97,7 +97,7 @@ def events(monkeypatch, tmp_path):
             found.append(("save", env_steps, run_dir.name, lines(run_dir)))
             super().save(env_steps, *arguments)
 
-    monkeypatch.setattr(video, "EvaluationVideo", Film)
+    monkeypatch.setattr(viewers, "EvaluationVideo", Film)
     monkeypatch.setattr(run_recorder, "CheckpointStore", CheckpointStore)
     monkeypatch.setattr(run_recorder, "find_backend", lambda: "egl")
     return found
@@ -113,7 +113,7 @@ def times(folder):
     return [json.loads(line)["time/recording_seconds"] for line in lines]
 
 
-def test_every_seed_is_filmed_after_all_are_logged_and_saved(recorder, events, tmp_path):
+def test_videos_of_every_seed_follow_after_all_are_logged_and_saved(recorder, events, tmp_path):
     with recorder("evaluation.video=true", "seeds=2") as it:
         report(it, 0, 4096, seeds=2)
     assert events == [
@@ -128,7 +128,7 @@ def test_every_seed_is_filmed_after_all_are_logged_and_saved(recorder, events, t
     assert after > 0.4
 
 
-def test_only_the_end_of_a_training_is_filmed_where_that_is_asked_for(recorder, events, tmp_path):
+def test_video_last_renders_the_end_of_a_training_only(recorder, events, tmp_path):
     with recorder("evaluation.video=last", "ppo.num_timesteps=8192") as it:
         report(it, 0, 4096)
         assert not it.on_interval([Progress(16_384, PARAMS, {}, 1.0)])
@@ -173,9 +173,7 @@ def test_a_full_disk_costs_one_line_and_no_checkpoint(recorder, events, tmp_path
 
 
 @pytest.mark.slow
-def test_a_filmed_training_is_bit_for_bit_the_one_that_was_not(
-    root, smoke_run, tmp_path, monkeypatch
-):
+def test_videos_change_no_bit_of_a_training(root, smoke_run, tmp_path, monkeypatch):
     try:
         opengl.find_backend()
     except UserError as error:
@@ -230,7 +228,7 @@ def test_all_logs_get_everything_and_are_all_closed(root, tmp_path):
     ("seconds", "said"),
     [(-0.1, "1 of 2 programs from the cache)"), (0.0, ")"), (1.0, "saved 1.0 s)")],
 )
-def test_what_the_cache_saved_is_told_where_it_saved_something(recorder, capsys, seconds, said):
+def test_the_seconds_saved_by_the_cache_are_reported(recorder, capsys, seconds, said):
     with recorder() as recording:
         recording.clock.programs, recording.clock.cached = 2, 1
         recording.clock.saved_seconds = seconds

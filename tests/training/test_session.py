@@ -1,4 +1,4 @@
-"""What the end of a training says comes next."""
+"""The hint at the end of a training."""
 
 import importlib.util
 import shlex

@@ -1,19 +1,18 @@
-"""A study goes on where it was stopped, shares its work, and loses nothing."""
+"""A study resumes, shares its trials among workers, and loses none."""
 
 import sys
 from pathlib import Path
-from typing import ClassVar
 
 import optuna
 import pytest
 import sqlalchemy.exc
 
+from helpers.quick_trials import Quick
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs import progress
+from jetbot_mjx.terminal import progress
 from jetbot_mjx.tuning import results, search
 from jetbot_mjx.tuning.space import Parameter
-from jetbot_mjx.tuning.trials import Outcome
 
 CONFIG = parse_config({"ppo": {"learning_rate": 1e-3}})
 SPACE = [
@@ -23,32 +22,6 @@ SPACE = [
 WAITING, COMPLETE, RUNNING, FAIL = (
     getattr(optuna.trial.TrialState, name) for name in ("WAITING", "COMPLETE", "RUNNING", "FAIL")
 )
-
-
-class Quick:
-    """Stands for `Trials`: scores a learning rate by its distance to 3e-3, and notes its calls."""
-
-    calls: ClassVar[list] = []
-
-    def __init__(self, config, names, evaluations):
-        self.config, self.names = config, names
-
-    def run(self, values, seeds):
-        # As in the program: arguments are numbers, and seeds of 32 bits.
-        assert all(isinstance(one[name], int | float) for one in values for name in self.names)
-        assert all(0 <= seed < 2**32 for seed in seeds)
-        self.calls.append((self.config.ppo.unroll_length, len(values), tuple(seeds)))
-        return [
-            Outcome((0.5, 1 - abs(one["ppo.learning_rate"] - 3e-3) * 10), 1.0, {"w": seed})
-            for one, seed in zip(values, seeds, strict=True)
-        ]
-
-    def evaluate(self, params, keys):
-        class Seen:
-            success = [[1.0, 0.0]] * len(params["w"])
-            steps = [[60.0, 10.0]] * len(params["w"])
-
-        return Seen
 
 
 @pytest.fixture(autouse=True)
@@ -181,7 +154,7 @@ def test_the_largest_seed_can_be_searched(tmp_path):
         ),
     ],
 )
-def test_what_trials_cannot_do_is_refused_before_anything_is_written(tmp_path, changes, told):
+def test_unsupported_settings_of_trials_are_refused_before_writing(tmp_path, changes, told):
     with pytest.raises(UserError, match=told):
         search.Search(parse_config(changes), SPACE, tmp_path / "s")
     assert list(tmp_path.iterdir()) == []

@@ -1,4 +1,4 @@
-"""The file that describes a search: what it accepts, and what each mistake is told."""
+"""The file that describes a search space, and the errors for mistakes in it."""
 
 import pytest
 
@@ -33,6 +33,12 @@ def test_ranges_and_choices_are_read(tmp_path):
     assert [one.whole for one in read_space(path, CONFIG)] == [False, True, False, False, False]
 
 
+@pytest.mark.parametrize("space", [None, 3, ["ppo.discounting"]])
+def test_what_names_no_space_is_told_what_does(space):
+    with pytest.raises(ConfigError, match="is wrong: give a YAML file, its content, or the name"):
+        read_space(space, CONFIG)
+
+
 def test_the_setting_decides_whether_numbers_are_whole(tmp_path):
     path = write(
         tmp_path,
@@ -51,7 +57,7 @@ def test_a_shipped_space_is_found_by_name_and_path(tmp_path, monkeypatch, name):
     assert "ppo.learning_rate" in {one.name for one in read_space(name, CONFIG)}
 
 
-def test_a_space_that_does_not_exist_is_told_with_the_shipped_ones(tmp_path, monkeypatch):
+def test_an_unknown_space_is_refused_with_the_shipped_names(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="--space sac does not exist: give a file, or one of ppo"):
         read_space("sac", CONFIG)

@@ -1,11 +1,11 @@
-"""Trials side by side are the trainings that they would be alone."""
+"""Trials trained side by side are the same as trained alone."""
 
-import gliding
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.tuning.space import with_values

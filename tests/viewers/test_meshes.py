@@ -1,3 +1,5 @@
+"""Meshes of MuJoCo's geoms."""
+
 import mujoco
 import numpy as np
 import pytest
@@ -38,7 +40,7 @@ def geoms(model):
     return {geom.name: geom for geom in visible_geoms(model)}
 
 
-def test_what_shows_is_there_and_nothing_else(model, geoms):
+def test_every_visual_geom_is_drawn_and_no_other(model, geoms):
     nameless = str(model.geom("pill").id + 1)
     assert set(geoms) == {"box", "own", "ball", "can", "pill", nameless, "wedge"}
     assert geoms["can"].body == model.body("arm").id

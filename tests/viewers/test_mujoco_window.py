@@ -1,4 +1,4 @@
-"""MuJoCo's own window. No test machine has a display: a stand-in takes what would be shown."""
+"""MuJoCo's window, with a substitute because no test machine has a display."""
 
 import contextlib
 import sys
@@ -78,7 +78,7 @@ def test_without_a_display_one_line_names_the_other_viewer(monkeypatch):
     assert "\n" not in str(caught.value)
 
 
-def test_what_keeps_the_window_shut_is_told_in_one_line(player, monkeypatch):
+def test_a_window_that_cannot_open_is_reported_in_one_line(player, monkeypatch):
     def launch_passive(*_, **__):
         raise RuntimeError("requires mjpython")
 

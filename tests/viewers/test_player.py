@@ -1,4 +1,4 @@
-"""A player without any viewer: what it drives, in which time, and what a user can change."""
+"""The player without a viewer: agents, time, and what a user can change."""
 
 import itertools
 import math
@@ -109,7 +109,7 @@ def test_a_player_that_was_held_up_does_not_race(player, wall):
     assert player.advance() == 6
 
 
-def test_a_paused_player_stands_and_takes_single_steps(player, wall):
+def test_a_paused_player_makes_single_steps(player, wall):
     player.agent = "scripted"
     player.paused = True
     before = player.time
@@ -159,7 +159,7 @@ def test_the_time_limit_ends_an_episode(player):
     assert player.time == player.time_limit
 
 
-def test_breaking_off_is_no_episode(player):
+def test_a_reset_in_mid_episode_counts_no_episode(player):
     ticks(player, 10)
     goal_w = player.snapshot.goal_w
     player.reset()
@@ -205,7 +205,7 @@ def test_a_goal_that_is_moved_has_the_whole_time_limit(player):
     assert tick_to_the_end(player) == 256
 
 
-def test_the_policy_sees_at_once_where_the_goal_has_gone(player):
+def test_the_policy_observes_a_moved_goal_at_once(player):
     player.move_goal(0.0, 0.6)
     robot_at_rest = player._states.obs[0]
     # Egocentric: straight to the left, 0.6 m away.
@@ -256,7 +256,7 @@ def test_a_task_whose_goals_cannot_be_moved_says_so_in_one_line(task, reason):
     assert "\n" not in why
 
 
-def test_the_players_goal_stays_where_the_task_says_so(player, monkeypatch):
+def test_a_goal_that_the_task_fixes_cannot_be_moved(player, monkeypatch):
     monkeypatch.setattr(player, "cannot_move_goal", "it stays")
     before = player.crowd
     assert not player.move_goal(0.1, 0.1)
@@ -264,7 +264,7 @@ def test_the_players_goal_stays_where_the_task_says_so(player, monkeypatch):
     ticks(player, 5)
 
 
-def test_the_obstacles_goal_moves_and_its_pillar_stays(root, monkeypatch):
+def test_dragging_the_goal_moves_no_pillar(root, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "examples"))
     env = make_env(load_config(root / "examples" / "obstacle.yaml"))
     state = env.reset(jax.random.PRNGKey(0))
@@ -297,7 +297,7 @@ def test_many_robots_drive_as_each_would_alone(four, one, first_goal):
     np.testing.assert_allclose(alone.crowd.goal_w[0], first_goal, rtol=1e-6)
 
 
-def test_each_robot_rests_after_its_own_end_and_begins_anew_alone(four):
+def test_each_robot_pauses_after_its_episode_and_resets_alone(four):
     four.reset()
     four.robot = 1
     assert four.move_goal(0.2, 0.0)
@@ -351,7 +351,7 @@ def test_the_terms_of_the_reward_add_up_over_the_episode(player):
 # Who drives.
 
 
-def test_every_agent_drives_its_own_way(player):
+def test_every_agent_drives_differently(player):
     start, ends = player._states, {}
     for agent in AGENTS:
         player._states, player.agent = start, agent
@@ -412,7 +412,7 @@ def test_a_user_drives_ahead_and_to_the_left(player):
     assert yaw(player) - before == pytest.approx(1.0, abs=0.1)
 
 
-def test_what_a_user_asks_for_is_held_within_the_limits(player):
+def test_requested_values_are_clipped_to_the_limits(player):
     player.drive(7.0, -70.0)
     assert player.command == pytest.approx((1.0, -math.pi))
     player.drive(-1.0, 0.0)
@@ -429,7 +429,7 @@ def test_presses_add_up_and_the_first_against_a_turn_ends_it(player):
     assert player.command == pytest.approx((2 / 8, -math.pi / 8))
 
 
-def test_who_is_no_agent_is_refused(player):
+def test_an_unknown_agent_is_refused(player):
     with pytest.raises(UserError, match="'nobody' is unknown: choose from policy, scripted"):
         Player(player.run_dir, agent="nobody")
 

@@ -1,4 +1,4 @@
-"""What a policy sees and looks at, as it is drawn, and as a page shows it."""
+"""What a policy sees and looks at, as images and on the page."""
 
 import types
 from pathlib import Path

@@ -1,3 +1,5 @@
+"""The clock of a viewer."""
+
 import pytest
 
 from jetbot_mjx.viewers.realtime import Clock, Rate
@@ -11,7 +13,7 @@ def test_steps_are_due_at_an_even_pace_that_does_not_drift():
     assert sum(map(clock.due, looks)) == pytest.approx(60 * (looks[-1] - 100.0), abs=1)
 
 
-def test_what_is_late_is_made_good_within_a_tenth_of_a_second():
+def test_a_late_frame_is_caught_up_within_a_tenth_of_a_second():
     clock = Clock(1 / 60, now=0.0)
     assert clock.due(0.09) == 5
     assert clock.due(60.0) == 6

@@ -1,4 +1,4 @@
-"""What a film shows, on episodes made by hand: nothing is compiled here, and little drawn."""
+"""Videos of episodes made by hand; nothing is compiled."""
 
 import functools
 import itertools
@@ -121,7 +121,7 @@ def test_goal_time_distance_and_outcome_are_written_in(renderer, drive, written,
     assert all(np.array_equal(frames[5], frame) for frame in frames[6:])
 
 
-def test_whoever_has_finished_stands_while_the_others_drive(renderer, drive, written):
+def test_finished_robots_stop_while_the_others_drive(renderer, drive, written):
     short, long = drive((0.3, 0.0), (0.4, 0.0)), drive((-0.9, 0.0), (0.4, 0.0), reached=False)
     frames = list(renderer.render_side_by_side([("0 steps", short), ("9 steps", long)]))
     assert len(frames) == 1 + 0.9 * FPS + round(video._HOLD_SECONDS * FPS)
@@ -248,7 +248,7 @@ def test_the_overview_is_where_mujoco_puts_its_camera(world_env, needs_opengl):
     assert 35 < row < 80
 
 
-def test_a_trail_shows_and_the_model_is_left_as_it_was(world_env, needs_opengl):
+def test_a_trail_is_drawn_without_changing_the_model(world_env, needs_opengl):
     model = world_env.mj_model
     before = (model.vis.quality.offsamples, model.vis.global_.offwidth, model.vis.map.znear)
     trail = np.array([[0.3, -1.0, 0.01], [0.3, 1.0, 0.01]])
@@ -273,7 +273,7 @@ def frames(count):
     return [rng.integers(0, 255, (32, 48, 3), dtype=np.uint8) for _ in range(count)]
 
 
-def test_a_film_plays_in_real_time(tmp_path):
+def test_a_video_plays_in_real_time(tmp_path):
     write_mp4(tmp_path / "a.mp4", iter(frames(20)))
     read = iio.imread(tmp_path / "a.mp4", plugin="pyav")
     assert read.shape == (20, 32, 48, 3)

@@ -1,4 +1,4 @@
-"""The page in a real browser, headless: what it shows, and what a click, a drag and a key do."""
+"""The page in a headless browser: its contents, clicks, drags and keys."""
 
 import math
 import threading
@@ -9,8 +9,7 @@ import pytest
 
 pytest.importorskip("viser")
 
-import chromium
-
+from helpers import chromium
 from jetbot_mjx.envs.robot_model import QPOS_XYZ
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.viser_server import ViserViewer
@@ -125,7 +124,7 @@ def test_the_page_shows_the_robot_and_a_red_goal(served, page, see):
     assert page.evaluate("document.body.innerText").count("Checkpoint") == 1
 
 
-def test_the_page_asks_nobody_else_for_anything(served, page):
+def test_the_page_loads_nothing_from_other_hosts(served, page):
     browser, _ = served
     origin = f"127.0.0.1:{browser.server.get_port()}/"
     own = (f"http://{origin}", f"ws://{origin}", f"blob:http://{origin}", "data:")

@@ -1,4 +1,4 @@
-"""The page's server, scene and panel, without a browser: `test_page.py` has one."""
+"""The page's server, scene and panel without a browser; `test_viser_page.py` has one."""
 
 import io
 import math
@@ -425,7 +425,7 @@ def test_the_way_a_user_turned_the_camera_is_kept(browser, player, client):
     assert_in_view(client, player.snapshot.goal_w, (0.0, 0.0, 0.0))
 
 
-def test_the_camera_stands_still_while_a_goal_is_dragged(browser, player, client):
+def test_the_camera_does_not_move_while_a_goal_is_dragged(browser, player, client):
     browser.panel.camera.value = "robot and goal"
     answer(browser)
     settle(browser)
@@ -587,7 +587,7 @@ def press(browser, button):
     answer(browser)
 
 
-def test_the_buttons_pause_step_and_begin_anew(browser, player):
+def test_the_buttons_pause_step_and_reset(browser, player):
     player.agent = "scripted"
     player.paused = False
     press(browser, "Pause")

@@ -14,14 +14,21 @@ product of both is c/a.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array
 
-Vector = tuple[Array, Array, Array]
-"""x, y and z of a vector, each a scalar or an image."""
+Scalar = Array | np.ndarray | float
+"""A number, a traced scalar, or an image of numbers."""
+
+Mask = Array | np.ndarray | bool
+"""A truth value, a traced one, or an image of them."""
+
+Vector = tuple[Scalar, Scalar, Scalar]
+"""x, y and z of a vector."""
 
 Size = tuple[float, float, float]
 """Sizes of a geom [m], as in MuJoCo; a sphere has its radius three times."""
@@ -32,25 +39,20 @@ _TINY = 1e-12
 class Hit(NamedTuple):
     """A `Hit` holds where rays enter a geom."""
 
-    mask: Bool[Array, "h w"]
+    mask: Mask
     """Whether the ray enters the geom."""
-    depth: Float[Array, "h w"]
+    depth: Scalar
     """Depth along the optical axis [m], where `mask`."""
-    faces: tuple[Bool[Array, "h w"], ...] = ()
+    faces: tuple[Mask, ...] = ()
     """For a box, which axis the entered face is perpendicular to: the first two of three."""
 
-    @property
-    def masked_depth(self) -> Float[Array, "h w"]:
-        """Return the depth [m], infinite where the ray does not enter."""
-        return jnp.where(self.mask, self.depth, jnp.inf)
 
-
-def dot(a: Vector, b: Vector) -> Array:
+def dot(a: Vector, b: Vector) -> Scalar:
     """Return the scalar product."""
     return a[0] * b[0] + (a[1] * b[1] + a[2] * b[2])
 
 
-def along(origin: Vector, direction: Vector, depth: Array) -> Vector:
+def along(origin: Vector, direction: Vector, depth: Scalar) -> Vector:
     """Return the points of rays at a depth [m]."""
     x, y, z = (o + depth * d for o, d in zip(origin, direction, strict=True))
     return x, y, z
@@ -165,7 +167,7 @@ def _enter_side(origin: Vector, direction: Vector, size: Size) -> Hit:
     return hit._replace(mask=hit.mask & (jnp.abs(oz + hit.depth * dz) <= size[1]))
 
 
-def _enter(a: Array, b: Array, c: Array) -> Hit:
+def _enter(a: Scalar, b: Scalar, c: Scalar) -> Hit:
     """Return the smaller root of a t² + 2 b t + c, where it is positive and c too: from outside."""
     inside_root = b * b - a * c
     mask = (inside_root > 0) & (b < 0) & (c > 0)
@@ -173,7 +175,7 @@ def _enter(a: Array, b: Array, c: Array) -> Hit:
     return Hit(mask, c / jnp.maximum(root - b, _TINY))
 
 
-def _scaled(vector: Vector, size: Sequence[Any]) -> Vector:
+def _scaled(vector: Vector, size: Sequence[float]) -> Vector:
     x, y, z = (v / s for v, s in zip(vector, size, strict=True))
     return x, y, z
 

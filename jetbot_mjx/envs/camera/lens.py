@@ -7,12 +7,13 @@ Everything here is NumPy and runs once: a lens costs a compiled program nothing 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.envs.camera.geometry import Scalar
 from jetbot_mjx.errors import InvalidError
 
 _MAX_ANGLE = np.radians(89.0)
@@ -21,8 +22,8 @@ _MAX_ANGLE = np.radians(89.0)
 class Rays(NamedTuple):
     """A `Rays` holds directions (x, y, 1), as arrays that broadcast or as scalars of one pixel."""
 
-    x: Any
-    y: Any
+    x: Scalar
+    y: Scalar
 
 
 class Footprint(NamedTuple):
@@ -67,7 +68,7 @@ class PixelGrid(NamedTuple):
 
     columns: tuple[Float[np.ndarray, "h w"], ...]
     """Arrays that broadcast to the size of the image."""
-    expand: Callable[[Sequence[Any]], tuple[list[Rays], Footprint]]
+    expand: Callable[[Sequence[Scalar]], tuple[list[Rays], Footprint]]
     """From the columns, or their entries for one pixel, to the directions of its samples, row by
     row, and to its footprint."""
 
@@ -86,17 +87,17 @@ def pixel_grid(config: CameraConfig) -> PixelGrid:
         matrix = intrinsics(config)
         pitch_x, pitch_y = 1 / matrix.fx, 1 / matrix.fy
 
-        def expand_linear(columns: Sequence[Any]) -> tuple[list[Rays], Footprint]:
+        def expand_linear(columns: Sequence[Scalar]) -> tuple[list[Rays], Footprint]:
             x, y = columns
             rays = [Rays(x + right * pitch_x, y + down * pitch_y) for right, down in offsets]
             return rays, Footprint(Rays(x, y), Rays(pitch_x, 0.0), Rays(0.0, pitch_y))
 
-        return PixelGrid(tuple(centre), expand_linear)
+        return PixelGrid(tuple(map(np.asarray, centre)), expand_linear)
     left, right = _rays(config, -0.5, 0.0), _rays(config, 0.5, 0.0)
     upper, lower = _rays(config, 0.0, -0.5), _rays(config, 0.0, 0.5)
     samples = [_rays(config, *offset) for offset in offsets]
 
-    def expand(columns: Sequence[Any]) -> tuple[list[Rays], Footprint]:
+    def expand(columns: Sequence[Scalar]) -> tuple[list[Rays], Footprint]:
         centre, to_right, to_lower, *rays = (
             Rays(*columns[i : i + 2]) for i in range(0, len(columns), 2)
         )
@@ -105,7 +106,7 @@ def pixel_grid(config: CameraConfig) -> PixelGrid:
     to_right = Rays(right.x - left.x, right.y - left.y)
     to_lower = Rays(lower.x - upper.x, lower.y - upper.y)
     every = [centre, to_right, to_lower, *samples]
-    return PixelGrid(tuple(column for rays in every for column in rays), expand)
+    return PixelGrid(tuple(np.asarray(column) for rays in every for column in rays), expand)
 
 
 def _rays(config: CameraConfig, right: float, down: float) -> Rays:

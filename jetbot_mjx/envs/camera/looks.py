@@ -7,16 +7,17 @@ the plain scene as long as nothing differs.
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt32
 
+from jetbot_mjx.config import LookParams
+from jetbot_mjx.envs.camera.geometry import Scalar
 from jetbot_mjx.envs.camera.lens import Footprint, Rays
-from jetbot_mjx.envs.camera.scene import GOAL, Rgb, Scene, SceneGeom, ground_of
+from jetbot_mjx.envs.camera.scene import GOAL, Checker, Rgb, Scene, SceneGeom, ground_of
 from jetbot_mjx.envs.camera.surroundings import Surroundings
-from jetbot_mjx.envs.look_params import LookParams
 
 IN_PIXELS = (
     *("cube_brightness", "cube_red", "cube_blue", "cube_yaw"),
@@ -69,12 +70,12 @@ def styled(scene: Scene, params: LookParams) -> Scene:
     return _lit(scene, params)
 
 
-def _tinted(rgb: Rgb, tint: Sequence[Any]) -> Rgb:
+def _tinted(rgb: Rgb, tint: Sequence[Scalar]) -> Rgb:
     red, brightness, blue = tint
     return rgb[0] * brightness * red, rgb[1] * brightness, rgb[2] * brightness * blue
 
 
-def _styled_checker(geom: SceneGeom, tint: Sequence[Any] | None, params: LookParams) -> Any:
+def _styled_checker(geom: SceneGeom, tint: Sequence[Scalar] | None, params: LookParams) -> Checker:
     checker = geom.checker
     assert checker is not None
     even, odd = checker.even, checker.odd
@@ -104,7 +105,7 @@ def _lit(scene: Scene, params: LookParams) -> Scene:
         lights = []
         for light in scene.lights:
             red, green, blue = (params.light * x for x in light.diffuse)
-            direction: Any = light.direction
+            direction = light.direction
             if params.differs("light_x", "light_y"):
                 slope = jnp.stack([jnp.asarray(params.light_x), jnp.asarray(params.light_y)])
                 tilt = jnp.append(slope, 0.0) * abs(light.direction[2])
@@ -115,13 +116,13 @@ def _lit(scene: Scene, params: LookParams) -> Scene:
     return scene
 
 
-def pixel_values(params: LookParams) -> dict[str, Any]:
+def pixel_values(params: LookParams) -> dict[str, Scalar]:
     """Return the parameters that differ and enter the pixels, by name."""
     return {name: getattr(params, name) for name in IN_PIXELS if params.differs(name)}
 
 
 def bend_rays(
-    params: Mapping[str, Any], samples: Sequence[Rays], footprint: Footprint, farthest: float
+    params: Mapping[str, Scalar], samples: Sequence[Rays], footprint: Footprint, farthest: float
 ) -> tuple[Sequence[Rays], Footprint]:
     """Return the directions of a pixel's rays for another lens.
 
@@ -162,7 +163,7 @@ def bend_rays(
     return [bent(rays) for rays in samples], extent
 
 
-def developed(params: Mapping[str, Any], channels: Sequence[Any]) -> list[Any]:
+def developed(params: Mapping[str, Scalar], channels: Sequence[Scalar]) -> list[Scalar]:
     """Return red, green and blue after exposure and white balance.
 
     Args:
@@ -175,7 +176,7 @@ def developed(params: Mapping[str, Any], channels: Sequence[Any]) -> list[Any]:
 
 
 def add_noise(
-    image: UInt8[Array, "h w c"], deviation: Any, seed: UInt32[Array, ""]
+    image: UInt8[Array, "h w c"], deviation: Scalar, seed: UInt32[Array, ""]
 ) -> UInt8[Array, "h w c"]:
     """Add noise to every pixel and channel by itself, and clip.
 
@@ -201,7 +202,7 @@ def add_noise(
     return jnp.clip(jnp.floor(noisy + 0.5), 0.0, 255.0).astype(jnp.uint8)
 
 
-def turned(rotation: Any, yaw: Any) -> Float[Array, "3 3"]:
+def turned(rotation: np.ndarray | Array, yaw: Scalar) -> Float[Array, "3 3"]:
     """Return axes turned about the vertical, counter-clockwise [rad]."""
     x, y, z = jnp.asarray(rotation)
     cosine, sine = jnp.cos(yaw), jnp.sin(yaw)

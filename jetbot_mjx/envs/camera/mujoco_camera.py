@@ -9,7 +9,6 @@ this process has one thread per core that renders, for all cameras and as long a
 has a context in each of them; when it is collected, they are freed at the thread's next picture.
 """
 
-import atexit
 import collections
 import concurrent.futures
 import copy
@@ -25,7 +24,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.config import CameraConfig, LookParams
 from jetbot_mjx.envs.camera.lens import pixel_grid
 from jetbot_mjx.envs.camera.looks import PLAIN, Appearance
 from jetbot_mjx.envs.camera.render import GREY, Camera, Pose
@@ -37,8 +36,8 @@ from jetbot_mjx.envs.camera.scenery import (
     paint,
     sky_side,
 )
-from jetbot_mjx.envs.look_params import LookParams
-from jetbot_mjx.envs.opengl import context_class
+from jetbot_mjx.envs.opengl import SceneRenderer, find_backend
+from jetbot_mjx.envs.robot_model import mocap_ids
 from jetbot_mjx.errors import UserError
 
 _SAMPLES = 4
@@ -148,14 +147,10 @@ class MujocoCamera(Camera):
           UserError: this machine has no OpenGL that works without a display; or as for `Camera`.
         """
         super().__init__(config, model, robot)
-        self._context_class = context_class()
+        find_backend()
         self._lens = make_lens(config)
         self._base = _without_robot(model, robot, self._lens)
-        self._mocap_ids = {
-            model.body(body).name: int(model.body_mocapid[body])
-            for body in range(model.nbody)
-            if model.body_mocapid[body] >= 0
-        }
+        self._mocap_ids = mocap_ids(model)
         self._sceneries: list[Scenery] = []
         if appearance == "varied":
             side = sky_side(model)
@@ -275,9 +270,9 @@ class MujocoCamera(Camera):
         """Draw one image; only the thread of that number may call it."""
         discarded = _render_threads()[thread].discarded
         while discarded:
-            discarded.pop().free()
+            discarded.pop().renderer.close()
         if thread not in self._stages:
-            self._stages[thread] = _Stage(self._context_class, copy.copy(self._base))
+            self._stages[thread] = _Stage(copy.copy(self._base))
         stage = self._stages[thread]
         if self._sceneries:
             stage.set_scenery(number, self._sceneries[number])
@@ -293,7 +288,8 @@ class _RenderThread(NamedTuple):
 
     pool: concurrent.futures.ThreadPoolExecutor
     discarded: "collections.deque[_Stage]"
-    """What its next picture frees first; whoever collects a camera may hold any lock."""
+    """Stages of collected cameras, which this thread frees before its next picture. They are not
+    freed where a camera is collected, because that thread may hold any lock."""
 
 
 @functools.cache
@@ -312,32 +308,18 @@ def _discard(stages: "dict[int, _Stage]") -> None:
 class _Stage:
     """A `_Stage` renders large pictures, in the thread that made it."""
 
-    def __init__(self, context_class: Any, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel) -> None:
         self._model, self._data = model, mujoco.MjData(model)
         self._data.mocap_quat[:] = model.body_quat[model.body_mocapid >= 0]
-        height, width = int(model.vis.global_.offheight), int(model.vis.global_.offwidth)
-        self._gl = context_class(width, height)
-        _end_at_exit()
-        self._gl.make_current()
-        self._context = mujoco.MjrContext(model, mujoco.mjtFontScale.mjFONTSCALE_50)
-        mujoco.mjr_setBuffer(mujoco.mjtFramebuffer.mjFB_OFFSCREEN, self._context)
-        self._scene, self._option = mujoco.MjvScene(model, _MOST_GEOMS), mujoco.MjvOption()
-        self._scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
-        self._camera = mujoco.MjvCamera()
-        self._camera.type = mujoco.mjtCamera.mjCAMERA_FIXED
-        self._camera.fixedcamid = model.ncam - 1
-        self._rect = mujoco.MjrRect(0, 0, width, height)
-        self._buffer = np.empty((height, width, 3), np.uint8)
+        self.renderer = SceneRenderer(model, _MOST_GEOMS)
+        self.renderer.scene.flags[mujoco.mjtRndFlag.mjRND_HAZE] = True
         self._number: int | None = None
-        _stages.add(self)
 
     def set_scenery(self, number: int, scenery: Scenery) -> None:
         """Show a scenery, and upload its textures unless they are there."""
         if number != self._number:
             self._number = number
-            self._gl.make_current()
-            for texture in paint(self._model, scenery):
-                mujoco.mjr_uploadTexture(self._model, self._context, texture)
+            self.renderer.upload(paint(self._model, scenery))
 
     def picture(
         self,
@@ -345,48 +327,18 @@ class _Stage:
         rotation: Float[np.ndarray, "3 3"],
         mocap: Float[np.ndarray, "nmocap 3"],
     ) -> UInt8[np.ndarray, "H W 3"]:
-        """Render a picture; the array is overwritten by the next one."""
-        # A thread may have made several contexts.
-        self._gl.make_current()
+        """Render a picture."""
         model, data = self._model, self._data
         data.mocap_pos[:] = mocap
         mujoco.mj_kinematics(model, data)
         mujoco.mj_comPos(model, data)
         mujoco.mj_camlight(model, data)
-        eye = self._camera.fixedcamid
+        eye = model.ncam - 1
         data.cam_xpos[eye] = position
         # MuJoCo's cameras look along their negative z axis.
         data.cam_xmat[eye] = (rotation * np.array([1.0, -1.0, -1.0])).reshape(-1)
-        all_geoms = mujoco.mjtCatBit.mjCAT_ALL
-        mujoco.mjv_updateScene(
-            model, data, self._option, None, self._camera, all_geoms, self._scene
-        )
-        mujoco.mjr_render(self._rect, self._scene, self._context)
-        mujoco.mjr_readPixels(self._buffer, None, self._rect, self._context)
-        # OpenGL's first row is the lowest.
-        return self._buffer[::-1]
-
-    def free(self) -> None:
-        """Free what OpenGL holds; another context may be current, and would lose its textures."""
-        self._gl.make_current()
-        self._context.free()
-        self.end()
-
-    def end(self) -> None:
-        """End the context, from any thread, while Python still has all that this calls."""
-        _stages.discard(self)
-        self._gl.free()
-        del self._gl
-
-
-_stages: "weakref.WeakSet[_Stage]" = weakref.WeakSet()
-"""All that have not ended."""
-
-
-@functools.cache
-def _end_at_exit() -> None:
-    """End all stages before EGL ends, whose own handler the first context has registered."""
-    atexit.register(lambda: [stage.end() for stage in list(_stages)])
+        self.renderer.update_scene(data, eye)
+        return self.renderer.render()
 
 
 def _without_robot(model: mujoco.MjModel, robot: str, lens: Lens) -> mujoco.MjModel:

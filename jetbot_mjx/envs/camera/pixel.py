@@ -6,8 +6,10 @@ do: a sphere around each geom decides whether any ray of the pixel can see it, a
 pixel of a vector or warp takes costs nothing.
 """
 
+import functools
+import operator
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.envs.camera import geometry
-from jetbot_mjx.envs.camera.geometry import Hit, Vector
+from jetbot_mjx.envs.camera.geometry import Hit, Mask, Scalar, Vector
 from jetbot_mjx.envs.camera.lens import Footprint, Rays
 from jetbot_mjx.envs.camera.scene import Checker, Rgb, Scene, SceneGeom, ground_of
 from jetbot_mjx.envs.camera.surroundings import Room, wall_colour, wall_slope
@@ -57,7 +59,7 @@ class Look(NamedTuple):
     """The camera in the geom's frame [m]."""
     centre: Vector
     """The geom in the camera's axes: right, down and forward [m]."""
-    faces: tuple[tuple[Any, Any, Any], ...]
+    faces: tuple[Vector, ...]
     """Light on the flat faces, by which the colour is multiplied: one of a plane, three of a box,
     none of another geom."""
 
@@ -71,61 +73,58 @@ class Frame(NamedTuple):
     """In the order of the scene's geoms."""
     up: Vector
     """How far right, down and forward of the image point upwards."""
-    params: dict[str, Any]
+    params: dict[str, Scalar]
     """The look parameters that differ from the plain scene and enter the pixels."""
     clutter: list[Rgb]
     """Colours of the objects around."""
     room: Room | None
     """The walls; None: there are none."""
-    floor_turn: tuple[Any, Any] | None
+    floor_turn: tuple[Scalar, Scalar] | None
     """Cosine and sine of the turn of the ground's pattern; None: it is not turned."""
 
 
 class _Sample(NamedTuple):
     """A `_Sample` holds what one ray of a pixel has met so far."""
 
-    depth: Any
+    depth: Scalar
     """Depth of the nearest geom but the ground [m]; infinite: none."""
-    red: Any
-    green: Any
-    blue: Any
+    rgb: Rgb
 
 
 class _Sums(NamedTuple):
     """A `_Sums` holds the sum of the colours of a pixel's rays, and how many see the background."""
 
-    red: Any
-    green: Any
-    blue: Any
-    ground: Any
+    rgb: Rgb
+    ground: Scalar
     """Number of rays that see the ground."""
-    sky: Any
+    sky: Scalar
     """Number of rays that see nothing."""
-    wall: Any
+    wall: Scalar | None
     """Number of rays that see a wall; None: there are none."""
 
 
 class _Slopes(NamedTuple):
     """A `_Slopes` holds 1/depth of what a ray meets behind all geoms, 0 or less: nothing."""
 
-    ground: Any
-    wall: Any
+    ground: Scalar
+    wall: Scalar | None
     """None: there are no walls."""
 
     @property
-    def nearest(self) -> Any:
+    def nearest(self) -> Scalar:
         """Return the larger one."""
         return self.ground if self.wall is None else jnp.maximum(self.ground, self.wall)
 
     @property
-    def is_wall(self) -> Any:
+    def is_wall(self) -> Mask:
         """Return whether the nearest one is a wall."""
+        assert self.wall is not None
         return self.wall > jnp.maximum(self.ground, 0.0)
 
 
 def pixel_colour(
     scene: Scene, frame: Frame, samples: Sequence[Rays], footprint: Footprint
-) -> list[Any]:
+) -> list[Scalar]:
     """Return red, green and blue of a pixel, 1 is white: the mean over its area.
 
     Args:
@@ -139,15 +138,14 @@ def pixel_colour(
     slopes = [_slopes(scene, frame, ground, rays) for rays in samples]
 
     def background() -> _Sums:
-        zero = jnp.zeros(())
-        seen = sum((slope.nearest > 0).astype(jnp.float32) for slope in slopes)
+        seen = sum(jnp.asarray(slope.nearest > 0, jnp.float32) for slope in slopes)
         if frame.room is None:
-            return _Sums(zero, zero, zero, seen, len(samples) - seen, None)
-        wall = sum(slope.is_wall.astype(jnp.float32) for slope in slopes)
-        return _Sums(zero, zero, zero, seen - wall, len(samples) - seen, wall)
+            return _Sums(_black(), seen, len(samples) - seen, None)
+        wall = sum(jnp.asarray(slope.is_wall, jnp.float32) for slope in slopes)
+        return _Sums(_black(), seen - wall, len(samples) - seen, wall)
 
-    def with_geoms(near: Sequence[Any]) -> _Sums:
-        found = [_Sample(jnp.float32(np.inf), *[jnp.zeros(())] * 3) for _ in samples]
+    def with_geoms(near: Sequence[Scalar]) -> _Sums:
+        found = [_Sample(jnp.float32(np.inf), _black()) for _ in samples]
         for index, is_near in zip(others, near, strict=True):
             found = jax.lax.cond(
                 is_near,
@@ -161,17 +159,15 @@ def pixel_colour(
     if not others:
         sums = background()
     else:
-        is_any = near[0]
-        for one in near[1:]:
-            is_any |= one
+        is_any = functools.reduce(operator.or_, near)
         sums = jax.lax.cond(is_any, lambda: with_geoms(near), background)
     # Add the background.
-    channels: list[Any] = [sums.red, sums.green, sums.blue]
+    channels = list(sums.rgb)
     if ground is not None:
         geom, look = scene.geoms[ground], frame.looks[ground]
         colour = _plane_colour(geom, look, frame, footprint, sums.ground > 0)
         channels = [channels[k] + sums.ground * (colour[k] * look.faces[0][k]) for k in range(3)]
-    if frame.room is not None:
+    if frame.room is not None and sums.wall is not None:
         wall = wall_colour(frame.room, footprint.centre)
         channels = [channels[k] + sums.wall * wall[k] for k in range(3)]
     sky = _sky(scene, frame.up, footprint.centre)
@@ -196,7 +192,7 @@ def _radius(geom: SceneGeom) -> float:
             return float(np.sqrt(x * x + y * y + z * z))
 
 
-def _is_near(geom: SceneGeom, look: Look, footprint: Footprint) -> Any:
+def _is_near(geom: SceneGeom, look: Look, footprint: Footprint) -> Scalar:
     """Return whether any ray of a pixel can meet the sphere around a geom.
 
     The ray through the pixel's centre passes a sphere of radius R at the distance |c × d|/|d|; the
@@ -222,7 +218,7 @@ def _slopes(scene: Scene, frame: Frame, ground: int | None, rays: Rays) -> _Slop
     return _Slopes(_ground_slope(scene, frame, ground, rays), wall)
 
 
-def _ground_slope(scene: Scene, frame: Frame, ground: int | None, rays: Rays) -> Any:
+def _ground_slope(scene: Scene, frame: Frame, ground: int | None, rays: Rays) -> Scalar:
     """Return how steeply a ray falls towards the ground: 1/depth, at most 0 if it does not."""
     if ground is None:
         return jnp.zeros(())
@@ -253,15 +249,15 @@ def _meet(
         colour = geom.rgb
         if geom.checker is not None:
             colour = _checker_colours(geom.checker, look.origin, axes, None, footprint)
-        seen = [hit.depth, *(colour[k] * light[k] for k in range(3))]
-        pairs = zip(seen, sample, strict=True)
-        after.append(_Sample(*(jnp.where(closer, new, old) for new, old in pairs)))
+        red, green, blue = (colour[k] * light[k] for k in range(3))
+        new = _Sample(hit.depth, (red, green, blue))
+        after.append(jax.tree.map(functools.partial(jnp.where, closer), new, sample))
     return after
 
 
 def _light(
     scene: Scene, geom: SceneGeom, look: Look, axes: Axes, direction: Vector, hit: Hit
-) -> Sequence[Any]:
+) -> Sequence[Scalar]:
     """Return the light on a geom where a ray enters it, by which its colour is multiplied."""
     if geom.kind == "plane":
         return look.faces[0]
@@ -283,23 +279,25 @@ def _light(
 
 def _sum(found: Sequence[_Sample], slopes: Sequence[_Slopes]) -> _Sums:
     """Add up the rays of a pixel; those that meet ground or wall before a geom see that."""
-    totals: list[Any] = [jnp.zeros(())] * (5 if slopes[0].wall is None else 6)
+    rays = []
     for sample, slope in zip(found, slopes, strict=True):
         is_free = sample.depth == np.inf
         is_behind = (slope.nearest > 0) & (sample.depth * slope.nearest > 1.0)
-        seen = [is_behind, is_free & ~is_behind]
-        if slope.wall is not None:
-            is_wall = is_behind & slope.is_wall
-            seen = [is_behind & ~is_wall, is_free & ~is_behind, is_wall]
-        shown = [jnp.where(is_behind, 0.0, x) for x in (sample.red, sample.green, sample.blue)]
-        counts = [x.astype(jnp.float32) for x in seen]
-        totals = [a + b for a, b in zip(totals, [*shown, *counts], strict=True)]
-    return _Sums(*totals, *[None] * (6 - len(totals)))
+        wall = None if slope.wall is None else is_behind & slope.is_wall
+        ground = is_behind if wall is None else is_behind & ~wall
+        red, green, blue = (jnp.where(is_behind, 0.0, x) for x in sample.rgb)
+        rays.append(_Sums((red, green, blue), ground, is_free & ~is_behind, wall))
+    return jax.tree.map(lambda *x: sum((y.astype(jnp.float32) for y in x), jnp.zeros(())), *rays)
+
+
+def _black() -> Rgb:
+    zero = jnp.zeros(())
+    return zero, zero, zero
 
 
 def _plane_colour(
-    geom: SceneGeom, look: Look, frame: Frame, footprint: Footprint, is_seen: Any
-) -> Sequence[Any]:
+    geom: SceneGeom, look: Look, frame: Frame, footprint: Footprint, is_seen: Scalar
+) -> Sequence[Scalar]:
     """Return the mean colour of the ground over a pixel, if it is seen there."""
     checker = geom.checker
     if checker is None:
@@ -308,7 +306,7 @@ def _plane_colour(
     return jax.lax.cond(
         is_seen,
         lambda: _checker_colours(checker, look.origin, axes, frame.floor_turn, footprint),
-        lambda: [jnp.zeros(())] * 3,
+        lambda: list(_black()),
     )
 
 
@@ -329,9 +327,9 @@ def _checker_colours(
     checker: Checker,
     origin: Vector,
     axes: Axes,
-    turn: tuple[Any, Any] | None,
+    turn: tuple[Scalar, Scalar] | None,
     pixel: Footprint,
-) -> list[Array]:
+) -> list[Scalar]:
     """Return the mean colour of a checker texture over every pixel's area on its plane.
 
     The point p = o - d o_z/d_z that a pixel sees moves by t (e - d e_z/d_z) where d changes by e.
@@ -355,7 +353,7 @@ def _checker_colours(
     for axis in (0, 1):
         scale = 1.0 / checker.size[axis]
         at = (origin[axis] - checker.start[axis]) + depth * direction[axis]
-        squared: Any = 0.0
+        squared: Scalar = 0.0
         for change in changes:
             moved = depth * (change[axis] - direction[axis] * (change[2] * slope))
             squared = squared + moved * moved
@@ -369,7 +367,7 @@ def _checker_colours(
     ]
 
 
-def _unturned(vector: Vector, turn: tuple[Any, Any]) -> Vector:
+def _unturned(vector: Vector, turn: tuple[Scalar, Scalar]) -> Vector:
     """Return a vector in axes that are turned about z by an angle of given cosine and sine."""
     (x, y, z), (cosine, sine) = vector, turn
     return cosine * x + sine * y, cosine * y - sine * x, z
@@ -379,7 +377,9 @@ _JOINT = 0.06
 """Width of the joints between tiles, of a tile's side."""
 
 
-def _pattern(texture: Any, waves: Sequence[Any], places: Sequence[tuple[Array, Array]]) -> Any:
+def _pattern(
+    texture: Scalar | None, waves: Sequence[Scalar], places: Sequence[tuple[Array, Array]]
+) -> Scalar:
     """Return the mean of a pattern over a pixel, from -1 to 1.
 
     Args:
@@ -426,7 +426,7 @@ def _square_wave(at: Array, width: Array) -> Array:
     return (integral(at + 0.5 * width) - integral(at - 0.5 * width)) / width
 
 
-def _sky(scene: Scene, up: Vector, rays: Rays) -> Sequence[Any]:
+def _sky(scene: Scene, up: Vector, rays: Rays) -> Sequence[Scalar]:
     """Return the colours of the sky, which change from the horizon to the zenith.
 
     MuJoCo's gradients are mixed by m = √2 e / √(1 + e²), where e is the elevation, 1 at the zenith.

@@ -18,39 +18,16 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, Int, UInt8
 
-from jetbot_mjx.compiler import llvm_codegen
-from jetbot_mjx.compiler.backends import obstacle, require_backend
-from jetbot_mjx.compiler.kernel import Kernel, as_map
-from jetbot_mjx.compiler.lower_jaxpr import scalarize
-from jetbot_mjx.compiler.scalar_ir import UnsupportedError
-from jetbot_mjx.config import CameraConfig
+from jetbot_mjx.config import CameraConfig, LookParams
 from jetbot_mjx.envs import kinematics
+from jetbot_mjx.envs.camera import looks, pixel
 from jetbot_mjx.envs.camera.geometry import Vector
 from jetbot_mjx.envs.camera.lens import pixel_grid
-from jetbot_mjx.envs.camera.looks import (
-    PLAIN,
-    Appearance,
-    bend_rays,
-    developed,
-    pixel_values,
-    squared_length,
-    styled,
-    turned,
-)
-from jetbot_mjx.envs.camera.pixel import (
-    HITS,
-    Axes,
-    Frame,
-    Look,
-    directions,
-    pixel_colour,
-    strengths,
-)
 from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, with_clutter
-from jetbot_mjx.envs.look_params import LookParams
-from jetbot_mjx.errors import UserError
-from jetbot_mjx.fallbacks import Fallback, report
+from jetbot_mjx.envs.kernel_impl import KernelImpl
+from jetbot_mjx.envs.robot_model import mocap_ids
+from onekernel import Kernel, scalarize
 
 GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 
@@ -76,17 +53,16 @@ class Camera:
           robot: the name of the body that carries the camera.
 
         Raises:
-          UserError: the scene has something that cannot be rendered, the lens is none, or the
+          UserError: the scene has something that cannot be rendered, the lens is invalid, or the
             requested kernel back end is not available.
         """
-        require_backend(config.impl, "camera.impl")
+        self.kernel_impl = KernelImpl("camera.impl", config.impl)
+        self.kernel_impl.require()
         self.config = config
         self.scene: Scene = read_scene(model, robot)
         self._grid = pixel_grid(config)
         self._standing = {
-            model.body(b).name: np.asarray(model.body_pos[b], np.float32)
-            for b in range(model.nbody)
-            if model.body_mocapid[b] >= 0
+            name: np.asarray(model.body(name).pos, np.float32) for name in mocap_ids(model)
         }
         pitch = np.radians(config.pitch)
         forward = np.array([np.cos(pitch), 0.0, -np.sin(pitch)])
@@ -94,7 +70,6 @@ class Camera:
         axes = np.stack([right, np.cross(forward, right), forward], axis=1)
         self._mount_rotation = axes.astype(np.float32)
         self._mount_position = np.asarray(config.position, np.float32)
-        self._kernels: dict[Any, Kernel | UnsupportedError] = {}
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -111,7 +86,7 @@ class Camera:
         self,
         position_w: Float[Array, "3"],
         quat: Float[Array, "4"],
-        params: LookParams = PLAIN.params,
+        params: LookParams = looks.PLAIN.params,
     ) -> Pose:
         """Return the camera's pose on a robot.
 
@@ -130,7 +105,7 @@ class Camera:
         self,
         pose: Pose,
         mocap_positions: Mapping[str, Float[Array, "3"]],
-        appearance: Appearance = PLAIN,
+        appearance: looks.Appearance = looks.PLAIN,
     ) -> UInt8[Array, "h w c"]:
         """Return the image, without noise.
 
@@ -147,35 +122,11 @@ class Camera:
         """
         leaves, structure = jax.tree.flatten(self._frame(pose, mocap_positions, appearance))
         shared = jnp.stack(leaves)
-        kernel = self._kernel(structure)
-        values = self._fallback(structure, shared)[0] if kernel is None else as_map(kernel)(shared)
+        # The structure says what differs between episodes.
+        lower = functools.partial(self._make_kernel, structure)
+        kernel = self.kernel_impl.find_kernel(structure, lower)
+        values = self._fallback(structure, shared)[0] if kernel is None else kernel.as_map()(shared)
         return values.reshape(self.shape)
-
-    def _kernel(self, structure: Any) -> Kernel | None:
-        """Return an image as one kernel; None: XLA compiles it.
-
-        Args:
-          structure: the tree structure of the `Frame`, which says what differs between episodes.
-        """
-        if self.config.impl == "xla":
-            return None
-        if reason := obstacle(self.config.impl):
-            report(Fallback("camera.impl", reason))
-        if structure not in self._kernels:
-            try:
-                self._kernels[structure] = self._make_kernel(structure)
-            except UnsupportedError as error:
-                self._kernels[structure] = error
-        found = self._kernels[structure]
-        if isinstance(found, Kernel):
-            return found
-        reason = f"one kernel cannot do {found}"
-        if self.config.impl != "auto":
-            raise UserError(f"camera.impl = {self.config.impl}: {reason}; choose xla or auto")
-        report(
-            Fallback("camera.impl", f"{reason}: try the versions that its constraints.txt names")
-        )
-        return None
 
     def _make_kernel(self, structure: Any) -> Kernel:
         """Lower an image to a kernel.
@@ -186,14 +137,11 @@ class Camera:
         sizes = structure.num_leaves, len(self._table)
         arguments = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in sizes]
         program = scalarize(functools.partial(self._pixel, structure), *arguments)
-        llvm_codegen.require(program)
-        return Kernel(
+        return self.kernel_impl.kernel_class(
             program,
             carried=0,
             steps=1,
             fallback=functools.partial(self._fallback, structure),
-            impl=self.config.impl,
-            setting="camera.impl",
             table=self._table,
         )
 
@@ -204,8 +152,8 @@ class Camera:
         # Keep the stages apart: XLA would compute what the pixels share in every pixel, and all
         # rays of a pixel for each of its channels.
         shared = jax.lax.optimization_barrier(shared)
-        pixel = functools.partial(self._pixel, structure)
-        channels = jax.vmap(pixel, in_axes=(None, 1))(shared, jnp.asarray(self._table))
+        one = functools.partial(self._pixel, structure)
+        channels = jax.vmap(one, in_axes=(None, 1))(shared, jnp.asarray(self._table))
         channels = jax.lax.optimization_barrier(channels)
         return [jnp.stack(channels, axis=-1).astype(jnp.uint8).reshape(-1)]
 
@@ -217,18 +165,18 @@ class Camera:
     @functools.cached_property
     def _farthest(self) -> float:
         """The largest x² + y² of the directions of all pixels."""
-        return squared_length(self._grid.expand(self._grid.columns)[1].centre)
+        return looks.squared_length(self._grid.expand(self._grid.columns)[1].centre)
 
     def _pixel(
         self, structure: Any, shared: Float[Array, " shared"], columns: Float[Array, " columns"]
     ) -> Any:
         """Return the channels of a pixel, whole numbers from 0 to 255 as floats."""
-        frame: Frame = jax.tree.unflatten(structure, list(shared))
+        frame: pixel.Frame = jax.tree.unflatten(structure, list(shared))
         scene = with_clutter(self.scene, frame.clutter)
-        scene = styled(scene, LookParams()._replace(**frame.params))
+        scene = looks.styled(scene, LookParams()._replace(**frame.params))
         samples, footprint = self._grid.expand(list(columns))
-        rays = bend_rays(frame.params, samples, footprint, self._farthest)
-        channels = developed(frame.params, pixel_colour(scene, frame, *rays))
+        rays = looks.bend_rays(frame.params, samples, footprint, self._farthest)
+        channels = looks.developed(frame.params, pixel.pixel_colour(scene, frame, *rays))
         if self.config.colour == "grey":
             channels = [sum(weight * x for weight, x in zip(GREY, channels, strict=True))]
         return [jnp.floor(jnp.clip(x, 0.0, 1.0) * 255.0 + 0.5) for x in channels]
@@ -246,14 +194,14 @@ class Camera:
           The depth along the optical axis [m], infinite where there is nothing, and the geom's
           index in the model, -1 where there is none.
         """
-        frame = self._frame(pose, mocap_positions, PLAIN)
+        frame = self._frame(pose, mocap_positions, looks.PLAIN)
         nearest = jnp.full(self.shape[:2], jnp.inf)
         found = jnp.full(self.shape[:2], -1)
         _, footprint = self._grid.expand(self._grid.columns)
         for geom, look in zip(self.scene.geoms, frame.looks, strict=True):
             axes = frame.axes[geom.axes_key]
-            rays = directions(axes, footprint.centre)
-            hit = HITS[geom.kind](look.origin, rays, geom.size)
+            rays = pixel.directions(axes, footprint.centre)
+            hit = pixel.HITS[geom.kind](look.origin, rays, geom.size)
             closer = hit.mask & (hit.depth < nearest)
             nearest = jnp.where(closer, hit.depth, nearest)
             found = jnp.where(closer, geom.geom_id, found)
@@ -263,38 +211,38 @@ class Camera:
         self,
         pose: Pose,
         mocap_positions: Mapping[str, Float[Array, "3"]],
-        appearance: Appearance,
-    ) -> Frame:
+        appearance: looks.Appearance,
+    ) -> pixel.Frame:
         """Compute everything that all pixels of a frame share."""
         params, (walls, clutter) = appearance
         places, colours = {**self._standing, **mocap_positions}, []
         if clutter is not None:
             places |= clutter_positions(clutter, params.clutter)
             colours = [(one[2], one[3], one[4]) for one in clutter]
-        scene = styled(with_clutter(self.scene, colours), params)
+        scene = looks.styled(with_clutter(self.scene, colours), params)
         towards = [*(-light.direction for light in scene.lights), -pose.rotation[:, 2]]
-        axes, looks = {}, []
+        axes, drawn = {}, []
         for geom in scene.geoms:
             rotation, position = geom.rotation, geom.position
             if geom.yaw is not None:
-                rotation = turned(rotation, geom.yaw)
-                position = turned(position[:, None], geom.yaw)[:, 0]
+                rotation = looks.turned(rotation, geom.yaw)
+                position = looks.turned(position[:, None], geom.yaw)[:, 0]
             if geom.axes_key not in axes:
                 right, down, forward = (_into(rotation, pose.rotation[:, k]) for k in range(3))
                 lights = tuple(_into(rotation, vector) for vector in towards)
-                axes[geom.axes_key] = Axes((right, down, forward), lights)
+                axes[geom.axes_key] = pixel.Axes((right, down, forward), lights)
             if geom.mocap is not None:
                 position = position + places[geom.mocap]
             origin = _into(rotation, pose.position - position)
             centre = _into(pose.rotation, position - pose.position)
             faces = _faces(scene, geom, origin, axes[geom.axes_key].lights)
-            looks.append(Look(origin, centre, faces))
+            drawn.append(pixel.Look(origin, centre, faces))
         yaw = params.floor_yaw
-        frame = Frame(
+        frame = pixel.Frame(
             axes,
-            looks,
+            drawn,
             up=(pose.rotation[2, 0], pose.rotation[2, 1], pose.rotation[2, 2]),
-            params=pixel_values(params),
+            params=looks.pixel_values(params),
             clutter=colours,
             room=None if walls is None else make_room(walls, params.walls, *pose),
             floor_turn=(jnp.cos(yaw), jnp.sin(yaw)) if params.differs("floor_yaw") else None,
@@ -318,7 +266,7 @@ def _mounted(
         x, y, z = jnp.stack([right, down, forward], axis=1)
         cosine, sine = jnp.cos(params.camera_pitch), jnp.sin(params.camera_pitch)
         lowered = jnp.stack([cosine * x + sine * z, y, cosine * z - sine * x])
-        axes = turned(lowered, params.camera_yaw)
+        axes = looks.turned(lowered, params.camera_yaw)
     return place, axes
 
 
@@ -327,7 +275,7 @@ def _faces(
 ) -> tuple[tuple[Any, Any, Any], ...]:
     """Return the light on the flat faces of a geom that the camera can see."""
     faces = []
-    ambient, *diffuse = strengths(scene, geom)
+    ambient, *diffuse = pixel.strengths(scene, geom)
     for axis in {"plane": (2,), "box": (0, 1, 2)}.get(geom.kind, ()):
         side = 1.0 if geom.kind == "plane" else jnp.sign(origin[axis])
         cosines = [jnp.maximum(side * light[axis], 0.0) for light in lights]

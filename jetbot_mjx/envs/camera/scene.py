@@ -1,15 +1,16 @@
 """Read what a camera can see out of a MuJoCo model: geoms, colours, lights and the sky."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import mujoco
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float, UInt8
 
+from jetbot_mjx.envs.camera.geometry import Scalar, Vector
 from jetbot_mjx.errors import UserError
 
-Rgb = tuple[Any, Any, Any]
+Rgb = Vector
 """Red, green and blue, 1 is white: numbers, or traced in the scene of one episode."""
 
 GOAL = "goal"
@@ -36,11 +37,11 @@ class Checker(NamedTuple):
     even: Rgb
     """Colour of the square whose least x and y are those of `start`."""
     odd: Rgb
-    size: tuple[Any, Any]
+    size: tuple[Scalar, Scalar]
     """Side lengths of a square [m]."""
     start: tuple[float, float]
     """Where the squares begin [m], in the plane's frame."""
-    texture: Any = None
+    texture: Scalar | None = None
     """Pattern as of `LookParams.floor_texture`; None: a checker."""
 
 
@@ -60,7 +61,7 @@ class SceneGeom(NamedTuple):
     """Position [m] in the axes of the world."""
     rotation: Float[np.ndarray, "3 3"]
     """Axes of the geom, as columns, in the axes of the world."""
-    yaw: Any = None
+    yaw: Scalar | None = None
     """Further turn about the vertical through the body [rad]; None: none."""
 
     @property
@@ -72,7 +73,7 @@ class SceneGeom(NamedTuple):
 class Light(NamedTuple):
     """A `Light` holds a directional light."""
 
-    direction: Any
+    direction: np.ndarray | Array
     """Direction of the light's rays, a unit vector in the world frame."""
     diffuse: Rgb
 
@@ -124,7 +125,7 @@ def read_scene(model: mujoco.MjModel, robot: str) -> Scene:
     geoms = []
     for geom in range(model.ngeom):
         chain = _ancestors(model, int(model.geom_bodyid[geom]))
-        hidden = model.geom_group[geom] >= _HIDDEN_GROUPS or _rgba(model, geom)[3] == 0
+        hidden = model.geom_group[geom] >= _HIDDEN_GROUPS or geom_rgba(model, geom)[3] == 0
         if not hidden and robot_id not in chain:
             geoms.append(_read_geom(model, data, geom, chain))
     headlight = model.vis.headlight
@@ -151,18 +152,18 @@ def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     return chain
 
 
-def _rgb(values: Sequence[float] | np.ndarray) -> Rgb:
+def _rgb(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
     red, green, blue = (float(value) for value in values)
     return red, green, blue
 
 
-def _rgba(model: mujoco.MjModel, geom: int) -> tuple[float, ...]:
-    """Return a geom's colour: its own, unless that is the default and it has a material."""
-    own = tuple(float(value) for value in model.geom_rgba[geom])
-    material = model.geom_matid[geom]
-    if material < 0 or not np.allclose(own, _DEFAULT_RGBA):
-        return own
-    return tuple(float(value) for value in model.mat_rgba[material])
+def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, float]:
+    """Return the colour that MuJoCo draws: a geom's own if it is set, else its material's."""
+    own, material = model.geom_rgba[geom], model.geom_matid[geom]
+    if material >= 0 and np.allclose(own, _DEFAULT_RGBA):
+        own = model.mat_rgba[material]
+    red, green, blue, alpha = own.tolist()
+    return red, green, blue, alpha
 
 
 def _read_geom(
@@ -187,7 +188,7 @@ def _read_geom(
     if kind == "sphere":
         size = np.repeat(size[0], 3)
     material = int(model.geom_matid[geom])
-    rgba = _rgba(model, geom)
+    rgba = geom_rgba(model, geom)
     texture = -1
     if material >= 0:
         texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
@@ -210,13 +211,24 @@ def _read_geom(
     )
 
 
-def _texture(model: mujoco.MjModel, texture: int) -> Float[np.ndarray, "h w 3"]:
-    """Return a texture's image, colours from 0 to 1; of a cube, its six sides one below another."""
-    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
-    channels, start = int(model.tex_nchannel[texture]), int(model.tex_adr[texture])
+def texture_bytes(model: mujoco.MjModel, texture: int) -> UInt8[np.ndarray, "h w c"]:
+    """Return a view of a texture in its model; of a cube, its six sides are one below another."""
+    sizes = model.tex_height, model.tex_width, model.tex_nchannel
+    height, width, channels = (int(size[texture]) for size in sizes)
+    start = int(model.tex_adr[texture])
     image = model.tex_data[start : start + height * width * channels]
-    image = image.reshape(height, width, channels) / 255.0
-    return image[..., :3] if channels >= 3 else np.repeat(image[..., :1], 3, axis=-1)
+    return image.reshape(height, width, channels)
+
+
+def _texture(model: mujoco.MjModel, texture: int) -> Float[np.ndarray, "h w 3"]:
+    """Return a texture's image, colours from 0 to 1."""
+    image = texture_bytes(model, texture) / 255.0
+    return image[..., :3] if image.shape[-1] >= 3 else np.repeat(image[..., :1], 3, axis=-1)
+
+
+def skyboxes(model: mujoco.MjModel) -> list[int]:
+    """Return the indices of a model's textures that are sky boxes."""
+    return np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).tolist()
 
 
 def _read_checker(
@@ -261,14 +273,14 @@ def _read_light(model: mujoco.MjModel, data: mujoco.MjData, light: int) -> Light
 
 def _read_sky(model: mujoco.MjModel) -> tuple[Rgb, Rgb]:
     """Return the sky's colours at the horizon and at the zenith; black without a skybox."""
-    for texture in range(model.ntex):
-        if model.tex_type[texture] == mujoco.mjtTexture.mjTEXTURE_SKYBOX:
-            image = _texture(model, texture)
-            side = image.shape[1]
-            # The sides are right, left, up, down, front, back.
-            sides = [image[i * side : (i + 1) * side] for i in range(image.shape[0] // side)]
-            if len(sides) != 6:
-                mean = image.reshape(-1, 3).mean(axis=0)
-                return _rgb(mean), _rgb(mean)
-            return _rgb(sides[0][side // 2, side // 2]), _rgb(sides[2][side // 2, side // 2])
-    return _SKY, _SKY
+    skies = skyboxes(model)
+    if not skies:
+        return _SKY, _SKY
+    image = _texture(model, skies[0])
+    height, side, _ = image.shape
+    if height // side != 6:
+        mean = _rgb(image.reshape(-1, 3).mean(axis=0))
+        return mean, mean
+    # The sides are right, left, up, down, front, back: take the middles of right and up.
+    middle = side // 2
+    return _rgb(image[middle, middle]), _rgb(image[2 * side + middle, middle])

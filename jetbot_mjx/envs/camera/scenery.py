@@ -6,6 +6,8 @@ import mujoco
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from jetbot_mjx.envs.camera.scene import skyboxes, texture_bytes
+
 SceneryKind = Literal["plain", "varied"]
 """`plain`: lights, floor and sky of the scene; `varied`: drawn ones."""
 
@@ -101,37 +103,35 @@ def paint(model: mujoco.MjModel, scenery: Scenery) -> list[int]:
         model.mat_texrepeat[material] = scenery.repeat
         model.mat_reflectance[material] = scenery.reflectance
         texture = int(model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB])
-        if texture >= 0 and _write(model, texture, _resized(model, texture, scenery.floor)):
-            changed.append(texture)
-    for texture in np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX).tolist():
-        if _write(model, texture, scenery.sky.reshape(-1, *scenery.sky.shape[2:])):
-            changed.append(texture)
+        if texture >= 0:
+            height, width, _ = texture_bytes(model, texture).shape
+            changed += _write(model, texture, _resized(scenery.floor, height, width))
+    for texture in skyboxes(model):
+        changed += _write(model, texture, scenery.sky.reshape(-1, *scenery.sky.shape[2:]))
     return changed
 
 
 def sky_side(model: mujoco.MjModel) -> int:
     """Return the side length of a model's sky box [pixels]; a small one if it has none."""
-    skies = np.flatnonzero(model.tex_type == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
-    return int(model.tex_width[skies[0]]) if skies.size else 8
+    skies = skyboxes(model)
+    return int(model.tex_width[skies[0]]) if skies else 8
 
 
 def _resized(
-    model: mujoco.MjModel, texture: int, image: UInt8[np.ndarray, "side side 3"]
+    image: UInt8[np.ndarray, "side side 3"], height: int, width: int
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Return an image in the size of a texture, by the nearest pixels."""
-    height, width = int(model.tex_height[texture]), int(model.tex_width[texture])
+    """Return an image in another size, by the nearest pixels."""
     rows = np.arange(height) * len(image) // height
     return image[rows][:, np.arange(width) * len(image) // width]
 
 
-def _write(model: mujoco.MjModel, texture: int, image: UInt8[np.ndarray, "h w 3"]) -> bool:
-    """Write the pixels of a texture; return whether it has their size."""
-    start = int(model.tex_adr[texture])
-    size = (model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture])
-    if image.shape != size:
-        return False
-    model.tex_data[start : start + image.size] = image.reshape(-1)
-    return True
+def _write(model: mujoco.MjModel, texture: int, image: UInt8[np.ndarray, "h w 3"]) -> list[int]:
+    """Write the pixels of a texture, if it has their size; return its index if it changed."""
+    pixels = texture_bytes(model, texture)
+    if image.shape != pixels.shape:
+        return []
+    pixels[:] = image
+    return [texture]
 
 
 def _floor(

@@ -3,17 +3,17 @@
 import functools
 import math
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, UInt32
 
-from jetbot_mjx.envs.camera.geometry import Vector
+from jetbot_mjx.config import LookParams
+from jetbot_mjx.envs.camera.geometry import Scalar, Vector
 from jetbot_mjx.envs.camera.lens import Rays
 from jetbot_mjx.envs.camera.scene import GOAL, Rgb, Scene, SceneGeom
-from jetbot_mjx.envs.look_params import LookParams
 
 _SHAPES = (
     ("box", (0.04, 0.06, 0.05)),
@@ -49,13 +49,17 @@ class Room(NamedTuple):
 
     sides: list[Vector]
     """Numbers by which right, down and forward of a ray give 1/depth of each wall."""
-    top: Any
+    top: Scalar
     """Height of the walls above the camera [m]."""
-    colours: list[Rgb]
+    colours: Sequence[Rgb]
 
 
 def draw_surroundings(
-    key: UInt32[Array, "2"], params: LookParams, objects: int, scene: Scene, goal_w: Any
+    key: UInt32[Array, "2"],
+    params: LookParams,
+    objects: int,
+    scene: Scene,
+    goal_w: Float[Array, "3"] | None,
 ) -> Surroundings:
     """Draw walls and objects for an episode.
 
@@ -103,7 +107,7 @@ def _other_hues(rgb: Rgb, u: Array, value: Array, chroma: Array) -> Float[Array,
       value: the mean of red, green and blue, of shape (n,).
       chroma: the distance from grey, of shape (n,).
     """
-    given = np.asarray(rgb) - np.mean(rgb)
+    given = np.asarray(rgb, float) - np.asarray(rgb, float).mean()
     along = given / max(float(np.linalg.norm(given)), 1e-6)
     across = np.cross(np.full(3, 1 / math.sqrt(3)), along)
     hue = jnp.pi * (0.5 + u)
@@ -112,7 +116,7 @@ def _other_hues(rgb: Rgb, u: Array, value: Array, chroma: Array) -> Float[Array,
 
 
 def clutter_positions(
-    clutter: Float[Array, "objects 5"], number: Any
+    clutter: Float[Array, "objects 5"], number: Scalar
 ) -> dict[str, Float[Array, "3"]]:
     """Return where the objects around stand [m], world frame, by the name of their body.
 
@@ -131,7 +135,7 @@ def _clutter_name(index: int) -> str:
     return f"clutter {index}"
 
 
-def with_clutter(scene: Scene, colours: Sequence[Any]) -> Scene:
+def with_clutter(scene: Scene, colours: Sequence[Rgb]) -> Scene:
     """Return a scene with objects around, which stand on the floor z = 0.
 
     Args:
@@ -159,7 +163,10 @@ def with_clutter(scene: Scene, colours: Sequence[Any]) -> Scene:
 
 
 def make_room(
-    walls: Float[Array, "14"], near: Any, position: Any, rotation: Float[Array, "3 3"]
+    walls: Float[Array, "14"],
+    near: Scalar,
+    position: Float[Array, "3"],
+    rotation: Float[Array, "3 3"],
 ) -> Room:
     """Return the walls as a camera sees them.
 
@@ -179,7 +186,7 @@ def make_room(
     return Room([(x, y, z) for x, y, z in sides], walls[1] - position[2], colours)
 
 
-def wall_slope(room: Room, up: Vector, rays: Rays) -> Any:
+def wall_slope(room: Room, up: Vector, rays: Rays) -> Scalar:
     """Return 1/depth of the wall that a ray meets; 0: it passes above, or there is none.
 
     Args:
@@ -193,7 +200,7 @@ def wall_slope(room: Room, up: Vector, rays: Rays) -> Any:
     return jnp.where(rise < room.top * nearest, nearest, 0.0)
 
 
-def wall_colour(room: Room, rays: Rays) -> list[Any]:
+def wall_colour(room: Room, rays: Rays) -> list[Scalar]:
     """Return the colour of the wall that a ray meets."""
     first, *others = zip(_wall_slopes(room, rays), room.colours, strict=True)
     nearest, rgb = first
@@ -203,5 +210,5 @@ def wall_colour(room: Room, rays: Rays) -> list[Any]:
     return list(rgb)
 
 
-def _wall_slopes(room: Room, rays: Rays) -> list[Any]:
+def _wall_slopes(room: Room, rays: Rays) -> list[Scalar]:
     return [x * rays.x + (y * rays.y + z) for x, y, z in room.sides]

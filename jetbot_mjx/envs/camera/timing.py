@@ -12,8 +12,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, UInt32
 
+from jetbot_mjx.config import LookParams
 from jetbot_mjx.envs.camera.surroundings import Surroundings
-from jetbot_mjx.envs.look_params import LookParams
 
 
 class SeenPose(NamedTuple):

@@ -5,14 +5,14 @@ from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
-from brax.envs import Wrapper
 from jaxtyping import Array, Bool, Float, UInt8, UInt32
 
-from jetbot_mjx.compiler.packed import Packed, pack
 from jetbot_mjx.envs.camera.looks import Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.timing import SeenPose, noise_seed
 from jetbot_mjx.envs.state import State, robot_state
+from jetbot_mjx.mjx_import import Wrapper
+from jetbot_mjx.packed import Packed, pack
 
 PIXELS = "pixels/front"
 """Key of the images in the observation; Brax's vision networks read every key that begins so."""

@@ -79,7 +79,9 @@ def purity(probe: TaskProbe) -> Iterator[str]:
             )
 
 
-def _traced(function: Callable[..., Any], arguments: Sequence[Any]) -> tuple[str, list[bytes]]:
+def _traced(
+    function: Callable[..., object], arguments: Sequence[object]
+) -> tuple[str, list[bytes]]:
     """Return the jaxpr of a function and its constants, to be compared."""
     # A new function each time, since JAX caches traces.
     closed = jax.make_jaxpr(lambda *given: function(*given))(*arguments)
@@ -139,13 +141,13 @@ def _unlike(name: str, got: Any, shape: Any, dtype: str, meaning: str) -> Iterat
 _CAST = {"bool": ", such as a comparison gives", "float32": ", as .astype(jnp.float32) makes it"}
 
 
-def _weak(name: str, tree: Any) -> Iterator[str]:
+def _weak(name: str, tree: object) -> Iterator[str]:
     """Find weakly typed results, with which JAX's loops fail or are compiled twice."""
     if any(getattr(leaf, "weak_type", False) for leaf in jax.tree.leaves(tree)):
         yield f"{name} has a weak type, of Python's own number: write jnp.float32(...) instead"
 
 
-def _other_tree(name: str, got: Any, goal: Any) -> Iterator[str]:
+def _other_tree(name: str, got: object, goal: object) -> Iterator[str]:
     """Compare the tree structure, shapes and dtypes of a new goal with those of `sample`."""
     if jax.tree.structure(got) != jax.tree.structure(goal):
         yield f"{name} returns another tree than sample: change the goal's leaves alone"
@@ -207,7 +209,7 @@ def finite(probe: TaskProbe) -> Iterator[str]:
                 )
 
 
-def _is_finite(tree: Any) -> bool:
+def _is_finite(tree: object) -> bool:
     return all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(tree))
 
 

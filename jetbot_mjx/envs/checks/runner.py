@@ -23,7 +23,7 @@ from jetbot_mjx.envs.checks.probe import (
     first_key,
 )
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model
+from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model, mocap_ids
 from jetbot_mjx.envs.task import Task, layout_size, make_task
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import InvalidError, UserError
@@ -125,7 +125,7 @@ def _scene(probe: TaskProbe) -> Iterator[str]:
         yield f"build_scene: MJX cannot simulate it: {error}: pair spheres and capsules"
         return
     # Compare the mocap bodies with `markers`.
-    names, solids = _mocap_bodies(model), _mocap_bodies(solid)
+    names, solids = set(mocap_ids(model)), set(mocap_ids(solid))
     for name in sorted(placed - names):
         yield (
             f"markers places {name!r}, which is not a mocap body: add_body(name={name!r},"
@@ -150,8 +150,8 @@ def _touching(probe: TaskProbe, solid: mujoco.MjModel) -> Iterator[str]:
     places = jax.device_get(jax.vmap(probe.task.markers)(probe.goals))
     data, touched = mujoco.MjData(solid), collections.Counter()
     for draw in range(DRAWS if solid.nmocap else 1):
-        for name in _mocap_bodies(solid):
-            data.mocap_pos[solid.body(name).mocapid[0]] = places[name][draw]
+        for name, index in mocap_ids(solid).items():
+            data.mocap_pos[index] = places[name][draw]
         mujoco.mj_forward(solid, data)
         pairs = data.contact.geom[data.contact.dist < 0]
         touched.update({solid.geom(geom).name for pair in pairs for geom in pair})
@@ -162,10 +162,6 @@ def _touching(probe: TaskProbe, solid: mujoco.MjModel) -> Iterator[str]:
                 f"{name!r} touches something in {often} of {DRAWS if solid.nmocap else 1} episodes"
                 " as they begin: leave room around the robot, 0.2 m from the origin"
             )
-
-
-def _mocap_bodies(model: mujoco.MjModel) -> set[str]:
-    return {model.body(i).name for i in range(model.nbody) if model.body(i).mocapid[0] >= 0}
 
 
 def _drive(probe: TaskProbe) -> Iterator[str]:
@@ -204,7 +200,7 @@ def _drive(probe: TaskProbe) -> Iterator[str]:
         )
 
 
-def _changed(first: Any, last: Any) -> str:
+def _changed(first: object, last: object) -> str:
     """Return the first leaf whose shape or dtype differs between two states; empty if none."""
     sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
     for path in (*sides[0], *sides[1]):

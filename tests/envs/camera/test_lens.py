@@ -3,8 +3,8 @@
 import mujoco
 import numpy as np
 import pytest
-from camera_scenes import ROBOT, make_model
 
+from helpers.camera_scenes import ROBOT, make_model
 from jetbot_mjx.config import CameraConfig, ConfigError, parse_config
 from jetbot_mjx.envs.camera.lens import Footprint, Rays, intrinsics, pixel_grid
 from jetbot_mjx.envs.camera.render import Camera
@@ -145,7 +145,7 @@ def test_a_calibration_counts_for_other_sizes():
         {"lens": "fisheye", "fovy": 170.0},
     ],
 )
-def test_a_lens_that_is_none_is_refused_in_one_line(camera):
+def test_an_invalid_lens_is_refused_in_one_line(camera):
     with pytest.raises(InvalidError, match=r"^camera\.") as error:
         Camera(CameraConfig(**camera), make_model([]), ROBOT)
     assert "\n" not in str(error.value)

@@ -1,4 +1,4 @@
-"""The looks of an episode: what each of them changes in the image, and what it leaves alone."""
+"""What each look changes in the image, and what it does not."""
 
 import dataclasses
 import functools
@@ -8,13 +8,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jetbot_mjx.config import CameraConfig, Config
+from jetbot_mjx.config import CameraConfig, Config, LookParams
 from jetbot_mjx.envs.camera.looks import PLAIN, Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.scene import GOAL
 from jetbot_mjx.envs.camera.surroundings import draw_surroundings
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.look_params import LookParams
 
 SIDE = 48
 FOCAL = SIDE / 2  # [pixels] of 90 degrees
@@ -110,9 +109,9 @@ PLACES = {"cube": CUBE_PLACE, "floor": FLOOR, "sky": SKY}
 
 
 def test_plain_looks_are_the_plain_image_to_the_bit_and_its_kernel(eye):
-    kernels = set(eye.camera._kernels)
+    kernels = set(eye.camera.kernel_impl.kernels)
     np.testing.assert_array_equal(eye.see_all(PLAIN), eye.see())
-    assert len(set(eye.camera._kernels) | kernels) == 1
+    assert len(set(eye.camera.kernel_impl.kernels) | kernels) == 1
 
 
 NAMES = [n for n in LookParams._fields if n not in (*LATE, *PLACED, "pixel_noise")]
@@ -329,7 +328,7 @@ def test_the_kernel_draws_what_xla_draws_with_everything_drawn(camera):
             **{name: getattr(LookParams(), name) for name in (*LATE, "pixel_noise")}
         )
         images.append(eye.see_all(Appearance(traced, some(eye, key=3))).astype(int))
-        assert any(eye.camera._kernels.values()) == (impl == "auto")
+        assert any(eye.camera.kernel_impl.kernels.values()) == (impl == "auto")
     difference = np.abs(images[0] - images[1])
     assert difference.max() <= 1 or (difference > 1).mean() < 2e-3
     assert images[0].std() > 10

@@ -1,4 +1,4 @@
-"""The camera through MuJoCo's renderer: the same directions, other light, and one line without."""
+"""The camera by MuJoCo's renderer: the same directions, and an error of one line without OpenGL."""
 
 import gc
 import subprocess
@@ -19,6 +19,7 @@ from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.evaluation.robustness import MujocoEvaluator
+from jetbot_mjx.runs import Setup
 
 MATRIX = {"matrix": (40.0, 40.0, 20.0, 28.0), "calibration_size": (48, 48)}
 LENSES = {
@@ -102,18 +103,19 @@ def test_a_policy_is_evaluated_by_both_appearances(with_opengl):
     policy = networks.policy_network.init(jax.random.PRNGKey(0))
     params = PolicyParams(normalizer, policy, None)
     keys = report_keys(3)
-    found = MujocoEvaluator(env, networks, pictures=True).run(params, keys)
+    setup = Setup(env.config, env=env, networks=networks)
+    found = MujocoEvaluator(setup, pictures=True).run(params, keys)
     assert list(found.rendered) == ["plain", "varied"]
     assert {one.episodes for one in found.rendered.values()} == {3}
     assert found.rendered["plain"].episode_return != found.rendered["varied"].episode_return
-    assert MujocoEvaluator(env, networks).run(params, keys).rendered is None
+    assert MujocoEvaluator(setup).run(params, keys).rendered is None
 
 
 def test_without_opengl_one_line_says_so(env, monkeypatch):
     def missing():
         raise UserError("no OpenGL to render with: install one")
 
-    monkeypatch.setattr(mujoco_camera, "context_class", missing)
+    monkeypatch.setattr(mujoco_camera, "find_backend", missing)
     with pytest.raises(UserError, match="no OpenGL") as caught:
         MujocoCamera(CameraConfig(), env.mj_model)
     assert "\n" not in str(caught.value)

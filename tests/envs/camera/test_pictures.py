@@ -1,4 +1,4 @@
-"""Our pictures beside those of `mujoco.Renderer`: outlines, colours, checkers, sky and light."""
+"""Images beside those of `mujoco.Renderer`: outlines, colours, checkers, sky and light."""
 
 from unittest import mock
 
@@ -7,16 +7,17 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from camera_scenes import Scenes, make_model, turned
 from mujoco.rendering.classic import gl_context
 from numpy.lib.stride_tricks import sliding_window_view
 
+from helpers.camera_scenes import Scenes, make_model, turned
 from jetbot_mjx.config import CameraConfig, Config
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.opengl import context_class
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
+from onekernel import Kernel
 
 SIDE = 224
 FOVY = 75.0
@@ -230,8 +231,9 @@ def test_the_kernel_draws_what_xla_draws(change):
         return np.asarray(jax.jit(jax.vmap(render))(states)).astype(int)
 
     ours, theirs = images(one), images(other)
-    assert one._kernels
-    assert not other._kernels
+    assert all(isinstance(kernel, Kernel) for kernel in one.kernel_impl.kernels.values())
+    assert len(one.kernel_impl.kernels) == 1
+    assert not other.kernel_impl.kernels
     assert np.abs(ours - theirs).max() <= 1 or (np.abs(ours - theirs) > 1).mean() < 1e-3
     assert ours.std() > 10
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 import pytest
-from camera_scenes import Scenes, make_model, turned
+
+from helpers.camera_scenes import Scenes, make_model, turned
 
 FLOOR = '<geom type="plane" size="0 0 0.1"/>'
 ALL_KINDS = [

@@ -1,12 +1,12 @@
-"""The camera as an observation: when it renders, what it stacks, and whose bodies it sees."""
+"""The camera as an observation: when it renders, what it stacks, and which bodies it sees."""
 
-import gliding
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
 
+from helpers import gliding
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS
@@ -217,7 +217,7 @@ def with_lamp(spec):
         (with_lamp, "light 'lamp' has a position: set its type to directional"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused_in_one_line(build_scene, message):
+def test_an_invalid_range_is_refused_in_one_line(build_scene, message):
     class Own(GoalTask):
         def build_scene(self, spec):
             build_scene(spec)

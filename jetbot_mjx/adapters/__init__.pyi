@@ -1,0 +1,2 @@
+from .gymnasium import JetBotGymEnv as JetBotGymEnv
+from .vector import JetBotVectorEnv as JetBotVectorEnv

@@ -1,0 +1,35 @@
+"""Write and launch the kernels of PPO, as docs/update.md explains them.
+
+- `shapes`: the networks and the minibatch
+- `sample_loss`: the action of one sample, and its loss with derivatives, as JAX functions
+- `adam`: a step of Adam along the gradient, as JAX functions
+- `reference`: what the kernels should compute, in NumPy
+- `arrays`: the arrays that the kernels take and return, with their axes
+- `launch`: the kernels as JAX functions, for every platform
+- `layout`: parameters and moments as vectors
+- `learner`: the kernels as a learner of `PPO`
+- `probe`: the check that a GPU's kernels compute correctly
+
+On GPUs:
+
+- `gpu_tiling`: the division of the work into tiles
+- `tensor_core`: the writer of kernels, with products on tensor cores
+- `network`: what all kernels share: loading a network, and its forward pass
+- `actions`: the kernel that draws the actions of all environments
+- `advantages`: the kernel that computes values, advantages and value targets
+- `gradient`: the kernel that computes the gradient of both networks
+- `gpu_adam`: the kernel of Adam
+- `launch_gpu`: their launch
+
+On CPUs:
+
+- `cpu_product`: products of matrices, and loops over numbers in memory
+- `cpu_stages`: a call whose threads go through several stages together
+- `cpu_network`: a stage that takes rows through a network, and its forward pass
+- `cpu_actions`: the call that draws the actions of all environments
+- `cpu_gradient`: the stages of the gradient, one for each network and the sum
+- `cpu_adam`: the stages of Adam
+- `cpu_update`: all minibatches as one call
+- `cpu_unroll`: all steps of an unroll as one call
+- `launch_cpu`: their launch
+"""

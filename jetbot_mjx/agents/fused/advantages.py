@@ -1,0 +1,186 @@
+"""Write the kernel that computes values, advantages and value targets of a minibatch.
+
+A tile holds whole unrolls, each followed by its last observation. When the values of all rows are
+in shared memory, one thread an unroll runs backwards through it by the equation of
+`jetbot_mjx.agents.gae`. The sums of the advantages and of their squares, a pair for each block, are
+all that their normalisation needs.
+"""
+
+from jetbot_mjx.agents.fused import sample_loss
+from jetbot_mjx.agents.fused.gpu_tiling import Tiling
+from jetbot_mjx.agents.fused.network import NetworkKernel
+from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch
+from jetbot_mjx.agents.fused.tensor_core import LANES, Value
+
+NAME = "ppo_advantages"
+"""Name of the kernel."""
+
+_ARRAYS = 11
+
+
+def tile_count(tiling: Tiling, batch: Minibatch) -> int:
+    """Return the number of tiles of a minibatch."""
+    return -(-batch.unrolls // (tiling.rows // (batch.time + 1)))
+
+
+def advantages_text(tiling: Tiling, batch: Minibatch) -> str:
+    """Write the kernel.
+
+    Its arguments are the parameters, mean and 1 / std of the observations, the collected rows,
+    the last observations, the unrolls of all minibatches, which of them to compute, and the
+    `LossTerms`; its results the advantages, the targets, and for each block the sums of the
+    advantages and of their squares.
+
+    Args:
+      tiling: the division of the work.
+      batch: the minibatch.
+
+    Returns:
+      The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
+    """
+    return _AdvantageKernel(tiling, batch).write()
+
+
+class _AdvantageKernel(NetworkKernel):
+    def __init__(self, tiling: Tiling, batch: Minibatch) -> None:
+        super().__init__(NAME, _ARRAYS, tiling, batch, tile_count(tiling, batch))
+        self.per_tile = tiling.rows // (batch.time + 1)
+
+    def write(self) -> str:
+        ir, shape, batch = self.ir, self.shape, self.batch
+        # The arrays of the policy, which the third axis of the grid says.
+        self.prepare()
+        seed = ir.register("ctaid.z")
+        sizes = [shape.size, shape.observations, shape.observations]
+        sizes += [batch.collected * batch.time * shape.columns["size"]]
+        sizes += [batch.collected * shape.observations, batch.count * batch.unrolls, 1]
+        sizes += [len(LossTerms._fields), batch.samples, batch.samples]
+        self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
+        # Each block has sums of its own.
+        part = seed * self.blocks + self.block
+        self.statistics = ir.row(ir.parameters[-1], part, 2)
+        self.unrolls = ir.row(self.arrays[5], self.minibatch(self.arrays[6]), batch.unrolls)
+        self.terms = self.load_terms(self.arrays[7])
+        params = self.arrays[0] + shape.policy_size
+        self.load_network(params, ir.constant(1, "u32"), self.arrays[1], self.arrays[2])
+        ir.synchronize()
+        zero = ir.constant(0.0)
+        with ir.repeat(self.block, zero, zero) as loop:
+            tile, total, squares = loop.carried
+            # The next tile overwrites nothing that is read after this one's last barrier.
+            advantage = self._tile(tile)
+            total, squares = total + advantage, squares + advantage * advantage
+            self.next_tile(loop, tile, total, squares)
+        self._store_statistics(total, squares)
+        return self.module()
+
+    def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
+        """Return the unroll of a row of a tile, which may not exist, and the step in it."""
+        length = self.batch.time + 1
+        return tile * self.per_tile + row // length, row % length
+
+    def _row(self, unroll: Value, step: Value) -> tuple[Value, Value]:
+        """Return the unroll among the collected ones, and the pointer to the row of its step."""
+        ir, time = self.ir, self.batch.time
+        kept = ir.minimum(unroll, self.batch.unrolls - 1)
+        collected = (self.unrolls + kept).load("u32")
+        sample = collected * time + ir.minimum(step, time - 1)
+        return collected, ir.row(self.arrays[3], sample, self.shape.columns["size"])
+
+    def _tile(self, tile: Value) -> Value:
+        """Compute a tile; return the thread's advantage, or 0 if it has none."""
+        ir, shape, time = self.ir, self.shape, self.batch.time
+        rows = self.tiling.rows
+        # Fetch what the step of the thread depends on before the threads wait for each other.
+        own = ir.minimum(self.thread, rows - 1)
+        unroll, step = self._unroll(tile, own)
+        _, start = self._row(unroll, step)
+        reward, discount, truncation = (
+            start[shape.columns[name]] for name in ("reward", "discount", "truncation")
+        )
+
+        def observation(row: Value) -> Value:
+            unroll, step = self._unroll(tile, row)
+            collected, start = self._row(unroll, step)
+            last = ir.row(self.arrays[4], collected, shape.observations)
+            return ir.select(step < time, start, last)
+
+        # The values of all rows.
+        self.load_observations(observation)()
+        ir.synchronize()
+        self._store_values()
+        ir.synchronize()
+        # The differences, for all steps at once.
+        given = [self._read("values", own), reward, discount, truncation]
+        delta, factor = self._error([*given, self._read("values", own, 1)])
+        self._write(delta, "deltas", own)
+        self._write(factor, "factors", own)
+        ir.synchronize()
+        # From the last step to the first, a thread for each unroll.
+        with ir.when(self.thread < self.per_tile):
+            self._accumulate()
+        ir.synchronize()
+        # The advantage is the difference by the next target.
+        # The advantage is the difference by the next target.
+        advantage, _ = self._error([*given, self._read("targets", own, 1)])
+        # Rows beyond the unrolls, and those of the last observations, have none.
+        beyond = ir.constant(self.batch.unrolls, "u32")
+        unroll = ir.select(own < self.per_tile * (time + 1), unroll, beyond)
+        unroll = ir.select(step < time, unroll, beyond)
+        there = ir.select(self.thread < rows, unroll, beyond) < beyond
+        with ir.when(there):
+            place = unroll * time + step
+            self.arrays[8][place] = advantage
+            self.arrays[9][place] = self._read("targets", own)
+        return ir.select(there, advantage, 0.0)
+
+    def _error(self, step: list[Value]) -> list[Value]:
+        """Return the results of `sample_loss.value_error` for a `ValueStep`."""
+        return self.ir.run(sample_loss.value_error_program(), [*step, *self.terms])
+
+    def _store_values(self) -> None:
+        """Write the forward pass, and store the first output of each row."""
+        ir = self.ir
+        pointer = ir.shared((self.row + self.sum_row) * 4, self.bytes_of("values"))
+        sums = self.forward()
+        with ir.when(self.sum_column.equals(0)):
+            for m, (four,) in enumerate(sums):
+                ir.moved(pointer, 64 * m).store(four[0])
+                ir.moved(pointer, 64 * m + 32).store(four[2])
+
+    def _accumulate(self) -> None:
+        """Run backwards through an unroll, and store its value targets."""
+        ir, time = self.ir, self.batch.time
+        first = self.thread * (time + 1)
+        total, gae_step = ir.constant(0.0), sample_loss.gae_program()
+        self._write(self._read("values", first, time), "targets", first, time)
+        for step in reversed(range(time)):
+            delta, factor = (self._read(name, first, step) for name in ("deltas", "factors"))
+            (total,) = ir.run(gae_step, [delta, factor, total])
+            self._write(total + self._read("values", first, step), "targets", first, step)
+
+    def _read(self, name: str, row: Value, offset: int = 0) -> Value:
+        return self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset).load()
+
+    def _write(self, value: Value, name: str, row: Value, offset: int = 0) -> None:
+        self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset).store(value)
+
+    def _store_statistics(self, *sums: Value) -> None:
+        """Add up the threads' sums in a fixed order, and store those of the block."""
+        ir, threads = self.ir, self.tiling.threads
+        for i, value in enumerate(sums):
+            self._write(value, "statistics", self.thread, threads * i)
+        ir.synchronize()
+        lanes = 2 * threads
+        with ir.when(self.thread < LANES):
+            for i in range(2):
+                total = ir.constant(0.0)
+                for j in range(threads // LANES):
+                    total += self._read("statistics", self.thread, threads * i + LANES * j)
+                self._write(total, "statistics", self.thread, lanes + LANES * i)
+        ir.synchronize()
+        with ir.when(self.thread < 2):
+            total = ir.constant(0.0)
+            for j in range(LANES):
+                total += self._read("statistics", self.thread * LANES, lanes + j)
+            self.statistics[self.thread] = total

@@ -1,0 +1,103 @@
+"""Write a step of Adam on CPUs: first the squares of the gradient, and then all elements."""
+
+from jetbot_mjx.agents.fused import adam
+from jetbot_mjx.agents.fused.adam import ARRAYS, METRICS, SIZES, UPDATED, AdamRule, Factors
+from jetbot_mjx.agents.fused.cpu_product import add_all
+from jetbot_mjx.agents.fused.cpu_stages import (
+    SQUARES,
+    Call,
+    SquareStage,
+    Stage,
+    VectorStage,
+    sample_function,
+)
+from onekernel.build import LlvmWriter, ScalarProgram, run_program
+
+_VECTORS = (*UPDATED[:3], "gradient")
+
+
+def adam_call(rule: AdamRule, lanes: int) -> Call:
+    """Return the call of a step, which takes `adam.ARRAYS` and changes `adam.UPDATED`.
+
+    Args:
+      rule: what the vectors hold.
+      lanes: the number of float32 values in a vector register.
+    """
+    sizes = {**rule.sizes, "squares": SQUARES}
+    return Call(ARRAYS, (*UPDATED, "squares"), sizes, adam_stages(rule, lanes), minibatches=None)
+
+
+def adam_stages(rule: AdamRule, lanes: int) -> list[Stage]:
+    """Return the stages that change `adam.UPDATED` by the array `gradient`.
+
+    Args:
+      rule: what the vectors hold.
+      lanes: the number of float32 values in a vector register.
+    """
+    return [SquareStage(lanes, rule.shape.ranges), _AdamStage(rule, lanes)]
+
+
+class _AdamStage(VectorStage):
+    """Computes what all elements have in common in each chunk, and then updates its elements."""
+
+    name = "adam"
+
+    def __init__(self, rule: AdamRule, lanes: int) -> None:
+        self.rule, self.lanes = rule, lanes
+        # Scratch memory: what `factors` reads, and what it returns.
+        self.writes = 1 + len(METRICS) + sum(SIZES.values())
+        self.scratch = self.writes + len(Factors._fields) + SIZES["progress"]
+
+    def functions(self, call: Call) -> list[LlvmWriter]:
+        """Write the function, and those that it calls."""
+        factors, element = adam.programs(self.rule)
+        elements = [_elements_function(element, n) for n in (self.lanes, 1)]
+        return [sample_function("factors", factors, 1), *elements, self._step(call)]
+
+    def _step(self, call: Call) -> LlvmWriter:
+        rule, lanes = self.rule, self.lanes
+        w, (job, policy, part, minibatch, scratch) = self.begin(lanes)
+        names = *_VECTORS, "progress", "adam_terms", "squares"
+        *vectors, rows, terms, squares = (call.array(job, policy, name) for name in names)
+        # What `factors` reads: the sum of squares, the metrics, the progress, and the terms.
+        reads, writes = scratch, scratch + self.writes
+        reads.store(0.0)
+        add_all(squares, SQUARES, reads)
+        before = rows + minibatch * SIZES["progress"]
+        sources = [vectors[-1] + place for place in rule.places]
+        sources += [before + i for i in range(SIZES["progress"])]
+        sources += [terms + i for i in range(SIZES["adam_terms"])]
+        for i, source in enumerate(sources, start=1):
+            reads[i] = source.load()
+        w.call("factors", reads, writes)
+        # One part stores the progress behind the row before, which the others still read.
+        progress, after = writes + len(Factors._fields), before + SIZES["progress"]
+        own = w.select(part.equals(0), w.constant(SIZES["progress"], "u64"), 0)
+        with w.loop(own) as i:
+            after[i] = progress[i]
+        # Update the elements of the chunk, first vectors and then the numbers that are left.
+        for start, stop in rule.shape.ranges:
+            first, count = self.chunk(part, start, stop)
+            whole = count // lanes
+            done = whole * lanes
+            for width, begin, length in (
+                (lanes, first, whole),
+                (1, first + done, count - done),
+            ):
+                w.call(f"elements.{width}", *(x + begin for x in vectors), writes, length)
+        return w
+
+
+def _elements_function(program: ScalarProgram, lanes: int) -> LlvmWriter:
+    """Write a function that updates a range of elements, as many at once as there are lanes."""
+    names = (f"ptr noalias {name}" for name in (*_VECTORS, "factors"))
+    w = LlvmWriter(f"elements.{lanes}", *names, "u64 count", lanes=lanes)
+    *vectors, factors, count = w.parameters
+    common = [factors[i].splat(lanes) for i in range(len(Factors._fields))]
+    with w.loop(count) as i:
+        places = [vector + i * lanes for vector in vectors]
+        values = [place.load(w.vector) for place in places]
+        results = run_program(w, program, [*values, *common])
+        for place, result in zip(places, results, strict=False):
+            place.store(result)
+    return w

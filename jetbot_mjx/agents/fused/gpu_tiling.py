@@ -1,0 +1,206 @@
+"""Divide the work of the kernels on GPUs into tiles, and a tile among the warps of a block."""
+
+import dataclasses
+import functools
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, starts
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE
+
+MOST_OUTPUTS = 8
+"""Columns of the last layer that are computed."""
+OUTPUT_BYTES = 4 * (MOST_OUTPUTS + 1)
+"""Bytes from one sample's outputs to those of the next in shared memory."""
+MOST_OBSERVATIONS = 64
+MOST_WIDTH = 128
+MOST_SUMS = 176
+"""Sums of the gradient that the registers of a thread hold beside those of a layer."""
+
+PAD = 8
+"""Numbers between the rows of a matrix in shared memory, so that eight rows meet all banks."""
+
+_GRADIENT_WARPS = 8
+_WARPS = {"gradient": _GRADIENT_WARPS, "advantages": 16, "actions": 16}
+"""Warps of a block, by the purpose of the kernel."""
+
+
+class Shares(NamedTuple):
+    """A `Shares` says which tiles of a gradient's matrix a warp sums up.
+
+    Where the tiles cannot be divided evenly, several warps compute and store the same ones.
+    """
+
+    row_tiles: int
+    """Tiles of 16 rows of a warp."""
+    pairs: int
+    """Pairs of column tiles, 16 columns, of a warp."""
+    groups: int
+    """Groups of rows."""
+
+    @classmethod
+    def of(cls, rows: int, pairs: int) -> "Shares":
+        """Return the shares with the fewest sums and, of these, with the fewest loads."""
+        options = []
+        for row_tiles in range(1, rows + 1):
+            groups = -(-rows // row_tiles)
+            if groups <= _GRADIENT_WARPS:
+                per_warp = -(-pairs // (_GRADIENT_WARPS // groups))
+                options.append(cls(row_tiles, per_warp, groups))
+        return min(options, key=lambda x: (x.row_tiles * x.pairs, x.row_tiles + x.pairs))
+
+
+def shares_of(shape: UpdateShape) -> list[Shares]:
+    """Return how the warps share each hidden layer's gradient."""
+    tiles = shape.width // TILE
+    return [Shares.of(tiles, padded(n) // TILE) for n in shape.inputs[:-1]]
+
+
+def sums_of(shape: UpdateShape) -> int:
+    """Return how many sums of the gradient of the weights a thread holds."""
+    return sum(8 * share.row_tiles * share.pairs for share in shares_of(shape))
+
+
+@dataclasses.dataclass(frozen=True)
+class Tiling:
+    """A `Tiling` divides the work of a block among its warps."""
+
+    shape: UpdateShape
+    rows: int
+    """Rows of a tile, one for each observation."""
+    row_tiles: int
+    """Row tiles of a warp in a layer's product."""
+    purpose: str = "gradient"
+    """What the kernel computes: `gradient`, `advantages` or `actions`."""
+
+    @property
+    def warps(self) -> int:
+        """Return the number of warps of a block."""
+        return _WARPS[self.purpose]
+
+    @property
+    def threads(self) -> int:
+        """Return the number of threads of a block."""
+        return self.warps * LANES
+
+    @property
+    def row_groups(self) -> int:
+        """Return how many groups of warps share a tile's rows."""
+        return self.rows // (TILE * self.row_tiles)
+
+    @property
+    def column_groups(self) -> int:
+        """Return how many warps share a group's columns."""
+        return self.warps // self.row_groups
+
+    @property
+    def is_gradient(self) -> bool:
+        """Return whether all layers are kept, for a backward pass."""
+        return self.purpose == "gradient"
+
+    @property
+    def extras(self) -> int:
+        """Return how many numbers of a sample beside the observation a row holds; it is odd."""
+        return 4 * self.shape.actions + 3
+
+    @functools.cached_property
+    def layout(self) -> dict[str, int]:
+        """Return the byte of shared memory where each array begins, and their `size`."""
+        shape, rows = self.shape, self.rows
+        stride = shape.width + PAD
+        first, outputs = padded(shape.observations), 4 * rows * (MOST_OUTPUTS + 1)
+        sizes = {f"weights{i}": 2 * padded(n) * stride for i, n in enumerate(shape.inputs[:-1])}
+        sizes["head"] = 2 * shape.width * (TILE + PAD)
+        sizes |= {f"biases{i}": 4 * shape.width for i in range(shape.layers)}
+        sizes |= {"head_biases": 4 * MOST_OUTPUTS, "mean": 4 * first, "scale": 4 * first}
+        sizes["layer0"] = 2 * rows * (first + PAD)
+        if self.is_gradient:
+            sizes |= {f"layer{i + 1}": 2 * rows * stride for i in range(shape.layers)}
+            if shape.activation == "swish":
+                sizes |= {f"slopes{i + 1}": 2 * rows * stride for i in range(shape.layers)}
+            sizes["outputs"] = outputs
+            sizes["errors"] = 2 * rows * (TILE + PAD)
+            sizes["extras"] = 4 * rows * self.extras
+            sizes["statistics"] = 4 * (2 * LANES + 2)
+            sizes["slots"] = 4 * shape.slots * (rows + 1)
+        elif self.purpose == "actions":
+            sizes |= {"layer1": 2 * rows * stride, "outputs": outputs}
+        else:
+            sizes["layer1"] = 2 * rows * stride
+            sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
+            sizes["statistics"] = 4 * 2 * (self.threads + LANES)
+        begins = starts({name: -(-size // 16) * 16 for name, size in sizes.items()})
+        return {**dict(zip(sizes, begins, strict=False)), "size": begins[-1]}
+
+
+def gradient_tiling(shape: UpdateShape, shared_memory: int) -> Tiling | None:
+    """Return the tiling of the gradient with the largest tile that fits.
+
+    Args:
+      shape: the networks.
+      shared_memory: bytes of shared memory that a block may have.
+
+    Returns:
+      The tiling; None: not even the smallest tile fits.
+    """
+    tilings = [Tiling(shape, 128, 2), Tiling(shape, 64, 1), Tiling(shape, 32, 1)]
+    return next((x for x in tilings if x.layout["size"] <= shared_memory), None)
+
+
+def advantage_tiling(
+    shape: UpdateShape, batch: Minibatch, blocks: int, shared_memory: int
+) -> Tiling | None:
+    """Return the tiling of the advantages that is likely fastest.
+
+    Args:
+      shape: the networks.
+      batch: the minibatch.
+      blocks: the number of blocks that run at the same time.
+      shared_memory: bytes of shared memory that a block may have.
+
+    Returns:
+      The tiling; None: no tile that holds an unroll fits.
+    """
+    tilings = [Tiling(shape, n, -(-n // 128), "advantages") for n in (256, 128, 64)]
+    return _fastest(
+        (x for x in tilings if x.rows > batch.time),
+        lambda rows: -(-batch.unrolls // (rows // (batch.time + 1))),
+        blocks,
+        shared_memory,
+    )
+
+
+def action_tiling(
+    shape: UpdateShape, environments: int, blocks: int, shared_memory: int
+) -> Tiling | None:
+    """Return the tiling of the actions that is likely fastest.
+
+    Args:
+      shape: the networks.
+      environments: the number of environments.
+      blocks: the number of blocks that run at the same time.
+      shared_memory: bytes of shared memory that a block may have.
+
+    Returns:
+      The tiling; None: not even the smallest tile fits.
+    """
+    tilings = [Tiling(shape, n, -(-n // 128), "actions") for n in (256, 128, 64, 32)]
+    return _fastest(tilings, lambda rows: -(-environments // rows), blocks, shared_memory)
+
+
+def _fastest(
+    tilings: Iterable[Tiling], tiles: Callable[[int], int], blocks: int, shared_memory: int
+) -> Tiling | None:
+    """Return the tiling that fits and is likely fastest, from the number of tiles by their rows."""
+    fitting = [x for x in tilings if x.layout["size"] <= shared_memory]
+
+    def cost(tiling: Tiling) -> int:
+        # A tile takes some time for its barriers, whatever its size.
+        return -(-tiles(tiling.rows) // blocks) * (tiling.rows + 64)
+
+    return min(fitting, key=cost, default=None)
+
+
+def padded(number: int) -> int:
+    """Return a number rounded up to whole tiles."""
+    return -(-number // TILE) * TILE

@@ -1,0 +1,392 @@
+"""Write the kernel that computes the gradient of both networks by PPO's loss.
+
+A block has 256 threads, serves one network (`ctaid.y`: 0 the policy, 1 the values), and loops over
+tiles of samples. Weights and activations are in shared memory as float16, all sums are float32,
+and the sums of the gradient stay in registers until the last tile.
+"""
+
+import itertools
+from collections.abc import Iterator
+
+from jetbot_mjx.agents.fused import sample_loss
+from jetbot_mjx.agents.fused.gpu_tiling import PAD, Tiling, padded, shares_of
+from jetbot_mjx.agents.fused.network import NetworkKernel
+from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, LossTerms, Minibatch
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Sums, Value
+
+NAME = "ppo_gradient"
+"""Name of the kernel."""
+
+_ARRAYS = 12
+
+_ONES = 0x3C003C00
+"""Two ones in float16."""
+
+_MEAN_SCALE = 1 / 16
+"""Derivatives by the outputs are those of the sum over this fraction of the samples: of the mean
+over many, they would be too small for float16."""
+
+
+def tile_count(tiling: Tiling, batch: Minibatch) -> int:
+    """Return the number of tiles of a minibatch."""
+    return -(-batch.samples // tiling.rows)
+
+
+def gradient_text(tiling: Tiling, batch: Minibatch, parts: int) -> str:
+    """Write the kernel.
+
+    Its arguments are the parameters, mean and 1 / std of the observations, the collected rows, the
+    unrolls of all minibatches and their noise, of shape (time, unrolls, action) each, which of them
+    to compute, the results of the kernel of the advantages, and the `LossTerms`; its result is a
+    vector for each block, whose sum is the gradient.
+
+    Args:
+      tiling: the division of the work.
+      batch: the minibatch.
+      parts: the number of blocks of the kernel of the advantages.
+
+    Returns:
+      The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
+    """
+    return _GradientKernel(tiling, batch, parts).write()
+
+
+class _GradientKernel(NetworkKernel):
+    def __init__(self, tiling: Tiling, batch: Minibatch, parts: int) -> None:
+        super().__init__(NAME, _ARRAYS, tiling, batch, tile_count(tiling, batch))
+        self.parts = parts
+        self.width, self.shares = self.shape.width, shares_of(self.shape)
+        self.error_scale = batch.samples * _MEAN_SCALE
+
+    def write(self) -> str:
+        ir, shape, batch = self.ir, self.shape, self.batch
+        self.prepare()
+        # The arrays of the policy, which the third axis of the grid says.
+        self.network, seed = ir.register("ctaid.y"), ir.register("ctaid.z")
+        self.is_policy = self.network.equals(0)
+        sizes = [shape.size, shape.observations, shape.observations]
+        drawn, noise = batch.unrolls, batch.samples * shape.actions
+        sizes += [batch.collected * batch.time * shape.columns["size"]]
+        sizes += [batch.count * drawn, batch.count * noise, 1]
+        sizes += [batch.samples, batch.samples, 2 * self.parts, len(LossTerms._fields)]
+        self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
+        # Those of the minibatch.
+        minibatch = self.minibatch(self.arrays[6])
+        self.unrolls = ir.row(self.arrays[4], minibatch, drawn)
+        self.noise = ir.row(self.arrays[5], minibatch, noise)
+        # Each block writes a gradient of its own, of one of the networks.
+        part = seed * self.blocks + self.block
+        start = self.network * shape.policy_size
+        parts = ir.row(ir.parameters[-1], part, shape.size)
+        self.part = parts + start
+        self.params = self.arrays[0] + start
+        self.terms = self.load_terms(self.arrays[10])
+        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
+        # Load what all tiles need into shared memory.
+        self.load_network(self.params, self.outputs, self.arrays[1], self.arrays[2])
+        self._clear()
+        if self.shape.normalizes:
+            self._load_statistics()
+        ir.synchronize()
+        self._take_sums(itertools.repeat(ir.constant(0.0)))
+        with ir.repeat(self.block, *self._all_sums()) as loop:
+            tile, *sums = loop.carried
+            self._take_sums(iter(sums))
+            self._load_tile(tile)
+            ir.synchronize()
+            self.store_outputs(self.forward())
+            ir.synchronize()
+            with ir.when(self.thread < self.tiling.rows):
+                self._loss(tile)
+            ir.synchronize()
+            self._backward()
+            ir.synchronize()
+            self.next_tile(loop, tile, *self._all_sums())
+        self._store_gradient()
+        return self.module()
+
+    def _clear(self) -> None:
+        ir = self.ir
+        zero = ir.constant(0, "u32")
+        # Errors beyond the outputs stay zero, and the slots begin so.
+        for name, following in (("errors", "extras"), ("slots", "size")):
+            for i in self.each((self.bytes_of(following) - self.bytes_of(name)) // 4):
+                ir.shared(i * 4, self.bytes_of(name)).store(zero)
+
+    def _load_statistics(self) -> None:
+        """Compute the mean of the advantages and 1 / std from the sums of all blocks."""
+        ir, place = self.ir, self.bytes_of("statistics")
+        # A warp adds up the sums of the blocks, and a thread those of the lanes.
+        with ir.when(self.thread < LANES):
+            for i in range(2):
+                total = ir.constant(0.0)
+                for j in range(0, self.parts, LANES):
+                    part = self.thread + j
+                    value = self.arrays[9][ir.minimum(part, self.parts - 1) * 2 + i]
+                    total += ir.select(part < self.parts, value, 0.0)
+                ir.shared(self.thread * 4, place + 4 * LANES * i).store(total)
+        ir.synchronize()
+        with ir.when(self.thread < 1):
+            totals = []
+            for i in range(2):
+                total = ir.constant(0.0)
+                for j in range(LANES):
+                    total += ir.shared(place + 4 * (LANES * i + j)).load()
+                totals.append(total * (1 / self.batch.samples))
+            mean, square = totals
+            variance = square - mean * mean
+            variance = ir.select(variance < 0.0, ir.constant(0.0), variance)
+            ir.shared(place + 4 * 2 * LANES).store(mean)
+            scale = ir.reciprocal(ir.sqrt(variance) + 1e-8)
+            ir.shared(place + 4 * (2 * LANES + 1)).store(scale)
+
+    def _load_tile(self, tile: Value) -> None:
+        """Copy a tile's observations and what else the loss reads to shared memory."""
+        ir, time, columns = self.ir, self.batch.time, self.shape.columns
+
+        def place(row: Value) -> tuple[Value, Value, Value, Value]:
+            sample = ir.minimum(tile * self.tiling.rows + row, self.batch.samples - 1)
+            unroll, step = sample // time, sample % time
+            collected = (self.unrolls + unroll).load("u32")
+            start = ir.row(self.arrays[3], collected * time + step, columns["size"])
+            return sample, unroll, step, start
+
+        # Fetch everything before anything is stored.
+        own = ir.minimum(self.thread, self.tiling.rows - 1)
+        sample, unroll, step, start = place(own)
+        first, last = columns["raw_action"], columns["reward"]
+        extras = [start[i] for i in range(first, last)]
+        noise = (step * self.batch.unrolls + unroll) * self.shape.actions
+        extras += [self.noise[noise + i] for i in range(self.shape.actions)]
+        extras += [self.arrays[i][sample] for i in (7, 8)]
+        self.load_observations(lambda row: place(row)[3])()
+        # Store it in a row for each sample.
+        pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
+        for i, value in enumerate(extras):
+            ir.moved(pointer, 4 * i).store(value)
+
+    # The sums of the gradient are carried from tile to tile.
+
+    def _take_sums(self, values: Iterator[Value]) -> None:
+        """Set the sums, in the order of `_all_sums`."""
+
+        def take(rows: int, columns: int) -> Sums:
+            return [[[next(values) for _ in range(4)] for _ in range(columns)] for _ in range(rows)]
+
+        self.weight_sums = [take(share.row_tiles, 2 * share.pairs) for share in self.shares]
+        self.bias_sums = [take(1, 1) for _ in range(self.shape.layers)]
+        self.head_sums = take(1, 1)
+
+    def _all_sums(self) -> list[Value]:
+        groups = [*self.weight_sums, *self.bias_sums, self.head_sums]
+        return [x for group in groups for row in group for four in row for x in four]
+
+    def _extra(self, index: int) -> Value:
+        """Return a number that the loss of the thread's sample reads."""
+        return self.ir.moved(self.extras, 4 * index).load()
+
+    def _loss(self, tile: Value) -> None:
+        """Write the derivative of the loss by the outputs of one sample, a thread for each."""
+        ir = self.ir
+        self.is_there = tile * self.tiling.rows + self.thread < self.batch.samples
+        self.extras = ir.shared(self.thread * (4 * self.tiling.extras), self.bytes_of("extras"))
+        # All threads of a block have the same network, so none of them waits here.
+        with ir.when(self.is_policy):
+            self._policy_loss()
+        with ir.when(self.network.equals(1)):
+            program = sample_loss.value_program(self.batch.samples)
+            (value,), target = self.outputs_of(self.thread, 1), self._extra(self.tiling.extras - 1)
+            slope, square = ir.run(program, [value, target, self.terms.vf_loss_coefficient])
+            self._store_errors([slope], [square])
+
+    def _policy_loss(self) -> None:
+        ir, shape = self.ir, self.shape
+        # A `PolicySample` and the coefficients.
+        extras = [self._extra(i) for i in range(self.tiling.extras - 2)]
+        outputs = self.outputs_of(self.thread, shape.outputs[0])
+        sample = [*outputs, *self.deviations(self.params), *extras]
+        sample += [self._advantage(), ir.constant(1.0), *self.terms]
+        program = sample_loss.policy_program(shape, self.batch.samples, for_gpu=True)
+        results = ir.run(program, sample)
+        self._store_errors(results[: shape.outputs[0]], results[shape.outputs[0] :])
+
+    def _advantage(self) -> Value:
+        """Return the advantage of the thread's sample, normalised if configured."""
+        advantage = self._extra(self.tiling.extras - 2)
+        if not self.shape.normalizes:
+            return advantage
+        place = self.bytes_of("statistics") + 4 * 2 * LANES
+        mean, scale = (self.ir.shared(place + 4 * i).load() for i in (0, 1))
+        return (advantage - mean) * scale
+
+    def _store_errors(self, slopes: list[Value], sums: list[Value]) -> None:
+        """Store a sample's derivatives by the outputs, and add them and the sums to their slots."""
+        ir = self.ir
+        # What is no sample adds nothing.
+        kept = [ir.select(self.is_there, x, 0.0) for x in (*slopes, *sums)]
+        # The derivatives, as the operand of a product.
+        errors = ir.shared(self.thread * (2 * (TILE + PAD)), self.bytes_of("errors"))
+        zero = ir.constant(0.0)
+        padded = [*(x * self.error_scale for x in kept[: len(slopes)]), zero]
+        for i in range(0, len(slopes), 2):
+            packed = ir.pack(padded[i], padded[i + 1])
+            ir.moved(errors, 2 * i).store(packed)
+        # Sums of a row of a tile, of which one thread changes each.
+        slots = ir.shared(self.thread * 4, self.bytes_of("slots"))
+        for i, value in enumerate(kept):
+            place = ir.moved(slots, 4 * i * (self.tiling.rows + 1))
+            place.store(place.load() + value)
+
+    def _backward(self) -> None:
+        """Add a tile's gradient of all weights to the sums, from the last layer to the first."""
+        ir, shape, tiling = self.ir, self.shape, self.tiling
+        samples, tiles = tiling.rows // TILE, self.width // TILE
+        # The head's weights: the activations, transposed, times the errors.
+        column = ir.minimum(self.warp, tiles - 1) * TILE
+        left = self.lanes(f"layer{shape.layers}", self.stride, self.column_first, 0, column)
+        right = self.lanes("errors", TILE + PAD, self.row_first)
+        self.head_sums = ir.product(
+            self.head_sums,
+            samples,
+            lambda _, k: ir.matrices(left, 32 * k * self.stride, transposed=True),
+            lambda _, k: ir.matrices(right, 32 * k * (TILE + PAD), transposed=True),
+        )
+        # Back through the layers; the weights of one need the errors behind it.
+        self._propagate(shape.layers, "errors", TILE + PAD, "head", TILE + PAD, 1)
+        for layer in reversed(range(shape.layers)):
+            self._add_weights(layer)
+            if layer:
+                name = f"layer{layer + 1}"
+                self._propagate(layer, name, self.stride, f"weights{layer}", self.stride, tiles)
+
+    def _propagate(
+        self, layer: int, errors: str, stride: int, weights: str, by: int, steps: int
+    ) -> None:
+        """Replace a layer's activations by the derivatives before its activation function."""
+        ir, tiling = self.ir, self.tiling
+        # The errors times the weights, transposed.
+        left = self.lanes(errors, stride, self.row_first, self.row)
+        right = self.lanes(weights, by, self.column_first, self.column)
+        zero = ir.constant(0.0)
+        sums = ir.product(
+            [[[zero] * 4 for _ in range(2 * self.pairs)] for _ in range(tiling.row_tiles)],
+            steps,
+            lambda row, k: ir.matrices(left, 32 * row * stride + 32 * k, transposed=False),
+            lambda pair, k: ir.matrices(right, 32 * pair * by + 32 * k, transposed=False),
+        )
+        # Times the slopes of the activations, which stand where the results go.
+        kind = self.shape.activation
+        name = f"slopes{layer}" if kind == "swish" else f"layer{layer}"
+        values = ir.shared(self.place, self.bytes_of(name))
+        pairs = []
+        for offset, low, high in self.halves(sums):
+            first, second = ir.unpack(ir.moved(values, offset).load("u32"))
+            low, high = _slope(ir, kind, first, low), _slope(ir, kind, second, high)
+            pairs.append((offset, ir.pack(low, high)))
+        # The gradient of the weights above has read the activations before they are replaced.
+        ir.synchronize()
+        pointer = ir.shared(self.place, self.bytes_of(f"layer{layer}"))
+        for offset, pair in pairs:
+            ir.moved(pointer, offset).store(pair)
+        ir.synchronize()
+
+    def _add_weights(self, layer: int) -> None:
+        """Add a tile's gradient of a layer's weights and biases, transposed: (outputs, inputs)."""
+        ir = self.ir
+        samples = self.tiling.rows // TILE
+        name, stride = self.source(layer)
+        errors = f"layer{layer + 1}"
+        # The weights: the errors, transposed, times the inputs of the layer.
+        row, column = self._share_of_warp(layer)
+        left = self.lanes(errors, self.stride, self.column_first, 0, row)
+        right = self.lanes(name, stride, self.row_first, 0, column)
+        self.weight_sums[layer] = ir.product(
+            self.weight_sums[layer],
+            samples,
+            lambda m, k: ir.matrices(left, 32 * k * self.stride + 32 * m, transposed=True),
+            lambda pair, k: ir.matrices(right, 32 * k * stride + 32 * pair, transposed=True),
+        )
+        # The biases: the same with ones in place of the layer's inputs.
+        tiles = self.width // TILE
+        place = ir.minimum(self.warp, tiles - 1) * TILE
+        own = self.lanes(errors, self.stride, self.column_first, 0, place)
+        one = ir.constant(_ONES, "u32")
+        self.bias_sums[layer] = ir.product(
+            self.bias_sums[layer],
+            samples,
+            lambda _, k: ir.matrices(own, 32 * k * self.stride, transposed=True),
+            lambda *_: [one] * 4,
+        )
+
+    def _share_of_warp(self, layer: int) -> tuple[Value, Value]:
+        """Return the first row (output) and column (input) of the warp's share of a gradient."""
+        share = self.shares[layer]
+        columns = padded(self.shape.inputs[layer]) // TILE
+        row = self.ir.minimum(
+            self.warp % share.groups * share.row_tiles, self.width // TILE - share.row_tiles
+        )
+        column = self.ir.minimum(self.warp // share.groups * share.pairs, columns - share.pairs)
+        return row * TILE, column * TILE
+
+    def _put_sum(self, value: Value, place: Value) -> None:
+        """Store a sum of products with errors."""
+        self.part[place] = value * (1 / self.error_scale)
+
+    def _store_gradient(self) -> None:
+        """Store the block's sums."""
+        ir, shape, offset = self.ir, self.shape, 0
+        # A lane has four sums of each product; `tensor_core` says which.
+        for layer, inputs in enumerate(shape.inputs[:-1]):
+            row, column = self._share_of_warp(layer)
+            output, first = row + self.sum_row, column + self.sum_column
+            for m, sums in enumerate(self.weight_sums[layer]):
+                for n, four in enumerate(sums):
+                    for i, value in enumerate(four):
+                        at = first + (8 * n + i % 2)
+                        place = at * self.width + output + (offset + TILE * m + 8 * (i // 2))
+                        if inputs % TILE:
+                            with ir.when(at < inputs):
+                                self._put_sum(value, place)
+                        else:
+                            self._put_sum(value, place)
+            offset += inputs * self.width
+            ((four,),) = self.bias_sums[layer]
+            place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row + offset
+            with ir.when(self.sum_column.equals(0)):
+                self._put_sum(four[0], place)
+                self._put_sum(four[2], place + 8)
+            offset += self.width
+        self._store_head(offset)
+
+    def _store_head(self, offset: int) -> None:
+        """Store the sums of the last layer, and of what the slots hold."""
+        ir, shape = self.ir, self.shape
+        ((four,),) = self.head_sums
+        row = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
+        for i, value in enumerate(four):
+            column = self.sum_column + i % 2
+            place = (row + 8 * (i // 2)) * self.outputs + column + offset
+            with ir.when(column < self.outputs):
+                self._put_sum(value, place)
+        count = ir.select(
+            self.is_policy,
+            ir.constant(shape.slots, "u32"),
+            1 + len(VALUE_METRICS),
+        )
+        with ir.when(self.thread < count):
+            first = ir.shared(self.thread * (4 * (self.tiling.rows + 1)), self.bytes_of("slots"))
+            total = ir.constant(0.0)
+            for i in range(self.tiling.rows):
+                total += ir.moved(first, 4 * i).load()
+            self.part[self.outputs * self.width + self.thread + offset] = total
+
+
+def _slope(ir: GpuWriter, activation: str, value: Value, factor: Value) -> Value:
+    """Return a factor times the slope of an activation, by its value or, of `swish`, its slope."""
+    if activation == "tanh":
+        return factor * (1.0 - value * value)
+    if activation == "relu":
+        return ir.select(ir.constant(0.0) < value, factor, 0.0)
+    if activation == "elu":
+        return ir.select(value < 0.0, factor * (value + 1.0), factor)
+    return factor * value

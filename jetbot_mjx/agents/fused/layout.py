@@ -1,0 +1,108 @@
+"""Lay the parameters of both networks out as one vector, in which Adam's moments lie likewise."""
+
+import math
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, VALUE_METRICS, UpdateShape
+from jetbot_mjx.agents.learner import Layout
+from jetbot_mjx.agents.networks import NetworkParams
+
+
+class _Place(NamedTuple):
+    """A `_Place` is where a parameter lies in the vector."""
+
+    network: str
+    path: tuple[str, ...]
+    shape: tuple[int, ...]
+    start: int
+
+    @property
+    def stop(self) -> int:
+        return self.start + math.prod(self.shape)
+
+
+class VectorLayout(Layout):
+    """A `VectorLayout` has a vector in place of every `NetworkParams`.
+
+    Between the parameters there is room for the sums of the metrics, which is zero.
+    """
+
+    def __init__(self, shape: UpdateShape) -> None:
+        """Find the places of the parameters.
+
+        Args:
+          shape: the networks.
+        """
+        self._size = shape.size
+        self._places = _places(shape)
+
+    def pack(self, tree: PyTree) -> PyTree:
+        """Return a tree with a vector in place of every `NetworkParams`, on host or device."""
+        return jax.tree.map(
+            lambda x: self._vector(x) if isinstance(x, NetworkParams) else x,
+            tree,
+            is_leaf=lambda x: isinstance(x, NetworkParams),
+        )
+
+    def unpack(self, tree: PyTree) -> PyTree:
+        """Return a tree with `NetworkParams` in place of every vector of that length."""
+        return jax.tree.map(lambda x: self._params(x) if x.shape == (self._size,) else x, tree)
+
+    def _vector(self, params: NetworkParams) -> Float[Array, " size"]:
+        """Return the vector that holds the parameters."""
+        library: Any = np if isinstance(jax.tree.leaves(params)[0], np.ndarray) else jnp
+        parts, end = [], 0
+        for place in self._places:
+            leaf = getattr(params, place.network)
+            for key in place.path:
+                leaf = leaf[key]
+            # The room for metrics before it, if any, and the parameter.
+            parts += [np.zeros(place.start - end, np.float32), leaf.reshape(-1)]
+            end = place.stop
+        return library.concatenate([*parts, np.zeros(self._size - end, np.float32)])
+
+    def _params(self, vector: Float[Array, " size"]) -> NetworkParams:
+        """Return the parameters that a vector holds."""
+        # Make the dictionaries on the way to each parameter, and put it there.
+        networks: dict[str, Any] = {"policy": {}, "value": {}}
+        for place in self._places:
+            inner = networks[place.network]
+            for key in place.path[:-1]:
+                inner = inner.setdefault(key, {})
+            inner[place.path[-1]] = vector[place.start : place.stop].reshape(place.shape)
+        return NetworkParams(**networks)
+
+
+def _places(shape: UpdateShape) -> list[_Place]:
+    """Return where each parameter lies, in the order of the vector."""
+    normal, places, start = shape.distribution == "normal", [], 0
+
+    def add(network: str, path: tuple[str, ...], *sizes: int) -> None:
+        nonlocal start
+        places.append(_Place(network, ("params", *path), sizes, start))
+        start = places[-1].stop
+
+    for network, outputs, metrics in zip(
+        ("policy", "value"), shape.outputs, (POLICY_METRICS, VALUE_METRICS), strict=True
+    ):
+        # Brax's policy with a `normal` distribution has other names.
+        by_mean = normal and network == "policy"
+        for layer, inputs in enumerate(shape.inputs):
+            # The hidden layers, and then the head, whose size is that of the outputs.
+            path = (*(["MLP_0"] if by_mean else []), f"hidden_{layer}")
+            size = shape.width
+            if layer == shape.layers:
+                path, size = (("Dense_0",) if by_mean else path), outputs
+            add(network, (*path, "kernel"), inputs, size)
+            add(network, (*path, "bias"), size)
+        # Standard deviations that are parameters themselves.
+        if by_mean:
+            add(network, ("std_param", "value"), shape.actions)
+        # Room for the sums of the network's metrics.
+        start += len(metrics)
+    return places

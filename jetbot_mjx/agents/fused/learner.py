@@ -1,0 +1,411 @@
+"""Learn by kernels of this package, for whom parameters and moments are vectors.
+
+Motivation: XLA passes the activations of every layer through memory between its kernels. It
+launches 140 of them for a minibatch, and takes seconds to compile them. Here one kernel runs the
+policy in all environments, and three compute advantages, the gradient of both networks and Adam's
+step on GPUs, or one all minibatches on CPUs; docs/update.md explains them.
+
+On GPUs, products round their operands to float16; everything else is float32.
+"""
+
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
+
+from jetbot_mjx.agents.brax_parts import Transition
+from jetbot_mjx.agents.fused import adam, launch, probe
+from jetbot_mjx.agents.fused.adam import AdamRule, AdamTerms, Progress
+from jetbot_mjx.agents.fused.cpu_unroll import Unroll as UnrollSpec
+from jetbot_mjx.agents.fused.layout import VectorLayout
+from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner, PackedEnv, Unroll
+from jetbot_mjx.agents.optimizer import read_adam, write_adam
+from jetbot_mjx.agents.random_keys import Keys
+from jetbot_mjx.agents.train_state import LOSSES, TrainState
+from jetbot_mjx.agents.unrolls import kept_of, step_by_step, transition
+from jetbot_mjx.config import PPOConfig
+from jetbot_mjx.packed import Packed, PackedStep, pack
+
+
+class Collected(NamedTuple):
+    """A `Collected` holds the data of a training step, in the order of the kernels' arguments."""
+
+    mean: Float[Array, " obs"]
+    """Mean of the observations."""
+    scale: Float[Array, " obs"]
+    """The inverse of their standard deviations."""
+    rows: Float[Array, "unrolls time columns"]
+    """A row for each step, with the columns of `UpdateShape.columns`."""
+    last: Float[Array, "unrolls obs"]
+    """The observations after the last steps."""
+
+
+def shape_of(
+    config: PPOConfig, observation_size: int | Mapping[str, Any], action_size: int
+) -> UpdateShape | str:
+    """Return the networks as the kernels know them, or why the kernels cannot compute them.
+
+    Args:
+      config: the settings of PPO, of which those of the networks are used.
+      observation_size: the length of the observation, or the shapes of its parts.
+      action_size: the length of the action.
+    """
+    # The kernels know one width, and one depth.
+    network = config.network
+    hidden = network.policy_hidden_layer_sizes
+    widths = {*hidden, *network.value_hidden_layer_sizes}
+    shape = UpdateShape(
+        observation_size if isinstance(observation_size, int) else 0,
+        max(widths),
+        len(hidden),
+        action_size,
+        network.distribution_type,
+        network.activation,
+        config.normalize_advantage,
+    )
+    if not isinstance(observation_size, int):
+        return "it takes observations without images"
+    if hidden != network.value_hidden_layer_sizes or len(widths) > 1:
+        return "it takes two networks of the same hidden layers of one width"
+    return shape
+
+
+def make_fused_learner(
+    config: PPOConfig,
+    observation_size: int | Mapping[str, Any],
+    action_size: int,
+    devices: DeviceAxis = ONE_DEVICE,
+) -> "FusedLearner | str":
+    """Return the learner of a configuration, or why this process cannot run its kernels.
+
+    Args:
+      config: the hyperparameters.
+      observation_size: the length of the observation, or the shapes of its parts.
+      action_size: the length of the action.
+      devices: the devices that share a minibatch.
+    """
+    # Whether any kernels know such networks, and whether those of this device do.
+    shape = shape_of(config, observation_size, action_size)
+    if isinstance(shape, str):
+        return shape
+    learner = FusedLearner(config, shape, devices)
+    return launch.refusal(shape, learner.batch) or learner
+
+
+class FusedLearner(Learner):
+    """A `FusedLearner` computes actions, gradients and Adam by kernels.
+
+    Parameters and moments are vectors during and between the calls.
+    """
+
+    name = "fused"
+    keeps_activations = False
+    draws_ahead = True
+
+    def __init__(
+        self, config: PPOConfig, shape: UpdateShape, devices: DeviceAxis = ONE_DEVICE
+    ) -> None:
+        """Divide the minibatches among the devices.
+
+        Args:
+          config: the hyperparameters.
+          shape: the networks, from `shape_of`.
+          devices: the devices that share a minibatch.
+        """
+        self.layout = VectorLayout(shape)
+        self.shape = shape
+        """The networks."""
+        self._config, self._devices = config, devices
+        # Each device has its share of the environments and of every minibatch.
+        self._environments = config.num_envs // devices.size
+        unrolls, steps = config.batch_size // devices.size, config.num_minibatches
+        self.batch = Minibatch(
+            unrolls * steps, unrolls, config.unroll_length, steps * config.num_updates_per_batch
+        )
+        """A minibatch on one device."""
+        schedule = config.learning_rate_schedule
+        self.rule = AdamRule(shape, self.batch.samples, schedule, self.batch.count)
+        """What the vectors hold, and how the step size changes."""
+        # Several devices average each gradient before Adam's step.
+        self.at_once = devices.size == 1 and launch.computes_at_once()
+        """Whether one kernel computes all minibatches."""
+
+    # Whether the kernels can be used.
+
+    def obstacle(self) -> str | None:
+        """Return why the back end of the kernels cannot be used in this process, or None."""
+        return launch.backend().obstacle()
+
+    def failure(self) -> str | None:
+        """Return that the kernels compute something else than NumPy on this GPU, or None."""
+        # A CPU's kernels are compiled by what compiled the probe of its back end.
+        if jax.default_backend() != "gpu" or probe.runs_correctly():
+            return None
+        return "its kernels failed their check on this machine"
+
+    def prepare(self, policies: int) -> None:
+        """Begin to compile the kernels for a number of policies that train at once."""
+        launch.prepare(self.rule, self.batch, self._environments, policies, at_once=self.at_once)
+
+    # The collection.
+
+    def unroll(self, env: PackedEnv, state: TrainState) -> Unroll:
+        """Return an unroll by one kernel if a step of the environments is one, as in `Learner`."""
+        # Policy and environments take turns where a step of these is more than one kernel.
+        spec = self.unroll_spec(env, state.env_state)
+        if spec is None:
+            return step_by_step(env, self.policy(state.params, state.normalizer), self.action_noise)
+        # All steps by one kernel, which writes what is kept of each state as a row of numbers.
+        launch.prepare_unroll(spec, self._environments, self.batch.time)
+        statistics = self._statistics(state.normalizer)
+        kept_like = jax.eval_shape(
+            lambda x: pack(kept_of(x.unpack()), batch_axes=1), state.env_state
+        )
+
+        def unroll(start: Packed, key: PRNGKeyArray) -> tuple[Packed, Transition]:
+            given = *statistics, start.words, self.action_noise(key)
+            end, words, drawn = launch.unroll(spec, state.params, *given)
+            kept = kept_like.replace(words=words).unpack()
+            # The observation before a step is that after the step before.
+            obs = jnp.concatenate([start.unpack().obs[None], kept["obs"][:-1]])
+            data = transition(obs, drawn.action, self._extras(drawn), kept)
+            return start.replace(words=end), data
+
+        return unroll
+
+    def unroll_spec(self, env: PackedEnv, start: Packed) -> UnrollSpec | None:
+        """Return the kernel of an unroll; None: the environments must be stepped one by one.
+
+        Args:
+          env: the environment from `wrap_for_training`.
+          start: its states.
+        """
+        step = env.step_packed
+        if not launch.unrolls_at_once() or not isinstance(step, PackedStep):
+            return None
+        kernel = step.kernel(start)
+        if kernel is None or jax.eval_shape(lambda x: x.unpack().obs, start).dtype != jnp.float32:
+            return None
+        # Where each number of a state is.
+        places = start.places()
+        kept = [x for leaf in jax.tree.leaves(kept_of(places)) for x in leaf.reshape(-1)]
+        return UnrollSpec(self.shape, kernel, int(places.obs[0]), tuple(map(int, kept)))
+
+    def policy(
+        self, params: Float[Array, " size"], normalizer: Any
+    ) -> Callable[[Array, Array], tuple[Array, dict[str, Any]]]:
+        """Return the policy of a collection.
+
+        Args:
+          params: the parameters.
+          normalizer: the statistics of the observations.
+
+        Returns:
+          A function from the observations of all environments, of shape (environments, obs), and
+          standard normal noise, of shape (environments, actions), to the actions and what Brax
+          keeps of them.
+        """
+        statistics = self._statistics(normalizer)
+
+        def act(observations: Array, noise: Array) -> tuple[Array, dict[str, Any]]:
+            drawn = launch.actions(self.shape, params, *statistics, observations, noise)
+            return drawn.action, self._extras(drawn)
+
+        return act
+
+    def action_noise(self, key: PRNGKeyArray) -> Float[Array, "time environments actions"]:
+        """Draw the noise of all actions of an unroll."""
+        return jax.random.normal(key, (self.batch.time, self._environments, self.shape.actions))
+
+    def _extras(self, drawn: launch.Actions) -> dict[str, Any]:
+        """Return what Brax keeps of actions."""
+        extras = drawn._asdict()
+        del extras["action"]
+        if self.shape.distribution == "normal":
+            extras["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
+        return extras
+
+    def _statistics(self, normalizer: Any) -> tuple[Array, Array]:
+        """Return the mean of the observations, and the inverse of their standard deviations."""
+        if self._config.normalize_observations:
+            return normalizer.mean, 1.0 / normalizer.std
+        size = self.shape.observations
+        return jnp.zeros(size), jnp.ones(size)
+
+    # The update.
+
+    def update(
+        self,
+        params: Float[Array, " size"],
+        optimizer_state: PyTree,
+        normalizer: Any,
+        data: Transition,
+        key: PRNGKeyArray,
+    ) -> tuple[Float[Array, " size"], PyTree, Float[Array, " totals"]]:
+        """Update the networks in several passes over the collected data, as in `Learner`."""
+        collected = self.collected(data, normalizer)
+        terms = self.adam_terms(optimizer_state)
+        # Shuffle for all passes, and draw all noise, with all keys at once, unlike Brax's.
+        shuffle_key, noise_key = jax.random.split(key)
+        shuffle_keys = jax.random.split(shuffle_key, self._config.num_updates_per_batch)
+        orders = jax.vmap(lambda key: jax.random.permutation(key, self.batch.collected))
+        unrolls = orders(shuffle_keys).reshape(self.batch.count, -1)
+        noise = self.noise(jax.random.split(noise_key, self.batch.count))
+        state = self.first_vectors(params, optimizer_state)
+        # All minibatches by one kernel.
+        if self.at_once:
+            given = *collected, unrolls, noise, self._loss_terms(), terms, *state
+            return self.results(launch.update(self.rule, *given), optimizer_state)
+
+        # Or one by one: advantages and gradient, and a step of Adam.
+        def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+            index, params, mu, nu, progress = state
+            gradient = self.gradient(params, collected, unrolls, noise, index)
+            made = launch.adam(self.rule, gradient, params, mu, nu, progress, index, terms)
+            return index + 1, *made
+
+        # One counter, unlike that of `scan` beside its own, which would be another launch.
+        begun = jnp.zeros((), jnp.int32), *state
+        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
+        return self.results(ended[1:], optimizer_state)
+
+    def collected(self, data: Transition, normalizer: Any) -> Collected:
+        """Return the collected data as the kernels read it.
+
+        Args:
+          data: the unrolls, of shape (unrolls, time, ...).
+          normalizer: the statistics of the observations.
+        """
+        # A row for each step: what the policy saw and did, and what came of it.
+        extras: Any = data.extras
+        distribution = extras["policy_extras"]["distribution_params"]
+        if self.shape.distribution == "normal":
+            distribution = jnp.concatenate(distribution, axis=-1)
+        rows = [
+            data.observation,
+            extras["policy_extras"]["raw_action"],
+            extras["policy_extras"]["log_prob"][..., None],
+            distribution,
+            data.reward[..., None],
+            data.discount[..., None],
+            extras["state_extras"]["truncation"][..., None],
+        ]
+        last = data.next_observation[:, -1]
+        return Collected(*self._statistics(normalizer), jnp.concatenate(rows, axis=-1), last)
+
+    def noise(self, keys: Keys) -> Float[Array, "minibatches time unrolls actions"]:
+        """Draw the noise that estimates the entropy, from the key of each minibatch."""
+        # Brax draws the noise with time as the first axis.
+        shape = self.batch.time, self.batch.unrolls, self.shape.actions
+        return jax.vmap(lambda key: jax.random.normal(key, shape))(keys)
+
+    def gradient(
+        self,
+        params: Float[Array, " size"],
+        collected: Collected,
+        unrolls: Int[Array, "minibatches unrolls"],
+        noise: Float[Array, "minibatches time unrolls actions"],
+        index: Int[Array, ""],
+    ) -> Float[Array, " size"]:
+        """Compute the gradient of Brax's PPO loss, the mean of all devices.
+
+        Args:
+          params: the parameters.
+          collected: all data, from `collected`.
+          unrolls: the unrolls of all minibatches.
+          noise: their noise, from `noise`.
+          index: the minibatch.
+
+        Returns:
+          The gradient as a vector, with the sums of the metrics at their places.
+        """
+        # Two kernels: advantages and value targets, then both networks forward and backward.
+        drawn = unrolls, noise, index
+        gradient = launch.gradient(self.shape, params, *collected, *drawn, self._loss_terms())
+        return gradient if self._devices.size == 1 else self._devices.mean(gradient)
+
+    def _loss_terms(self) -> Float[Array, " terms"]:
+        return _array(getattr(self._config, name) for name in LossTerms._fields)
+
+    # The state of the optimizer as vectors and an array of `adam.Progress`.
+
+    def adam_terms(self, optimizer_state: PyTree) -> Float[Array, " terms"]:
+        """Return the array of `AdamTerms` of a training step.
+
+        Args:
+          optimizer_state: the state before it.
+        """
+        config, share = self._config, 1.0 / self._config.gradient_steps
+        return _array(
+            AdamTerms(
+                max_grad_norm=jnp.inf if config.max_grad_norm is None else config.max_grad_norm,
+                learning_rate=config.learning_rate,
+                begun=read_adam(optimizer_state).count * share,
+                share=share,
+                desired_kl=config.desired_kl,
+                min_rate=config.learning_rate_schedule_min_lr,
+                max_rate=config.learning_rate_schedule_max_lr,
+            )
+        )
+
+    def first_vectors(
+        self, params: Array, optimizer_state: PyTree
+    ) -> tuple[Array, Array, Array, Array]:
+        """Return the parameters, Adam's means, and the progress before the first minibatch."""
+        # The powers of Adam's β are carried from step to step.
+        state = read_adam(optimizer_state)
+        progress = Progress(
+            rate=state.rate,
+            power_1=adam.BETA_1**state.count,
+            power_2=adam.BETA_2**state.count,
+            sums=[0.0] * len(adam.METRICS),
+            rates=0.0,
+            applied=0.0,
+        )
+        row = _array(jax.tree.leaves(progress))
+        rows = jnp.zeros((self.rule.steps, len(row)))
+        return params, state.mu, state.nu, jnp.concatenate([row[None], rows])
+
+    def results(
+        self, vectors: tuple[Array, ...], optimizer_state: PyTree
+    ) -> tuple[Array, PyTree, Float[Array, " totals"]]:
+        """Return the results of `update`.
+
+        Args:
+          vectors: the parameters, Adam's means, and the progress after the last minibatch.
+          optimizer_state: the state before the first one.
+        """
+        # The last row of the progress has the sums over all minibatches.
+        params, mu, nu, progress = vectors
+        rate, _, _, *sums, rates, applied = progress[-1]
+        optimizer_state = write_adam(optimizer_state, rate, applied, mu, nu)
+        metrics = {**self.metrics(jnp.stack(sums)), "learning_rate": rates}
+        totals = jnp.stack([*(metrics[name] for name in LOSSES), applied])
+        return params, optimizer_state, totals
+
+    def metrics(self, sums: Float[Array, " metrics"]) -> dict[str, Array]:
+        """Return the sums of some minibatches' metrics under Brax's names.
+
+        Args:
+          sums: the sums of `adam.METRICS` over all of their samples.
+        """
+        config = self._config
+        mean = dict(zip(adam.METRICS, sums / self.rule.samples, strict=True))
+        losses = {
+            "policy_loss": mean["policy_loss"],
+            "v_loss": mean["value_loss"] * (0.5 * config.vf_loss_coefficient),
+            "entropy_loss": mean["entropy"] * -config.entropy_cost,
+        }
+        return {
+            **losses,
+            "total_loss": sum(losses.values(), jnp.zeros(())),
+            "kl_mean": mean["kl"],
+            "policy_dist_mean_std": mean["std"] / self.shape.actions,
+        }
+
+
+def _array(numbers: Iterable[Any]) -> Float[Array, " numbers"]:
+    return jnp.stack([jnp.asarray(x, jnp.float32) for x in numbers])

@@ -1,0 +1,63 @@
+"""Explain in one line what is wrong with a setting: the key, the value, and what would be right."""
+
+from collections.abc import Mapping
+
+from pydantic_core import ErrorDetails
+
+from jetbot_mjx.config.keys import ALL_KEYS, likely_key
+from jetbot_mjx.errors import clipped, shown
+
+_MOST_SECTIONS = 8
+"""Largest number of nested sections that a message names."""
+
+
+_KINDS = {
+    "integer": "a whole number",
+    "number": "a number",
+    "boolean": "true or false",
+    "string": "text",
+    "dictionary": "a dictionary",
+}
+"""Pydantic's names of types, in words."""
+
+
+def explain(error: ErrorDetails) -> str:
+    """Return one line about pydantic's first error: the key, the value, and what is expected."""
+    # Pydantic adds the name of a union's branch or the index in a tuple; keep only the keys.
+    location = [clipped(str(part), 100) for part in error["loc"]]
+    key = ".".join(location)
+    value = shown(error["input"])
+    if location[:2] == ["task", "options"] and len(location) > 2:
+        key = ".".join(location[:3])
+        return f"{key} = {value} is wrong: it should be true, false, a finite number or text"
+    match error["type"]:
+        case "invalid_key":
+            return f"{key} = {value} is not a key: keys should be strings"
+        case "missing" if isinstance(error["input"], list | tuple):
+            value = shown(list(error["input"]))
+            return f"{'.'.join(location[:-1])} = {value} is wrong: it lacks items"
+        case "tuple_type":
+            return f"{key} = {value} is wrong: it should be a list"
+        case "too_short":
+            return f"{key} = {value} is wrong: it should have at least 1 item"
+        case "too_long":
+            most = error.get("ctx", {}).get("max_length")
+            return f"{key} = {value} is wrong: it should have at most {most} items"
+        case "extra_forbidden":
+            # Of an unknown section, tell the first key.
+            value = error["input"]
+            while isinstance(value, Mapping) and value and len(location) < _MOST_SECTIONS:
+                name, value = next(iter(value.items()))
+                location.append(clipped(str(name), 100))
+            return f"{'.'.join(location)} = {shown(value)} is unknown: {likely_key(location)}"
+        case "value_error":
+            prefix = f"{key}: " if key else ""
+            return prefix + str(error["ctx"]["error"]) if "ctx" in error else error["msg"]
+        case "model_type" | "model_attributes_type":
+            inside = next(one for one in ALL_KEYS if one.startswith(f"{key}."))
+            empty = error["input"] is None
+            remedy = "write its keys below it, indented" if empty else f"set {inside}"
+            return f"{key} = {value} is not a section: {remedy}"
+        case _:
+            wanted = error["msg"].removeprefix("Input should be ").removeprefix("a valid ")
+            return f"{key} = {value} is wrong: it should be {_KINDS.get(wanted, wanted)}"

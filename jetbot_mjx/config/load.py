@@ -1,0 +1,128 @@
+"""Load a configuration: read it, apply overrides, and check every key, type and bound."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from pydantic import ValidationError
+
+from jetbot_mjx.config.errors import ConfigError
+from jetbot_mjx.config.files import find_config
+from jetbot_mjx.config.run import Config
+from jetbot_mjx.config.task_modules import find_task_beside
+from jetbot_mjx.config.yaml_text import parse_any, read_yaml
+from jetbot_mjx.errors import clipped, shown
+
+Overrides = Mapping[str, object] | Sequence[str]
+"""Settings that replace those of a configuration: `{"ppo.num_envs": 256}`, or a list of
+`section.key=value` as after `--set`."""
+
+
+def load_config(config: "str | Path | Config | None", overrides: Overrides = ()) -> Config:
+    """Read a configuration, apply overrides, and check the result.
+
+    The module of `task.name` is found beside the file, from now on in the whole process.
+
+    Args:
+      config: the name of a configuration that comes with the package; a YAML file with the settings
+        that differ from the defaults; or a `Config`. None: only defaults.
+      overrides: the settings to change, such as `{"ppo.num_envs": 256}`; or a list of
+        `section.key=value`, as after `--set`, the value read as YAML, of which the last one wins.
+
+    Returns:
+      The resolved configuration.
+
+    Raises:
+      ConfigError: the file or an override cannot be read, or a key is unknown, of the wrong
+        type, out of bounds or at odds with another.
+      InvalidError: the task's module is beside the file, and another one of its name was found
+        before.
+    """
+    file = None
+    if isinstance(config, Config):
+        if not overrides:
+            return config
+        values, name = config.model_dump(mode="json"), "config"
+    elif config is None:
+        values, name = {}, "config"
+    elif isinstance(config, str | Path):
+        file = find_config(config)
+        values, name = read_yaml(file), str(config)
+    else:
+        raise ConfigError(
+            f"config = {shown(config)} is wrong: it should be a name, a file or Config"
+        )
+    if isinstance(overrides, str):
+        raise ConfigError(
+            f"overrides = {shown(overrides)} is wrong: give settings and values, as in"
+            " {'ppo.num_envs': 256}"
+        )
+    if isinstance(overrides, Mapping):
+        name += f" with {shown(dict(overrides))}" if overrides else ""
+        for key, value in overrides.items():
+            _set(values, str(key), value, f"{clipped(str(key))} = {shown(value)}")
+    else:
+        for override in overrides:
+            given = f"--set {clipped(override)}"
+            name += f" {given}"
+            _apply_override(values, override, given)
+    resolved = parse_config(values, source=name)
+    if file is not None:
+        find_task_beside(file, resolved.task.name.partition(":")[0])
+    return resolved
+
+
+def parse_config(values: Mapping[str, object], source: str = "config") -> Config:
+    """Check a nested mapping of settings.
+
+    Args:
+      values: the settings, nested as in YAML.
+      source: description of their origin for error messages.
+
+    Returns:
+      The resolved configuration.
+
+    Raises:
+      ConfigError: as for `load_config`.
+    """
+    try:
+        return Config.model_validate(values)
+    except ValidationError as error:
+        # Only a mistake needs it.
+        from jetbot_mjx.config.explain import explain
+
+        raise ConfigError(f"{source}: {explain(error.errors()[0])}") from None
+
+
+def _apply_override(values: dict[str, object], override: str, source: str) -> None:
+    key, separator, text = override.partition("=")
+    if not separator or not all(key.strip().split(".")):
+        raise ConfigError(f"{source}: write section.key=value, as in ppo.num_envs=256")
+    value = parse_any(text, source)
+    _set(values, key.strip(), value, source, "--set {}={}")
+
+
+def _set(
+    values: dict[str, object], key: str, value: object, source: str, form: str = "'{}': {}"
+) -> None:
+    """Set one key of nested values.
+
+    Args:
+      values: the nested values, which are changed.
+      key: the key with its sections, such as `ppo.num_envs`.
+      value: its new value.
+      source: the override as it was written, for error messages.
+      form: how an override is written, for error messages.
+    """
+    *sections, last = key.split(".")
+    section = values
+    for part in sections:
+        section = section.setdefault(part, {})
+        if not isinstance(section, dict):
+            raise ConfigError(f"{source}: {part} is a value, not a section")
+    if isinstance(value, Mapping):
+        # A whole section would silently discard the file's values of its other keys.
+        inner, one = next(iter(value.items()), ("key", "value"))
+        inner, one = (x if isinstance(x, str) else shown(x) for x in (inner, one))
+        example = form.format(f"{key}.{clipped(inner)}", clipped(one))
+        raise ConfigError(f"{source}: set single keys, as in {example}")
+    section[last] = value

@@ -1,0 +1,82 @@
+"""Find the module of a task of one's own.
+
+It is looked for beside the configuration file that names it, then in the current folder, and then
+as Python finds any other.
+"""
+
+import importlib
+import importlib.util
+import os
+import sys
+from pathlib import Path
+
+from jetbot_mjx.errors import InvalidError
+
+TASK_FOLDERS: dict[str, Path] = {}
+"""Folders of configuration files beside which a task's module was found, by the module's top-level
+name. They are also in `sys.path`."""
+
+
+def find_task_beside(config: Path, module: str) -> None:
+    """Let a task's module be imported from the folder of a configuration file, if it is there.
+
+    Args:
+      config: path of the configuration file.
+      module: full name of the module.
+
+    Raises:
+      InvalidError: another module of this name was found before. Python can import only one of
+        them.
+    """
+    folder, top = config.absolute().parent.resolve(), module.partition(".")[0]
+    file = source_file(folder, module)
+    if file is None or top == __name__.partition(".")[0]:
+        return
+    earlier = TASK_FOLDERS.get(top) or (import_root(top) if top in sys.modules else folder)
+    other = earlier and source_file(earlier, module)
+    # An installed copy of the same module may have been imported.
+    if other is None or other.read_bytes() != file.read_bytes():
+        raise InvalidError(
+            f"{file} cannot be imported: this process uses another module {module} already"
+            f"{f', {other}' if other else ''}: rename one of them"
+        )
+    if earlier is not None and earlier.resolve() == folder:
+        TASK_FOLDERS[top] = folder
+        _import_first_from(folder)
+
+
+def find_task_here(module: str) -> None:
+    """Let a task's module be imported from the current folder, unless it was found before."""
+    top, folder = module.partition(".")[0], Path.cwd().resolve()
+    if top not in TASK_FOLDERS and top not in sys.modules and source_file(folder, module):
+        _import_first_from(folder)
+
+
+def _import_first_from(folder: Path) -> None:
+    if str(folder) in sys.path:
+        sys.path.remove(str(folder))
+    sys.path.insert(0, str(folder))
+    importlib.invalidate_caches()
+
+
+def source_file(folder: Path, module: str) -> Path | None:
+    """Return the source file of a module below a folder that imports begin in, or None."""
+    if not all(part.isidentifier() for part in module.split(".")):
+        return None
+    path = folder.joinpath(*module.split("."))
+    candidates = path / "__init__.py", path.with_name(f"{path.name}.py")
+    return next((file for file in candidates if os.path.isfile(file)), None)
+
+
+def import_root(module: str) -> Path | None:
+    """Return the folder that the import of a module begins in; None if Python does not find it."""
+    top = module.partition(".")[0]
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):  # a module without a spec, such as `__main__`
+        return None
+    if spec is None:
+        return None
+    if spec.submodule_search_locations:
+        return Path(next(iter(spec.submodule_search_locations))).absolute().parent
+    return Path(spec.origin).absolute().parent if spec.has_location and spec.origin else None

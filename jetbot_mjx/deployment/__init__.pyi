@@ -1,0 +1,4 @@
+from .drive_comparison import compare_drive as compare_drive
+from .drive_comparison import summarize_drive as summarize_drive
+from .policy_export import export_policy as export_policy
+from .policy_export import summarize_export as summarize_export

@@ -1,0 +1,121 @@
+"""Save the complete state of a training in checkpoints and restore the newest usable one.
+
+A checkpoint of the resumable trainer holds two trees: the policy, and `training`, the rest of
+`ppo.TrainState`. A checkpoint is skipped if a name, a shape, a dtype or a bit changed after it was
+written, or if it was written under another configuration.
+"""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import PyTree
+
+from jetbot_mjx.agents import TALLIED, PolicyParams, TrainState
+from jetbot_mjx.config import Config, ConfigError, parse_config
+from jetbot_mjx.runs.checkpoint import POLICY, explanation
+from jetbot_mjx.runs import checkpoint_store
+from jetbot_mjx.runs.checkpoint_store import CheckpointError, checkpoint_path
+from jetbot_mjx.runs.run_dir import JsonObject
+
+TRAINING = "training"
+"""Name of the tree that holds the part of the state that acting does not need."""
+
+_REST = ("optimizer_state", "env_state", "key", "env_steps")
+
+
+class Resumption(NamedTuple):
+    """A `Resumption` holds the restored state of every seed of a run."""
+
+    env_steps: int
+    states: list[TrainState]
+    progress: list[JsonObject]
+    """The progress that the recorder of each seed stored in its checkpoint."""
+    skipped: list[str]
+    """Error messages of the newer checkpoints that were skipped."""
+
+
+def to_trees(state: TrainState) -> dict[str, PyTree]:
+    """Return a training state as the trees of a checkpoint, with its sums by name."""
+    rest = {name: getattr(state, name) for name in _REST}
+    sums = {name: np.asarray(total) for name, total in state.sums.items()}
+    return {POLICY: state.policy_params, TRAINING: {**rest, "tally": sums}}
+
+
+def tree_shapes(template: TrainState) -> dict[str, PyTree]:
+    """Return the shapes and dtypes of the trees of `to_trees`.
+
+    Args:
+      template: the shapes and dtypes of a training state.
+    """
+    rest = {name: getattr(template, name) for name in _REST}
+    sums = dict.fromkeys(TALLIED, jax.ShapeDtypeStruct((), np.float32))
+    return {POLICY: template.policy_params, TRAINING: {**rest, "tally": sums}}
+
+
+def resume(
+    run_dirs: Sequence[Path], configs: Sequence[Config], template: TrainState
+) -> Resumption | None:
+    """Read the newest checkpoint that is usable in the folder of every seed.
+
+    Newer checkpoints are then moved to `set_aside/` in the run folder; nothing is deleted.
+
+    Args:
+      run_dirs: the run folder of each seed.
+      configs: the configuration of each seed.
+      template: the shapes and dtypes of a training state.
+
+    Returns:
+      The restored state of each seed; None if there is no checkpoint at all.
+
+    Raises:
+      CheckpointError: there are checkpoints, but none of them can be used. No file is changed.
+    """
+    # Try the steps from the newest to the oldest, until all seeds can be read at one of them.
+    known = sorted({step for run_dir in run_dirs for step in checkpoint_store.checkpoint_steps(run_dir)})
+    skipped: list[str] = []
+    for step in reversed(known):
+        try:
+            found = [
+                _read(checkpoint_path(run_dir, step), config, template)
+                for run_dir, config in zip(run_dirs, configs, strict=True)
+            ]
+        except CheckpointError as error:
+            skipped.append(str(error))
+            continue
+        # Move newer checkpoints away, so that the resumed training can write its own.
+        for run_dir in run_dirs:
+            for newer in checkpoint_store.checkpoint_steps(run_dir):
+                if newer > step:
+                    checkpoint_store.set_aside(checkpoint_path(run_dir, newer))
+        states, progress = zip(*found, strict=True)
+        return Resumption(step, list(states), list(progress), skipped)
+    if not known:
+        return None
+    raise CheckpointError(
+        f"no checkpoint in {run_dirs[0] / checkpoint_store.FOLDER} can be used. The newest: {skipped[0]}."
+        " Train into a new folder"
+    )
+
+
+def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState, JsonObject]:
+    """Return the training state and the recorder's progress that a checkpoint holds."""
+    if not path.is_dir():
+        raise CheckpointError(f"checkpoint {path} is missing")
+    about = explanation(path)
+    try:
+        parse_config(about["config"], source="stored config").check_resume(config)
+    except ConfigError as error:
+        raise CheckpointError(f"checkpoint {path} belongs to another run: {error}") from None
+    shapes = tree_shapes(template)
+    policy: PolicyParams = checkpoint_store.read_tree(path, POLICY, shapes[POLICY])
+    rest = checkpoint_store.read_tree(path, TRAINING, shapes[TRAINING])
+    rest["tally"] = np.stack([rest["tally"][name] for name in TALLIED])
+    state = TrainState(
+        params=template.params.replace(policy=policy.policy, value=policy.value),
+        normalizer=policy.normalizer,
+        **rest,
+    )
+    return state, about.get("progress", {})

@@ -1,0 +1,263 @@
+"""Find runs by name, list them, and copy those that come with the package.
+
+A run may be named by its path, by its folder's name in `runs/`, as `latest`, or, if it comes with
+the package, as `pretrained:NAME`.
+"""
+
+import difflib
+import os
+import shlex
+import shutil
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+from jetbot_mjx.config import run_around
+from jetbot_mjx.errors import NotFoundError, UserError, clipped, os_errors, printable
+from jetbot_mjx.runs.metrics import METRICS, read_history
+from jetbot_mjx.runs.run_dir import (
+    CONFIG,
+    DamagedRunError,
+    atomic_folder,
+    read_config,
+    shortened,
+)
+from jetbot_mjx.terminal import text_table
+
+ROOT = Path("runs")
+"""The folder in which trainings create their run folders, relative to the current folder."""
+
+PRETRAINED = Path(__file__).parents[1] / "assets" / "pretrained"
+"""Runs that come with the package, each named after its configuration."""
+
+_LATEST = "latest"
+_PREFIX = "pretrained:"
+
+
+class RunInfo(NamedTuple):
+    """A `RunInfo` holds what a list of runs says about one of them."""
+
+    path: Path
+    task: str
+    """Name of the task, with the robot's preset and the observation."""
+    env_steps: int
+    """Environment steps of the last line of its log."""
+    num_timesteps: int
+    """Environment steps it was asked to train for."""
+    success_rate: float | None
+    """Success rate of the best evaluation; None before the first one."""
+    changed: float
+    """Time of the last line of its log [s since 1970]."""
+
+    @property
+    def name(self) -> str:
+        """Return the shortest name by which commands find the run."""
+        return _shortest_name(self.path)
+
+
+class DamagedRun(NamedTuple):
+    """A `DamagedRun` holds what a list of runs says about a run that cannot be read."""
+
+    path: Path
+    reason: str
+    """The reason, with the name of the file that is damaged."""
+
+
+def _shortest_name(path: Path) -> str:
+    if path.parent == PRETRAINED:
+        return _PREFIX + path.name
+    return path.name if path.parent == ROOT else str(path)
+
+
+def find_run(name: str | Path, root: Path = ROOT) -> Path:
+    """Return the path of a run or of a checkpoint, which need not exist.
+
+    Args:
+      name: a path; the name of a folder in `root`; `latest`; or `pretrained:NAME`.
+      root: the folder of runs.
+
+    Raises:
+      NotFoundError: there is no latest run, or none of this name comes with the package.
+    """
+    text = str(name)
+    if text.startswith(_PREFIX):
+        return _find_pretrained(text.removeprefix(_PREFIX))
+    if os.path.lexists(text):
+        return Path(name)
+    if text == _LATEST:
+        runs, damaged = scan_runs(root)
+        if runs:
+            return runs[0].path
+        reason = f"there is no run in {root}/: train one first"
+        if damaged:
+            path, why = damaged[0]
+            reason = f"every run in {root}/ is damaged, such as {path.name}: {why}"
+        raise NotFoundError(f"{_LATEST}: {reason}")
+    if Path(text).name == text and os.path.lexists(root / text):
+        return root / text
+    return Path(name)
+
+
+def find_run_config(run_dir: Path) -> Path:
+    """Return the file that holds the configuration of the run in a folder.
+
+    Raises:
+      NotFoundError: there is no run in the folder.
+      DamagedRunError: as for `read_config`.
+      UserError: the folder cannot be read.
+    """
+    with os_errors(f"--resume {run_dir} cannot be read"):
+        try:
+            os.lstat(run_dir / CONFIG)
+        except (FileNotFoundError, NotADirectoryError):
+            hint = suggest_run(run_dir, "a run folder")
+            message = f"--resume {run_dir}: there is no run in this folder; {hint}"
+            raise NotFoundError(message) from None
+    read_config(run_dir)
+    return run_dir / CONFIG
+
+
+def list_runs(root: Path = ROOT) -> list[RunInfo]:
+    """Return the runs in the subfolders of a folder, the latest first, without damaged ones.
+
+    Args:
+      root: the folder, which may be missing.
+
+    Raises:
+      UserError: the folder cannot be read.
+    """
+    return scan_runs(root)[0]
+
+
+def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRun]]:
+    """Return the runs in the subfolders of a folder, the latest first, and the damaged ones.
+
+    Args:
+      root: the folder, which may be missing.
+
+    Raises:
+      UserError: the folder cannot be read.
+    """
+    with os_errors(f"{root} cannot be read"):
+        if not root.is_dir():
+            return [], []
+        folders = sorted(root.iterdir())
+    runs, damaged = [], []
+    for folder in folders:
+        if any(os.path.lexists(folder / name) for name in (CONFIG, METRICS)):
+            try:
+                runs.append(read_info(folder))
+            except DamagedRunError as error:
+                damaged.append(DamagedRun(folder, error.reason))
+    return sorted(runs, key=lambda run: -run.changed), damaged
+
+
+def read_info(run_dir: Path) -> RunInfo:
+    """Return what a list says about the run in a folder.
+
+    Raises:
+      DamagedRunError: its configuration or its metrics cannot be read.
+    """
+    config = read_config(run_dir)
+    try:
+        # Of several seeds, show the first.
+        seeds = sorted(run_dir.glob(f"seed-*/{METRICS}"))
+        history = read_history(seeds[0] if seeds else run_dir / METRICS)
+        changed = history[-1].timestamp if history else (run_dir / CONFIG).stat().st_mtime
+    except (UserError, OSError) as error:
+        raise DamagedRunError(run_dir, str(error)) from None
+    rates = [line.metrics.get("eval/success_rate") for line in history]
+    task = config.task
+    return RunInfo(
+        path=run_dir,
+        task=f"{clipped(task.name, 60)} {config.robot.preset} {task.observation}",
+        env_steps=history[-1].env_steps if history else 0,
+        num_timesteps=config.ppo.num_timesteps,
+        success_rate=max((x for x in rates if x is not None and 0 <= x <= 1), default=None),
+        changed=changed,
+    )
+
+
+def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRun] = ()) -> str:
+    """Return a list of runs as text, one line each, or a line that says there are none.
+
+    Args:
+      runs: the runs.
+      damaged: runs that cannot be read, which follow with the reason.
+    """
+    rows = [("run", "task", "steps", "success", "age")]
+    rows += [
+        (
+            run.name,
+            run.task,
+            f"{run.env_steps:,}" + (" *" if run.env_steps < run.num_timesteps else ""),
+            "-" if run.success_rate is None else f"{run.success_rate:.1%}",
+            _age(time.time() - run.changed),
+        )
+        for run in runs
+    ]
+    lines = [text_table(rows, left=2)]
+    if not runs:
+        lines = ["no runs here: train one, or use one that comes with the package: pretrained:NAME"]
+    if any(run.env_steps < run.num_timesteps for run in runs):
+        lines.append("* stopped before its last step, or reached stop_at_success")
+    lines += [printable(f"damaged: {_shortest_name(one.path)}: {one.reason}") for one in damaged]
+    return "\n".join(lines)
+
+
+def _find_pretrained(name: str) -> Path:
+    known = sorted(path.name for path in PRETRAINED.iterdir())
+    if name in known:
+        return PRETRAINED / name
+    raise NotFoundError(
+        f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}"
+    )
+
+
+def copy_pretrained(folder: Path) -> tuple[Path, ...]:
+    """Copy the runs that come with the package, without overwriting anything.
+
+    Args:
+      folder: The folder in which each run gets a folder of its own.
+
+    Returns:
+      The run folders, named after their configurations. Each is complete or absent.
+
+    Raises:
+      UserError: one of them exists already, or cannot be written.
+    """
+    runs = {path: folder / path.name for path in sorted(PRETRAINED.iterdir())}
+    for target in runs.values():
+        if target.exists():
+            raise UserError(f"{target} exists already: choose another folder with --output")
+    for source, target in runs.items():
+        with atomic_folder(target) as unfinished:
+            shutil.copytree(source, unfinished, dirs_exist_ok=True)
+    return tuple(runs.values())
+
+
+def suggest_run(path: Path, what: str = "a run folder or a checkpoint in it") -> str:
+    """Return a remedy for a path at which there is no run.
+
+    Args:
+      path: the path.
+      what: what to give instead, if no name is similar.
+    """
+    names = [_LATEST, *(run.path.name for run in list_runs())]
+    names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
+    if path.name == _PREFIX[:-1]:
+        return f"write {_PREFIX}NAME, as in {names[-1]}"
+    if (run := run_around(path)) and run != path:
+        return f"did you mean {shlex.quote(str(shortened(run)))}?"
+    if close := difflib.get_close_matches(path.name, names, n=1):
+        return f"did you mean {close[0]}?"
+    return f"give {what}"
+
+
+def _age(seconds: float) -> str:
+    """Return a duration in the largest unit of which there is at least one."""
+    for unit, size in (("d", 86_400), ("h", 3_600), ("min", 60)):
+        if seconds >= size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{max(seconds, 0):.0f} s"

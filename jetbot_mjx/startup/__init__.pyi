@@ -1,0 +1,13 @@
+from .device import divide_cpu as divide_cpu
+from .device import enable_jax_cache as enable_jax_cache
+from .device import load_blas as load_blas
+from .device import wake_device as wake_device
+from .device import wake_driver as wake_driver
+from .interrupts import exit_if_stuck as exit_if_stuck
+from .interrupts import exit_on_interrupt as exit_on_interrupt
+from .interrupts import repeat_interrupts as repeat_interrupts
+from .lazy_imports import install_lazy_imports as install_lazy_imports
+from .output import protect_output as protect_output
+from .process import collect_garbage_late as collect_garbage_late
+from .process import exit_at_once as exit_at_once
+from .process import set_environment as set_environment

@@ -1,0 +1,95 @@
+"""Search for hyperparameters, many trials at once, with Optuna.
+
+The study is stored in the output folder. The same command with the same `--output` continues a
+search that was stopped, and several workers may share one study through `--storage`.
+"""
+
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+
+from jetbot_mjx import cli, startup
+
+
+def _parser() -> cli.Parser:
+    parser = cli.Parser(prog="jetbot-mjx tune", description=__doc__)
+    cli.add_config_arguments(parser)
+    what = "YAML file with the settings to search, or `ppo`, which comes with the package"
+    parser.add_argument("--space", type=Path, required=True, metavar="SPACE", help=what)
+    parser.add_argument(
+        "--trials",
+        type=cli.positive_int,
+        default=64,
+        metavar="N",
+        help="how many trials the study shall have (default: 64)",
+    )
+    parser.add_argument(
+        "--round",
+        type=cli.whole_number(1, 1024),
+        default=16,
+        metavar="N",
+        help="how many trials to train at once (default: 16)",
+    )
+    parser.add_argument(
+        "--storage", metavar="URL", help="database of the study (default: SQLite in --output)"
+    )
+    parser.add_argument(
+        "--confirm",
+        type=cli.whole_number(0),
+        default=3,
+        metavar="N",
+        help="how many of the best trials to retrain with new seeds, beside the configuration as"
+        " given; 0: none (default: 3)",
+    )
+    parser.add_argument(
+        "--output", type=Path, metavar="DIR", help="default: runs/tune-<config>-<date>-<time>"
+    )
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line and search.
+
+    Args:
+      arguments: The arguments without the program's name, or None for those of the process.
+
+    Returns:
+      0.
+    """
+    options = (parser := _parser()).parse_args(arguments)
+    cli.require_config(parser, options)
+    startup.wake_driver()
+    config = cli.config_of(options)
+    startup.wake_device()
+    with startup.exit_on_interrupt():
+        from jetbot_mjx.runs import default_run_dir
+        from jetbot_mjx.terminal import process_seconds
+        from jetbot_mjx.tuning import CONFIRM_SEEDS, entrants_table, read_space, run_search
+    space = read_space(options.space, config)
+    cli.prepare_device()
+    folder = options.output or default_run_dir(Path(f"tune-{options.config.stem}"))
+    with cli.show_progress():
+        found = run_search(
+            config,
+            space,
+            folder,
+            trials=options.trials,
+            round_size=options.round,
+            confirm=options.confirm,
+            storage=options.storage,
+            say=cli.tell,
+        )
+    if found.entrants:
+        cli.tell(
+            f"\nretrained with {CONFIRM_SEEDS} new seeds, evaluated on the report's goals:\n\n"
+            f"{entrants_table(found.entrants)}\n"
+        )
+    cli.tell(
+        f"total {process_seconds():.1f} s\nresults: {folder}\n"
+        f"next: jetbot-mjx train {shlex.quote(str(found.config_file))}"
+    )
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main, at_once=True, writes_files=True)

@@ -1,0 +1,14 @@
+from .gallery import GALLERY_EPISODES as GALLERY_EPISODES
+from .gallery import VIDEO_EPISODES as VIDEO_EPISODES
+from .gallery import Rendered as Rendered
+from .gallery import render_gallery as render_gallery
+from .gallery import render_run as render_run
+from .live import play_live as play_live
+from .many import render_many as render_many
+from .many import render_training_strip as render_training_strip
+from .mujoco_window import Window as Window
+from .mujoco_window import require_window as require_window
+from .offscreen import Renderer as Renderer
+from .offscreen import overview as overview
+from .player import Player as Player
+from .video import EvaluationVideo as EvaluationVideo

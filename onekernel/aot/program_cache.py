@@ -1,0 +1,343 @@
+"""Cache compiled programs on disk under a key, so that later processes need not trace them.
+
+JAX's own cache finds a program by its lowered code. To look there, a process must first trace and
+lower the program, which takes far longer than loading it. This cache finds a program by a key that
+its user computes from everything that the program depends on.
+"""
+
+import contextlib
+import hashlib
+import pickle
+import platform
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple, Protocol, Self
+
+import jax
+from jax.experimental import serialize_executable
+
+from onekernel import cpu
+from onekernel.aot.xla_options import Options, unseen_options, untuned_options
+from onekernel.background import in_background
+from onekernel.trusted_files import distrust, read_trusted, write_private
+
+_UNUSED_DAYS = 30
+# Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
+_tracing = threading.Lock()
+
+_CACHE_HIT = "/jax/compilation_cache/cache_hits"
+
+
+class _Lowered(NamedTuple):
+    """A `_Lowered` holds a program before it is compiled."""
+
+    program: jax.stages.Lowered
+    seconds: float
+    """Time that it took to trace and lower it [s]."""
+    notices: list[Any]
+    """What was reported meanwhile."""
+
+
+class _Stored(NamedTuple):
+    """A `_Stored` holds a compiled program as a file does."""
+
+    program: jax.stages.Compiled
+    notices: list[Any]
+    """What was reported when it was traced."""
+
+
+class Notices(Protocol):
+    """A `Notices` knows what users are told while a program is traced, to repeat it later."""
+
+    def collect(self) -> contextlib.AbstractContextManager[list[Any]]:
+        """Return a context that yields a list of all that is reported inside it."""
+        ...
+
+    def report(self, notice: Any, /) -> None:
+        """Report again what was reported when a program was traced."""
+        ...
+
+
+class _NoNotices:
+    """A `_NoNotices` is for callers that tell their users nothing."""
+
+    def collect(self) -> contextlib.AbstractContextManager[list[Any]]:
+        return contextlib.nullcontext([])
+
+    def report(self, notice: Any, /) -> None:
+        pass
+
+
+class ProgramCache:
+    """A `ProgramCache` holds the compiled programs of one configuration, by name."""
+
+    def __init__(
+        self,
+        options: Options,
+        folder: Path | None = None,
+        key: str = "",
+        notices: Notices | None = None,
+    ) -> None:
+        """Set the options, folder and key of the cache.
+
+        Args:
+          options: the compiler options of the programs.
+          folder: an existing folder; None: programs are not cached.
+          key: everything that the programs depend on, but for the options and the processor.
+          notices: who tells users about the programs; what is told while a program is traced is
+            stored with it, and told again where it is loaded.
+        """
+        self.options = options
+        """The compiler options of the programs."""
+        self._folder = folder
+        self._key = f"{key} {processor()} {sorted(options.items())}" if folder else ""
+        self._notices = notices or _NoNotices()
+        self._prefetched: dict[str, Future[_Stored | None]] = {}
+        self.loads = False
+        """Whether programs are being loaded, and not one of them must be compiled."""
+
+    def prefetch(self, *names: str) -> None:
+        """Start to load programs in threads, and return at once."""
+        if self._folder is None:
+            return
+        for name in names:
+            pool = ThreadPoolExecutor(1)
+            self._prefetched[name] = pool.submit(_load, self._path(name))
+            pool.shutdown(wait=False)
+        self.loads = all(self._path(name).exists() for name in names)
+
+    def find(self, name: str) -> jax.stages.Compiled | None:
+        """Return a program if it was compiled before.
+
+        Args:
+          name: the name of the program, unique within the configuration.
+
+        Returns:
+          The program; None if it is not in the cache.
+        """
+        if self._folder is None:
+            return None
+        prefetched = self._prefetched.pop(name, None)
+        stored = prefetched.result() if prefetched else _load(self._path(name))
+        if stored is None:
+            return None
+        for notice in stored.notices:
+            self._notices.report(notice)
+        return stored.program
+
+    def compile(
+        self,
+        name: str,
+        trace: Callable[[], jax.stages.Traced],
+        check: Callable[[], Callable[[], jax.stages.Traced] | None] = lambda: None,
+        *,
+        tune: bool = False,
+    ) -> jax.stages.Compiled:
+        """Return a program, and compile it if it is not cached.
+
+        Args:
+          name: name of the program.
+          trace: a function that traces the program.
+          check: a function that returns None if what was traced can be used, and otherwise a
+            function that traces another program in its place. It runs while XLA compiles, and not
+            at all if the program is cached.
+          tune: whether XLA may time kernels on a GPU to choose the fastest, for a program that runs
+            for most of the time.
+
+        Returns:
+          The program, which takes arguments of the shapes and shardings it was traced with.
+        """
+        program = self.find(name)
+        if program is not None:
+            return program
+        lowered = self._lower(trace)
+        checked = in_background(check).result
+        try:
+            program = self._compile(name, lowered, lambda: checked() is None, tune=tune)
+        except jax.errors.JaxRuntimeError:
+            # What fails its check may also fail to compile.
+            if checked() is None:
+                raise
+            program = None
+        otherwise = checked()
+        if program is not None and otherwise is None:
+            return program
+        return self._compile(name, self._lower(otherwise or trace), tune=tune)
+
+    def compile_later(
+        self,
+        name: str,
+        trace: Callable[[], jax.stages.Traced],
+        inside: contextlib.AbstractContextManager[Any] | None = None,
+    ) -> Callable[[], jax.stages.Compiled]:
+        """Trace a program now if it is not cached, and compile it in a thread.
+
+        Args:
+          name: name of the program.
+          trace: a function that traces the program.
+          inside: a context in which the program is traced and lowered, while no cache lowers
+            another one.
+
+        Returns:
+          A function that waits for the program, as `compile` returns it.
+        """
+        program = self.find(name)
+        if program is not None:
+            return lambda: program
+        lowered = self._lower(trace, inside)
+        return in_background(lambda: self._compile(name, lowered)).result
+
+    def _lower(
+        self,
+        trace: Callable[[], jax.stages.Traced],
+        inside: contextlib.AbstractContextManager[Any] | None = None,
+    ) -> "_Lowered":
+        around = inside or contextlib.nullcontext()
+        with _tracing, around, self._notices.collect() as notices:
+            began = time.perf_counter()
+            return _Lowered(trace().lower(), time.perf_counter() - began, notices)
+
+    def _compile(
+        self,
+        name: str,
+        lowered: "_Lowered",
+        usable: Callable[[], bool] = lambda: True,
+        *,
+        tune: bool = False,
+    ) -> jax.stages.Compiled:
+        """Compile a program and write it to the folder.
+
+        Args:
+          name: name of the program.
+          lowered: the program.
+          usable: a function that returns whether to write it.
+          tune: whether XLA may time kernels.
+        """
+        options = self.options if tune else {**self.options, **untuned_options()}
+        began = time.perf_counter()
+        program, loaded = _compiled(lowered.program, options)
+        if self._folder and loaded and (unseen := unseen_options()):
+            # Compile it once, instead of at every start: JAX finds nothing under other options.
+            program, loaded = _compiled(lowered.program, {**options, **unseen})
+        if self._folder and not loaded and usable():
+            seconds = lowered.seconds + time.perf_counter() - began
+            # Only programs for CPUs call kernels by name, and their text takes a while to write.
+            text = lowered.program.as_text() if jax.default_backend() == "cpu" else ""
+            kernels = cpu.kernels_in(text)
+            _save(self._path(name), _Stored(program, lowered.notices), kernels, seconds)
+        return program
+
+    def _path(self, name: str) -> Path:
+        assert self._folder is not None
+        text = f"{self._key} {name}"
+        return self._folder / f"program-{hashlib.sha256(text.encode()).hexdigest()}"
+
+
+def processor() -> str:
+    """Return a short name for this processor's instruction set."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = [platform.machine(), platform.processor()]
+    kind = sorted({line for line in lines if line.startswith(("flags", "Features", "model name"))})
+    return hashlib.sha256("\n".join(kind or lines).encode()).hexdigest()[:8]
+
+
+def cache_folder(path: Path, *, by_processor: bool = False) -> Path:
+    """Create a folder of compiled programs if it is missing, and return it.
+
+    Args:
+      path: the folder.
+      by_processor: whether to return a folder inside it, for this kind of processor and version of
+        JAX, because a program that was compiled for one may not run on another.
+
+    Raises:
+      OSError: the folder cannot be used, or other users may write to it, and JAX would run the
+        programs that it finds there.
+    """
+    folder = path / f"jax-{jax.__version__}-{processor()}" if by_processor else path
+    folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if reason := distrust(folder, folder.stat()):
+        raise PermissionError(reason)
+    return folder
+
+
+class _CacheHits:
+    """A counter of the programs that this thread finds in JAX's own cache."""
+
+    def __enter__(self) -> Self:
+        self.count = 0
+        self._thread = threading.get_ident()
+        jax.monitoring.register_event_listener(self._listen)
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        jax.monitoring.unregister_event_listener(self._listen)
+
+    def _listen(self, event: str, **kwargs: str | int) -> None:
+        self.count += event == _CACHE_HIT and threading.get_ident() == self._thread
+
+
+def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages.Compiled, bool]:
+    """Compile a program; return also whether XLA loaded it and cannot serialize it.
+
+    On a CPU, functions of a program that JAX found in its own cache would be missing.
+    """
+    # Tracing may have found small programs in JAX's cache, which do not count.
+    with _CacheHits() as hits:
+        program = lowered.compile(compiler_options=options)
+    return program, hits.count > 0 and jax.default_backend() == "cpu"
+
+
+def _load(path: Path) -> _Stored | None:
+    """Load the program in a file; return None if it is missing, damaged, untrusted or unusable."""
+    began = time.perf_counter()
+    content = read_trusted(path)
+    if content is None:
+        return None
+    seconds, kernels, notices, ids, serialized = pickle.loads(content)
+    cpu.register(kernels)
+    devices = {device.id: device for device in jax.devices()}
+    try:
+        program = serialize_executable.deserialize_and_load(
+            # Without these, JAX would load it as one program for all devices.
+            *serialized,
+            execution_devices=[devices[number] for number in ids],
+        )
+    except jax.errors.JaxRuntimeError:
+        # For example, a newer driver rejects the program: compile it again.
+        return None
+    with contextlib.suppress(OSError):
+        path.touch()
+    # Report the same events as JAX does when it finds a program in its own cache.
+    loaded = time.perf_counter() - began
+    monitoring = jax.monitoring
+    monitoring.record_event(_CACHE_HIT)
+    monitoring.record_event_duration_secs(
+        "/jax/compilation_cache/compile_time_saved_sec", max(0.0, seconds - loaded)
+    )
+    monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", loaded)
+    return _Stored(program, notices)
+
+
+def _save(path: Path, stored: _Stored, kernels: dict[str, bytes], seconds: float) -> None:
+    """Write a program, the kernels that it calls and its compile time to a file.
+
+    An error while writing is ignored, because a missing file only costs time.
+    """
+    try:
+        serialized = serialize_executable.serialize(stored.program)
+        loaded: Any = stored.program.runtime_executable()
+        ids = [device.id for device in loaded.local_devices()]
+    except (NotImplementedError, ValueError):
+        # Devices of this kind cannot serialize programs.
+        return
+    content = pickle.dumps((seconds, kernels, stored.notices, ids, serialized))
+    with contextlib.suppress(OSError):
+        for other in path.parent.glob("program-*"):
+            if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
+                other.unlink(missing_ok=True)
+        write_private(path, content)

@@ -1,0 +1,30 @@
+"""Register the back ends that compile kernels."""
+
+from typing import Any
+
+import jax
+
+from onekernel import cpu, gpu
+from onekernel.kernel import Backend, register
+from onekernel.kernel import Kernel as Kernel  # who takes it from the face has the back ends, too
+
+BACKENDS: tuple[Backend, ...] = (gpu, cpu)
+"""Back ends that can compile a kernel."""
+
+register(*BACKENDS)
+
+
+_PLATFORMS = {"gpu": "cuda"}
+"""Names of lowering platforms, where they differ from those of JAX's devices."""
+
+
+def default_backend() -> Backend | None:
+    """Return the back end for the platform of JAX's default device, if there is one.
+
+    Its `obstacle` tells whether it can run kernels in this process.
+    """
+    settings: Any = jax.config
+    device = settings.jax_default_device or jax.local_devices()[0]
+    platform = device if isinstance(device, str) else device.platform
+    platform = _PLATFORMS.get(platform, platform)
+    return next((x for x in BACKENDS if platform == x.PLATFORM), None)

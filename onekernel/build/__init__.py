@@ -1,0 +1,23 @@
+"""Write kernels around a lowered function, as LLVM IR that the back ends compile and launch."""
+
+from onekernel import cpu, gpu
+from onekernel.background import in_background
+from onekernel.codegen import LlvmWriter, Repeat, Value, run_program
+from onekernel.kernel import Backend, make_primitive
+from onekernel.lower import ScalarProgram, evaluate, scalarize_part, unroll_linear_algebra
+
+__all__ = [
+    "Backend",
+    "LlvmWriter",
+    "Repeat",
+    "ScalarProgram",
+    "Value",
+    "cpu",
+    "evaluate",
+    "gpu",
+    "in_background",
+    "make_primitive",
+    "run_program",
+    "scalarize_part",
+    "unroll_linear_algebra",
+]

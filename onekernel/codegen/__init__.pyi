@@ -1,0 +1,10 @@
+from .llvm import STEP as STEP
+from .llvm import ProgramWriter as ProgramWriter
+from .llvm import map_function as map_function
+from .llvm import require as require
+from .llvm import run_program as run_program
+from .llvm import tile_function as tile_function
+from .writer import LlvmWriter as LlvmWriter
+from .writer import Repeat as Repeat
+from .writer import Value as Value
+from .writer import module_text as module_text

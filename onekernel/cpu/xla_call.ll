@@ -1,0 +1,277 @@
+; What XLA calls on a CPU, around a function `block`. It reads the call frame, and XLA's own threads take
+; blocks from a job as long as there are any. Offsets are those of XLA's xla/ffi/api/c_api.h, version 0.3.
+;
+; `onekernel.cpu.xla_call` puts in front of this text what differs between kernels: the functions `block` and
+; `needed`, the constants @instances_per_block, @blocks_per_instance, @blocks_per_thread and @scratch_bytes,
+; and for the processor `begin`, `end` and `relax`.
+
+; What threads share of one call: blocks that are begun, blocks that are ended, who holds the job, blocks in all,
+; instances in all, the addresses of arguments and results.
+%Job = type { i64, i64, i64, i64, i64, [0 x ptr] }
+declare ptr @malloc(i64)
+declare ptr @aligned_alloc(i64, i64)
+declare void @free(ptr)
+declare i32 @sched_yield()
+
+; Lets go of a job; the last one frees it.
+define internal void @release(ptr %job) {
+  %holders = getelementptr %Job, ptr %job, i32 0, i32 2
+  %before = atomicrmw sub ptr %holders, i64 1 acq_rel
+  %is.last = icmp eq i64 %before, 1
+  br i1 %is.last, label %drop, label %done
+drop:
+  call void @free(ptr %job)
+  ret void
+done:
+  ret void
+}
+
+; Waits until so many blocks have ended; those are in other threads' hands, and begun.
+define internal void @wait_for(ptr %job, i64 %count) {
+entry:
+  %ended.at = getelementptr %Job, ptr %job, i32 0, i32 1
+  br label %check
+check:
+  %ended = load atomic i64, ptr %ended.at acquire, align 8
+  %enough = icmp uge i64 %ended, %count
+  br i1 %enough, label %done, label %wait
+wait:
+  ; A block takes microseconds: who gives the core away at once has it back later than that. After so many
+  ; rounds, about 20 µs, it does.
+  %round = phi i64 [0, %check], [%round.next, %relax]
+  %round.next = add i64 %round, 1
+  %long = icmp uge i64 %round, 1000
+  br i1 %long, label %yield, label %relax
+relax:
+  call void @relax()
+  %seen = load atomic i64, ptr %ended.at acquire, align 8
+  %over = icmp uge i64 %seen, %count
+  br i1 %over, label %done, label %wait
+yield:
+  %ignored = call i32 @sched_yield()
+  br label %check
+done:
+  ret void
+}
+
+; Takes blocks as long as there are any.
+define internal void @work(ptr %job) {
+entry:
+  %blocks.at = getelementptr %Job, ptr %job, i32 0, i32 3
+  %blocks = load i64, ptr %blocks.at
+  %ended = getelementptr %Job, ptr %job, i32 0, i32 1
+  %mode = call i64 @begin()
+  ; Memory to work with, which stays in the cache of this thread's core from block to block.
+  %scratch.bytes = load i64, ptr @scratch_bytes
+  %scratch = call ptr @aligned_alloc(i64 64, i64 %scratch.bytes)
+  br label %take
+take:
+  %index = atomicrmw add ptr %job, i64 1 monotonic
+  %is.left = icmp ult i64 %index, %blocks
+  br i1 %is.left, label %do, label %done
+do:
+  %needed = call i64 @needed(ptr %job, i64 %index)
+  call void @wait_for(ptr %job, i64 %needed)
+  call void @block(ptr %job, i64 %index, ptr %scratch)
+  %old = atomicrmw add ptr %ended, i64 1 acq_rel
+  br label %take
+done:
+  call void @free(ptr %scratch)
+  call void @end(i64 %mode)
+  ret void
+}
+
+; What XLA's other threads run. They may come late, when all is done and the call is over.
+define internal void @task(ptr %job) {
+  call void @work(ptr %job)
+  call void @release(ptr %job)
+  ret void
+}
+
+; Every structure of the interface begins with its size.
+define internal i1 @has_size(ptr %structure, i64 %size) {
+  %told = load i64, ptr %structure
+  %same = icmp eq i64 %told, %size
+  ret i1 %same
+}
+
+; Frees an error, if it is one (XLA_FFI_Error_Destroy).
+define internal void @forgive(ptr %api, ptr %error) {
+entry:
+  %none = icmp eq ptr %error, null
+  br i1 %none, label %done, label %destroy
+destroy:
+  %arguments = alloca [3 x i64]
+  store [3 x i64] [i64 24, i64 0, i64 0], ptr %arguments
+  %error.at = getelementptr i8, ptr %arguments, i64 16
+  store ptr %error, ptr %error.at
+  %function.at = getelementptr i8, ptr %api, i64 64
+  %function = load ptr, ptr %function.at
+  call void %function(ptr %arguments)
+  br label %done
+done:
+  ret void
+}
+
+; XLA's threads (XLA_FFI_ThreadPool_NumThreads); one if it has none.
+define internal i64 @thread_count(ptr %api, ptr %context) {
+  %count = alloca i64
+  store i64 1, ptr %count
+  %arguments = alloca [4 x i64]
+  store [4 x i64] [i64 32, i64 0, i64 0, i64 0], ptr %arguments
+  %context.at = getelementptr i8, ptr %arguments, i64 16
+  store ptr %context, ptr %context.at
+  %count.at = getelementptr i8, ptr %arguments, i64 24
+  store ptr %count, ptr %count.at
+  %function.at = getelementptr i8, ptr %api, i64 144
+  %function = load ptr, ptr %function.at
+  %error = call ptr %function(ptr %arguments)
+  call void @forgive(ptr %api, ptr %error)
+  %result = load i64, ptr %count
+  ret i64 %result
+}
+
+; Gives a job to one more thread (XLA_FFI_ThreadPool_Schedule).
+define internal void @ask_for_help(ptr %api, ptr %context, ptr %job) {
+  %holders = getelementptr %Job, ptr %job, i32 0, i32 2
+  %before = atomicrmw add ptr %holders, i64 1 monotonic
+  %arguments = alloca [5 x i64]
+  store [5 x i64] [i64 40, i64 0, i64 0, i64 0, i64 0], ptr %arguments
+  %context.at = getelementptr i8, ptr %arguments, i64 16
+  store ptr %context, ptr %context.at
+  %task.at = getelementptr i8, ptr %arguments, i64 24
+  store ptr @task, ptr %task.at
+  %job.at = getelementptr i8, ptr %arguments, i64 32
+  store ptr %job, ptr %job.at
+  %function.at = getelementptr i8, ptr %api, i64 136
+  %function = load ptr, ptr %function.at
+  %error = call ptr %function(ptr %arguments)
+  %helped = icmp eq ptr %error, null
+  br i1 %helped, label %done, label %alone
+alone:
+  call void @release(ptr %job)
+  call void @forgive(ptr %api, ptr %error)
+  ret void
+done:
+  ret void
+}
+
+; Copies the addresses of the arrays of some buffers (XLA_FFI_Buffer).
+define internal void @copy_addresses(ptr %buffers, i64 %count, ptr %addresses) {
+entry:
+  br label %check
+check:
+  %i = phi i64 [0, %entry], [%i.next, %copy]
+  %more = icmp ult i64 %i, %count
+  br i1 %more, label %copy, label %done
+copy:
+  %buffer.at = getelementptr ptr, ptr %buffers, i64 %i
+  %buffer = load ptr, ptr %buffer.at
+  %data.at = getelementptr i8, ptr %buffer, i64 24
+  %data = load ptr, ptr %data.at
+  %address.at = getelementptr ptr, ptr %addresses, i64 %i
+  store ptr %data, ptr %address.at
+  %i.next = add i64 %i, 1
+  br label %check
+done:
+  ret void
+}
+
+; XLA's handler: a call frame in, no error out.
+define ptr @kernel(ptr %frame) {
+entry:
+  %extension.at = getelementptr i8, ptr %frame, i64 8
+  %extension = load ptr, ptr %extension.at
+  %plain = icmp eq ptr %extension, null
+  br i1 %plain, label %call, label %question
+; Asked for the version of the interface (XLA_FFI_Metadata_Extension).
+question:
+  %kind.at = getelementptr i8, ptr %extension, i64 8
+  %kind = load i32, ptr %kind.at
+  %is.metadata = icmp eq i32 %kind, 1
+  br i1 %is.metadata, label %answer, label %call
+answer:
+  %metadata.at = getelementptr i8, ptr %extension, i64 24
+  %metadata = load ptr, ptr %metadata.at
+  %major.at = getelementptr i8, ptr %metadata, i64 24
+  store i32 0, ptr %major.at
+  %minor.at = getelementptr i8, ptr %metadata, i64 28
+  store i32 3, ptr %minor.at
+  %traits.at = getelementptr i8, ptr %metadata, i64 32
+  store i32 0, ptr %traits.at
+  ret ptr null
+call:
+  %arguments = getelementptr i8, ptr %frame, i64 40
+  %results = getelementptr i8, ptr %frame, i64 80
+  %frame.fits = call i1 @has_size(ptr %frame, i64 168)
+  br i1 %frame.fits, label %look, label %refuse
+; Arguments, results, the first buffer and the interface's major version: other than expected, nothing is done.
+look:
+  %arguments.fit = call i1 @has_size(ptr %arguments, i64 40)
+  %results.fit = call i1 @has_size(ptr %results, i64 40)
+  %buffers.at = getelementptr i8, ptr %arguments, i64 32
+  %buffers = load ptr, ptr %buffers.at
+  %buffer = load ptr, ptr %buffers
+  %buffer.fits = call i1 @has_size(ptr %buffer, i64 48)
+  %api.at = getelementptr i8, ptr %frame, i64 16
+  %api = load ptr, ptr %api.at
+  %api.major.at = getelementptr i8, ptr %api, i64 32
+  %api.major = load i32, ptr %api.major.at
+  %api.fits = icmp eq i32 %api.major, 0
+  %fit.1 = and i1 %arguments.fit, %results.fit
+  %fit.2 = and i1 %buffer.fits, %api.fits
+  %fit = and i1 %fit.1, %fit.2
+  br i1 %fit, label %prepare, label %refuse
+refuse:
+  ret ptr null
+prepare:
+  %context.at = getelementptr i8, ptr %frame, i64 24
+  %context = load ptr, ptr %context.at
+  %sizes.at = getelementptr i8, ptr %buffer, i64 40
+  %sizes = load ptr, ptr %sizes.at
+  %instances = load i64, ptr %sizes
+  %per.block = load i64, ptr @instances_per_block
+  %fill = sub i64 %per.block, 1
+  %rounded = add i64 %instances, %fill
+  %groups = udiv i64 %rounded, %per.block
+  %per.instance = load i64, ptr @blocks_per_instance
+  %blocks = mul i64 %groups, %per.instance
+  %argument.count.at = getelementptr i8, ptr %arguments, i64 16
+  %argument.count = load i64, ptr %argument.count.at
+  %result.count.at = getelementptr i8, ptr %results, i64 16
+  %result.count = load i64, ptr %result.count.at
+  %count = add i64 %argument.count, %result.count
+  %end = getelementptr %Job, ptr null, i32 0, i32 5, i64 %count
+  %bytes = ptrtoint ptr %end to i64
+  %job = call ptr @malloc(i64 %bytes)
+  store %Job { i64 0, i64 0, i64 1, i64 0, i64 0, [0 x ptr] zeroinitializer }, ptr %job
+  %blocks.at = getelementptr %Job, ptr %job, i32 0, i32 3
+  store i64 %blocks, ptr %blocks.at
+  %instances.at = getelementptr %Job, ptr %job, i32 0, i32 4
+  store i64 %instances, ptr %instances.at
+  %outputs.at = getelementptr i8, ptr %results, i64 32
+  %outputs = load ptr, ptr %outputs.at
+  %given.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 0
+  call void @copy_addresses(ptr %buffers, i64 %argument.count, ptr %given.at)
+  %returned.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 %argument.count
+  call void @copy_addresses(ptr %outputs, i64 %result.count, ptr %returned.at)
+  %threads = call i64 @thread_count(ptr %api, ptr %context)
+  %per.thread = load i64, ptr @blocks_per_thread
+  %useful = udiv i64 %blocks, %per.thread
+  %most = call i64 @llvm.umin.i64(i64 %threads, i64 %useful)
+  br label %help
+help:
+  %helpers = phi i64 [1, %prepare], [%helpers.next, %ask]
+  %enough = icmp uge i64 %helpers, %most
+  br i1 %enough, label %start, label %ask
+ask:
+  call void @ask_for_help(ptr %api, ptr %context, ptr %job)
+  %helpers.next = add i64 %helpers, 1
+  br label %help
+start:
+  call void @work(ptr %job)
+  call void @wait_for(ptr %job, i64 %blocks)
+  call void @release(ptr %job)
+  ret ptr null
+}
+declare i64 @llvm.umin.i64(i64, i64)

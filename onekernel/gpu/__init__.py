@@ -1,0 +1,262 @@
+"""Compile and launch kernels on NVIDIA GPUs; this module is a `onekernel.kernel.Backend`.
+
+LLVM compiles a kernel to PTX, NVIDIA's portable assembly, and XLA passes the PTX to the driver
+through its custom call for PTX kernels. That call is internal to XLA, so `obstacle` tries
+whether the installed version has it. Each thread runs the whole program for one instance, with all
+intermediate values in registers.
+"""
+
+import contextlib
+import ctypes
+import functools
+import importlib
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from onekernel.background import in_background
+from onekernel.gpu.kernel_text import (
+    INSTANCES,
+    ITEM_THREADS,
+    MAX_THREADS,
+    NAME,
+    kernel_text,
+    map_kernel_text,
+)
+from onekernel.gpu.kernel_text import module_text as module_text
+from onekernel.kernel import Kernel, probe
+
+IMPL: str = "ptx"
+PLATFORM: str = "cuda"
+
+_MIN_THREADS = 32
+
+_DIRECT_WORDS = 32
+"""Number of words of an instance that its thread reads where they are. Of longer rows, the threads
+of a block copy their part of an array to shared memory and back, each the word beside that of the
+next thread: threads that each read a row of their own wait 70 µs for 65,536 rows of 77 words."""
+
+_SHARED_MEMORY = {70: 49_152, 80: 98_304, 90: 98_304}
+"""Bytes of shared memory for that, by target architecture; all GPUs that run its code have it."""
+
+_BLOCKS = 128
+"""Number of blocks above which blocks grow: a GPU has about as many multiprocessors."""
+
+_TARGET = "__gpu$xla.gpu.ptx"
+_TRIPLE = "nvptx64-nvidia-cuda"
+_LEVEL = 3
+_FULL_BLOCKS = 2**31 - 1
+"""Number of instances in the PTX if the blocks have no more threads than instances: the same text
+serves all these numbers, and the driver assembles it once."""
+
+_ARCHITECTURES = (70, 80, 90)
+"""Target architectures, as ten times the compute capability; newer GPUs run PTX of older ones."""
+
+
+@functools.cache
+def obstacle() -> str | None:
+    """Return why XLA cannot launch kernels that LLVM compiled for an NVIDIA GPU, or None."""
+    try:
+        device = jax.local_devices(backend=PLATFORM)[0]
+    except (RuntimeError, IndexError):
+        return "there is no NVIDIA GPU that JAX can use: pip install 'jax[cuda13]'"
+    try:
+        _binding()
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"llvmlite cannot be used ({error}): pip install llvmlite"
+    return probe(launch, device, instances=2)
+
+
+def prepare(kernel: Kernel) -> None:
+    """Begin to compile a kernel, as specified by `onekernel.kernel.Backend`."""
+    in_background(lambda: assemble_ahead(_text(kernel, _FULL_BLOCKS)))
+
+
+def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
+    """Run a kernel, as specified by `onekernel.kernel.Backend`."""
+    instances = leaves[0].shape[0]
+    words = _shared_words(kernel, target_architecture())
+    threads = threads_in_block(instances, words)
+    blocks, rest = divmod(instances, threads)
+    if kernel.table is not None:
+        # A block computes all items of an instance.
+        threads, blocks, rest = ITEM_THREADS, instances, 0
+    text = _text(kernel, instances if rest else _FULL_BLOCKS)
+    blocks += rest > 0
+    grid, shared = (blocks, 1, 1), 4 * threads * words
+    return launch_ptx(NAME, text, leaves, kernel.results(instances), grid, threads, shared)
+
+
+def _shared_words(kernel: Kernel, architecture: int) -> int:
+    """Return how many words of an instance are in shared memory; 0: it reads them directly."""
+    if kernel.table is not None:
+        return 0
+    shapes = kernel.argument_shapes, [x.shape for x in kernel.results()]
+    words = max(sum(map(math.prod, one)) for one in shapes)
+    fits = 4 * _MIN_THREADS * words <= _SHARED_MEMORY[architecture]
+    return words if words > _DIRECT_WORDS and fits else 0
+
+
+def _text(kernel: Kernel, instances: int) -> str:
+    """Return the PTX of a kernel for the present GPUs, which is compiled on first use."""
+    architecture = target_architecture()
+    text = kernel.text(f"{IMPL} {architecture}", lambda: compiled(kernel, architecture))
+    return text.replace(INSTANCES, str(instances))
+
+
+def launch_ptx(
+    name: str,
+    text: str,
+    arguments: Sequence[Array],
+    results: Sequence[jax.ShapeDtypeStruct],
+    grid: tuple[int, int, int],
+    threads: int,
+    shared_memory: int = 0,
+    aliases: Mapping[int, int] | None = None,
+) -> list[Array]:
+    """Launch a kernel, while JAX lowers a program for an NVIDIA GPU.
+
+    Args:
+      name: the name of the kernel.
+      text: its PTX. Its parameters are the addresses of the arguments, then of the results.
+      arguments: the arrays that it reads.
+      results: shapes and dtypes of the arrays that it writes.
+      grid: the number of blocks along each axis.
+      threads: the number of threads of a block.
+      shared_memory: dynamic shared memory of a block [bytes].
+      aliases: which arguments it changes, and as which results it returns them.
+
+    Returns:
+      The results.
+    """
+    assemble_ahead(text)
+    sizes = {f"grid_{axis}": np.int64(n) for axis, n in zip("xyz", grid, strict=True)}
+    sizes |= {f"block_{axis}": np.int64(n) for axis, n in zip("xyz", (threads, 1, 1), strict=True)}
+    return list(
+        jax.ffi.ffi_call(_TARGET, list(results), input_output_aliases=dict(aliases or {}))(
+            *arguments,
+            name=name,
+            kernel_type="ptx",
+            kernel_data=text,
+            **sizes,
+            shared_mem_bytes=np.int64(shared_memory),
+            output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
+        )
+    )
+
+
+@functools.cache
+def assemble_ahead(text: str) -> None:
+    """Let the driver assemble PTX in a thread, while XLA compiles the rest of the program.
+
+    The driver keeps the result in its own cache on disk, from which XLA's first launch takes it.
+
+    Args:
+      text: the PTX.
+    """
+
+    def load() -> None:
+        # If this fails, or there is no GPU here, the first launch takes longer.
+        with contextlib.suppress(OSError, AttributeError, RuntimeError):
+            device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
+            cuda = ctypes.CDLL("libcuda.so.1")
+            context, module = ctypes.c_void_p(), ctypes.c_void_p()
+            if cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device):
+                return
+            cuda.cuCtxSetCurrent(context)
+            if not cuda.cuModuleLoadData(ctypes.byref(module), text.encode()):
+                cuda.cuModuleUnload(module)
+            cuda.cuDevicePrimaryCtxRelease_v2(device)
+
+    in_background(load)
+
+
+def threads_in_block(instances: int, words: int = 0) -> int:
+    """Return the number of instances per block, a power of two that occupies every multiprocessor.
+
+    Args:
+      instances: the number of all instances.
+      words: how many words of an instance are in shared memory.
+    """
+    wanted = 2 ** math.ceil(math.log2(max(1, instances / _BLOCKS)))
+    most = MAX_THREADS
+    if words:
+        fitting = _SHARED_MEMORY[target_architecture()] // (4 * words)
+        most = min(most, 2 ** int(math.log2(fitting)))
+    return min(max(wanted, _MIN_THREADS), most)
+
+
+def compiled(kernel: Kernel, architecture: int) -> str:
+    """Return the PTX of a kernel, with a placeholder for the number of instances.
+
+    Args:
+      kernel: the kernel.
+      architecture: the target architecture, as ten times the compute capability.
+
+    Returns:
+      The PTX.
+
+    Raises:
+      UnsupportedError: the program has an operation that has no LLVM instruction.
+    """
+    if kernel.table is not None:
+        return assembled(map_kernel_text(kernel), architecture)
+    shares = _shared_words(kernel, architecture) > 0
+    return assembled(kernel_text(kernel, shares=shares), architecture)
+
+
+def assembled(text: str, architecture: int, version: int | None = None) -> str:
+    """Return the PTX of a module of LLVM IR.
+
+    Args:
+      text: the module.
+      architecture: the target architecture, as ten times the compute capability.
+      version: ten times the version of PTX; None: the oldest that knows the architecture.
+    """
+    version = version or (70 if architecture < 90 else 80)
+    binding = _binding()
+    module = binding.parse_assembly(text, binding.create_context())
+    module.triple = _TRIPLE
+    target = binding.Target.from_triple(_TRIPLE)
+    machine = target.create_target_machine(
+        cpu=f"sm_{architecture}", features=f"+ptx{version}", opt=_LEVEL
+    )
+    return machine.emit_assembly(module)
+
+
+@functools.cache
+def compute_capability() -> int:
+    """Return ten times the lowest compute capability of the present GPUs."""
+    return min(
+        round(10 * float(device.compute_capability))
+        for device in jax.local_devices(backend=PLATFORM)
+    )
+
+
+def processor_count() -> int:
+    """Return the number of multiprocessors of a GPU."""
+    return jax.local_devices(backend=PLATFORM)[0].core_count
+
+
+def target_architecture() -> int:
+    """Return the newest supported architecture that all present GPUs can run."""
+    supported = [x for x in _ARCHITECTURES if x <= compute_capability()]
+    return max(supported, default=_ARCHITECTURES[0])
+
+
+@functools.cache
+def _binding() -> Any:
+    """Return the LLVM binding with its target for NVIDIA's GPUs.
+
+    Raises:
+      RuntimeError: this LLVM has no such target.
+    """
+    binding = importlib.import_module("llvmlite.binding")
+    binding.initialize_all_targets()
+    binding.initialize_all_asmprinters()
+    binding.Target.from_triple(_TRIPLE)
+    return binding

@@ -1,0 +1,321 @@
+"""Run a function of one instance as one kernel for all instances.
+
+Motivation: `jax.vmap` and XLA compile a step of a simulation to hundreds of kernels, and every
+value that passes from one kernel to the next goes through memory. Lowered to scalars
+(`onekernel.lower`), the same function is one kernel that reads the state of an instance, runs any
+number of steps, and writes the state back.
+
+An image is the other case: a function of what all of its pixels share, and of what differs between
+them. With `Kernel.table` the program runs once for every column of a table, an item, for every
+instance. What depends on the instance only is computed once per instance (CPU) or thread (GPU), and
+the results are bytes.
+
+Protocol: JAX sees the kernel as a primitive.
+
+1. `Kernel.as_step` binds the primitive to the leaves of (carry, consts) of one instance,
+   `Kernel.as_map` to those that all items of an instance share; all are float32.
+2. The batching rule of `jax.vmap` puts any number of batch axes into one launch.
+3. The primitive is lowered for the platform that a program is compiled for, whatever the
+   process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
+   (`onekernel.cpu` or `onekernel.gpu`) compiles and launches the kernel. Without a back end, a
+   kernel with `impl = auto` runs its fallback in JAX, and any other one raises a `KernelError`.
+4. Differentiation raises a `KernelError`.
+"""
+
+import dataclasses
+import math
+import threading
+import warnings
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array, Float, PyTree, UInt8
+
+from onekernel.codegen import require
+from onekernel.errors import KernelError
+from onekernel.lower import ScalarProgram, scalarize
+
+
+def warn_of_fallback(reason: str) -> None:
+    """Warn that something slower takes the place of a kernel."""
+    warnings.warn(f"a kernel is computed by XLA, slower: {reason}", stacklevel=2)
+
+
+Step = Callable[[PyTree, PyTree], PyTree]
+"""A function of (carry, consts) that returns the carry some steps later."""
+
+
+@dataclasses.dataclass(eq=False, repr=False)
+class Kernel:
+    """A `Kernel` holds a function of one instance that a back end can run for many instances.
+
+    Without a table it is a step, whose results replace its first arguments, between what is
+    computed once before the first step and once after the last. Kernels are compared by identity.
+    """
+
+    program: ScalarProgram
+    """The step. Its results have the shapes of its first `carried` arguments, unless it runs only
+    once; with a table, its last argument is a column of it, and its results are scalars from 0 to
+    255, which are rounded down to bytes."""
+    carried: int
+    """Number of argument leaves that are carried from step to step."""
+    steps: int
+    """Number of steps."""
+    fallback: Callable[..., list[Array]]
+    """The same computation in JAX, as a function of all leaves of one instance, for platforms
+    without a back end."""
+    impl: str = "auto"
+    """Name of the back end that must run the kernel; `auto` takes the back end of the platform, or
+    the fallback if there is none."""
+    explain: Callable[[KernelError], Exception] = lambda error: error
+    """A function that returns the exception that is raised for an error, in the caller's words."""
+    on_fallback: Callable[[str], None] = warn_of_fallback
+    """A function that is called with the reason where the fallback runs although the platform has a
+    back end."""
+    before: ScalarProgram | None = None
+    """A function from the arguments to those of the first step; None: they are the same."""
+    after: ScalarProgram | None = None
+    """A function from the arguments and the results of the last step to the results; None: they
+    are those of the last step."""
+    table: Float[np.ndarray, "rows items"] | None = None
+    """What differs between the items of an instance; None: the kernel is a step."""
+    _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
+    # Programs are lowered in several threads.
+    _lock: Any = dataclasses.field(default_factory=threading.Lock, init=False)
+
+    def __post_init__(self) -> None:
+        """Check that the programs can be written as LLVM IR.
+
+        Raises:
+          UnsupportedError: one of them has an operation that has no LLVM instruction.
+        """
+        for program in (self.before, self.program, self.after):
+            if program is not None:
+                require(program)
+
+    def as_step(self) -> Step:
+        """Return the kernel as a JAX function of one instance, which `jax.vmap` can batch.
+
+        Returns:
+          A function of (carry, consts) that returns the new carry. The leaves of both pytrees are
+          the kernel's arguments and must be float32. The function cannot be differentiated.
+        """
+
+        def step(carry: PyTree, consts: PyTree) -> PyTree:
+            results = _kernel_p.bind(*jax.tree.leaves((carry, consts)), kernel=self)
+            return jax.tree.unflatten(jax.tree.structure(carry), results)
+
+        return step
+
+    def as_function(self) -> Callable[[Sequence[Array]], list[Array]]:
+        """Return a kernel without a table as a JAX function of one instance; `jax.vmap` batches it.
+
+        Returns:
+          A function from the kernel's arguments, which must be float32, to its results. It cannot
+          be differentiated.
+        """
+        return lambda leaves: _kernel_p.bind(*leaves, kernel=self)
+
+    def as_map(self) -> Callable[[PyTree], UInt8[Array, " bytes"]]:
+        """Return a kernel with a table as a JAX function of one instance; `jax.vmap` batches it.
+
+        Returns:
+          A function of a pytree, whose leaves are the kernel's arguments and must be float32. It
+          returns the bytes of all items, one after the other. It cannot be differentiated.
+        """
+        return lambda shared: _kernel_p.bind(*jax.tree.leaves(shared), kernel=self)[0]
+
+    def text(self, name: str, write: Callable[[], str]) -> str:
+        """Return the text that is cached under a name; call `write` for it on first use."""
+        with self._lock:
+            if name not in self._texts:
+                self._texts[name] = write()
+            return self._texts[name]
+
+    @property
+    def argument_shapes(self) -> list[tuple[int, ...]]:
+        """Return the shapes of the arguments of one instance."""
+        shapes = [array.shape for array in (self.before or self.program).inputs]
+        return shapes if self.table is None else shapes[:-1]
+
+    def results(self, *batch: int) -> list[jax.ShapeDtypeStruct]:
+        """Return the shapes, behind the given batch axes, and dtypes of the results."""
+        if self.table is not None:
+            size = self.table.shape[1] * len(self.program.outputs)
+            return [jax.ShapeDtypeStruct((*batch, size), np.uint8)]
+        shapes = [array.shape for array in (self.after or self.program).outputs]
+        return [jax.ShapeDtypeStruct((*batch, *shape), np.float32) for shape in shapes]
+
+
+class Backend(Protocol):
+    """A `Backend` compiles and launches kernels for one platform."""
+
+    IMPL: str
+    """The back end's name in `Kernel.impl`."""
+    PLATFORM: str
+    """The JAX platform that the back end serves."""
+
+    def obstacle(self) -> str | None:
+        """Return why kernels cannot run in this process, with the remedy, or None if they can."""
+        ...
+
+    def prepare(self, kernel: Kernel) -> None:
+        """Begin to compile a kernel in a thread, before a program is lowered that launches it."""
+        ...
+
+    def launch(self, kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
+        """Run a kernel; JAX calls this while it lowers a program for the platform.
+
+        Args:
+          kernel: the kernel.
+          leaves: its arguments, float32 arrays of shape (instances, ...), and its table if it has
+            one.
+
+        Returns:
+          The results, as in `Kernel.results(instances)`.
+        """
+        ...
+
+
+def called_by(equation: Any) -> Kernel | None:
+    """Return the kernel that an equation of a jaxpr calls; None: it does something else."""
+    return equation.params["kernel"] if equation.primitive is _kernel_p else None
+
+
+def make_primitive(name: str, static: str) -> Primitive:
+    """Return a primitive of one instance, which `jax.vmap` batches by an axis in front of all.
+
+    Its arguments and results are arrays; who makes it defines its shapes and its lowering.
+
+    Args:
+      name: its name.
+      static: the name of its parameter, which is not an array.
+    """
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    compiled = jax.jit(primitive.bind, static_argnames=static)
+
+    @primitive.def_impl
+    def run(*arrays: Array, **parameters: Any) -> list[Array]:
+        # Enable jit here: within `jax.disable_jit` this function would call itself.
+        with jax.disable_jit(False):
+            return compiled(*arrays, **parameters)
+
+    def batch(
+        arrays: Sequence[Array], axes: Sequence[int | None], **parameters: Any
+    ) -> tuple[list[Array], list[int]]:
+        (size,) = {x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None}
+        moved = [
+            jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+            for x, axis in zip(arrays, axes, strict=True)
+        ]
+        results = primitive.bind(*moved, **parameters)
+        return results, [0] * len(results)
+
+    batching.primitive_batchers[primitive] = batch
+    return primitive
+
+
+_kernel_p = make_primitive("onekernel", "kernel")
+
+
+def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
+    """Return the batch axes that all arguments have in front of the axes of one instance.
+
+    Raises:
+      KernelError: an argument is not float32.
+      ValueError: an argument does not have the shape that the kernel expects.
+    """
+    shapes = kernel.argument_shapes
+    batch = leaves[0].shape[: leaves[0].ndim - len(shapes[0])]
+    for leaf, shape in zip(leaves, shapes, strict=True):
+        if leaf.dtype != np.float32:
+            error = KernelError(f"one kernel takes float32 only, not {leaf.dtype}", "dtype")
+            raise kernel.explain(error)
+        if leaf.shape != (*batch, *shape):
+            raise ValueError(f"an argument of shape {leaf.shape}, not {(*batch, *shape)}")
+    return batch
+
+
+@_kernel_p.def_abstract_eval
+def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
+    batch = _batch_shape(kernel, leaves)
+    return [ShapedArray(result.shape, result.dtype) for result in kernel.results(*batch)]
+
+
+def _differentiate(primals: Any, tangents: Any, *, kernel: Kernel) -> Any:
+    raise kernel.explain(KernelError("one kernel cannot be differentiated", "derivative"))
+
+
+ad.primitive_jvps[_kernel_p] = _differentiate
+
+
+def probe(
+    launch: Callable[[Kernel, Sequence[Array]], list[Array]], device: Any, instances: int
+) -> str | None:
+    """Run a small kernel, and return why it failed, or None if its result is correct.
+
+    Args:
+      launch: the back end's function.
+      device: the device to run on.
+      instances: the number of instances.
+    """
+    kernel = Kernel(
+        scalarize(lambda x: 2.0 * x + 1.0, jax.ShapeDtypeStruct((2,), jnp.float32)),
+        carried=1,
+        steps=2,
+        fallback=lambda x: [4.0 * x + 3.0],
+    )
+    values = np.arange(2 * instances, dtype=np.float32).reshape(-1, 2)
+    # Run the probe at once, because the caller may be tracing another function.
+    with jax.ensure_compile_time_eval(), jax.default_device(device):
+        try:
+            # An array of JAX would be another program to compile.
+            (result,) = jax.jit(lambda x: launch(kernel, [x]))(values)
+        except jax.errors.JaxRuntimeError as error:
+            return f"a small kernel failed: {str(error).partition(chr(10))[0]}"
+        correct = (np.asarray(result) == 4 * values + 3).all()
+        return None if correct else "a small kernel returned wrong numbers"
+
+
+def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
+    """Return the function that JAX lowers for a back end's platform; None: all other platforms."""
+
+    def lowered(*leaves: Array, kernel: Kernel) -> list[Array]:
+        batch = _batch_shape(kernel, leaves)
+        instances = math.prod(batch)
+        flat = [
+            x.reshape(instances, *shape)
+            for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
+        ]
+        if backend and kernel.impl in ("auto", backend.IMPL) and not backend.obstacle():
+            table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
+            results = backend.launch(kernel, [*flat, *table])
+        elif kernel.impl == "auto":
+            if backend and (obstacle := backend.obstacle()):
+                kernel.on_fallback(obstacle)
+            results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
+        else:
+            platform = backend.PLATFORM if backend else "another platform"
+            raise kernel.explain(KernelError(f"this program is for {platform}", "platform"))
+        wanted = kernel.results(*batch)
+        return [x.reshape(like.shape) for x, like in zip(results, wanted, strict=True)]
+
+    return lowered
+
+
+def register(*backends: Backend) -> None:
+    """Make back ends known to JAX."""
+    mlir.register_lowering(_kernel_p, mlir.lower_fun(_lowered(None), multiple_results=True))
+    for backend in backends:
+        mlir.register_lowering(
+            _kernel_p,
+            mlir.lower_fun(_lowered(backend), multiple_results=True),
+            platform=backend.PLATFORM,
+        )

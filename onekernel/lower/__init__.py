@@ -1,0 +1,5 @@
+"""Lower a jaxpr to operations on scalars, and place them in blocks."""
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

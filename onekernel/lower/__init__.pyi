@@ -1,0 +1,13 @@
+from .evaluation import evaluate as evaluate
+from .jaxpr import ScalarProgram as ScalarProgram
+from .jaxpr import scalarize as scalarize
+from .jaxpr import scalarize_part as scalarize_part
+from .linear_algebra import unroll_linear_algebra as unroll_linear_algebra
+from .scalar_ir import COMPARISONS as COMPARISONS
+from .scalar_ir import Expr as Expr
+from .scalar_ir import Scalar as Scalar
+from .scalar_ir import is_constant as is_constant
+from .schedule import Block as Block
+from .schedule import Item as Item
+from .schedule import PlacedBranch as PlacedBranch
+from .schedule import PlacedLoop as PlacedLoop

@@ -1,0 +1,321 @@
+"""Lower reads and writes at indices that are known only when the program runs.
+
+Scalars have no addresses: what is read is selected among all places where it may be, one comparison
+and one selection for each. That is right for arrays of tens of numbers. An index that is a constant
+costs nothing, as in `indexing`.
+
+A rule is a function of the graph, the equation and its operands.
+"""
+
+import functools
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from onekernel.errors import UnsupportedError
+from onekernel.lower.indexing import (
+    ScalarArray,
+    fill_value,
+    scalar_array,
+    shape_of,
+)
+from onekernel.lower.scalar_ir import ExprGraph, Scalar, is_constant
+
+MAX_PLACES = 256
+"""Largest number of places among which an index may choose; beyond, an address is faster."""
+
+
+def _check_places(count: int) -> None:
+    if count > MAX_PLACES:
+        raise UnsupportedError(f"an index that depends on the state, with {count} places")
+
+
+def _clipped(graph: ExprGraph, start: Scalar, last: int) -> Scalar:
+    """Return a start index, moved into 0 ... last."""
+    if is_constant(start):
+        return min(max(int(start), 0), last)
+    kind = start.dtype.type
+    return graph.apply("min", graph.apply("max", start, kind(0)), kind(last))
+
+
+def _is_inside(graph: ExprGraph, start: Scalar, last: int) -> Scalar:
+    """Return whether a start index is in 0 ... last."""
+    if is_constant(start):
+        return np.bool_(0 <= start <= last)
+    kind = start.dtype.type
+    above = graph.apply("ge", start, kind(0))
+    return graph.apply("and", above, graph.apply("le", start, kind(last)))
+
+
+def _select(
+    graph: ExprGraph, condition: Scalar, if_false: ScalarArray, if_true: ScalarArray
+) -> ScalarArray:
+    pairs = zip(if_false.ravel(), if_true.ravel(), strict=True)
+    return scalar_array((graph.select(condition, *pair) for pair in pairs), if_true.shape)
+
+
+def _read_window(
+    graph: ExprGraph, x: ScalarArray, starts: Sequence[Scalar], sizes: Sequence[int]
+) -> ScalarArray:
+    """Return the window of an array that begins at the given index of each axis, moved inside."""
+    for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
+        last = x.shape[axis] - size
+        at = _clipped(graph, start, last)
+        if is_constant(at):
+            x = np.take(x, range(at, at + size), axis)
+            continue
+        x = _read_along(graph, x, axis, at, last, size)
+    return x
+
+
+def _read_along(
+    graph: ExprGraph, x: ScalarArray, axis: int, at: Scalar, last: int, size: int
+) -> ScalarArray:
+    """Return `size` entries of one axis from an index on, which is in 0 ... last."""
+    _check_places(last + 1)
+    kind = at.dtype.type
+    cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
+    # A tournament: of neighbours, the index tells which one is nearer to it.
+    found = list(enumerate(cases))
+    while len(found) > 1:
+        rounds = []
+        for (first, low), (middle, high) in zip(found[::2], found[1::2], strict=False):
+            is_high = graph.apply("ge", at, kind(middle))
+            rounds.append((first, _select(graph, is_high, low, high)))
+        found = rounds + ([found[-1]] if len(found) % 2 else [])
+    return found[0][1]
+
+
+def _dynamic_slice(
+    graph: ExprGraph, equation: Any, x: ScalarArray, *starts: ScalarArray
+) -> ScalarArray:
+    sizes = equation.params["slice_sizes"]
+    return _read_window(graph, x, [start.item() for start in starts], sizes)
+
+
+def _dynamic_update_slice(
+    graph: ExprGraph, equation: Any, x: ScalarArray, update: ScalarArray, *starts: ScalarArray
+) -> ScalarArray:
+    lasts = [n - size for n, size in zip(x.shape, update.shape, strict=True)]
+    places = [
+        _clipped(graph, start.item(), last) for start, last in zip(starts, lasts, strict=True)
+    ]
+    return _write_window(graph, x, places, update, np.bool_(True), lambda old, new: new)
+
+
+def _write_window(
+    graph: ExprGraph,
+    x: ScalarArray,
+    starts: Sequence[Scalar],
+    update: ScalarArray,
+    is_written: Scalar,
+    combine: Callable[[Scalar, Scalar], Scalar],
+) -> ScalarArray:
+    """Return an array with a window of it combined with an update.
+
+    Args:
+      graph: the graph.
+      x: the array.
+      starts: the index of each axis where the window begins, inside of the array.
+      update: the update, of the window's shape.
+      is_written: whether the window is written at all.
+      combine: a function of an old number and its update that returns the new number.
+    """
+    lasts = [n - size for n, size in zip(x.shape, update.shape, strict=True)]
+    ranges = [
+        [int(start)] if is_constant(start) else range(last + 1)
+        for start, last in zip(starts, lasts, strict=True)
+    ]
+    _check_places(math.prod(map(len, ranges)))
+    result = x.copy()
+    # Go through all places where the window may be; at most one of them is where it is.
+    for place in np.ndindex(*map(len, ranges)):
+        offset = [each[i] for each, i in zip(ranges, place, strict=True)]
+        is_here = is_written
+        for start, i in zip(starts, offset, strict=True):
+            if not is_constant(start):
+                is_here = graph.apply("and", is_here, graph.apply("eq", start, start.dtype.type(i)))
+        for index in np.ndindex(*update.shape):
+            at = tuple(a + b for a, b in zip(offset, index, strict=True))
+            new = combine(x[at], update[index])
+            result[at] = graph.select(is_here, result[at], new)
+    return result
+
+
+def _windows(
+    indices: ScalarArray, dims: jax.lax.GatherDimensionNumbers, rank: int
+) -> list[tuple[tuple[int, ...], list[Scalar]]]:
+    """Return of each window of a gather its place among them and its start along each axis."""
+    batching = list(zip(dims.operand_batching_dims, dims.start_indices_batching_dims, strict=True))
+    found = []
+    for at in np.ndindex(*indices.shape[:-1]):
+        starts: list[Scalar] = [np.int32(0)] * rank
+        for axis, start in zip(dims.start_index_map, indices[at], strict=True):
+            starts[axis] = start
+        for axis, source in batching:
+            starts[axis] = np.int32(at[source])
+        found.append((at, starts))
+    return found
+
+
+def gather(graph: ExprGraph, equation: Any, x: ScalarArray, indices: ScalarArray) -> ScalarArray:
+    """Read windows at indices that may depend on the program's inputs.
+
+    Source: the semantics of gather and scatter in the StableHLO specification.
+    """
+    dims, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    is_filled = "FILL" in str(equation.params["mode"])
+    fill = equation.outvars[0].aval.dtype.type(fill_value(equation)) if is_filled else None
+    fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
+    window_shape = [size for axis, size in enumerate(sizes) if axis not in fixed]
+    result = np.empty((*indices.shape[:-1], *window_shape), object)
+    for at, starts in _windows(indices, dims, x.ndim):
+        window = _read_window(graph, x, starts, sizes)
+        if is_filled:
+            inside = _all_inside(graph, starts, x.shape, sizes)
+            outside = scalar_array([fill] * window.size, window.shape)
+            window = _select(graph, inside, outside, window)
+        result[at] = window.reshape(window_shape)[()]
+    return _with_offsets(result, dims.offset_dims, len(window_shape)).reshape(
+        shape_of(equation.outvars[0])
+    )
+
+
+def _with_offsets(result: ScalarArray, offsets: Sequence[int], count: int) -> ScalarArray:
+    """Move the last `count` axes, those of the windows, to `offsets`."""
+    batch = [axis for axis in range(result.ndim) if axis not in offsets]
+    return result.transpose(np.argsort([*batch, *offsets])) if count else result
+
+
+def _all_inside(
+    graph: ExprGraph, starts: Sequence[Scalar], shape: Sequence[int], sizes: Sequence[int]
+) -> Scalar:
+    inside: Scalar = np.bool_(True)
+    for start, n, size in zip(starts, shape, sizes, strict=True):
+        inside = graph.apply("and", inside, _is_inside(graph, start, n - size))
+    return inside
+
+
+def _scatter(
+    graph: ExprGraph,
+    equation: Any,
+    x: ScalarArray,
+    indices: ScalarArray,
+    updates: ScalarArray,
+    op: str | None = None,
+) -> ScalarArray:
+    # The dimension numbers of a scatter are those of the gather that reads the same windows.
+    dims = jax.lax.GatherDimensionNumbers(*equation.params["dimension_numbers"])
+    fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
+    window = iter(updates.shape[axis] for axis in dims.offset_dims)
+    sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
+    is_clipped = "CLIP" in str(equation.params["mode"])
+
+    def combine(old: Scalar, new: Scalar) -> Scalar:
+        return new if op is None else graph.apply(op, old, new)
+
+    # Bring the axes of the windows to the end, as `_with_offsets` moves them away.
+    batch = [axis for axis in range(updates.ndim) if axis not in dims.offset_dims]
+    ordered = updates.transpose([*batch, *dims.offset_dims])
+    lasts = [n - size for n, size in zip(x.shape, sizes, strict=True)]
+    for at, starts in _windows(indices, dims, x.ndim):
+        update = scalar_array(np.asarray(ordered[at], object).ravel(), sizes)
+        inside: Scalar = np.bool_(True)
+        if not is_clipped:
+            inside = _all_inside(graph, starts, x.shape, sizes)
+        if is_constant(inside) and not inside:
+            continue
+        places = [_clipped(graph, start, last) for start, last in zip(starts, lasts, strict=True)]
+        x = _write_window(graph, x, places, update, inside, combine)
+    return x
+
+
+def _sort(graph: ExprGraph, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    """Sort by a network: neighbours are exchanged until all are in order, which keeps equal ones.
+
+    Keys are compared as `jax.lax.sort` does: -0 equals 0, and NaN comes last.
+    """
+    axis, keys = equation.params["dimension"], equation.params["num_keys"]
+    columns = [np.moveaxis(x, axis, 0).reshape(x.shape[axis], -1).copy() for x in operands]
+    count = operands[0].shape[axis]
+    for lane in range(columns[0].shape[1] if count else 0):
+        rows = [[column[i, lane] for column in columns] for i in range(count)]
+        if all(is_constant(x) for row in rows for x in row[:keys]):
+            rows.sort(key=functools.cmp_to_key(lambda a, b: _order(graph, a[:keys], b[:keys])))
+        else:
+            rows = _in_order(graph, rows, lambda a, b: _is_before(graph, b[:keys], a[:keys]))
+        for i, row in enumerate(rows):
+            for column, x in zip(columns, row, strict=True):
+                column[i, lane] = x
+    shapes = [np.moveaxis(x, axis, 0).shape for x in operands]
+    return [
+        np.moveaxis(x.reshape(shape), 0, axis) for x, shape in zip(columns, shapes, strict=True)
+    ]
+
+
+def _order(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> int:
+    """Return how constant keys compare: below, at or above 0."""
+    return int(bool(_is_before(graph, b, a))) - int(bool(_is_before(graph, a, b)))
+
+
+def _in_order(
+    graph: ExprGraph,
+    rows: list[list[Scalar]],
+    is_wrong: Callable[[list[Scalar], list[Scalar]], Scalar],
+) -> list[list[Scalar]]:
+    """Return rows in an order in which no neighbours are wrong; rows that may stay do."""
+    rows = list(rows)
+    for turn in range(len(rows)):
+        for i in range(turn % 2, len(rows) - 1, 2):
+            swap = is_wrong(rows[i], rows[i + 1])
+            pairs = list(zip(rows[i], rows[i + 1], strict=True))
+            rows[i] = [graph.select(swap, x, y) for x, y in pairs]
+            rows[i + 1] = [graph.select(swap, y, x) for x, y in pairs]
+    return rows
+
+
+def _is_before(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
+    """Return whether a row is before another one by its first key that differs."""
+    result: Scalar = np.bool_(False)
+    for x, y in zip(reversed(a), reversed(b), strict=True):
+        before, same = graph.apply("lt", x, y), graph.apply("eq", x, y)
+        if x.dtype.kind == "f":
+            x_is, y_is = graph.apply("eq", x, x), graph.apply("eq", y, y)
+            last = graph.apply("and", x_is, graph.apply("not", y_is))
+            before = graph.apply("or", before, last)
+            both = graph.apply("not", graph.apply("or", x_is, y_is))
+            same = graph.apply("or", same, both)
+        result = graph.apply("or", before, graph.apply("and", same, result))
+    return result
+
+
+def _top_k(graph: ExprGraph, equation: Any, x: ScalarArray) -> list[ScalarArray]:
+    """Sort the last axis from the largest number to the smallest, and keep the first ones."""
+    count = equation.params["k"]
+    kind = equation.outvars[1].aval.dtype.type
+    found = []
+    for numbers in x.reshape(-1, x.shape[-1]):
+        rows = [[number, kind(i)] for i, number in enumerate(numbers)]
+        rows = _in_order(graph, rows, lambda a, b: _is_before(graph, a[:1], b[:1]))
+        found += rows[:count]
+    shape = (*x.shape[:-1], count)
+    return [scalar_array((row[i] for row in found), shape) for i in range(2)]
+
+
+DYNAMIC_RULES: dict[str, Callable[..., Any]] = {
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": gather,
+    "scatter": _scatter,
+    "scatter-add": functools.partial(_scatter, op="add"),
+    "scatter-max": functools.partial(_scatter, op="max"),
+    "scatter-min": functools.partial(_scatter, op="min"),
+    "scatter-mul": functools.partial(_scatter, op="mul"),
+    "scatter-sub": functools.partial(_scatter, op="sub"),
+    "sort": _sort,
+    "top_k": _top_k,
+}
+"""Lowering rules by the name of the JAX primitive."""

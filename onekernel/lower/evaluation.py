@@ -1,0 +1,48 @@
+"""Run a scalar program in NumPy, without a compiler: the reference for what the back ends run."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from onekernel.errors import UnsupportedError
+from onekernel.lower.jaxpr import ScalarProgram
+from onekernel.lower.scalar_ir import EVALUATE, Expr, Scalar, convert_constant, is_constant
+
+
+def evaluate(program: ScalarProgram, scalars: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Run a program without loops and branches for many instances, in their precision.
+
+    A program with approximate instructions can also be run in float64; one with polynomials works
+    on the bits of float32 numbers.
+
+    Args:
+      program: the program.
+      scalars: the numbers of all instances for each scalar of the program's arguments.
+
+    Returns:
+      The numbers of all instances for each scalar of the program's results.
+
+    Raises:
+      UnsupportedError: the program has a loop or a branch.
+    """
+    # The numbers of each scalar, by its place in the order of recording.
+    inputs = [x for array in program.inputs for x in array.ravel()]
+    values = {x.index: numbers for x, numbers in zip(inputs, scalars, strict=True)}
+
+    def value(x: Scalar) -> np.ndarray:
+        return np.asarray(x) if is_constant(x) else values[x.index]
+
+    # Each operation for all instances at once.
+    with np.errstate(all="ignore"):
+        for item in program.block.items:
+            if not isinstance(item, Expr):
+                raise UnsupportedError("a loop or a branch, evaluated in NumPy")
+            operands = [value(x) for x in item.operands]
+            if item.op == "select":
+                condition, if_false, if_true = operands
+                values[item.index] = np.where(condition, if_true, if_false)
+            elif item.op == "convert":
+                values[item.index] = convert_constant(operands[0], item.dtype)
+            else:
+                values[item.index] = EVALUATE[item.op](*operands)
+    return [value(x) for array in program.outputs for x in array.ravel()]

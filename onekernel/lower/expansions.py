@@ -1,0 +1,319 @@
+"""Compute operations of JAX by other operations of JAX, which have lowering rules.
+
+A function here is what a user could have written in place of the operation: it is traced, and what
+results is lowered. So an operation that is missing needs a formula, and nothing else.
+
+Numbers that float32 holds in a subnormal form are taken for 0 by `exp` and `log`, and so by all
+functions that are made of them.
+
+Source of formulas: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, chapter 4;
+H. S. Warren, Hacker's Delight, chapters 5 and 9. The polynomials are interpolated here.
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from onekernel.errors import UnsupportedError
+
+_LN2 = math.log(2.0)
+_BIG = 1e9
+"""Beyond, x² + 1 and x² are the same float32."""
+
+
+# Functions of floats.
+
+
+def _asin(x: Array) -> Array:
+    return 2.0 * jnp.arctan2(x, 1.0 + jnp.sqrt((1.0 - x) * (1.0 + x)))
+
+
+def _acos(x: Array) -> Array:
+    angle = 2.0 * jnp.arctan2(jnp.sqrt((1.0 - x) * (1.0 + x)), 1.0 + x)
+    return jnp.where(x == -1.0, math.pi, angle)
+
+
+def _atan(x: Array) -> Array:
+    return jnp.arctan2(x, jnp.ones_like(x))
+
+
+def _asinh(x: Array) -> Array:
+    size = jnp.abs(x)
+    square = jnp.minimum(size, _BIG) ** 2
+    near = jnp.log1p(size + square / (1.0 + jnp.sqrt(square + 1.0)))
+    return _with_sign(x, jnp.where(size < _BIG, near, jnp.log(size) + _LN2))
+
+
+def _acosh(x: Array) -> Array:
+    above = jnp.minimum(x, _BIG) - 1.0
+    near = jnp.log1p(above + jnp.sqrt(above * (above + 2.0)))
+    angle = jnp.where(x < _BIG, near, jnp.log(x) + _LN2)
+    return jnp.where(x < 1.0, jnp.nan, angle)
+
+
+def _atanh(x: Array) -> Array:
+    size = jnp.abs(x)
+    return _with_sign(x, 0.5 * jnp.log1p(2.0 * size / (1.0 - size)))
+
+
+def _sinh(x: Array) -> Array:
+    size = jnp.abs(x)
+    grown = jnp.expm1(jnp.minimum(size, 80.0))
+    near = 0.5 * (grown + grown / (grown + 1.0))
+    return _with_sign(x, jnp.where(size < 80.0, near, jnp.exp(size - _LN2)))
+
+
+def _cosh(x: Array) -> Array:
+    return jnp.exp(x - _LN2) + jnp.exp(-x - _LN2)
+
+
+def _exp2(x: Array) -> Array:
+    whole = jnp.round(jnp.clip(x, -127.0, 128.0))
+    power = jax.lax.bitcast_convert_type((whole.astype(jnp.int32) + 127) << 23, jnp.float32)
+    result = jnp.exp((x - whole) * _LN2) * power
+    # Infinity times zero would be no number.
+    return jnp.where(x >= 128.0, jnp.inf, jnp.where(x < -126.0, 0.0, result))
+
+
+def _cbrt(x: Array) -> Array:
+    size = jnp.abs(x)
+    root = jnp.exp(jnp.log(size) * (1.0 / 3.0))
+    # One of Newton's steps gives back what the logarithm has lost.
+    root = root - (root - size / (root * root)) * (1.0 / 3.0)
+    is_end = (x == 0.0) | jnp.isinf(x)
+    return jnp.where(is_end, x, _with_sign(x, root))
+
+
+def power(x: Array, y: Array) -> Array:
+    """Compute x to the power of y, to 1e-5 of the result."""
+    y = y.astype(jnp.float32)
+    size = jnp.abs(x)
+    result = jnp.exp(y * jnp.log(size))
+    # A negative number has powers with whole exponents only.
+    is_whole, is_odd = jnp.floor(y) == y, jnp.floor(y * 0.5) * 2.0 != y
+    is_below = jnp.signbit(x)
+    result = jnp.where(is_below & is_whole & is_odd, -result, result)
+    result = jnp.where((x < 0.0) & ~is_whole & jnp.isfinite(x), jnp.nan, result)
+    return jnp.where((y == 0.0) | (x == 1.0) | ((x == -1.0) & jnp.isinf(y)), 1.0, result)
+
+
+def _with_sign(x: Array, size: Array) -> Array:
+    """Return a number that is not negative with the sign of another one, also of -0."""
+    word = functools.partial(jax.lax.bitcast_convert_type, new_dtype=jnp.uint32)
+    sign = word(x) & np.uint32(1 << 31)
+    return jax.lax.bitcast_convert_type(word(size) | sign, jnp.float32)
+
+
+_ERF_END = 0.8
+_ERFC_SCALE = 0.4
+
+
+@functools.cache
+def _error_polynomials() -> tuple[list[float], list[float]]:
+    """Return the coefficients, highest first, of erf(x)/x in x², and of log(erfc(x)/t) + x² in t.
+
+    For large x, erfc(x) falls like exp(-x²)/x; so it is t exp(-x² + p(t)) with t = 1/(1 + c x).
+    """
+    # Imported late, because few programs need it.
+    from scipy import special
+
+    def fit(function: Callable[[np.ndarray], np.ndarray], degree: int, *ends: float) -> list[float]:
+        found = np.polynomial.Chebyshev.interpolate(function, degree, domain=ends)
+        power = found.convert(kind=np.polynomial.Polynomial, domain=[-1, 1], window=[-1, 1])
+        return [float(c) for c in reversed(power.coef)]
+
+    def tail(t: np.ndarray) -> np.ndarray:
+        x = (1.0 / t - 1.0) / _ERFC_SCALE
+        return np.log(special.erfcx(x) / t)
+
+    near = fit(lambda s: special.erf(np.sqrt(s)) / np.sqrt(s), 7, 1e-12, _ERF_END**2)
+    return near, fit(tail, 11, 0.15, 1.0)
+
+
+def _erf(x: Array) -> Array:
+    near = x * _horner(_error_polynomials()[0], x * x)
+    far = _with_sign(x, 1.0 - _positive_erfc(jnp.abs(x)))
+    return jnp.where(jnp.abs(x) < _ERF_END, near, far)
+
+
+def _erfc(x: Array) -> Array:
+    near = 1.0 - x * _horner(_error_polynomials()[0], x * x)
+    far = _positive_erfc(jnp.abs(x))
+    far = jnp.where(x < 0.0, 2.0 - far, far)
+    return jnp.where(jnp.abs(x) < _ERF_END, near, far)
+
+
+def _positive_erfc(x: Array) -> Array:
+    """Return erfc(x) for x of at least `_ERF_END`; float32 has none beyond x = 10.1."""
+    x = jnp.minimum(x, 11.0)
+    t = 1.0 / (1.0 + _ERFC_SCALE * x)
+    # Square a rounded x exactly: an error of x² would be an error of its exponential.
+    coarse = jax.lax.bitcast_convert_type(
+        jax.lax.bitcast_convert_type(x, jnp.uint32) & np.uint32(0xFFFFF000), jnp.float32
+    )
+    rest = (x - coarse) * (x + coarse)
+    return t * jnp.exp(-coarse * coarse) * jnp.exp(_horner(_error_polynomials()[1], t) - rest)
+
+
+def _horner(coefficients: list[float], x: Array) -> Array:
+    total: Any = coefficients[0]
+    for coefficient in coefficients[1:]:
+        total = total * x + coefficient
+    return total
+
+
+def round_away_from_zero(x: Array) -> Array:
+    """Round to the nearest whole number, and half of one away from zero."""
+    size = jnp.abs(x)
+    below = jnp.floor(size)
+    return _with_sign(x, jnp.where(size - below >= 0.5, below + 1.0, below))
+
+
+# Functions of bits.
+
+
+def _shift_right_arithmetic(x: Array, by: Array) -> Array:
+    if x.dtype.kind == "u":
+        whole = jax.lax.bitcast_convert_type(x, jnp.int32)
+        shifted = _shift_right_arithmetic(whole, by.astype(jnp.int32))
+        return jax.lax.bitcast_convert_type(shifted, x.dtype)
+    shift = jax.lax.shift_right_logical
+    return jnp.where(x < 0, ~shift(~x, by), shift(x, by))
+
+
+def _population_count(x: Array) -> Array:
+    word = x.astype(jnp.uint32)
+    word = word - ((word >> 1) & np.uint32(0x55555555))
+    word = (word & np.uint32(0x33333333)) + ((word >> 2) & np.uint32(0x33333333))
+    word = (word + (word >> 4)) & np.uint32(0x0F0F0F0F)
+    return ((word * np.uint32(0x01010101)) >> 24).astype(x.dtype)
+
+
+def _clz(x: Array) -> Array:
+    word = x.astype(jnp.uint32)
+    # Fill all bits below the highest one, and count those that are left.
+    for by in (1, 2, 4, 8, 16):
+        word = word | (word >> by)
+    return _population_count(~word).astype(x.dtype)
+
+
+def _total_order(x: Array) -> Array:
+    """Return integers in the order of floats by their bits: -NaN < -inf < ... < -0 < 0 < ..."""
+    if x.dtype.kind != "f":
+        return x
+    bits = jax.lax.bitcast_convert_type(x, jnp.int32)
+    return jnp.where(bits < 0, bits ^ np.int32(0x7FFFFFFF), bits)
+
+
+def _lt_to(x: Array, y: Array) -> Array:
+    return _total_order(x) < _total_order(y)
+
+
+def _le_to(x: Array, y: Array) -> Array:
+    return _total_order(x) <= _total_order(y)
+
+
+def _nextafter(x: Array, y: Array) -> Array:
+    order = _total_order(x)
+    # Both zeros are one number.
+    order = jnp.where(x == 0.0, jnp.where(y > 0.0, 0, -1), order)
+    order = jnp.where(y > x, order + 1, order - 1)
+    bits = jnp.where(order < 0, order ^ np.int32(0x7FFFFFFF), order)
+    moved = jax.lax.bitcast_convert_type(bits, jnp.float32)
+    return jnp.where(jnp.isnan(x) | jnp.isnan(y), jnp.nan, jnp.where(x == y, y, moved))
+
+
+def _reduce_precision(x: Array, *, exponent_bits: int, mantissa_bits: int) -> Array:
+    dropped = 23 - mantissa_bits
+    if exponent_bits == 8 and dropped > 0:
+        bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
+        # Round to the nearest, and half to the even.
+        odd = (bits >> dropped) & 1
+        bits = (bits + odd + np.uint32((1 << (dropped - 1)) - 1)) & np.uint32(
+            0xFFFFFFFF & ~((1 << dropped) - 1)
+        )
+        return jnp.where(jnp.isnan(x), x, jax.lax.bitcast_convert_type(bits, jnp.float32))
+    raise UnsupportedError(f"a rounding to {exponent_bits} and {mantissa_bits} bits")
+
+
+def _cumlogsumexp(x: Array, *, axis: int, reverse: bool) -> Array:
+    rows = list(jnp.moveaxis(x, axis, 0))
+    rows = rows[::-1] if reverse else rows
+    for i in range(1, len(rows)):
+        rows[i] = jnp.logaddexp(rows[i - 1], rows[i])
+    return jnp.moveaxis(jnp.stack(rows[::-1] if reverse else rows), 0, axis)
+
+
+def _conv_general_dilated(
+    x: Array,
+    kernel: Array,
+    *,
+    window_strides: Any,
+    padding: Any,
+    lhs_dilation: Any,
+    rhs_dilation: Any,
+    dimension_numbers: Any,
+    feature_group_count: int,
+    batch_group_count: int,
+) -> Array:
+    if batch_group_count != 1:
+        raise UnsupportedError("a convolution with groups of batches")
+    # Bring the axes into the order (batch, channels, space ...), and (outputs, inputs, space ...).
+    x = x.transpose(dimension_numbers.lhs_spec)
+    kernel = kernel.transpose(dimension_numbers.rhs_spec)
+    groups, outputs, inputs = feature_group_count, *kernel.shape[:2]
+    inside = [by - 1 for by in lhs_dilation]
+    widths = [(low, high, n) for (low, high), n in zip(padding, inside, strict=True)]
+    x = jax.lax.pad(x, jnp.zeros((), x.dtype), [(0, 0, 0), (0, 0, 0), *widths])
+    space = kernel.shape[2:]
+    reach = [(n - 1) * by + 1 for n, by in zip(space, rhs_dilation, strict=True)]
+    sizes = zip(x.shape[2:], reach, window_strides, strict=True)
+    shape = [(n - size) // by + 1 for n, size, by in sizes]
+    total = jnp.zeros((len(x), groups, outputs // groups, *shape), x.dtype)
+    # Add what each place of the kernel reads, wherever the kernel lies.
+    for place in np.ndindex(*space):
+        first = [i * by for i, by in zip(place, rhs_dilation, strict=True)]
+        last = [i + (n - 1) * by + 1 for i, n, by in zip(first, shape, window_strides, strict=True)]
+        part = jax.lax.slice(x, (0, 0, *first), (*x.shape[:2], *last), (1, 1, *window_strides))
+        part = part.reshape(len(x), groups, inputs, *shape)
+        weights = kernel[(..., *place)].reshape(groups, outputs // groups, inputs)
+        total = total + jnp.einsum("bgi...,goi->bgo...", part, weights)
+    result = total.reshape(len(x), outputs, *shape)
+    return result.transpose(np.argsort(dimension_numbers.out_spec))
+
+
+EXPANSIONS: dict[str, Callable[..., Any]] = {
+    "acos": _acos,
+    "acosh": _acosh,
+    "asin": _asin,
+    "asinh": _asinh,
+    "atan": _atan,
+    "atanh": _atanh,
+    "cbrt": _cbrt,
+    "ceil": lambda x: -jnp.floor(-x),
+    "clz": _clz,
+    "conv_general_dilated": _conv_general_dilated,
+    "cosh": _cosh,
+    "cumlogsumexp": _cumlogsumexp,
+    "erf": _erf,
+    "erfc": _erfc,
+    "exp2": _exp2,
+    "le_to": _le_to,
+    "log2": lambda x: jnp.log(x) * (1.0 / _LN2),
+    "lt_to": _lt_to,
+    "nextafter": _nextafter,
+    # The derivative of tanh has it since JAX 0.12.
+    "one_minus_square": lambda x: (1.0 - x) * (1.0 + x),
+    "population_count": _population_count,
+    "reduce_precision": _reduce_precision,
+    "shift_right_arithmetic": _shift_right_arithmetic,
+    "sinh": _sinh,
+    "tan": lambda x: jnp.sin(x) / jnp.cos(x),
+}
+"""Functions that compute the JAX primitive of a name; some take its parameters as keywords."""

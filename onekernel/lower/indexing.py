@@ -1,0 +1,154 @@
+"""Lower the JAX operations that only rearrange scalars: slices, gathers, transposes and the like.
+
+They cost nothing in the program, because every index is a constant when the function is lowered.
+"""
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any
+
+import numpy as np
+
+from onekernel.errors import UnsupportedError
+from onekernel.lower.scalar_ir import Scalar, is_constant
+
+ScalarArray = np.ndarray
+"""An array of `Scalar`, dtype object."""
+
+
+def full_array(shape: Sequence[int], make: Callable[[], Scalar]) -> ScalarArray:
+    """Return an array of the given shape whose elements are results of `make`."""
+    return scalar_array((make() for _ in range(math.prod(shape))), shape)
+
+
+def scalar_array(scalars: Iterable[Scalar], shape: Sequence[int]) -> ScalarArray:
+    """Return an array of the given shape from its elements in row-major order."""
+    elements = list(scalars)
+    array = np.empty(len(elements), object)
+    array[:] = elements
+    return array.reshape(shape)
+
+
+def constant_array(array: Any) -> ScalarArray:
+    """Convert an array of constants to an array of scalars."""
+    array = np.asarray(array)
+    return scalar_array(array.ravel(), array.shape)
+
+
+def constant_values(array: ScalarArray, dtype: Any) -> np.ndarray:
+    """Convert scalars that are all constants to a plain NumPy array.
+
+    Args:
+      array: the scalars.
+      dtype: the dtype of the result.
+
+    Returns:
+      The array.
+
+    Raises:
+      UnsupportedError: a scalar depends on an input of the program.
+    """
+    if not all(map(is_constant, array.ravel())):
+        raise UnsupportedError("an index that depends on the state")
+    return np.asarray(list(array.ravel()), dtype).reshape(array.shape)
+
+
+def shape_of(variable: Any) -> tuple[int, ...]:
+    """Return the shape of a jaxpr variable."""
+    return tuple(variable.aval.shape)
+
+
+def fill_value(equation: Any) -> float:
+    """Return what a gather reads beyond its operand."""
+    given = equation.params.get("fill_value")
+    dtype = equation.outvars[0].aval.dtype
+    if given is not None:
+        return given
+    return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
+
+
+def _reshape(equation: Any, x: ScalarArray) -> ScalarArray:
+    return x.reshape(shape_of(equation.outvars[0]))
+
+
+def _slice(equation: Any, x: ScalarArray) -> ScalarArray:
+    params = equation.params
+    strides = params["strides"] or [1] * x.ndim
+    bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
+    return x[tuple(slice(*bound) for bound in bounds)]
+
+
+def _broadcast_in_dim(equation: Any, x: ScalarArray) -> ScalarArray:
+    shape = [1] * len(equation.params["shape"])
+    for axis, size in zip(equation.params["broadcast_dimensions"], x.shape, strict=True):
+        shape[axis] = size
+    return np.broadcast_to(x.reshape(shape), equation.params["shape"])
+
+
+def _unstack(equation: Any, x: ScalarArray) -> list[ScalarArray]:
+    parts = np.split(x, x.shape[equation.params["axis"]], equation.params["axis"])
+    return [part.reshape(shape_of(equation.outvars[0])) for part in parts]
+
+
+def _pad(equation: Any, x: ScalarArray, padding: ScalarArray) -> ScalarArray:
+    widths = equation.params["padding_config"]
+    # Pad between and around the numbers, and then cut off where a width is negative.
+    spread = [
+        max(n - 1, 0) * (inside + 1) + min(n, 1)
+        for n, (*_, inside) in zip(x.shape, widths, strict=True)
+    ]
+    around = [(max(low, 0), max(high, 0)) for low, high, _ in widths]
+    shape = [low + n + high for n, (low, high) in zip(spread, around, strict=True)]
+    padded = full_array(shape, padding.item)
+    padded[
+        tuple(
+            slice(low, low + n, inside + 1)
+            for n, (low, _), (*_, inside) in zip(spread, around, widths, strict=True)
+        )
+    ] = x
+    return padded[
+        tuple(
+            slice(max(-low, 0), n - max(-high, 0))
+            for n, (low, high, _) in zip(shape, widths, strict=True)
+        )
+    ]
+
+
+def _iota(equation: Any) -> ScalarArray:
+    params = equation.params
+    return constant_array(np.indices(params["shape"], params["dtype"])[params["dimension"]])
+
+
+def _empty(equation: Any) -> ScalarArray:
+    variable = equation.outvars[0]
+    return constant_array(np.zeros(shape_of(variable), variable.aval.dtype))
+
+
+RULES: dict[str, Callable[..., Any]] = {
+    "broadcast_in_dim": _broadcast_in_dim,
+    "concatenate": lambda equation, *xs: np.concatenate(xs, equation.params["dimension"]),
+    "copy": lambda equation, x: x,
+    "empty": _empty,
+    "expand_dims": _reshape,
+    "iota": _iota,
+    "optimization_barrier": lambda equation, *xs: list(xs),
+    "pad": _pad,
+    # Arrays are on devices; the scalars of one instance are where it is computed.
+    "pvary": lambda equation, *xs: list(xs),
+    "reshape": _reshape,
+    "reshard": lambda equation, x: x,
+    "rev": lambda equation, x: np.flip(x, equation.params["dimensions"]),
+    "slice": _slice,
+    "split": lambda equation, x: np.split(
+        x, np.cumsum(equation.params["sizes"])[:-1], equation.params["axis"]
+    ),
+    "squeeze": _reshape,
+    "stack": lambda equation, *xs: np.stack(xs, equation.params["axis"]),
+    "stop_gradient": lambda equation, x: x,
+    "tile": lambda equation, x: np.tile(x, equation.params["reps"]),
+    "transpose": lambda equation, x: x.transpose(equation.params["permutation"]),
+    "unstack": _unstack,
+}
+"""Lowering rules of operations that only rearrange scalars, by the name of the JAX primitive.
+
+A rule is a function of the equation and its operands."""

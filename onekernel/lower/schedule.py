@@ -1,0 +1,234 @@
+"""Place each recorded operation in a block of the program.
+
+An `ExprGraph` records dependencies, not an order of execution. This module places every operation
+in a block: outside of all loops that it does not depend on, and inside a branch if only one side of
+the branch needs it.
+
+Source: C. Click, Global Code Motion / Global Value Numbering, PLDI 1995, with blocks that are
+nested instead of a control-flow graph.
+"""
+
+import dataclasses
+from collections.abc import Iterable, Iterator
+from typing import TypeAlias
+
+from onekernel.lower.scalar_ir import Branch, Expr, Loop, Scalar, is_constant
+
+Item: TypeAlias = "Expr | PlacedLoop | PlacedBranch"
+_Node: TypeAlias = Expr | Loop | Branch
+
+
+@dataclasses.dataclass(eq=False, repr=False)
+class Block:
+    """A `Block` holds operations that are executed one after the other."""
+
+    parent: "Block | None" = None
+    """The enclosing block, whose values this block can use; None: the outermost block."""
+    loop: Loop | None = None
+    """The loop whose head this block is; None: this block is no loop's head."""
+    items: list[Item] = dataclasses.field(default_factory=list)
+
+    def ancestors(self) -> "Iterator[Block]":
+        """Yield this block and all enclosing blocks, the innermost first."""
+        block: Block | None = self
+        while block is not None:
+            yield block
+            block = block.parent
+
+    def values(self) -> Iterator[Expr]:
+        """Yield all operations of this block and of the blocks inside it."""
+        for item in self.items:
+            if isinstance(item, Expr):
+                yield item
+            else:
+                for block in item.blocks:
+                    yield from block.values()
+
+
+@dataclasses.dataclass(eq=False, repr=False)
+class PlacedLoop:
+    """A `PlacedLoop` is a loop whose `head` computes the condition and `body` the iteration."""
+
+    loop: Loop
+    places: list[int]
+    """Indices of the carries that are needed; the others are not computed."""
+    results: list[Expr]
+    """The results that are needed."""
+    head: Block
+    body: Block
+
+    @property
+    def blocks(self) -> tuple[Block, Block]:
+        """Return the blocks inside."""
+        return self.head, self.body
+
+
+@dataclasses.dataclass(eq=False, repr=False)
+class PlacedBranch:
+    """A `PlacedBranch` is a branch with a block for each side."""
+
+    branch: Branch
+    results: list[Expr]
+    """The results that are needed."""
+    if_false: Block
+    if_true: Block
+
+    @property
+    def blocks(self) -> tuple[Block, Block]:
+        """Return the blocks inside."""
+        return self.if_false, self.if_true
+
+
+def schedule(outputs: Iterable[Scalar]) -> Block:
+    """Place all operations that the outputs depend on.
+
+    Args:
+      outputs: the scalars that the program returns; constants are not placed.
+
+    Returns:
+      The outermost block. Every operand of an item precedes it in the same block or in an enclosing
+      one.
+    """
+    return _Scheduler().schedule([x for x in outputs if not is_constant(x)])
+
+
+class _Scheduler:
+    """A `_Scheduler` places operations from the last to the first, so that users come first."""
+
+    def __init__(self) -> None:
+        self._reached: dict[int, _Node] = {}
+        self._results: dict[int, list[Expr]] = {}
+        self._carries: dict[int, list[int]] = {}
+        self._loops: dict[int, frozenset[int]] = {}
+        self._use: dict[int, Block] = {}
+
+    def schedule(self, outputs: list[Expr]) -> Block:
+        root = Block()
+        # Find the loops that each operation depends on, in the order of recording.
+        self._reach(outputs)
+        nodes = sorted(self._reached.values(), key=lambda node: node.index)
+        for node in nodes:
+            inputs = [self._loops[x.index] for x in self._inputs(node)]
+            own = {node.index} if isinstance(node, Loop) else set()
+            carried = {self._owner(node).index} if _op(node) == "carry" else set()
+            self._loops[node.index] = frozenset().union(*inputs, carried) - own
+        # Place the operations in reverse order, so that all users of one are placed before it.
+        self._add_uses(root, outputs)
+        blocks = [root]
+        for node in reversed(nodes):
+            if isinstance(node, Expr):
+                self._place_value(node)
+            else:
+                blocks += self._place_control(node)
+        for block in blocks:
+            block.items.reverse()
+        return root
+
+    def _reach(self, outputs: list[Expr]) -> None:
+        pending: list[_Node] = list(outputs)
+        while pending:
+            node = pending.pop()
+            if node.index in self._reached:
+                continue
+            self._reached[node.index] = node
+            if isinstance(node, Expr) and node.owner is not None:
+                pending += self._reach_owned(node)
+            elif isinstance(node, Expr):
+                pending += _expressions(node.operands)
+            else:
+                pending += _expressions([node.condition])
+
+    def _reach_owned(self, value: Expr) -> list[_Node]:
+        owner, place = self._owner(value), value.place
+        if value.op == "carry":
+            assert isinstance(owner, Loop)
+            self._carries.setdefault(owner.index, []).append(place)
+            return [owner, *_expressions([owner.initial[place], owner.updated[place]])]
+        self._results.setdefault(owner.index, []).append(value)
+        sides = (
+            [owner.results[place]]
+            if isinstance(owner, Loop)
+            else [owner.if_false[place], owner.if_true[place]]
+        )
+        return [owner, *_expressions(sides)]
+
+    def _owner(self, value: _Node) -> Loop | Branch:
+        assert isinstance(value, Expr)
+        assert value.owner is not None
+        return value.owner
+
+    def _inputs(self, node: _Node) -> list[_Node]:
+        """Return all dependencies of a node, except the next value of a carry of the same loop."""
+        if isinstance(node, Expr):
+            if node.op == "carry":
+                return []
+            return [self._owner(node)] if node.op == "result" else [*_expressions(node.operands)]
+        results = [value.place for value in self._results.get(node.index, [])]
+        if isinstance(node, Branch):
+            sides = [side[place] for place in results for side in (node.if_false, node.if_true)]
+            return [*_expressions([node.condition, *sides])]
+        places = self._carries.get(node.index, [])
+        scalars = [side[place] for place in places for side in (node.initial, node.updated)]
+        return [*_expressions([node.condition, *scalars, *(node.results[i] for i in results)])]
+
+    def _place_value(self, value: Expr) -> None:
+        if value.op in ("input", "carry"):
+            return
+        if value.op == "result":
+            self._add_uses(self._use[value.index], [self._owner(value)])
+            return
+        block = self._place(value)
+        block.items.append(value)
+        self._add_uses(block, _expressions(value.operands))
+
+    def _place_control(self, node: Loop | Branch) -> tuple[Block, Block]:
+        block = self._place(node)
+        results = sorted(self._results.get(node.index, []), key=lambda value: value.place)
+        places = [value.place for value in results]
+        if isinstance(node, Branch):
+            if_false, if_true = Block(block), Block(block)
+            block.items.append(PlacedBranch(node, results, if_false, if_true))
+            self._add_uses(block, _expressions([node.condition]))
+            self._add_uses(if_false, _expressions(node.if_false[place] for place in places))
+            self._add_uses(if_true, _expressions(node.if_true[place] for place in places))
+            return if_false, if_true
+        head = Block(block, node)
+        body = Block(head)
+        carries = sorted(self._carries.get(node.index, []))
+        block.items.append(PlacedLoop(node, carries, results, head, body))
+        self._add_uses(block, _expressions(node.initial[place] for place in carries))
+        self._add_uses(
+            head, _expressions([node.condition, *(node.results[place] for place in places)])
+        )
+        self._add_uses(body, _expressions(node.updated[place] for place in carries))
+        return head, body
+
+    def _place(self, node: _Node) -> Block:
+        """Return the innermost block that encloses all users, outside of independent loops."""
+        block = self._use[node.index]
+        for head in [x for x in block.ancestors() if x.loop is not None]:
+            assert head.loop is not None
+            if head.loop.index in self._loops[node.index]:
+                break
+            assert head.parent is not None
+            block = head.parent
+        return block
+
+    def _add_uses(self, block: Block, nodes: Iterable[_Node]) -> None:
+        for node in nodes:
+            known = self._use.get(node.index)
+            self._use[node.index] = block if known is None else _common_ancestor(known, block)
+
+
+def _expressions(scalars: Iterable[Scalar]) -> list[Expr]:
+    return [x for x in scalars if not is_constant(x)]
+
+
+def _op(node: _Node) -> str:
+    return node.op if isinstance(node, Expr) else ""
+
+
+def _common_ancestor(one: Block, other: Block) -> Block:
+    """Return the innermost block that contains both blocks."""
+    around = set(map(id, one.ancestors()))
+    return next(block for block in other.ancestors() if id(block) in around)

@@ -1,0 +1,336 @@
+"""Kernels that XLA calls on a CPU: batches, devices, files kept. What one computes: test_llvm."""
+
+import functools
+import json
+import os
+import subprocess
+import sys
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.experimental.compilation_cache import compilation_cache
+from jax.sharding import Mesh, PartitionSpec
+
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs import program_key
+from jetbot_mjx.envs.jetbot_env import make_env
+from jetbot_mjx.envs.program_key import open_program_cache
+from jetbot_mjx.errors import UserError
+from onekernel import cpu, kernel
+from onekernel.cpu import xla_call
+from onekernel.lower.jaxpr import scalarize
+
+pytestmark = pytest.mark.cpu
+
+DEVICES = 8
+
+needs_it = pytest.mark.skipif(
+    cpu.obstacle() is not None, reason="llvmlite compiles nothing for XLA"
+)
+
+
+def kernel_of(function, *shapes, carried=1, steps=1):
+    program = scalarize(function, *shapes)
+    return kernel.Kernel(program, carried=carried, steps=steps, fallback=list, impl="llvm")
+
+
+def made_step():
+    def once(changing, held):
+        return {"x": changing["x"] * held, "n": changing["n"] + 1}
+
+    shapes = {"x": jnp.zeros(3), "n": jnp.zeros(())}
+    return kernel_of(once, shapes, jnp.zeros(()), carried=2, steps=2).as_step()
+
+
+@pytest.fixture(scope="module")
+def step():
+    return made_step()
+
+
+@pytest.fixture
+def cache(tmp_path):
+    before = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", str(tmp_path))
+    yield tmp_path
+    jax.config.update("jax_compilation_cache_dir", before)
+
+
+@needs_it
+def test_one_robot_or_any_batch_of_batches_in_a_loop(step):
+    def body(states, held):
+        return jax.vmap(jax.vmap(step), in_axes=(0, None))(states, held), states["n"][0, 0]
+
+    states = {"x": jnp.ones((2, 17, 3)), "n": jnp.zeros((2, 17))}
+    held = jnp.broadcast_to(jnp.arange(1.0, 4.0)[:, None], (3, 17))
+    last, counts = jax.jit(lambda s: jax.lax.scan(body, s, held))(states)
+    np.testing.assert_array_equal(counts, [0, 2, 4])
+    np.testing.assert_array_equal(last["x"], np.full((2, 17, 3), 36))
+    alone = step({"x": jnp.arange(3.0), "n": jnp.zeros(())}, jnp.float32(3))
+    np.testing.assert_array_equal(alone["x"], [0, 9, 18])
+
+
+@pytest.fixture(scope="module", params=["isaac", pytest.param("real", marks=pytest.mark.slow)])
+def driven(request):
+    """An environment of each preset, and a function that drives so many robots with targets."""
+    env = make_env(parse_config({"robot": {"preset": request.param}, "physics": {"impl": "llvm"}}))
+    assert env.physics.impl == "llvm"
+    return env, functools.partial(drive, env)
+
+
+def drive(env, targets):
+    """Where robots end after targets (t, n, 2), each held for 16 steps."""
+
+    @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
+    def run(states, targets):
+        step = jax.vmap(env.step_physics)
+
+        def hold(states, target):
+            return jax.lax.fori_loop(0, 16, lambda _, s: step(s, target), states), None
+
+        return jax.lax.scan(hold, states, targets)[0]
+
+    keys = jax.random.split(jax.random.PRNGKey(0), targets.shape[1])
+    return run(jax.vmap(env.reset)(keys).pipeline_state, targets)
+
+
+def drawn(robots, holds=16):
+    rng = np.random.default_rng(0)
+    return jnp.asarray(rng.uniform(-12, 31, (holds, robots, 2)), jnp.float32)
+
+
+@needs_it
+def test_it_drives_as_xla_does(driven):
+    env, drive_it = driven
+    values = env.config.model_dump(mode="json")
+    values["physics"]["impl"] = "xla"
+    ours, theirs = drive_it(drawn(24)), drive(make_env(parse_config(values)), drawn(24))
+    # After 256 environment steps; a wheel has turned some 100 rad by then.
+    np.testing.assert_allclose(ours.qpos[:, :7], theirs.qpos[:, :7], atol=1e-3)
+    np.testing.assert_allclose(ours.qpos[:, 7:], theirs.qpos[:, 7:], atol=5e-2)
+    assert np.ptp(np.asarray(ours.qpos[:, 0])) > 0.5
+
+
+@needs_it
+def test_a_robots_bits_do_not_depend_on_those_beside_it(driven):
+    _, drive_it = driven
+    targets = drawn(1000, holds=2)
+    together = drive_it(targets)
+    for robots in (
+        1,
+        cpu.host_processor().lanes - 1,
+        cpu.host_processor().lanes + 1,
+    ):
+        few = drive_it(targets[:, :robots])
+        np.testing.assert_array_equal(few.qpos, together.qpos[:robots])
+    spoilt = drive_it(targets.at[0, 3].set(jnp.nan))
+    others = np.delete(np.arange(1000), 3)
+    assert not np.isfinite(spoilt.qpos[3]).any()
+    np.testing.assert_array_equal(spoilt.qpos[others], together.qpos[others])
+
+
+@needs_it
+def test_models_that_differ_from_robot_to_robot_go_into_the_kernel():
+    env = make_env(parse_config({}))
+    gains = jnp.float32([0.5, 1.0])
+
+    def one(gain):
+        gainprm = env.mjx_model.actuator_gainprm * gain
+        here = env.with_model(env.mjx_model.replace(actuator_gainprm=gainprm))
+        assert here.physics.impl == "llvm"
+        state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+        return here.step_physics(state, jnp.ones(2)).qvel
+
+    ours = jax.vmap(one)(gains)
+    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    np.testing.assert_allclose(ours[1], env.step_physics(state, jnp.ones(2)).qvel, atol=1e-5)
+    assert ours[0, 6] < 0.9 * ours[1, 6]
+
+
+@needs_it
+def test_on_eight_devices_at_once_each_steps_its_own():
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={DEVICES}"
+    done = subprocess.run(
+        [sys.executable, __file__],
+        env={**os.environ, "XLA_FLAGS": flags.strip()},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert done.returncode == 0, done.stderr
+    # MJX prints lines of its own where its optional part Warp is missing.
+    assert json.loads(done.stdout.splitlines()[-1]) == [
+        4.0 ** (2 * steps) for steps in range(1, DEVICES + 1)
+    ]
+
+
+def tell():
+    """The other process: every device with robots, and work for several threads."""
+    step = made_step()
+    mesh = Mesh(np.array(jax.devices()), ("i",))
+    assert mesh.size == DEVICES
+
+    def on_one(states, held):
+        states = jax.lax.fori_loop(0, 100, lambda _, s: jax.vmap(step)(s, held), states)
+        return states["x"][:, 0]
+
+    robots = DEVICES * 500
+    factor = 4.0 ** (np.arange(DEVICES) / 100 + 1 / 100)
+    states = {"x": jnp.ones((robots, 3)), "n": jnp.zeros(robots)}
+    spec = PartitionSpec("i")
+    on_all = jax.jit(
+        jax.shard_map(on_one, mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    )
+    held = jnp.asarray(np.repeat(factor, 500), jnp.float32)
+    ends = np.asarray(on_all(states, held)).reshape(DEVICES, 500)
+    assert (ends == ends[:, :1]).all()
+    print(json.dumps([float(4.0 ** round(np.log(x) / np.log(4))) for x in ends[:, 0]]))
+
+
+@needs_it
+def test_threads_that_trace_at_once_compile_it_once(monkeypatch):
+    compiled = []
+    original = cpu._compile
+    monkeypatch.setattr(cpu, "_compile", lambda text: compiled.append(text) or original(text))
+    shape = jax.ShapeDtypeStruct((2,), jnp.float32)
+    written = kernel_of(lambda x: x - 41.5, shape)
+    x = jnp.ones((3, 2))
+    results = []
+
+    def trace():
+        results.append(jax.jit(lambda x: cpu.launch(written, [x])[0])(x))
+
+    with_no_cache = jax.config.values["jax_compilation_cache_dir"]
+    jax.config.update("jax_compilation_cache_dir", None)
+    try:
+        threads = [threading.Thread(target=trace) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    finally:
+        jax.config.update("jax_compilation_cache_dir", with_no_cache)
+    assert len(compiled) == 1
+    np.testing.assert_array_equal(results, np.full((4, 3, 2), -40.5))
+
+
+@needs_it
+def test_machine_code_is_kept_for_its_text_and_its_processor(cache, monkeypatch):
+    compiled = []
+    monkeypatch.setattr(cpu, "_compile", lambda text: compiled.append(text) or b"code")
+
+    def compiles(text="text"):
+        before = len(compiled)
+        assert cpu._machine_code(text) == b"code"
+        return len(compiled) - before
+
+    assert (compiles(), compiles()) == (1, 0)
+    (kept,) = cache.glob("object-*")
+    kept.write_bytes(kept.read_bytes()[:-1])
+    assert (compiles(), compiles()) == (1, 0)
+    assert (compiles("other"), compiles("other")) == (1, 0)
+    host = cpu.host_processor()
+    for other in ({"name": "x86-64"}, {"features": ""}, {"version": "0"}):
+        monkeypatch.setattr(cpu, "host_processor", lambda other=other: host._replace(**other))
+        assert (compiles(), compiles()) == (1, 0)
+
+
+@needs_it
+def test_another_kernel_has_another_name():
+    shape = jax.ShapeDtypeStruct((2,), jnp.float32)
+    texts = [
+        cpu.kernel_text(kernel_of(lambda x, n=n: x + n, shape, steps=steps))
+        for n, steps in ((1.0, 1), (2.0, 1), (1.0, 2))
+    ]
+    assert len({cpu.registered(text) for text in texts}) == 3
+
+
+@pytest.fixture
+def fresh():
+    """Where JAX keeps nothing: what it found in its own cache, a CPU could not write again."""
+    before = jax.config.values["jax_enable_compilation_cache"]
+    jax.config.update("jax_enable_compilation_cache", False)
+    compilation_cache.reset_cache()  # or what an earlier test had asked for would hold
+    yield
+    jax.config.update("jax_enable_compilation_cache", before)
+    compilation_cache.reset_cache()
+
+
+@needs_it
+def test_a_kept_program_brings_its_kernels_into_the_next_process(
+    cache, fresh, own_tasks, monkeypatch
+):
+    monkeypatch.setattr(program_key, "BUILT_IN_TASKS", own_tasks)
+    shape = jax.ShapeDtypeStruct((2,), jnp.float32)
+    written = kernel_of(lambda x: x * 2.5, shape)
+    x = np.ones((3, 2), np.float32)
+    config = parse_config({})
+    program = open_program_cache(config).compile(
+        "test", lambda: jax.jit(lambda x: cpu.launch(written, [x])[0]).trace(x)
+    )
+    (name,) = cpu.kernels_in(program.as_text())
+    # As in a new process, but that XLA knows the name already.
+    monkeypatch.setattr(cpu, "_loaded", {})
+    told = []
+    monkeypatch.setattr(jax.ffi, "register_ffi_target", lambda name, *_, **__: told.append(name))
+    found = open_program_cache(config).find("test")
+    assert told == [name]
+    np.testing.assert_array_equal(found(x), np.full((3, 2), 2.5))
+
+
+@pytest.fixture
+def asked_anew():
+    cpu.obstacle.cache_clear()
+    cpu.host_processor.cache_clear()
+    cpu._binding.cache_clear()
+    yield
+    cpu.obstacle.cache_clear()
+    cpu.host_processor.cache_clear()
+    cpu._binding.cache_clear()
+
+
+def without_llvmlite(monkeypatch):
+    monkeypatch.setitem(sys.modules, "llvmlite.binding", None)
+
+
+def with_an_xla_of_another_version(monkeypatch):
+    own, other = "store i32 3, ptr %minor.at", "store i32 99, ptr %minor.at"
+    assert own in xla_call.TEXT
+    monkeypatch.setattr(xla_call, "TEXT", xla_call.TEXT.replace(own, other))
+
+
+def with_an_xla_of_other_structures(monkeypatch):
+    monkeypatch.setattr(xla_call, "TEXT", xla_call.TEXT.replace("i64 168", "i64 176"))
+
+
+def on_another_processor(monkeypatch):
+    monkeypatch.setattr(xla_call, "MACHINES", ())
+
+
+@pytest.mark.parametrize(
+    "where",
+    [
+        without_llvmlite,
+        with_an_xla_of_another_version,
+        with_an_xla_of_other_structures,
+        on_another_processor,
+    ],
+)
+def test_where_it_cannot_be_had_xla_makes_the_step_and_one_line_says_so(
+    asked_anew, where, monkeypatch, capsys
+):
+    where(monkeypatch)
+    env = make_env(parse_config({}))
+    for _ in range(2):
+        jax.eval_shape(lambda key: env.step(env.reset(key), jnp.zeros(2)), jax.random.PRNGKey(0))
+    assert env.physics.impl == "xla"
+    line = f"slow: physics.impl: training is 5 to 11 times slower: {cpu.obstacle()}\n"
+    assert capsys.readouterr().err == line
+    with pytest.raises(UserError, match=r"physics\.impl = llvm: .+; or choose xla or auto"):
+        make_env(parse_config({"physics": {"impl": "llvm"}}))
+
+
+if __name__ == "__main__":
+    tell()

@@ -1,0 +1,107 @@
+"""Kernels in PTX: what can be told of them without a GPU, and what they compute on one."""
+
+import re
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from helpers.kernel_cases import FUNCTIONS, VECTOR, robots
+from jetbot_mjx.config import parse_config
+from jetbot_mjx.envs.jetbot_env import make_env
+from onekernel import gpu
+from onekernel.kernel import Kernel
+from onekernel.lower.jaxpr import scalarize
+
+pytest.importorskip("llvmlite")
+on_a_gpu = pytest.mark.skipif(gpu.obstacle() is not None, reason="there is no NVIDIA GPU")
+
+
+def kernel(function, *shapes, carried=1, steps=1):
+    program = scalarize(function, *(shapes or (VECTOR,)))
+    return Kernel(program, carried=carried, steps=steps, fallback=function, impl="ptx")
+
+
+@pytest.mark.parametrize("architecture", [70, 80, 90])
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_it_is_compiled_for_every_architecture(name, architecture):
+    text = gpu.compiled(kernel(FUNCTIONS[name]), architecture)
+    assert f".target sm_{architecture}" in text
+    assert text.count(gpu.INSTANCES) == 1
+    assert f".maxntid {gpu.MAX_THREADS}" in text
+    # All threads of a block begin a step together.
+    assert len(re.findall(r"bar(rier)?\.(cta\.)?sync", text)) == 1
+    # Values in between stay in registers.
+    assert text.count("st.global") == 4
+    assert text.count("ld.global") <= 4
+    assert not re.search(r"\b(ld|st)\.local", text)
+    assert "call" not in text
+
+
+@pytest.mark.parametrize(
+    ("robots", "threads"),
+    [(1, 32), (4096, 32), (4097, 64), (16384, 128), (65536, 256), (10**7, 256)],
+)
+def test_blocks_grow_with_the_number_of_robots(robots, threads):
+    assert gpu.threads_in_block(robots) == threads
+
+
+@pytest.mark.skipif(gpu.obstacle() is None, reason="there is an NVIDIA GPU")
+def test_without_a_gpu_there_is_none():
+    assert make_env(parse_config({})).physics.impl != "ptx"
+
+
+@on_a_gpu
+@pytest.mark.parametrize("name", FUNCTIONS)
+def test_it_does_what_the_function_does(name):
+    x = robots(300)
+    step = kernel(lambda x, held: FUNCTIONS[name](x), VECTOR, ()).as_step()
+    ours = jax.jit(jax.vmap(lambda x: step(x, ())))(x)
+    with jax.default_matmul_precision("highest"):
+        theirs = jax.jit(jax.vmap(FUNCTIONS[name]))(x)
+    np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
+
+
+@on_a_gpu
+@pytest.mark.parametrize("preset", ["isaac", "real"])
+def test_it_drives_as_xla_does(preset):
+    count = 256
+    rng = np.random.default_rng(0)
+    targets = rng.uniform(-12, 31, (16, count, 2)).astype(np.float32)
+    ends = []
+    for impl in ("ptx", "xla"):
+        env = make_env(parse_config({"robot": {"preset": preset}, "physics": {"impl": impl}}))
+        keys = jax.random.split(jax.random.PRNGKey(0), count)
+        states = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
+        step = jax.jit(jax.vmap(env.step_physics))
+        for ctrl in np.repeat(targets, 16, 0):
+            states = step(states, ctrl)
+        ends.append(np.asarray(states.qpos))
+    np.testing.assert_allclose(*ends, atol=1e-3)
+
+
+@on_a_gpu
+def test_a_robots_bits_do_not_depend_on_those_beside_it():
+    env = make_env(parse_config({"physics": {"impl": "ptx"}}))
+    keys = jax.random.split(jax.random.PRNGKey(0), 1000)
+    states = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
+    ctrl = np.random.default_rng(0).choice([-12.0, 31.0], (1000, 2)).astype(np.float32)
+    step = jax.jit(
+        lambda s, c: jax.lax.fori_loop(0, 20, lambda _, s: jax.vmap(env.step_physics)(s, c), s)
+    )
+    together = step(states, ctrl)
+    for few in (1, 31, 33):
+        alone = step(jax.tree.map(lambda x, few=few: x[:few], states), ctrl[:few])
+        np.testing.assert_array_equal(alone.qpos, together.qpos[:few])
+
+
+@on_a_gpu
+def test_a_program_for_the_cpu_steps_by_its_own_kernel_beside_it():
+    env = make_env(parse_config({}))
+    state = env.reset(jax.random.PRNGKey(0)).pipeline_state
+    here = env.step_physics(state, jnp.ones(2))
+    on_cpu = jax.device_put((state, jnp.ones(2)), jax.devices("cpu")[0])
+    there = jax.jit(env.step_physics)(*on_cpu)
+    assert there.qpos.devices() == {jax.devices("cpu")[0]}
+    np.testing.assert_allclose(here.qpos, there.qpos, atol=1e-5)

@@ -1,0 +1,203 @@
+"""Runs by name, lists of runs, and the errors for unknown names."""
+
+import json
+import os
+import re
+from pathlib import Path
+
+import pytest
+
+from helpers.run_folders import make_run
+from jetbot_mjx import list_runs as list_runs_command
+from jetbot_mjx.config import ConfigError, find_config, load_config, parse_config, shipped_configs
+from jetbot_mjx.errors import NotFoundError
+from jetbot_mjx.runs.checkpoint import find_checkpoint, load_checkpoint, load_policy
+from jetbot_mjx.runs.checkpoint_store import CheckpointError
+from jetbot_mjx.runs.run_dir import DamagedRunError
+from jetbot_mjx.runs.run_finder import (
+    PRETRAINED,
+    find_run,
+    list_runs,
+    read_info,
+    runs_table,
+    scan_runs,
+)
+
+
+
+
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    make_run(tmp_path / "runs/older", (0, 10.0, 0.1), (1_000_000, 20.0, 0.9))
+    make_run(tmp_path / "runs/newer", (0, 30.0, 0.2), (500_000, 40.0, 0.7), (600_000, 50.0, 0.5))
+    (tmp_path / "runs/no run").mkdir()
+    return tmp_path
+
+
+def test_a_run_is_found_by_each_of_its_names(runs):
+    assert str(find_run("latest")) == "runs/newer"
+    assert str(find_run("older")) == "runs/older"
+    assert str(find_run("runs/older")) == "runs/older"
+    assert find_run(runs / "runs" / "older") == runs / "runs" / "older"
+    assert find_run("pretrained:real_jetbot") == PRETRAINED / "real_jetbot"
+    # A path comes before a name.
+    make_run(runs / "older", (0, 1.0, 0.0))
+    assert str(find_run("older")) == "older"
+
+
+def test_a_missing_run_is_refused_with_the_likely_name(runs):
+    with pytest.raises(CheckpointError, match=r"did you mean newer\?") as caught:
+        find_checkpoint("newr")
+    assert isinstance(caught.value, FileNotFoundError)
+    with pytest.raises(CheckpointError, match="give a run folder or a checkpoint in it"):
+        find_checkpoint("something else")
+    names = "there are camera_real, jetbot_camera, jetbot_egocentric, real_jetbot"
+    with pytest.raises(NotFoundError, match=names):
+        find_run("pretrained:x")
+
+
+def test_a_folder_of_runs_says_which_there_are(runs):
+    with pytest.raises(CheckpointError, match="it holds 2 runs; name one of newer, older"):
+        find_checkpoint("runs")
+
+
+def test_without_runs_there_is_no_latest(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(NotFoundError, match="there is no run in runs/: train one first"):
+        find_run("latest")
+
+
+def test_python_takes_names_too():
+    assert load_policy("pretrained:jetbot_egocentric") is not None
+
+
+def test_results_of_the_package_s_runs_go_to_the_current_folder():
+    checkpoint = load_checkpoint("pretrained:jetbot_egocentric")
+    assert str(checkpoint.results_dir) == "runs/pretrained/jetbot_egocentric"
+    own = checkpoint._replace(run_dir=Path("runs/mine"))
+    assert own.results_dir == Path("runs/mine")
+
+
+def test_runs_are_listed_the_latest_first(runs):
+    newer, older = list_runs()
+    assert (newer.name, older.name) == ("newer", "older")
+    assert (newer.env_steps, newer.success_rate, newer.changed) == (600_000, 0.7, 50.0)
+    assert older.task == "jetbot_mjx:GoalTask isaac world"
+    lines = runs_table([newer, older]).splitlines()
+    assert lines[0].split() == ["run", "task", "steps", "success", "age"]
+    assert lines[1].split()[4:7] == ["600,000", "*", "70.0%"]
+    assert lines[2].split()[4:6] == ["1,000,000", "90.0%"]
+    assert "stopped before its last step" in lines[-1]
+
+
+LAUGHS = "a0: &a0 [x, x]\n" + "".join(
+    f"a{n}: &a{n} [{', '.join([f'*a{n - 1}'] * 9)}]\n" for n in range(1, 12)
+)
+
+
+def config_cut(length):
+    """A harm: the configuration ends after so many characters, or lines if that is negative."""
+
+    def cut(path):
+        text = path.read_text()
+        lines = text.splitlines(keepends=True)
+        path.write_text(text[:length] if length >= 0 else "".join(lines[:length]))
+
+    return cut
+
+
+HARMS = {
+    "open": (lambda path: path.write_text("seed: [\n"), "line 2 is not valid YAML"),
+    "empty": (config_cut(0), "config.yaml is empty"),
+    "one character": (config_cut(1), "was cut off: its last line is not complete"),
+    "half": (config_cut(700), "was cut off: its last line is not complete"),
+    "whole lines": (config_cut(-30), "was cut off: it has no section evaluation"),
+    "before the last section": (config_cut(-3), "was cut off: it has no section evaluation"),
+    "aliases": (lambda path: path.write_text(LAUGHS), "aliases stand for more than 100,000"),
+    "digits": (lambda path: path.write_text(f"seed: {'9' * 5000}\n"), "has too many digits"),
+    "large": (lambda path: path.write_text("#" * 200_000 + "\n"), "more than 100,000 characters"),
+    "binary": (lambda path: path.write_bytes(b"\xff\n"), "is not UTF-8 text"),
+    "gone": (lambda path: path.unlink(), "config.yaml is missing"),
+    "folder": (lambda path: (path.unlink(), path.mkdir()), "cannot be read: Is a directory"),
+    "pipe": (lambda path: (path.unlink(), os.mkfifo(path)), "is not a regular file"),
+    "loop": (lambda path: (path.unlink(), path.symlink_to(path.name)), "levels of symbolic links"),
+    "device": (lambda path: (path.unlink(), path.symlink_to("/dev/zero")), "not a regular file"),
+}
+
+
+@pytest.mark.parametrize(("harm", "said"), HARMS.values(), ids=HARMS)
+def test_a_damaged_run_is_listed_with_the_reason_and_stops_no_other(runs, capsys, harm, said):
+    harm(runs / "runs/newer/config.yaml")
+    assert [run.name for run in list_runs()] == ["older"]
+    assert str(find_run("latest")) == "runs/older"
+    with pytest.raises(DamagedRunError, match=re.escape(said)):
+        read_info(runs / "runs/newer")
+    assert list_runs_command.main(["runs"]) == 0
+    _, older, damaged = capsys.readouterr().out.splitlines()
+    assert older.startswith("older ")
+    assert damaged.startswith("damaged: newer: config.yaml")
+    assert said in damaged
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        '{"env_steps": "9", "timestamp": 99}',
+        '{"env_steps": 9, "timestamp": "99"}',
+        '{"env_steps": -9, "timestamp": 99}',
+        '{"env_steps": 9, "timestamp": NaN}',
+        '{"env_steps": 9, "timestamp": 1e300}',
+        '{"env_steps": 9, "timestamp": 99, "eval/success_rate": [1]}',
+        '{"env_steps": 9, "timestamp": 99, "eval/success_rate": 1' + "0" * 400 + "}",
+        '{"env_steps": ' + "9" * 5000 + ', "timestamp": 99}',
+        "[" * 100_000,
+    ],
+    ids=range(9),
+)
+def test_a_line_that_no_training_wrote_is_left_out(runs, line):
+    with (runs / "runs/newer/metrics.jsonl").open("a") as file:
+        file.write(line + "\n")
+    assert (list_runs()[0].env_steps, list_runs()[0].changed) == (600_000, 50.0)
+    assert len(runs_table(list_runs()).splitlines()) == 4
+
+
+@pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo], ids=["folder", "pipe"])
+def test_metrics_that_cannot_be_read_are_told(runs, make):
+    path = runs / "runs/newer/metrics.jsonl"
+    path.unlink()
+    make(path)
+    (healthy,), (damaged,) = scan_runs()
+    assert (healthy.name, damaged.path.name) == ("older", "newer")
+    assert "metrics.jsonl cannot be read: " in damaged.reason
+
+
+def test_without_an_intact_run_latest_says_what_is_wrong(runs):
+    for name in ("older", "newer"):
+        (runs / f"runs/{name}/config.yaml").write_text("")
+    with pytest.raises(NotFoundError, match=r"damaged, such as newer: config\.yaml is empty"):
+        find_run("latest")
+
+
+def test_no_name_can_command_the_terminal(runs, capsys):
+    make_run(runs / "runs" / "\x1b[31mred\r\n\u202e", (0, 1.0, 0.0))
+    make_run(runs / "runs" / "\x1b]0;title\x07", (0, 1.0, 0.0))
+    (runs / "runs" / "\x1b]0;title\x07" / "config.yaml").write_text("\x1b: 1")
+    assert list_runs_command.main(["runs"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert all(line.isprintable() for line in lines)
+    assert lines[3].startswith(r"\x1b[31mred\r\n\u202e")
+    assert lines[5].startswith(r"damaged: \x1b]0;title\x07: config.yaml was cut off")
+
+
+
+
+
+
+# Configurations.
+
+
+
+

@@ -1,0 +1,80 @@
+"""Errors that the user can correct: one line each, short, with nothing that a terminal obeys."""
+
+import io
+
+import pytest
+
+from jetbot_mjx.errors import (
+    InvalidError,
+    MissingPackageError,
+    UserError,
+    check_count,
+    clipped,
+    printable,
+    printable_lines,
+    ran_out,
+    requires_extra,
+    shown,
+    write_error,
+)
+
+
+def test_a_message_of_several_lines_becomes_one():
+    assert str(UserError("first\nsecond\r\nthird")) == "first second third"
+
+
+def test_characters_that_a_terminal_obeys_are_written_out():
+    assert str(UserError("a \x1b[31mred")) == r"a \x1b[31mred"
+    assert printable("größer\t") == r"größer\t"
+    assert printable_lines("a\x07\nb") == "a\\x07\nb"
+
+
+def test_a_long_text_keeps_its_beginning_and_its_end():
+    assert clipped("x" * 300) == "x" * 300
+    short = clipped("a" * 500 + "b" * 500)
+    assert short.startswith("a" * 150 + " ... ")
+    assert short.endswith("b" * 150)
+
+
+def test_a_large_value_is_shown_in_short():
+    assert shown(10**400) == "(a number of 401 digits)"
+    assert shown(10**90) == repr(10**90)
+    assert len(shown(["x" * 1000] * 1000)) < 2000
+    assert shown([[[[[1]]]]]) == "[[[[...]]]]"
+
+
+@pytest.mark.parametrize("value", [0, -1, True, 1.0, "3", None])
+def test_an_invalid_count_is_refused(value):
+    with pytest.raises(InvalidError, match=r"^trials = .* is wrong: it should be a whole number"):
+        check_count("trials", value)
+
+
+def test_a_count_has_a_largest_value():
+    check_count("trials", 1024, 1024)
+    with pytest.raises(ValueError, match=r"^trials = 1025 is wrong: it should be at most 1024$"):
+        check_count("trials", 1025, 1024)
+
+
+def test_a_missing_package_is_named_with_the_command_that_installs_it():
+    with (
+        pytest.raises(MissingPackageError, match=r"^the search needs not_there, .*\[tune\]"),
+        requires_extra("tune", "the search"),
+    ):
+        import not_there  # noqa: F401
+
+
+def test_a_device_that_ran_out_of_memory_is_told_from_other_failures():
+    assert ran_out(RuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 9 bytes"))
+    assert not ran_out(RuntimeError("INVALID_ARGUMENT"))
+
+
+def test_only_a_stream_that_keeps_its_error_has_one():
+    class Kept(io.RawIOBase):
+        error = OSError("full")
+
+        def writable(self):
+            return True
+
+    assert write_error(io.TextIOWrapper(io.BufferedWriter(Kept()))) is Kept.error
+    assert write_error(io.StringIO()) is None
+    assert write_error(None) is None
