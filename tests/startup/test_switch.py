@@ -30,6 +30,9 @@ def count_and_start(thread):
 
 threading.Thread.start = count_and_start
 
+# A shell lets its background jobs ignore Ctrl-C, and a command leaves that as it is.
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
 def process():
     return (
         [*sys.meta_path], gc.get_threshold(), dict(os.environ), signal.getsignal(signal.SIGINT),
