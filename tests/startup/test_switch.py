@@ -15,6 +15,15 @@ from jetbot_mjx.startup.switch import PLAIN_START
 ALWAYS = {"divide_cpu", "protect_output"}
 """What `startup` exports and the switch does not turn off."""
 
+SET_BY_TESTS = {
+    "JAX_COMPILATION_CACHE_DIR",
+    # Commands set these, also the ones that earlier tests ran in this process.
+    "OPENBLAS_NUM_THREADS",
+    "PYDANTIC_DISABLE_PLUGINS",
+    "XLA_PYTHON_CLIENT_PREALLOCATE",
+}
+"""Environment variables that a process of these tests does not inherit."""
+
 PROCESS = """
 import gc, os, signal, sys, threading
 import jax
@@ -29,9 +38,6 @@ def count_and_start(thread):
     start(thread)
 
 threading.Thread.start = count_and_start
-
-# A shell lets its background jobs ignore Ctrl-C, and a command leaves that as it is.
-signal.signal(signal.SIGINT, signal.default_int_handler)
 
 def process():
     return (
@@ -69,7 +75,8 @@ with gliding.everywhere():
 
 def python(*arguments, plain="1", **environment):
     environment = {**os.environ, **environment, PLAIN_START: plain}
-    environment.pop("JAX_COMPILATION_CACHE_DIR", None)
+    for name in SET_BY_TESTS:
+        environment.pop(name, None)
     return subprocess.run(
         [sys.executable, "-W", "ignore", *arguments],
         env=environment,
