@@ -6,7 +6,7 @@ import jax
 
 from onekernel import cpu, gpu
 from onekernel.kernel import Backend, register
-from onekernel.kernel import Kernel as Kernel  # who takes it from the face has the back ends, too
+from onekernel.kernel import Kernel as Kernel  # the face takes it from here: with its back ends
 
 BACKENDS: tuple[Backend, ...] = (gpu, cpu)
 """Back ends that can compile a kernel."""

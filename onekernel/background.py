@@ -22,5 +22,6 @@ def in_background(function: Callable[[], _Result]) -> Future[_Result]:
         except BaseException as error:  # `result` raises it in the caller's thread.
             future.set_exception(error)
 
+    # A daemon thread: the interpreter does not wait for a compiler when it exits.
     threading.Thread(target=contextvars.copy_context().run, args=(run,), daemon=True).start()
     return future

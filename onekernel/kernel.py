@@ -55,8 +55,9 @@ Step = Callable[[PyTree, PyTree], PyTree]
 class Kernel:
     """A `Kernel` holds a function of one instance that a back end can run for many instances.
 
-    Without a table it is a step, whose results replace its first arguments, between what is
-    computed once before the first step and once after the last. Kernels are compared by identity.
+    Without a table it is a step whose results replace its first arguments. It is repeated `steps`
+    times; `before` runs once in front of the first step, and `after` once behind the last. Kernels
+    are compared by identity.
     """
 
     program: ScalarProgram
@@ -86,7 +87,8 @@ class Kernel:
     table: Float[np.ndarray, "rows items"] | None = None
     """What differs between the items of an instance; None: the kernel is a step."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
-    # Programs are lowered in several threads.
+    """Texts that back ends have written of the kernel, by a name of their choice."""
+    # Programs are lowered in several threads, and each text is written once.
     _lock: Any = dataclasses.field(default_factory=threading.Lock, init=False)
 
     def __post_init__(self) -> None:
@@ -108,6 +110,8 @@ class Kernel:
         """
 
         def step(carry: PyTree, consts: PyTree) -> PyTree:
+            # While JAX traces, `bind` records one equation; `_lowered` below says what it compiles
+            # to.
             results = _kernel_p.bind(*jax.tree.leaves((carry, consts)), kernel=self)
             return jax.tree.unflatten(jax.tree.structure(carry), results)
 
@@ -191,7 +195,8 @@ def called_by(equation: Any) -> Kernel | None:
 def make_primitive(name: str, static: str) -> Primitive:
     """Return a primitive of one instance, which `jax.vmap` batches by an axis in front of all.
 
-    Its arguments and results are arrays; who makes it defines its shapes and its lowering.
+    Its arguments and results are arrays. The caller defines the shapes of its results
+    (`def_abstract_eval`) and its lowering for each platform (`mlir.register_lowering`).
 
     Args:
       name: its name.
@@ -199,6 +204,8 @@ def make_primitive(name: str, static: str) -> Primitive:
     """
     primitive = Primitive(name)
     primitive.multiple_results = True
+    # Outside of a jitted function, JAX runs a primitive by compiling a program of this one
+    # operation.
     compiled = jax.jit(primitive.bind, static_argnames=static)
 
     @primitive.def_impl
@@ -210,11 +217,15 @@ def make_primitive(name: str, static: str) -> Primitive:
     def batch(
         arrays: Sequence[Array], axes: Sequence[int | None], **parameters: Any
     ) -> tuple[list[Array], list[int]]:
+        # All arguments that have the batch axis agree on its size. Move it to the front of these,
+        # and repeat the others along it.
         (size,) = {x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None}
         moved = [
             jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
             for x, axis in zip(arrays, axes, strict=True)
         ]
+        # Bind the same primitive again, which takes any number of leading axes: `vmap` can be
+        # nested.
         results = primitive.bind(*moved, **parameters)
         return results, [0] * len(results)
 
@@ -233,6 +244,7 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
       ValueError: an argument does not have the shape that the kernel expects.
     """
     shapes = kernel.argument_shapes
+    # The first argument tells the batch axes, and all others must have the same.
     batch = leaves[0].shape[: leaves[0].ndim - len(shapes[0])]
     for leaf, shape in zip(leaves, shapes, strict=True):
         if leaf.dtype != np.float32:
@@ -272,6 +284,7 @@ def probe(
         steps=2,
         fallback=lambda x: [4.0 * x + 3.0],
     )
+    # Two steps of 2x + 1 are 4x + 3.
     values = np.arange(2 * instances, dtype=np.float32).reshape(-1, 2)
     # Run the probe at once, because the caller may be tracing another function.
     with jax.ensure_compile_time_eval(), jax.default_device(device):
@@ -290,16 +303,20 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
     def lowered(*leaves: Array, kernel: Kernel) -> list[Array]:
         batch = _batch_shape(kernel, leaves)
         instances = math.prod(batch)
+        # Back ends know one axis of instances: merge all batch axes into it, and split them at the
+        # end.
         flat = [
             x.reshape(instances, *shape)
             for x, shape in zip(leaves, kernel.argument_shapes, strict=True)
         ]
+        # Run the kernel where its back end is allowed and works, the fallback where `auto` permits.
         if backend and kernel.impl in ("auto", backend.IMPL) and not backend.obstacle():
             table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
             results = backend.launch(kernel, [*flat, *table])
         elif kernel.impl == "auto":
             if backend and (obstacle := backend.obstacle()):
                 kernel.on_fallback(obstacle)
+            # The fallback is written for one instance.
             results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)
         else:
             platform = backend.PLATFORM if backend else "another platform"
@@ -312,6 +329,7 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
 
 def register(*backends: Backend) -> None:
     """Make back ends known to JAX."""
+    # The first call sets the rule for all platforms; those with a back end get their own below.
     mlir.register_lowering(_kernel_p, mlir.lower_fun(_lowered(None), multiple_results=True))
     for backend in backends:
         mlir.register_lowering(

@@ -70,6 +70,7 @@ class OneKernel:
         """Compute the function."""
         if not self._is_allowed():
             return self._function(*arguments)
+        # A kernel takes flat arrays: it is found by the tree, shapes and dtypes of the arguments.
         leaves, structure = jax.tree.flatten(arguments)
         arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
         lowered = self._find(structure, [x.aval for x in arrays], arguments)
@@ -84,9 +85,10 @@ class OneKernel:
           arguments: the shapes and dtypes of the arguments.
 
         Returns:
-          The kernel, whose arguments are the leaves of the function's and whose results are those
-          of the first one again; None: a call does something else, takes or returns other numbers
-          than float32, or returns another structure or other shapes than its first argument has.
+          The kernel. Its arguments are the leaves of the function's arguments, and its results have
+          the shapes of the first argument's leaves. None: a call launches no kernel, takes or
+          returns other numbers than float32, or returns another structure or other shapes than its
+          first argument has.
         """
         if not self._is_allowed():
             return None
@@ -96,6 +98,7 @@ class OneKernel:
         jaxpr = lowered.traced.jaxpr
         if lowered.places or any(x != np.float32 for x in _dtypes([*jaxpr.invars, *jaxpr.outvars])):
             return None
+        # A caller repeats the kernel: its results must look like its first argument.
         carried, tree = jax.tree.flatten(arguments[0])
         results = [x.aval.shape for x in jaxpr.outvars]
         if lowered.structure != tree or results != [x.shape for x in carried]:
@@ -108,21 +111,25 @@ class OneKernel:
 
     def _find(self, structure: Any, avals: Sequence[Any], arguments: Sequence[Any]) -> "_Lowered":
         """Return the function for arguments like these, traced and lowered if it is not yet."""
+        # The same function lowers differently under other settings of JAX.
         settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
         key = (structure, settings, *((x.shape, x.dtype, x.weak_type) for x in avals))
         if key in self._known:
             return self._known[key]
         traced, shapes = jax.make_jaxpr(self._function, return_shape=True)(*arguments)
-        # What another function traces is an argument of the kernel too.
+        # A constant that is a tracer comes from a function that is being traced around this one.
+        # Its value is not known now, so the kernel takes it as one more argument.
         places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
         try:
             one = _lower(traced, places)
+            # A step inside has brought its own messages; a kernel without one takes those of this
+            # object.
             if not one.before:
                 one.explain, one.on_fallback = self._explain, self._on_fallback
         except UnsupportedError as error:
             one = error
         lowered = _Lowered(traced, jax.tree.structure(shapes), places, one)
-        # What depends on what another function traces holds only inside of it.
+        # A tracer is valid only while that other function is traced: do not remember such a kernel.
         if not places:
             self._known[key] = lowered
         return lowered
@@ -145,10 +152,12 @@ class _Lowered:
         """Return the function of flat arguments, whose kernel begins to be compiled."""
         if isinstance(self.one, UnsupportedError):
             return jaxpr_as_fun(self.traced)
+        # Compile the kernel in a thread, while XLA compiles the program around it.
         backend = default_backend()
         if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
             backend.prepare(self.one)
         launch = self.one.as_function()
+        # Kernels take and return float32 only, so numbers of other dtypes travel as their bits.
         constants = [self.traced.consts[i] for i in self.places]
         arguments = _dtypes(_arguments(self.traced, self.places))
         results = _dtypes(self.traced.jaxpr.outvars)
@@ -171,20 +180,27 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     Raises:
       UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
     """
+    # A kernel without arguments has no instances.
     arguments, results = _arguments(traced, places), traced.jaxpr.outvars
     if not arguments:
         raise UnsupportedError("a function of nothing")
-    # Whether a state is finite is decided here: NaN must stay NaN.
+    # Functions around a step test whether its state is finite, so here NaN must stay NaN.
     lower = functools.partial(scalarize_part, traced, words=True, finite=False)
     calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
+    # Without a kernel inside, the whole function becomes one that runs once.
     if not calls:
         program = lower(arguments, results)
         return Kernel(program, carried=0, steps=1, fallback=_fallback(traced, places))
+    # Otherwise cut the function at the call. The one step must be plain: not a map, not itself made
+    # of three parts, and called for one instance.
     step = called_by(calls[0])
     if len(calls) > 1 or step is None or step.table is not None or step.before or step.after:
         raise UnsupportedError("more than one kernel")
     if [tuple(x.aval.shape) for x in calls[0].invars] != step.argument_shapes:
         raise UnsupportedError("a kernel for several instances")
+    # The part in front computes the arguments of the call; the part behind computes the results
+    # from the arguments of the function and the results of the call. `scalarize_part` lowers only
+    # what its results need, so the cut needs no list of equations.
     before = lower(arguments, calls[0].invars)
     after = lower([*arguments, *calls[0].outvars], results)
     return Kernel(
@@ -210,12 +226,16 @@ def _dtypes(atoms: Sequence[Any]) -> list[np.dtype]:
 
 
 def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
-    """Return the same computation in JAX, from and to words."""
+    """Return the same computation in JAX, whose arguments and results are words as in the kernel.
+
+    A word is a float32 with the bits of a number of another dtype (see `_to_word`).
+    """
     dtypes = _dtypes(_arguments(traced, places))
 
     def run(*words: Array) -> list[Array]:
         arguments = _from_words(words, dtypes)
         constants = list(traced.consts)
+        # The first words are constants; `zip` stops after these.
         for place, argument in zip(places, arguments, strict=False):
             constants[place] = argument
         closed = ClosedJaxpr(traced.jaxpr, constants)

@@ -31,11 +31,15 @@ def read_trusted(path: Path) -> bytes | None:
       trusted costs a warning.
     """
     try:
+        # Check the folder first: whoever may write to it may replace any file in it.
         reason = distrust(path.parent, path.parent.stat())
         if reason is None:
             with path.open("rb") as file:
+                # Ask the file that is open, not its path, behind which there may be another file by
+                # now.
                 reason = distrust(path, os.fstat(file.fileno()))
                 if reason is None:
+                    # A file that was cut off or changed does not have the digest it begins with.
                     digest, content = file.read(_DIGEST_BYTES), file.read()
                     return content if digest == hashlib.sha256(content).digest() else None
     except OSError:
@@ -56,6 +60,8 @@ def write_private(path: Path, content: bytes) -> None:
     """
     if distrust(path.parent, path.parent.stat()) is not None:
         return
+    # Write to a new folder and rename: readers find the old file or the whole new one. The file is
+    # private from its first byte.
     with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         written = Path(folder) / path.name
         with open(os.open(written, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:
@@ -73,10 +79,12 @@ def distrust(path: Path, status: os.stat_result) -> str | None:
     Returns:
       The reason and the remedy, on one line.
     """
+    # Windows has no owners and modes that could be checked.
     if not hasattr(os, "geteuid"):
         return None
     if status.st_uid not in (os.geteuid(), 0):
         return f"{path} belongs to another user, number {status.st_uid}"
+    # Its group or everybody may write to it.
     if status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
         return f"others may write to {path}: chmod go-w {path}"
     return None
@@ -93,6 +101,7 @@ def cached_bytes(kind: str, key: bytes, make: Callable[[], bytes]) -> bytes:
     Returns:
       The content.
     """
+    # The folder is the one in which JAX caches its own programs; without one, nothing is cached.
     cache = jax.config.values["jax_compilation_cache_dir"]
     if not cache or not jax.config.values["jax_enable_compilation_cache"]:
         return make()

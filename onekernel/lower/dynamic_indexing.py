@@ -1,8 +1,8 @@
 """Lower reads and writes at indices that are known only when the program runs.
 
-Scalars have no addresses: what is read is selected among all places where it may be, one comparison
-and one selection for each. That is right for arrays of tens of numbers. An index that is a constant
-costs nothing, as in `indexing`.
+Scalars are in registers, which have no addresses. So a read at an unknown index compares the index
+with every place where it may point, and selects among the scalars there. That pays off for arrays
+of tens of numbers. An index that is a constant costs nothing, as in `indexing`.
 
 A rule is a function of the graph, the equation and its operands.
 """
@@ -64,6 +64,7 @@ def _read_window(
     for axis, (start, size) in enumerate(zip(starts, sizes, strict=True)):
         last = x.shape[axis] - size
         at = _clipped(graph, start, last)
+        # The usual case: a constant index only picks scalars.
         if is_constant(at):
             x = np.take(x, range(at, at + size), axis)
             continue
@@ -77,8 +78,10 @@ def _read_along(
     """Return `size` entries of one axis from an index on, which is in 0 ... last."""
     _check_places(last + 1)
     kind = at.dtype.type
+    # All windows that may be meant, in order; one of them remains.
     cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
-    # A tournament: of neighbours, the index tells which one is nearer to it.
+    # Halve the candidates in each round, like a tournament: of two neighbours, the index keeps the
+    # second if it has reached it. The depth grows with the logarithm of the number of places.
     found = list(enumerate(cases))
     while len(found) > 1:
         rounds = []
@@ -92,6 +95,7 @@ def _read_along(
 def _dynamic_slice(
     graph: ExprGraph, equation: Any, x: ScalarArray, *starts: ScalarArray
 ) -> ScalarArray:
+    # JAX moves a window that would reach beyond the array back inside.
     sizes = equation.params["slice_sizes"]
     return _read_window(graph, x, [start.item() for start in starts], sizes)
 
@@ -131,13 +135,16 @@ def _write_window(
     ]
     _check_places(math.prod(map(len, ranges)))
     result = x.copy()
-    # Go through all places where the window may be; at most one of them is where it is.
+    # Go through all places where the window may lie, and write the update at each of them if the
+    # window lies there. At most one place passes.
     for place in np.ndindex(*map(len, ranges)):
         offset = [each[i] for each, i in zip(ranges, place, strict=True)]
+        # Compare the start of every axis with this place.
         is_here = is_written
         for start, i in zip(starts, offset, strict=True):
             if not is_constant(start):
                 is_here = graph.apply("and", is_here, graph.apply("eq", start, start.dtype.type(i)))
+        # Each number under the window is chosen between old and new.
         for index in np.ndindex(*update.shape):
             at = tuple(a + b for a, b in zip(offset, index, strict=True))
             new = combine(x[at], update[index])
@@ -148,10 +155,15 @@ def _write_window(
 def _windows(
     indices: ScalarArray, dims: jax.lax.GatherDimensionNumbers, rank: int
 ) -> list[tuple[tuple[int, ...], list[Scalar]]]:
-    """Return of each window of a gather its place among them and its start along each axis."""
+    """Return a pair for each window of a gather: its index in the result, and its start.
+
+    A start has one scalar for each axis of the operand, of which there are `rank`.
+    """
     batching = list(zip(dims.operand_batching_dims, dims.start_indices_batching_dims, strict=True))
     found = []
     for at in np.ndindex(*indices.shape[:-1]):
+        # The index vector gives the start of some axes; that of a batching axis is the window's own
+        # place along it; all other axes start at 0.
         starts: list[Scalar] = [np.int32(0)] * rank
         for axis, start in zip(dims.start_index_map, indices[at], strict=True):
             starts[axis] = start
@@ -167,6 +179,8 @@ def gather(graph: ExprGraph, equation: Any, x: ScalarArray, indices: ScalarArray
     Source: the semantics of gather and scatter in the StableHLO specification.
     """
     dims, sizes = equation.params["dimension_numbers"], equation.params["slice_sizes"]
+    # In the mode FILL, a window that reaches beyond the array is read as the fill value; otherwise
+    # it is moved inside.
     is_filled = "FILL" in str(equation.params["mode"])
     fill = equation.outvars[0].aval.dtype.type(fill_value(equation)) if is_filled else None
     fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
@@ -212,6 +226,7 @@ def _scatter(
     fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
     window = iter(updates.shape[axis] for axis in dims.offset_dims)
     sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
+    # A scatter leaves out windows that reach beyond the array, unless it is to move them inside.
     is_clipped = "CLIP" in str(equation.params["mode"])
 
     def combine(old: Scalar, new: Scalar) -> Scalar:
@@ -234,15 +249,19 @@ def _scatter(
 
 
 def _sort(graph: ExprGraph, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
-    """Sort by a network: neighbours are exchanged until all are in order, which keeps equal ones.
+    """Sort with a sorting network, which exchanges neighbours.
 
-    Keys are compared as `jax.lax.sort` does: -0 equals 0, and NaN comes last.
+    The sort is stable: rows with equal keys keep their order. Keys are compared as in
+    `jax.lax.sort`: -0 equals 0, and NaN comes last.
     """
     axis, keys = equation.params["dimension"], equation.params["num_keys"]
+    # Bring the axis to the front and merge all others: each lane is sorted on its own, by the same
+    # comparisons for all operands.
     columns = [np.moveaxis(x, axis, 0).reshape(x.shape[axis], -1).copy() for x in operands]
     count = operands[0].shape[axis]
     for lane in range(columns[0].shape[1] if count else 0):
         rows = [[column[i, lane] for column in columns] for i in range(count)]
+        # Constant keys are sorted now; no comparison is left for the program.
         if all(is_constant(x) for row in rows for x in row[:keys]):
             rows.sort(key=functools.cmp_to_key(lambda a, b: _order(graph, a[:keys], b[:keys])))
         else:
@@ -266,7 +285,12 @@ def _in_order(
     rows: list[list[Scalar]],
     is_wrong: Callable[[list[Scalar], list[Scalar]], Scalar],
 ) -> list[list[Scalar]]:
-    """Return rows in an order in which no neighbours are wrong; rows that may stay do."""
+    """Return the rows in an order in which `is_wrong` holds for no two neighbours.
+
+    The sort is stable: rows that may stay in their order do.
+    """
+    # Odd-even transposition sort: n rounds order n rows, and each compares fixed neighbours, so
+    # that no index depends on the numbers.
     rows = list(rows)
     for turn in range(len(rows)):
         for i in range(turn % 2, len(rows) - 1, 2):
@@ -280,8 +304,10 @@ def _in_order(
 def _is_before(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> Scalar:
     """Return whether a row is before another one by its first key that differs."""
     result: Scalar = np.bool_(False)
+    # From the last key to the first: an earlier key decides, unless it is the same in both rows.
     for x, y in zip(reversed(a), reversed(b), strict=True):
         before, same = graph.apply("lt", x, y), graph.apply("eq", x, y)
+        # NaN is behind all numbers, and the same as NaN.
         if x.dtype.kind == "f":
             x_is, y_is = graph.apply("eq", x, x), graph.apply("eq", y, y)
             last = graph.apply("and", x_is, graph.apply("not", y_is))
@@ -298,6 +324,7 @@ def _top_k(graph: ExprGraph, equation: Any, x: ScalarArray) -> list[ScalarArray]
     kind = equation.outvars[1].aval.dtype.type
     found = []
     for numbers in x.reshape(-1, x.shape[-1]):
+        # Sort the numbers together with their places, which are the second result.
         rows = [[number, kind(i)] for i, number in enumerate(numbers)]
         rows = _in_order(graph, rows, lambda a, b: _is_before(graph, a[:1], b[:1]))
         found += rows[:count]

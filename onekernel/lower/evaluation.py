@@ -10,10 +10,10 @@ from onekernel.lower.scalar_ir import EVALUATE, Expr, Scalar, convert_constant, 
 
 
 def evaluate(program: ScalarProgram, scalars: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Run a program without loops and branches for many instances, in their precision.
+    """Run a program without loops and branches for many instances, in the dtypes of its inputs.
 
-    A program with approximate instructions can also be run in float64; one with polynomials works
-    on the bits of float32 numbers.
+    A program with approximate instructions (`approximate` of `scalarize`) can be run in float64,
+    too. Others need float32, because their formulas of exp and log work on its bits.
 
     Args:
       program: the program.
@@ -29,6 +29,7 @@ def evaluate(program: ScalarProgram, scalars: Sequence[np.ndarray]) -> list[np.n
     inputs = [x for array in program.inputs for x in array.ravel()]
     values = {x.index: numbers for x, numbers in zip(inputs, scalars, strict=True)}
 
+    # A constant stands for all instances.
     def value(x: Scalar) -> np.ndarray:
         return np.asarray(x) if is_constant(x) else values[x.index]
 

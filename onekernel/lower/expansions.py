@@ -1,10 +1,10 @@
 """Compute operations of JAX by other operations of JAX, which have lowering rules.
 
-A function here is what a user could have written in place of the operation: it is traced, and what
-results is lowered. So an operation that is missing needs a formula, and nothing else.
+A user could have written these functions in place of the operations: they are traced to jaxprs of
+operations that have lowering rules. So to add an operation, add a formula here.
 
-Numbers that float32 holds in a subnormal form are taken for 0 by `exp` and `log`, and so by all
-functions that are made of them.
+Subnormal float32 (below 1.2e-38) are taken for 0 by `exp` and `log`, and so by all functions that
+are made of them.
 
 Source of formulas: M. Abramowitz and I. A. Stegun, Handbook of Mathematical Functions, chapter 4;
 H. S. Warren, Hacker's Delight, chapters 5 and 9. The polynomials are interpolated here.
@@ -24,17 +24,20 @@ from onekernel.errors import UnsupportedError
 
 _LN2 = math.log(2.0)
 _BIG = 1e9
-"""Beyond, x² + 1 and x² are the same float32."""
+"""Beyond this number, x² + 1 and x² are the same float32."""
 
 
 # Functions of floats.
 
 
 def _asin(x: Array) -> Array:
+    # tan(y / 2) = sin y / (1 + cos y) with sin y = x. The factors of 1 - x² keep the digits that the
+    # difference would lose near ±1.
     return 2.0 * jnp.arctan2(x, 1.0 + jnp.sqrt((1.0 - x) * (1.0 + x)))
 
 
 def _acos(x: Array) -> Array:
+    # tan(y / 2) = sin y / (1 + cos y) with cos y = x.
     angle = 2.0 * jnp.arctan2(jnp.sqrt((1.0 - x) * (1.0 + x)), 1.0 + x)
     return jnp.where(x == -1.0, math.pi, angle)
 
@@ -45,12 +48,15 @@ def _atan(x: Array) -> Array:
 
 def _asinh(x: Array) -> Array:
     size = jnp.abs(x)
+    # asinh x = log(x + √(x² + 1)) = log1p(x + x² / (1 + √(x² + 1))), which keeps the digits of a
+    # small x; for a large one, log(2x). The bound keeps the square finite.
     square = jnp.minimum(size, _BIG) ** 2
     near = jnp.log1p(size + square / (1.0 + jnp.sqrt(square + 1.0)))
     return _with_sign(x, jnp.where(size < _BIG, near, jnp.log(size) + _LN2))
 
 
 def _acosh(x: Array) -> Array:
+    # acosh x = log(x + √(x² - 1)) = log1p(d + √(d (d + 2))) with d = x - 1.
     above = jnp.minimum(x, _BIG) - 1.0
     near = jnp.log1p(above + jnp.sqrt(above * (above + 2.0)))
     angle = jnp.where(x < _BIG, near, jnp.log(x) + _LN2)
@@ -58,22 +64,29 @@ def _acosh(x: Array) -> Array:
 
 
 def _atanh(x: Array) -> Array:
+    # atanh x = ½ log((1 + x) / (1 - x)) = ½ log1p(2x / (1 - x)).
     size = jnp.abs(x)
     return _with_sign(x, 0.5 * jnp.log1p(2.0 * size / (1.0 - size)))
 
 
 def _sinh(x: Array) -> Array:
     size = jnp.abs(x)
+    # sinh x = (eˣ - e⁻ˣ) / 2 = (g + g / (g + 1)) / 2 with g = eˣ - 1. Beyond 80, e⁻ˣ is nothing
+    # beside eˣ, and eˣ / 2 is computed without overflow of eˣ.
     grown = jnp.expm1(jnp.minimum(size, 80.0))
     near = 0.5 * (grown + grown / (grown + 1.0))
     return _with_sign(x, jnp.where(size < 80.0, near, jnp.exp(size - _LN2)))
 
 
 def _cosh(x: Array) -> Array:
+    # Half of each exponential, inside of the exponent: so the result overflows, and no term before
+    # it.
     return jnp.exp(x - _LN2) + jnp.exp(-x - _LN2)
 
 
 def _exp2(x: Array) -> Array:
+    # 2ˣ = 2ⁿ exp((x - n) ln 2) with the nearest whole n, whose power is a float32 with the exponent
+    # n + 127.
     whole = jnp.round(jnp.clip(x, -127.0, 128.0))
     power = jax.lax.bitcast_convert_type((whole.astype(jnp.int32) + 127) << 23, jnp.float32)
     result = jnp.exp((x - whole) * _LN2) * power
@@ -83,8 +96,9 @@ def _exp2(x: Array) -> Array:
 
 def _cbrt(x: Array) -> Array:
     size = jnp.abs(x)
+    # ∛x = exp(log(x) / 3).
     root = jnp.exp(jnp.log(size) * (1.0 / 3.0))
-    # One of Newton's steps gives back what the logarithm has lost.
+    # One step of Newton's method for r³ = |x| gives back the digits that the logarithm has lost.
     root = root - (root - size / (root * root)) * (1.0 / 3.0)
     is_end = (x == 0.0) | jnp.isinf(x)
     return jnp.where(is_end, x, _with_sign(x, root))
@@ -94,6 +108,7 @@ def power(x: Array, y: Array) -> Array:
     """Compute x to the power of y, to 1e-5 of the result."""
     y = y.astype(jnp.float32)
     size = jnp.abs(x)
+    # xʸ = exp(y log|x|); then the sign and the special cases of C's pow.
     result = jnp.exp(y * jnp.log(size))
     # A negative number has powers with whole exponents only.
     is_whole, is_odd = jnp.floor(y) == y, jnp.floor(y * 0.5) * 2.0 != y
@@ -104,7 +119,8 @@ def power(x: Array, y: Array) -> Array:
 
 
 def _with_sign(x: Array, size: Array) -> Array:
-    """Return a number that is not negative with the sign of another one, also of -0."""
+    """Return `size`, which is not negative, with the sign of x; -0 has a sign, too."""
+    # The sign of a float32 is its highest bit.
     word = functools.partial(jax.lax.bitcast_convert_type, new_dtype=jnp.uint32)
     sign = word(x) & np.uint32(1 << 31)
     return jax.lax.bitcast_convert_type(word(size) | sign, jnp.float32)
@@ -116,7 +132,7 @@ _ERFC_SCALE = 0.4
 
 @functools.cache
 def _error_polynomials() -> tuple[list[float], list[float]]:
-    """Return the coefficients, highest first, of erf(x)/x in x², and of log(erfc(x)/t) + x² in t.
+    """Return the coefficients, highest first, of erf(x)/x in x² and of p(t) = log(erfc(x)/t) + x².
 
     For large x, erfc(x) falls like exp(-x²)/x; so it is t exp(-x² + p(t)) with t = 1/(1 + c x).
     """
@@ -129,6 +145,7 @@ def _error_polynomials() -> tuple[list[float], list[float]]:
         return [float(c) for c in reversed(power.coef)]
 
     def tail(t: np.ndarray) -> np.ndarray:
+        # erfcx(x) is exp(x²) erfc(x), which neither overflows nor vanishes.
         x = (1.0 / t - 1.0) / _ERFC_SCALE
         return np.log(special.erfcx(x) / t)
 
@@ -137,12 +154,14 @@ def _error_polynomials() -> tuple[list[float], list[float]]:
 
 
 def _erf(x: Array) -> Array:
+    # erf(x) is x times a polynomial near 0, and 1 - erfc(x) beyond.
     near = x * _horner(_error_polynomials()[0], x * x)
     far = _with_sign(x, 1.0 - _positive_erfc(jnp.abs(x)))
     return jnp.where(jnp.abs(x) < _ERF_END, near, far)
 
 
 def _erfc(x: Array) -> Array:
+    # 1 - erf(x) loses no digits as long as erf(x) is not near 1.
     near = 1.0 - x * _horner(_error_polynomials()[0], x * x)
     far = _positive_erfc(jnp.abs(x))
     far = jnp.where(x < 0.0, 2.0 - far, far)
@@ -153,7 +172,8 @@ def _positive_erfc(x: Array) -> Array:
     """Return erfc(x) for x of at least `_ERF_END`; float32 has none beyond x = 10.1."""
     x = jnp.minimum(x, 11.0)
     t = 1.0 / (1.0 + _ERFC_SCALE * x)
-    # Square a rounded x exactly: an error of x² would be an error of its exponential.
+    # The relative error of exp(-x²) is the absolute error of x². So split x² = c² + (x - c)(x + c),
+    # where c is x with 12 bits, whose square is exact, and the rest is small.
     coarse = jax.lax.bitcast_convert_type(
         jax.lax.bitcast_convert_type(x, jnp.uint32) & np.uint32(0xFFFFF000), jnp.float32
     )
@@ -183,12 +203,14 @@ def _shift_right_arithmetic(x: Array, by: Array) -> Array:
         whole = jax.lax.bitcast_convert_type(x, jnp.int32)
         shifted = _shift_right_arithmetic(whole, by.astype(jnp.int32))
         return jax.lax.bitcast_convert_type(shifted, x.dtype)
+    # Of a negative number, shift the inverted bits: what is filled with zeros is inverted to ones.
     shift = jax.lax.shift_right_logical
     return jnp.where(x < 0, ~shift(~x, by), shift(x, by))
 
 
 def _population_count(x: Array) -> Array:
     word = x.astype(jnp.uint32)
+    # Count the ones of each pair of bits, then of each 4, of each 8, and add up the four bytes.
     word = word - ((word >> 1) & np.uint32(0x55555555))
     word = (word & np.uint32(0x33333333)) + ((word >> 2) & np.uint32(0x33333333))
     word = (word + (word >> 4)) & np.uint32(0x0F0F0F0F)
@@ -220,8 +242,9 @@ def _le_to(x: Array, y: Array) -> Array:
 
 
 def _nextafter(x: Array, y: Array) -> Array:
+    # In the order of `_total_order`, neighbouring numbers are neighbouring integers.
     order = _total_order(x)
-    # Both zeros are one number.
+    # -0 and 0 are one number: start from the one that lies on the side of y.
     order = jnp.where(x == 0.0, jnp.where(y > 0.0, 0, -1), order)
     order = jnp.where(y > x, order + 1, order - 1)
     bits = jnp.where(order < 0, order ^ np.int32(0x7FFFFFFF), order)
@@ -230,6 +253,7 @@ def _nextafter(x: Array, y: Array) -> Array:
 
 
 def _reduce_precision(x: Array, *, exponent_bits: int, mantissa_bits: int) -> Array:
+    # Keep the exponent and drop the last bits of the fraction, as in bfloat16.
     dropped = 23 - mantissa_bits
     if exponent_bits == 8 and dropped > 0:
         bits = jax.lax.bitcast_convert_type(x, jnp.uint32)
@@ -243,6 +267,7 @@ def _reduce_precision(x: Array, *, exponent_bits: int, mantissa_bits: int) -> Ar
 
 
 def _cumlogsumexp(x: Array, *, axis: int, reverse: bool) -> Array:
+    # Unrolled: every entry is combined with the one before.
     rows = list(jnp.moveaxis(x, axis, 0))
     rows = rows[::-1] if reverse else rows
     for i in range(1, len(rows)):
@@ -268,15 +293,18 @@ def _conv_general_dilated(
     x = x.transpose(dimension_numbers.lhs_spec)
     kernel = kernel.transpose(dimension_numbers.rhs_spec)
     groups, outputs, inputs = feature_group_count, *kernel.shape[:2]
+    # Pad the image, also between its numbers (a transposed convolution).
     inside = [by - 1 for by in lhs_dilation]
     widths = [(low, high, n) for (low, high), n in zip(padding, inside, strict=True)]
     x = jax.lax.pad(x, jnp.zeros((), x.dtype), [(0, 0, 0), (0, 0, 0), *widths])
+    # The size of the result, from how far the kernel reaches with its gaps.
     space = kernel.shape[2:]
     reach = [(n - 1) * by + 1 for n, by in zip(space, rhs_dilation, strict=True)]
     sizes = zip(x.shape[2:], reach, window_strides, strict=True)
     shape = [(n - size) // by + 1 for n, size, by in sizes]
     total = jnp.zeros((len(x), groups, outputs // groups, *shape), x.dtype)
-    # Add what each place of the kernel reads, wherever the kernel lies.
+    # For each weight of the kernel: take the numbers of the image that it meets at all positions of
+    # the kernel, a strided slice, and add their products with it.
     for place in np.ndindex(*space):
         first = [i * by for i, by in zip(place, rhs_dilation, strict=True)]
         last = [i + (n - 1) * by + 1 for i, n, by in zip(first, shape, window_strides, strict=True)]

@@ -25,6 +25,7 @@ def scalar_array(scalars: Iterable[Scalar], shape: Sequence[int]) -> ScalarArray
     """Return an array of the given shape from its elements in row-major order."""
     elements = list(scalars)
     array = np.empty(len(elements), object)
+    # Assigned to a slice, the elements stay objects; `np.array` would look into them.
     array[:] = elements
     return array.reshape(shape)
 
@@ -59,11 +60,12 @@ def shape_of(variable: Any) -> tuple[int, ...]:
 
 
 def fill_value(equation: Any) -> float:
-    """Return what a gather reads beyond its operand."""
+    """Return the value that a gather returns for a window outside of its operand."""
     given = equation.params.get("fill_value")
     dtype = equation.outvars[0].aval.dtype
     if given is not None:
         return given
+    # JAX's defaults: NaN, the smallest integer with a sign, or all bits set.
     return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
 
 
@@ -73,12 +75,14 @@ def _reshape(equation: Any, x: ScalarArray) -> ScalarArray:
 
 def _slice(equation: Any, x: ScalarArray) -> ScalarArray:
     params = equation.params
+    # No strides stand for strides of 1.
     strides = params["strides"] or [1] * x.ndim
     bounds = zip(params["start_indices"], params["limit_indices"], strides, strict=True)
     return x[tuple(slice(*bound) for bound in bounds)]
 
 
 def _broadcast_in_dim(equation: Any, x: ScalarArray) -> ScalarArray:
+    # Put the operand's axes where they belong, with axes of length 1 between them.
     shape = [1] * len(equation.params["shape"])
     for axis, size in zip(equation.params["broadcast_dimensions"], x.shape, strict=True):
         shape[axis] = size

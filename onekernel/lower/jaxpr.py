@@ -137,10 +137,11 @@ def scalarize_part(
 
     Args:
       closed: the function.
-      arguments: its variables that are arguments of the program.
-      results: its variables or literals that the program returns.
-      words: whether arguments and results are float32 whatever their dtypes: those of 32 bits by
-        their bits, and a bool as 0 or 1.
+      arguments: the variables whose values the program is given. They need not be the function's
+        own arguments: what is computed before them is left out.
+      results: the variables or literals that the program returns.
+      words: whether the program takes and returns float32 only. A number of another dtype of 32
+        bits is then passed as a float32 with the same bits, and a bool as 0 or 1.
       finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: whether to use approximate instructions of GPUs, as for `ExprGraph`.
 
@@ -150,9 +151,11 @@ def scalarize_part(
     Raises:
       UnsupportedError: as `scalarize`, or the function does more than return results.
     """
+    # Reject what cannot be lowered at all.
     if closed.effects:
         # For example `jax.debug.print`, on which no result depends.
         raise UnsupportedError(f"an effect: {', '.join(map(str, closed.effects))}")
+    # Start with the program's arguments, each split into scalars of the graph.
     graph = ExprGraph(finite=finite, approximate=approximate)
     lowering = _JaxprLowering(graph)
     env: dict[Any, ScalarArray] = {}
@@ -165,12 +168,14 @@ def scalarize_part(
         given = _FLOAT if words else dtype
         inputs.append(full_array(shape_of(variable), lambda dtype=given: graph.input(dtype)))
         env[variable] = lowering.bitcast(inputs[-1], given, dtype)
+    # Record the operations of all equations that the results need.
     outputs = lowering.lower_part(closed, env, results)
     if words:
         outputs = [
             lowering.bitcast(x, np.dtype(atom.aval.dtype), _FLOAT)
             for x, atom in zip(outputs, results, strict=True)
         ]
+    # Arrange the recorded operations, without those on which no result depends.
     block = schedule(x for array in outputs for x in array.ravel())
     program = ScalarProgram(inputs, outputs, block)
     if program.size > MAX_PROGRAM_OPERATIONS:
@@ -182,9 +187,9 @@ class _JaxprLowering:
     """A `_JaxprLowering` records the operations of a jaxpr on scalars.
 
     The lowering rule of the JAX primitive `name` is `RULES[name]` or the method `_name`: a function
-    of the equation and its operands that returns the results. Those of random numbers and of
-    indices that are not constant are in `_GRAPH_RULES`. What is in `EXPANSIONS` is lowered as
-    other operations of JAX.
+    of the equation and its operands that returns the results. The rules of random numbers and of
+    indices that are not constant are in `_GRAPH_RULES`. An operation in `EXPANSIONS` is replaced by
+    a formula of other JAX operations, which is traced and lowered in its place.
     """
 
     def __init__(self, graph: ExprGraph) -> None:
@@ -211,6 +216,8 @@ class _JaxprLowering:
                 return constant_array(np.asarray(atom.val, aval.dtype))
             return env[atom]
 
+        # Walk backwards from the results to find the equations that they need. A variable of `env`
+        # is known already, so the walk does not go beyond it: this cuts a part out of a function.
         needed = {atom for atom in results if not isinstance(atom, Literal)} - env.keys()
         equations = []
         for equation in reversed(closed.jaxpr.eqns):
@@ -218,9 +225,12 @@ class _JaxprLowering:
                 equations.append(equation)
                 atoms = (atom for atom in equation.invars if not isinstance(atom, Literal))
                 needed |= {atom for atom in atoms if atom not in env}
+        # Split the constants into scalars, but only the needed ones: others may be what cannot be
+        # lowered.
         for variable, constant in zip(closed.jaxpr.constvars, closed.consts, strict=True):
             if variable in needed:
                 env[variable] = _constants(constant)
+        # Lower these equations in the order of the function.
         for equation in reversed(equations):
             values = self._lower_eqn(equation, [read(atom) for atom in equation.invars])
             env |= dict(zip(equation.outvars, values, strict=True))
@@ -236,8 +246,13 @@ class _JaxprLowering:
 
     def _apply_rule(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
         name = equation.primitive.name
+        # Most operations on single elements have the same name in JAX and in the graph, and need
+        # no rule of their own.
         if name in EVALUATE and not hasattr(self, f"_{name}"):
             return [self._elementwise(name, *operands)]
+        # Otherwise look for a rule, in this order: a rearrangement, a method of this class, a rule
+        # that takes the graph, a formula in JAX, JAX's own expansion. Names such as `scatter-add`
+        # have a hyphen, which a method's name cannot.
         rule = RULES.get(name) or getattr(self, f"_{name.replace('-', '_')}", None)
         if rule is None and name in _GRAPH_RULES:
             rule = functools.partial(_GRAPH_RULES[name], self._graph)
@@ -257,13 +272,15 @@ class _JaxprLowering:
           function: the function; its keyword arguments are parameters of the operation.
           equation: the equation.
         """
+        # The formula's keyword arguments name the parameters of the equation that it needs. With
+        # them given, it is traced like any function of arrays.
         names = inspect.getfullargspec(function).kwonlyargs
         called = functools.partial(function, **{name: equation.params[name] for name in names})
         closed = jax.make_jaxpr(called)(*(x.aval for x in equation.invars))
         return lambda _, *operands: self.lower(closed, operands)
 
     def _expand(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        """Lower an operation that JAX itself computes by others (see `_is_expandable`)."""
+        """Lower an operation that JAX itself expands into others (see `_is_expandable`)."""
 
         def expanded(*arrays: Any) -> Any:
             with equation.ctx.manager:
@@ -282,6 +299,8 @@ class _JaxprLowering:
         """Select between two arrays by one condition, or one for each index of leading axes."""
         if not isinstance(condition, np.ndarray):
             condition = scalar_array([condition], ())
+        # Give the condition axes of length 1 behind its own, so that it broadcasts along the
+        # others.
         trailing = [1] * (if_false.ndim - condition.ndim)
         arrays = np.broadcast_arrays(
             condition.reshape((*condition.shape, *trailing)), if_false, if_true
@@ -307,18 +326,23 @@ class _JaxprLowering:
     _custom_vjp_call = _custom_jvp_call
 
     def _platform_index(self, equation: Any) -> ScalarArray:
-        # What is written for all platforms has no name.
+        # `jax.lax.platform_dependent`: choose the case that is written for all platforms, whose
+        # names are None. A scalar program does not know which platform it is for.
         platforms = equation.params["platforms"]
         index = next((i for i, names in enumerate(platforms) if names is None), len(platforms) - 1)
         return constant_array(np.int32(index))
 
     def _remat2(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
-        # What a derivative computes again is computed once: nothing is stored in between.
+        # `jax.checkpoint` computes values again in the backward pass instead of storing them. Here
+        # all values are registers, and equal operations are recorded once.
         return self.lower(ClosedJaxpr(equation.params["jaxpr"], ()), operands)
 
     _checkpoint = _remat2
 
     def _custom_linear_solve(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        # The operands are the constants of four functions (matvec, vecmat, solve, transpose_solve),
+        # then the right-hand sides. Only `solve` runs here; the others serve checks and
+        # derivatives.
         lengths, solve = equation.params["const_lengths"], equation.params["jaxprs"].solve
         first = lengths.matvec + lengths.vecmat
         right = operands[first + lengths.solve + lengths.transpose_solve :]
@@ -343,12 +367,14 @@ class _JaxprLowering:
             rolled = self._counted_loop(body, length, constants, carry)
             if rolled is not None:
                 return rolled
+        # Lower the body once for each iteration, with this iteration's rows of the sequences.
         order = range(length)
         rows: dict[int, list[ScalarArray]] = {}
         for i in reversed(order) if equation.params["reverse"] else order:
             slices = [_at(sequence, i) for sequence in sequences]
             results = self.lower(body, [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
+        # Stack the rows that the iterations returned.
         shapes = [shape_of(variable) for variable in equation.outvars[carried:]]
         columns = [
             scalar_array((x for i in order for x in rows[i][k].ravel()), shape)
@@ -372,6 +398,7 @@ class _JaxprLowering:
             counter = self._elementwise("add", state[0], constant_array(np.int32(1)))
             return [counter, *self.lower(body, [*constants, *state[1:]])]
 
+        # A scan counts its iterations itself; here the counter is the first carried value.
         state = [constant_array(np.int32(0)), *carry]
         with contextlib.suppress(UnsupportedError):
             return self._unroll_or_loop(state, condition, next_state)[1:]
@@ -379,6 +406,8 @@ class _JaxprLowering:
         return None
 
     def _while(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+        # The operands are the constants of the condition, those of the body, and the carried
+        # values.
         first = equation.params["cond_nconsts"]
         second = first + equation.params["body_nconsts"]
         cond_consts, body_consts = operands[:first], operands[first:second]
@@ -391,6 +420,7 @@ class _JaxprLowering:
             return self._fold("or", np.bool_(False), row_conditions(state).ravel())
 
         def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
+            # Rows whose condition is false keep their values.
             rows = row_conditions(state)
             updated = self.lower(equation.params["body_jaxpr"], [*body_consts, *state])
             pairs = zip(state, updated, strict=True)
@@ -437,6 +467,7 @@ class _JaxprLowering:
         """
         count_before = self._graph.count
         result = state
+        # Whether the loop is still running, as a scalar of the program.
         active: Scalar = np.bool_(True)
         # `state` advances even after the loop may have ended, while `result` keeps the value at the
         # end. So a counter in `state` stays constant, and with it the number of iterations.
@@ -469,6 +500,8 @@ class _JaxprLowering:
         Returns:
           The state after the last iteration.
         """
+        # Every scalar of the state is a candidate for a carried value, with a placeholder
+        # (`carries`) for its value at the start of an iteration.
         initial = _flatten(state)
         loop = self._graph.begin_loop(initial)
         carried: set[int] = set()
@@ -502,10 +535,14 @@ class _JaxprLowering:
             return self.lower(branches[min(max(int(selected), 0), len(branches) - 1)], operands)
         count_before = self._graph.count
         sides = [self.lower(branch, operands) for branch in branches]
+        # All sides are recorded by now, so their size is known. Nest the choices, from the last
+        # side to the first: side i if the index is not above i, else what the later sides choose.
         is_branch = self._graph.count - count_before >= MIN_BRANCH_OPERATIONS
         result = sides[-1]
         for i in reversed(range(len(sides) - 1)):
             later = self._graph.apply("gt", selected, selected.dtype.type(i))
+            # `schedule` moves operations that only one side needs into the branch, which skips
+            # them. Short sides are both computed, and a selection takes one result.
             if is_branch:
                 flat = self._graph.branch(later, _flatten(sides[i]), _flatten(result))
                 result = _unflatten(result, flat)
@@ -540,8 +577,10 @@ class _JaxprLowering:
             raise UnsupportedError(f"the bits of {source} as {to}")
 
         def cast(one: Scalar) -> Scalar:
+            # Between a float32 and an integer, take the bits as they are. Between integers of 32
+            # bits, a conversion keeps them.
             if {source.kind, to.kind} in ({"f", "i"}, {"f", "u"}):
-                # The graph knows the bits of a float32 as int32.
+                # The graph's `bitcast` is between float32 and int32 only.
                 whole = one if source.kind == "f" else self._graph.convert(one, np.dtype(np.int32))
                 one = self._graph.apply("bitcast", whole)
             return self._graph.convert(one, to)
@@ -574,7 +613,7 @@ class _JaxprLowering:
 
     def _integer_pow(self, equation: Any, x: ScalarArray) -> ScalarArray:
         one = constant_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
-        # Powers of 1/x, which a function mostly has already if its derivative has them.
+        # x⁻ⁿ is (1/x)ⁿ. Where a derivative needs it, the function mostly has 1/x already.
         base = x if equation.params["y"] >= 0 else self._elementwise("div", one, x)
         result = one
         for _ in range(abs(equation.params["y"])):
@@ -596,6 +635,7 @@ class _JaxprLowering:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
     def _reduce(self, op: str, initial: Scalar, equation: Any, x: ScalarArray) -> ScalarArray:
+        # Each group holds the scalars of one result, which are combined in their order.
         (groups,) = _group_axes(x, (), equation.params["axes"])
         scalars = (self._fold(op, initial, group) for group in groups)
         return scalar_array(scalars, shape_of(equation.outvars[0]))
@@ -618,12 +658,14 @@ class _JaxprLowering:
         return self._reduce("or", equation.outvars[0].aval.dtype.type(0), equation, x)
 
     def _reduce_max(self, equation: Any, x: ScalarArray) -> ScalarArray:
+        # Start with the number that changes nothing: max(-inf, x) is x.
         return self._reduce("max", _lowest(equation), equation, x)
 
     def _reduce_min(self, equation: Any, x: ScalarArray) -> ScalarArray:
         return self._reduce("min", -_lowest(equation), equation, x)
 
     def _cumulate(self, op: str, equation: Any, x: ScalarArray) -> ScalarArray:
+        # Go along the axis, and combine each entry with the one before it (behind it, if reversed).
         result = np.moveaxis(x.copy(), equation.params["axis"], 0)
         order = range(1, len(result))
         for i in [len(result) - 1 - i for i in order] if equation.params["reverse"] else order:
@@ -640,12 +682,15 @@ class _JaxprLowering:
     def _arg_extreme(self, better: str, equation: Any, x: ScalarArray) -> ScalarArray:
         (axis,) = equation.params["axes"]
         kind = equation.outvars[0].aval.dtype.type
+        # The graph cannot compare truth values.
         if equation.invars[0].aval.dtype == bool:
             x = scalar_array(
                 (self._graph.convert(one, np.dtype(np.int32)) for one in x.ravel()), x.shape
             )
         x = np.moveaxis(x, axis, -1)
         places = full_array(x.shape[:-1], lambda: kind(0))
+        # Keep the best scalar so far and its place; a later one must be better, so the first of
+        # equals wins.
         for row in np.ndindex(*x.shape[:-1]):
             best = x[row][0]
             for i, scalar in enumerate(x[row][1:], start=1):
@@ -674,6 +719,8 @@ class _JaxprLowering:
     _cholesky = _lu = _qr = _triangular_solve = _linear_algebra
 
     def _dot_general(self, equation: Any, a: ScalarArray, b: ScalarArray) -> ScalarArray:
+        # Group the axes of both operands as (batch, free, summed); the result has (batch, free a,
+        # free b).
         (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
         rows = _group_axes(a, batch_a, sum_a)
         columns = _group_axes(b, batch_b, sum_b)
@@ -696,7 +743,9 @@ def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, 
     """Find carried values of a loop that are functions of other carried values.
 
     A carried value is derived if it is the same function of the others before the first iteration
-    and after every iteration. The two expressions are compared operation by operation.
+    and after every iteration. Example: a loop carries x and y, starts with y = f(x₀), and ends each
+    iteration with y = f(x). Then y need not be carried, but is f(x) at the start of an iteration.
+    The two expressions are compared operation by operation.
 
     Returns:
       How each derived value is computed from the others, by its place.
@@ -705,12 +754,15 @@ def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, 
     known: dict[Any, Scalar] = {}
     # Begin with the values that were recorded first, because others may be derived from them.
     for place in sorted(carried, key=lambda k: _index(loop.updated[k])):
+        # If an earlier place has the same two values, take its value; otherwise try to rebuild both
+        # values from what is known at the start of an iteration.
         pair = loop.initial[place], loop.updated[place]
         found = known.get(_pair_key(pair))
         if found is None:
             found = _matched(graph, known, *pair)
         if found is not None:
             derived[place] = found
+        # From here on, this pair is computed from the carried or derived value.
         known[_pair_key(pair)] = loop.carries[place] if found is None else found
     return derived
 
@@ -718,7 +770,17 @@ def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, 
 def _matched(
     graph: ExprGraph, known: dict[Any, Scalar], before: Scalar, after: Scalar
 ) -> Scalar | None:
-    """Return one expression for both `before` and `after`; None if there is none."""
+    """Return one expression for both `before` and `after`; None if there is none.
+
+    Args:
+      graph: the graph, to which the expression is added.
+      known: for pairs of a value before the loop and after an iteration, the scalar that has this
+        value at the start of every iteration.
+      before: a carried value before the first iteration.
+      after: the same value after an iteration.
+    """
+    # Walk down both expressions at once, with a stack instead of recursion: they may be thousands
+    # of operations deep. A pair stays on the stack until all pairs of its operands are found.
     pending = [(before, after)]
     found: dict[Any, Scalar | None] = {}
     while pending:
@@ -727,10 +789,13 @@ def _matched(
         if key in known or key in found:
             pending.pop()
             continue
+        # An operation on different values matches if all of its operands do.
         parts = _parts(*pair)
         if parts is None:
             # The two have no common operation, so the expressions that contain them differ.
             return None
+        # Each operand is the same scalar on both sides, a known pair, a pair found before, or still
+        # missing.
         operands, missing = [], []
         for part in parts:
             key_of_part = None if is_same(*part) else _pair_key(part)
@@ -745,6 +810,7 @@ def _matched(
         if missing:
             pending += missing
             continue
+        # All operands are there: record the operation once more, on them.
         found[key] = graph.repeat(pair[1], operands)
         pending.pop()
     return found[_pair_key((before, after))]
@@ -760,6 +826,7 @@ def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
 
 
 def _pair_key(pair: tuple[Scalar, Scalar]) -> tuple[Any, ...]:
+    """Return a key that two pairs share if they are the same operations or equal constants."""
     return tuple((x.dtype.str, x.tobytes()) if is_constant(x) else x.index for x in pair)
 
 

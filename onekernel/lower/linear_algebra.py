@@ -37,6 +37,8 @@ def unroll_linear_algebra(function: _F) -> _F:
 
     @functools.wraps(function)
     def unrolled(*arguments: Any) -> Any:
+        # Trace, replace the operations, and evaluate the new jaxpr, which JAX may be tracing
+        # itself.
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
         results = jaxpr_as_fun(_unroll(closed))(*jax.tree.leaves(arguments))
         return jax.tree.unflatten(jax.tree.structure(shapes), results)
@@ -59,6 +61,7 @@ def expansion(equation: JaxprEqn) -> Callable[..., Any] | None:
     matrix: Any = equation.invars[0].aval
     if matrix.shape[-1] > MAX_ROWS or not jnp.issubdtype(matrix.dtype, jnp.floating):
         return None
+    # Pass the parameters that the formula has; others do not change the result.
     names = inspect.signature(function).parameters
     return functools.partial(
         function, **{name: x for name, x in equation.params.items() if name in names}
@@ -83,10 +86,12 @@ def cholesky(a: Float[Array, "n n"]) -> Float[Array, "n n"]:
     size = len(a)
     if not size:
         return a
+    # One column after the other, each from those on its left.
     zero = jnp.zeros((), a.dtype)
     columns: list[list[Array]] = []
     for j in range(size):
         pivot = jnp.sqrt(_subtract_products(a[j, j], [(c[j], c[j]) for c in columns]))
+        # One division for a column, and products for its entries.
         inverse = 1.0 / pivot
         below = [
             _subtract_products(a[i, j], [(c[j], c[i]) for c in columns]) * inverse
@@ -135,6 +140,7 @@ def triangular_solve(
         size = len(t)
         if not size:
             return b
+        # Forwards through a lower triangle, backwards through an upper one.
         x: list[Array] = [jnp.zeros_like(b[0])] * size
         for i in range(size) if lower else reversed(range(size)):
             before = range(i) if lower else range(i + 1, size)
@@ -158,6 +164,7 @@ def lu(a: Float[Array, "m n"]) -> tuple[Array, Array, Array]:
       U and, below its diagonal, L without its diagonal of ones; the row that each row was exchanged
       with; and the rows of A in their new order.
     """
+    # A row is an array, and which row it is in A is kept beside it.
     rows, order = list(a), [jnp.int32(i) for i in range(len(a))]
     pivots = []
     for k in range(min(a.shape)):
@@ -165,6 +172,8 @@ def lu(a: Float[Array, "m n"]) -> tuple[Array, Array, Array]:
         column = jnp.stack([jnp.abs(row[k]) for row in rows[k:]])
         pivot = jnp.argmax(column).astype(jnp.int32) + k
         pivots.append(pivot)
+        # Which row is the pivot is known only when the program runs: each row may take part in the
+        # exchange.
         for each in (rows, order):
             first, found = each[k], each[k]
             for i in range(k + 1, len(a)):
@@ -196,6 +205,7 @@ def qr(
     if pivoting:
         raise UnsupportedError("a QR factorisation with pivoting")
     rows, columns = a.shape[-2:]
+    # Columns of Q that are returned.
     kept = rows if full_matrices else min(rows, columns)
 
     @functools.partial(jnp.vectorize, signature="(m,n)->(m,k),(k,n)")
@@ -204,6 +214,9 @@ def qr(
         for k in range(min(rows - 1, columns)):
             # Reflect the rest of the column onto its first entry.
             first, rest = r[k, k], r[k + 1 :, k]
+            # The reflection I - factor · v vᵀ maps the column to (wanted, 0, ..., 0). `wanted` has
+            # the sign that avoids cancellation. A column that is zero below the diagonal needs
+            # none.
             square = jnp.sum(rest * rest)
             norm = jnp.sqrt(first * first + square)
             wanted = jnp.where(first < 0, norm, -norm)
@@ -213,6 +226,7 @@ def qr(
             vector = jnp.concatenate([jnp.zeros(k), jnp.ones(1), vector])
             r = r - factor * jnp.outer(vector, vector @ r)
             reflections.append((factor, vector))
+        # Q is the product of all reflections, applied from the last to the first.
         q = jnp.eye(rows, kept, dtype=a.dtype)
         for factor, vector in reversed(reflections):
             q = q - factor * jnp.outer(vector, vector @ q)
@@ -256,6 +270,8 @@ def _unroll_equation(equation: JaxprEqn) -> JaxprEqn:
         # The bodies of loops, branches and calls are parameters, some of them in tuples.
         return equation.replace(params=jax.tree.map(_unroll, equation.params))
     operands = [x.aval for x in equation.invars]
+    # Trace a call of the expansion as one equation, whose primitive and parameters replace the
+    # operation's.
     with jax.disable_jit(False):
         (call,) = jax.make_jaxpr(jax.jit(function))(*operands).jaxpr.eqns
     return equation.replace(primitive=call.primitive, params=call.params)

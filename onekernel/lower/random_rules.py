@@ -38,17 +38,20 @@ def words_of(x: Any) -> tuple[Scalar, ...]:
 
 
 def like(x: Any, words: Iterable[Scalar]) -> Any:
-    """Return a key or a scalar, as `x` is one, of the next words."""
+    """Return a key if `x` is a key, else a scalar, from the next of some words."""
     words = iter(words)
     return Key(next(words), next(words)) if isinstance(x, Key) else next(words)
 
 
 def threefry(graph: ExprGraph, key: Key, first: Scalar, second: Scalar) -> Key:
-    """Return the hash of two counts under a key; all are uint32."""
+    """Return the hash of a count of 64 bits, in two words, under a key; all scalars are uint32."""
     add = functools.partial(graph.apply, "add")
     xor = functools.partial(graph.apply, "xor")
+    # Threefry-2x32 (figure 2 of the source): the third key is the parity of the other two.
     keys = key.first, key.second, xor(xor(key.first, key.second), _PARITY)
     first, second = add(first, keys[0]), add(second, keys[1])
+    # Five groups of four rounds; after each group, two of the three keys and the group's number are
+    # added.
     for group in range(5):
         for rotation in _ROTATIONS[group % 2]:
             first = add(first, second)
@@ -78,6 +81,7 @@ def _threefry2x32(
 
 def _wrap(graph: ExprGraph, equation: Any, words: ScalarArray) -> ScalarArray:
     pairs = words.reshape(-1, words.shape[-1])
+    # Keys of other generators have more words.
     if words.shape[-1] != 2:
         raise UnsupportedError("random numbers other than those of Threefry")
     return scalar_array((Key(*pair) for pair in pairs), words.shape[:-1])
@@ -92,6 +96,8 @@ def _hashes(graph: ExprGraph, key: Key, shape: tuple[int, ...]) -> list[Key]:
     """Return the hashes of the places of an array under a key."""
     if not jax.config.values.get("jax_threefry_partitionable", False):
         raise UnsupportedError("random numbers without jax_threefry_partitionable")
+    # With `jax_threefry_partitionable`, each number is the hash of its place in the array, a count
+    # of 64 bits; so it does not depend on how many are drawn.
     counts = range(math.prod(shape))
     return [threefry(graph, key, np.uint32(0), np.uint32(count)) for count in counts]
 
@@ -107,6 +113,7 @@ def _bits(graph: ExprGraph, equation: Any, keys: ScalarArray) -> ScalarArray:
         raise UnsupportedError("random bits other than words of 32")
     shape = equation.params["shape"]
     hashes = [one for key in keys.ravel() for one in _hashes(graph, key, shape)]
+    # A hash has two words; random bits of 32 are both of them combined.
     bits = (graph.apply("xor", one.first, one.second) for one in hashes)
     return scalar_array(bits, shape_of(equation.outvars[0]))
 

@@ -115,6 +115,7 @@ def _bitcast(x: Any) -> Any:
 
 def _reduced(x: Any) -> tuple[Any, Any]:
     """Return how many quarter turns, modulo 4, are nearest to an angle, and what is left."""
+    # In float64, π/2 is exact to far more digits than the result needs.
     wide = x.astype(np.float64)
     angle = np.arctan2(np.sin(wide), np.cos(wide))
     turns = np.round(angle * (2 / np.pi))
@@ -173,12 +174,13 @@ EVALUATE: dict[str, Callable[..., Any]] = {
 }
 """The NumPy function of every operation except `select` and `convert`. `bitcast` takes the bits of
 a float32 for an int32, or the other way round; `round` rounds to the nearest whole number, and half
-of one to the nearest even. `quarter_turns` and `angle_rest` divide an angle up to 2⁵⁰ into quarter
-turns, modulo 4, and an angle up to π/4."""
+of one to the nearest even. For an angle up to 2⁵⁰, `quarter_turns` is the nearest number of quarter
+turns, modulo 4, and `angle_rest` the angle that is left, between -π/4 and π/4."""
 
 MAX_OPERATIONS = 1_000_000
 """Largest number of recorded operations, including those that nothing depends on."""
 
+# Operations whose operands may be exchanged: a + b and b + a are recorded once.
 _COMMUTATIVE = ("add", "and", "eq", "max", "min", "mul", "ne", "or", "xor")
 
 
@@ -199,7 +201,7 @@ class ExprGraph:
         """Number of recorded operations."""
 
     def is_exact(self, dtype: np.dtype) -> bool:
-        """Return whether what follows for finite numbers holds for all numbers of a dtype."""
+        """Return whether a rule for finite numbers, such as 0·x = 0, holds for a dtype here."""
         return self.finite or dtype != _FLOAT
 
     def input(self, dtype: np.dtype) -> Expr:
@@ -222,16 +224,22 @@ class ExprGraph:
         if op not in EVALUATE:
             raise UnsupportedError(f"the operation {op}")
         recorded = [x for x in operands if isinstance(x, Expr)]
+        # NumPy computes an operation on constants at once.
         if not recorded:
             with np.errstate(all="ignore"):
                 return np.asarray(EVALUATE[op](*operands))[()]
         operand_dtype = recorded[0].dtype
+        # All operands have one dtype: jaxprs convert numbers explicitly, and the generated code
+        # cannot.
         if operand_dtype not in _DTYPES or any(x.dtype != operand_dtype for x in operands):
             raise UnsupportedError(f"{op} of {', '.join(str(x.dtype) for x in operands)}")
+        # A simplification may return an existing scalar, a constant, or a longer formula of basic
+        # operations.
         if simplify := self._simplifications.get(op):
             simplified = simplify(self, operand_dtype, *operands)
             if simplified is not None:
                 return simplified
+        # Only comparisons and changes of bits have another dtype than their operands.
         dtype = _BOOL if op in COMPARISONS or op == "is_finite" else operand_dtype
         if op == "bitcast":
             dtype = _INT if dtype == _FLOAT else _FLOAT
@@ -244,6 +252,7 @@ class ExprGraph:
         check_scalars([on_false, on_true])
         if is_same(on_false, on_true):
             return on_false
+        # Select the other way round instead of inverting the condition.
         if condition.op == "not":
             return self.select(condition.operands[0], on_true, on_false)
         dtype = on_true.dtype
@@ -264,8 +273,8 @@ class ExprGraph:
             raise UnsupportedError(f"a conversion to {dtype}")
         if x.dtype == dtype:
             return x
+        # A conversion between int32 and uint32 keeps the bits: there and back, nothing changes.
         if x.op == "convert" and {x.dtype, dtype} == {_INT, _UINT}:
-            # Converted back, the bits are those of before.
             before = x.operands[0]
             if before.dtype == dtype:
                 return before
@@ -281,6 +290,7 @@ class ExprGraph:
         """Begin a loop; the operations of its iterations are recorded before `end_loop`."""
         loop = Loop(-1, [], list(initial))
         for place, scalar in enumerate(initial):
+            # Whether a carry is needed is found later: `schedule` drops those that nothing uses.
             loop.carries.append(self._new("carry", (), scalar.dtype, loop, place))
         return loop
 
@@ -296,6 +306,7 @@ class ExprGraph:
         self, condition: Expr, if_false: Sequence[Scalar], if_true: Sequence[Scalar]
     ) -> list[Scalar]:
         """Record a branch, of which only the selected side is computed, and return its results."""
+        # The callers have recorded both sides, so the branch has a larger index than they have.
         branch = Branch(self._next(), condition, list(if_false), list(if_true))
         return [
             b if is_same(a, b) else self._new("result", (), b.dtype, branch, place)
@@ -359,14 +370,19 @@ _INVERTING = {"mul": (-1, "neg"), "xor": (True, "not")}
 def _simplify_commutative(
     graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar, *, op: str
 ) -> Scalar | None:
+    # Combining a number with itself changes nothing.
     if x is y and op in ("and", "or", "max", "min"):
         return x
+    # NaN wins against every number, as in JAX.
     if op in ("max", "min") and dtype == _FLOAT:
         for one in (x, y):
             if is_constant(one) and np.isnan(one):
                 return one
+    # On bits, the constants of the tables hold for truth values only.
     if op in ("and", "or", "xor") and dtype != _BOOL:
         return None
+    # x · 0 = 0 (for finite x), x + 0 = x, x · 1 = x and x · -1 = -x, with the constant on either
+    # side; and likewise for truth values.
     for one, other in ((x, y), (y, x)):
         if op in _ABSORBING and _equals(one, _ABSORBING[op]) and graph.is_exact(dtype):
             return dtype.type(_ABSORBING[op])
@@ -378,6 +394,7 @@ def _simplify_commutative(
 
 
 def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    # x - x is NaN for an infinite x.
     if x is y and graph.is_exact(dtype):
         return dtype.type(0)
     if _equals(x, 0):
@@ -386,12 +403,15 @@ def _simplify_sub(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 
 
 def _simplify_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
+    # Integers whose divisor may be 0 or negative are divided by magnitudes, and the sign is set
+    # afterwards.
     if dtype != _FLOAT and not _is_positive(y):
         return _divided(graph, dtype, x, y)[0]
     if _equals(x, 0) and graph.is_exact(dtype):
         return dtype.type(0)
     if _equals(y, 1):
         return x
+    # Multiply by the reciprocal instead, since a division takes several times as long.
     if is_constant(y) and dtype == _FLOAT and y != 0:
         return graph.apply("mul", x, np.float32(1 / np.float64(y)))
     return None
@@ -404,44 +424,56 @@ def _simplify_rem(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Sc
 
 
 def _float_rest(graph: ExprGraph, x: Scalar, y: Scalar) -> Scalar:
-    """Return what is left of a float by a division, with its sign.
+    """Return the remainder of x / y as C's fmod does, with the sign of x.
 
-    It is as exact as a product of the quotient and the divisor.
+    Its error is that of the product of the whole quotient and y.
     """
     do, zero = graph.apply, np.float32(0)
     size, rest = do("abs", y), do("abs", x)
-    # A quotient has 24 bits: the first round leaves what the second one divides.
+    # A float32 quotient has 24 bits. If the whole quotient needs more, the first round leaves a
+    # rest that is still larger than y, and the second round divides that.
     for _ in range(2):
         whole = do("floor", do("div", rest, size))
         rest = do("sub", rest, do("mul", whole, size))
+        # The quotient may be rounded to the next whole number: bring the rest into 0 ... |y|.
         rest = graph.select(do("lt", rest, zero), rest, do("add", rest, size))
         rest = graph.select(do("ge", rest, size), rest, do("sub", rest, size))
-    # Infinity divides nothing, and is not divided; and nothing is divided by 0.
+    # If y is infinite, the remainder is x. If x is infinite or NaN, or y is 0 or NaN, it is NaN.
     rest = graph.select(do("eq", size, np.float32(np.inf)), rest, do("abs", x))
     is_number = do("and", do("lt", do("abs", x), np.float32(np.inf)), do("gt", size, zero))
     rest = graph.select(is_number, np.float32(np.nan), rest)
+    # The rest has the sign of the dividend.
     return graph.select(do("lt", x, zero), rest, do("neg", rest))
 
 
 def _is_positive(y: Scalar) -> bool:
-    """Return whether an integer is known to be positive: with others, some processors fail."""
+    """Return whether an integer is known to be positive.
+
+    Processors divide by such an integer without trouble; division by 0 stops a program on x86.
+    """
     if is_constant(y):
         return bool(y > 0)
     return y.op == "max" and y.dtype == _UINT and any(is_constant(x) and x > 0 for x in y.operands)
 
 
 def _divided(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> tuple[Scalar, Scalar]:
-    """Return quotient and remainder of integers as JAX computes them: of n and 0, -1 and n."""
+    """Return quotient and remainder of integers as JAX computes them, also of a division by 0.
+
+    The magnitudes are divided, as integers without a sign; -2³¹ has a magnitude, too, as uint32.
+    """
     do, zero, one = graph.apply, dtype.type(0), np.uint32(1)
     size_x, size_y = (graph.convert(_magnitude(graph, dtype, each), _UINT) for each in (x, y))
+    # Divide by 1 in place of 0, which would stop the program on x86, and replace the result below.
     divisor = do("max", size_y, one)
     quotient = graph.convert(do("div", size_x, divisor), dtype)
     rest = graph.convert(do("rem", size_x, divisor), dtype)
+    # The quotient is negative if the signs differ, and the remainder has the sign of the dividend.
     if dtype == _INT:
         is_below = do("lt", x, zero)
         differ = do("xor", is_below, do("lt", y, zero))
         quotient = graph.select(differ, quotient, do("neg", quotient))
         rest = graph.select(is_below, rest, do("neg", rest))
+    # JAX divides n by 0 to a quotient with all bits set and the remainder n.
     is_zero = do("eq", y, zero)
     none = np.int32(-1) if dtype == _INT else np.uint32(2**32 - 1)
     return graph.select(is_zero, quotient, none), graph.select(is_zero, rest, x)
@@ -454,8 +486,12 @@ def _magnitude(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
 def _simplify_shift(
     graph: ExprGraph, dtype: np.dtype, x: Scalar, by: Scalar, *, op: str
 ) -> Scalar | None:
-    """Shift by what is known, as all processors do it alike."""
+    """Expand a shift by an unknown number of bits into shifts by constants.
+
+    Processors differ in what they do for 32 bits and more, and LLVM leaves it undefined.
+    """
     do = graph.apply
+    # In JAX, the result of a shift by 32 bits or more is 0.
     if is_constant(by):
         return None if 0 <= by < 32 else dtype.type(0)
     # Shift by each bit of the number that is set; beyond 31, nothing is left.
@@ -496,6 +532,7 @@ def _simplify_sign(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     zero, one = dtype.type(0), dtype.type(1)
     if dtype.kind == "u":
         return graph.select(graph.apply("gt", x, zero), zero, one)
+    # sign(x) is x itself where it is neither positive nor negative: 0, -0 or NaN.
     below = graph.select(graph.apply("lt", x, zero), x, -one)
     return graph.select(graph.apply("gt", x, zero), below, one)
 
@@ -520,6 +557,8 @@ class _Polynomial(NamedTuple):
 def _coefficients(polynomial: _Polynomial) -> list[np.float32]:
     """Return the coefficients of a polynomial, lowest first."""
     function, degree, *domain = polynomial
+    # Interpolation at Chebyshev's points is close to the best polynomial of its degree, with almost
+    # the same error everywhere in the interval. Horner's scheme needs the coefficients of powers.
     fit = np.polynomial.Chebyshev.interpolate(function, degree, domain=domain)
     power = fit.convert(kind=np.polynomial.Polynomial, domain=[-1, 1], window=[-1, 1])
     return [np.float32(c) for c in power.coef]
@@ -534,7 +573,7 @@ def _horner(graph: ExprGraph, polynomial: _Polynomial, x: Scalar) -> Scalar:
     return total
 
 
-# The polynomials of sine and cosine are in s = r², for |r| up to π/4.
+# sin(r)/r and cos(r) are polynomials in s = r², for |r| up to π/4. NumPy's sinc(x) is sin(πx)/(πx).
 _SINE = _Polynomial(lambda s: np.sinc(np.sqrt(s) / np.pi), 4, 0.0, (np.pi / 4) ** 2)  # sin(r)/r
 _COSINE = _Polynomial(lambda s: np.cos(np.sqrt(s)), 5, 0.0, (np.pi / 4) ** 2)
 
@@ -548,6 +587,7 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
     do = graph.apply
     if graph.finite:
         turns = do("floor", do("add", do("mul", x, np.float32(2 / np.pi)), np.float32(0.5)))
+        # r = x - turns · (coarse + fine + finest): the products with the first two parts are exact.
         r = x
         for part in _QUARTER_TURN:
             r = do("sub", r, do("mul", turns, part))
@@ -564,6 +604,7 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
 
     # Evaluate both polynomials, and select value and sign by the quadrant.
     sine, cosine = do("mul", r, _horner(graph, _SINE, s)), _horner(graph, _COSINE, s)
+    # sin(r + k π/2) is sin r, cos r, -sin r, -cos r for k = 0, 1, 2, 3.
     quarter = modulo(do("add", turns, np.float32(ahead)), 4.0)
     odd = do("ge", modulo(quarter, 2.0), np.float32(1))
     value = graph.select(odd, sine, cosine)
@@ -571,7 +612,7 @@ def _simplify_sine(graph: ExprGraph, dtype: np.dtype, x: Scalar, ahead: int = 0)
 
 
 _LN2 = float(np.log(2.0))
-# ln 2 as a sum of two parts, of which the products of the first with an exponent are exact.
+# ln 2 as a sum of two parts. The first has so few bits that its product with an exponent is exact.
 _LN2_COARSE = np.float32(round(_LN2 * 2**14) / 2**14)
 _LN2_FINE = np.float32(_LN2 - float(_LN2_COARSE))
 _EXP = _Polynomial(np.exp, 6, -_LN2 / 2, _LN2 / 2)
@@ -587,8 +628,8 @@ _TANH = _Polynomial(lambda s: np.tanh(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _TANH_
 # atan(t)/t in s = t², for t up to tan(π/8).
 _ATAN_END = float(np.tan(np.pi / 8))
 _ATAN = _Polynomial(lambda s: np.arctan(np.sqrt(s)) / np.sqrt(s), 5, 1e-12, _ATAN_END**2)
-# For w = -log(1 - x²), erf⁻¹(x)/x is a polynomial in w up to the first end, then in √w; float32 has
-# no x between 1 and that of the last end.
+# For w = -log(1 - x²), erf⁻¹(x)/x is a polynomial in w up to `_ERF_INV_NEAR`, and one in √w up to
+# `_ERF_INV_FAR`; beyond, float32 has no x below 1.
 _ERF_INV_NEAR = 5.0
 _ERF_INV_FAR = 16.7
 _ERF_INV_CENTRE = float((np.sqrt(_ERF_INV_NEAR) + np.sqrt(_ERF_INV_FAR)) / 2)
@@ -596,17 +637,19 @@ _ERF_INV_CENTRE = float((np.sqrt(_ERF_INV_NEAR) + np.sqrt(_ERF_INV_FAR)) / 2)
 
 def _simplify_exp(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     """Expand exp(x) to basic arithmetic; where the result is subnormal, it is 0."""
-    # exp(x) = 2^n exp(r) with |r| at most ln(2)/2. In the sum with 1.5 * 2^23, the last bits are n.
+    # exp(x) = 2^n exp(r) with |r| at most ln(2)/2, where n is x / ln(2) rounded. Near 1.5 · 2^23,
+    # neighbouring float32 differ by 1: so the sum is rounded to a whole number, and its last bits
+    # are those of n.
     do = graph.apply
     rounding = np.float32(1.5 * 2**23)
     rounded = do("add", do("mul", x, np.float32(1 / _LN2)), rounding)
     n = do("sub", rounded, rounding)
     r = do("sub", do("sub", x, do("mul", n, _LN2_COARSE)), do("mul", n, _LN2_FINE))
-    # Add n to the exponent.
+    # Multiply by 2^n: add n to the exponent, which begins at bit 23 of a float32.
     shifted = do("shift_left", do("bitcast", rounded), np.int32(23))
     result = do("bitcast", do("add", do("bitcast", _horner(graph, _EXP, r)), shifted))
     result = graph.select(do("lt", x, np.float32(-87.336)), result, np.float32(0))
-    # Infinity where the result is too large, and NaN of NaN.
+    # Infinity where the result is too large for float32, and NaN of NaN: both are x · ∞.
     beyond = do("mul", x, np.float32(np.inf))
     return graph.select(do("lt", x, np.float32(88.722839)), beyond, result)
 
@@ -614,6 +657,7 @@ def _simplify_exp(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
 def _simplify_expm1(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     """Expand exp(x) - 1 to basic arithmetic."""
     do = graph.apply
+    # exp(x) - 1 would lose all digits near 0; there, x times a polynomial keeps them.
     near = do("mul", x, _horner(graph, _EXPM1, x))
     far = do("sub", do("exp", x), np.float32(1))
     return graph.select(do("lt", do("abs", x), np.float32(_EXPM1_END)), far, near)
@@ -624,14 +668,18 @@ def _simplify_log(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     # x = 2^n m with m from √½ to √2, and log(m) = 2 artanh((m - 1) / (m + 1)).
     do = graph.apply
     bits = do("bitcast", x)
+    # The bits of a positive float32 are 8 bits e and 23 bits f, and its value is 2^(e - 127) · 1.f.
+    # So n is e - 127, and m has the bits of x with the exponent 127 in place of e.
     n = graph.convert(do("shift_right_logical", bits, np.int32(23)), _FLOAT)
     n = do("sub", n, np.float32(127))
     m = do("bitcast", do("or", do("and", bits, np.int32((1 << 23) - 1)), np.int32(127 << 23)))
+    # If m is above √2, take m/2 and n + 1: so m is near 1, and a short polynomial is enough.
     is_high = do("gt", m, np.float32(_ROOT))
     m = graph.select(is_high, m, do("mul", m, np.float32(0.5)))
     n = graph.select(is_high, n, do("add", n, np.float32(1)))
     series = _log_near_one(graph, do("sub", m, np.float32(1)))
     result = do("add", do("mul", n, _LN2_COARSE), do("add", do("mul", n, _LN2_FINE), series))
+    # log 0 is -∞, and that of a negative number NaN.
     smallest = np.finfo(np.float32).tiny
     result = graph.select(do("lt", x, smallest), result, np.float32(-np.inf))
     result = graph.select(do("lt", x, np.float32(0)), result, np.float32(np.nan))
@@ -651,6 +699,8 @@ def _log_near_one(graph: ExprGraph, x: Scalar) -> Scalar:
 def _simplify_log1p(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     """Expand log(1 + x) to basic arithmetic."""
     do = graph.apply
+    # The sum 1 + x would lose the last digits of a small x, and the series in x does not. It holds
+    # for 1 + x from √½ to √2, that is for x between -0.29 and 0.41.
     far = do("log", do("add", x, np.float32(1)))
     is_near = do("lt", do("abs", do("sub", x, np.float32(0.06))), np.float32(0.35))
     return graph.select(is_near, far, _log_near_one(graph, x))
@@ -659,6 +709,8 @@ def _simplify_log1p(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
 def _simplify_tanh(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     """Expand tanh(x) to basic arithmetic."""
     do = graph.apply
+    # Near 0, x times a polynomial; beyond, tanh|x| = 1 - 2 / (exp(2|x|) + 1), which is 1 when exp
+    # is infinite.
     near = do("mul", x, _horner(graph, _TANH, do("mul", x, x)))
     size = do("abs", x)
     grown = do("add", do("exp", do("add", size, size)), np.float32(1))
@@ -674,17 +726,21 @@ def _simplify_atan2(graph: ExprGraph, dtype: np.dtype, y: Scalar, x: Scalar) -> 
     across, along = do("abs", y), do("abs", x)
     small, large = do("min", across, along), do("max", across, along)
     t = do("div", small, large)
+    # 0 / 0: the angle of the origin is 0.
     t = graph.select(do("eq", large, np.float32(0)), t, np.float32(0))
     # Infinity in both directions is halfway between them.
     t = graph.select(do("eq", small, np.float32(np.inf)), t, np.float32(1))
     beyond = do("gt", t, np.float32(_ATAN_END))
     turned = do("div", do("sub", t, np.float32(1)), do("add", t, np.float32(1)))
+    # In both cases |u| is at most tan(π/8), so one polynomial serves both.
     u = graph.select(beyond, t, turned)
     angle = do("mul", u, _horner(graph, _ATAN, do("mul", u, u)))
     angle = graph.select(beyond, angle, do("add", angle, np.float32(np.pi / 4)))
-    # Reflect it at the diagonal and at the axis of y.
+    # This is the angle from the nearest axis: reflect it at the diagonal if that is the axis of y,
+    # and at the axis of y if x is negative.
     steep = do("gt", across, along)
     angle = graph.select(steep, angle, do("sub", np.float32(np.pi / 2), angle))
+    # Test the sign bit, because -0 is not less than 0 but counts as negative here.
     backwards = do("lt", do("bitcast", x), np.int32(0))
     angle = graph.select(backwards, angle, do("sub", np.float32(np.pi), angle))
     return graph.select(do("lt", do("bitcast", y), np.int32(0)), angle, do("neg", angle))
@@ -697,13 +753,16 @@ def _simplify_erf_inv(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar:
     x p(w) with w = -log(1 - x²); the polynomials are interpolated here.
     """
     do = graph.apply
-    # Near ±1, one of the factors is exact.
+    # Compute 1 - x² as (1 - x)(1 + x). Near ±1, where it is small, this loses no digits: the small
+    # factor is exact.
     w = do("neg", do("log", do("mul", do("sub", np.float32(1), x), do("add", x, np.float32(1)))))
+    # Evaluate both polynomials, around the centres of their intervals, where powers stay small.
     near, far = _inverse_error_polynomials()
     inside = _horner(graph, near, do("sub", w, np.float32(_ERF_INV_NEAR / 2)))
     root = do("sub", do("sqrt", w), np.float32(_ERF_INV_CENTRE))
     factor = graph.select(do("lt", w, np.float32(_ERF_INV_NEAR)), _horner(graph, far, root), inside)
     result = do("mul", x, factor)
+    # erf⁻¹(±1) is ±∞.
     is_end = do("eq", do("abs", x), np.float32(1))
     return graph.select(is_end, result, do("mul", x, np.float32(np.inf)))
 
@@ -757,6 +816,7 @@ _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
 
 def _approximate_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     """Divide by a product with the reciprocal, which all quotients of one divisor share."""
+    # Keep what needs no reciprocal at all, such as a quotient by a constant.
     simplified = _simplify_div(graph, dtype, x, y)
     if simplified is not None or dtype != _FLOAT:
         return simplified
@@ -779,5 +839,6 @@ _APPROXIMATE: dict[str, Callable[..., Scalar | None]] = {
     "log1p": lambda graph, dtype, x: graph.apply("log", graph.apply("add", x, np.float32(1))),
     "tanh": _approximate_tanh,
 }
-"""What replaces some of `_SIMPLIFY` in a graph whose `exp`, `log` and `reciprocal` are instructions
-of a GPU, to about 2⁻²² of their size: near 0, expm1, log1p and tanh are exact to 2⁻²² only."""
+"""Functions that replace those of `_SIMPLIFY` in an approximate graph, whose `exp`, `log` and
+`reciprocal` are instructions of a GPU with a relative error of about 2⁻²². For x near 0, expm1,
+log1p and tanh have that as an absolute error, and so lose digits."""

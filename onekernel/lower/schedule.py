@@ -25,7 +25,7 @@ class Block:
     parent: "Block | None" = None
     """The enclosing block, whose values this block can use; None: the outermost block."""
     loop: Loop | None = None
-    """The loop whose head this block is; None: this block is no loop's head."""
+    """The loop whose head (see `PlacedLoop`) is this block; None for all other blocks."""
     items: list[Item] = dataclasses.field(default_factory=list)
 
     def ancestors(self) -> "Iterator[Block]":
@@ -96,10 +96,15 @@ class _Scheduler:
     """A `_Scheduler` places operations from the last to the first, so that users come first."""
 
     def __init__(self) -> None:
+        # A node is an operation, a loop or a branch. All tables are by the index of a node. The
+        # first one has all nodes that an output needs.
         self._reached: dict[int, _Node] = {}
+        # The needed results of each loop or branch, and the places of the needed carries of a loop.
         self._results: dict[int, list[Expr]] = {}
         self._carries: dict[int, list[int]] = {}
+        # Indices of the loops whose iterations a node depends on: it must be inside of them.
         self._loops: dict[int, frozenset[int]] = {}
+        # The innermost block that encloses all uses of a node that are placed so far.
         self._use: dict[int, Block] = {}
 
     def schedule(self, outputs: list[Expr]) -> Block:
@@ -108,6 +113,8 @@ class _Scheduler:
         self._reach(outputs)
         nodes = sorted(self._reached.values(), key=lambda node: node.index)
         for node in nodes:
+            # A node depends on the loops of its inputs, and a carry on its own loop. Behind a loop,
+            # its results no longer do.
             inputs = [self._loops[x.index] for x in self._inputs(node)]
             own = {node.index} if isinstance(node, Loop) else set()
             carried = {self._owner(node).index} if _op(node) == "carry" else set()
@@ -125,6 +132,7 @@ class _Scheduler:
         return root
 
     def _reach(self, outputs: list[Expr]) -> None:
+        # A stack instead of recursion, since chains of operations are thousands long.
         pending: list[_Node] = list(outputs)
         while pending:
             node = pending.pop()
@@ -142,8 +150,10 @@ class _Scheduler:
         owner, place = self._owner(value), value.place
         if value.op == "carry":
             assert isinstance(owner, Loop)
+            # A carry needs its first value and the one at the end of an iteration.
             self._carries.setdefault(owner.index, []).append(place)
             return [owner, *_expressions([owner.initial[place], owner.updated[place]])]
+        # A result needs what it is inside of the loop, or on both sides of the branch.
         self._results.setdefault(owner.index, []).append(value)
         sides = (
             [owner.results[place]]
@@ -172,8 +182,10 @@ class _Scheduler:
         return [*_expressions([node.condition, *scalars, *(node.results[i] for i in results)])]
 
     def _place_value(self, value: Expr) -> None:
+        # Inputs and carries are there when their block begins.
         if value.op in ("input", "carry"):
             return
+        # A result is computed where its loop or branch is.
         if value.op == "result":
             self._add_uses(self._use[value.index], [self._owner(value)])
             return
@@ -192,6 +204,8 @@ class _Scheduler:
             self._add_uses(if_false, _expressions(node.if_false[place] for place in places))
             self._add_uses(if_true, _expressions(node.if_true[place] for place in places))
             return if_false, if_true
+        # The condition is computed in the head, which runs once more than the body. The body is
+        # inside of it, and so can use what the head computes.
         head = Block(block, node)
         body = Block(head)
         carries = sorted(self._carries.get(node.index, []))
@@ -216,6 +230,7 @@ class _Scheduler:
 
     def _add_uses(self, block: Block, nodes: Iterable[_Node]) -> None:
         for node in nodes:
+            # A node with several users belongs to the innermost block around all of them.
             known = self._use.get(node.index)
             self._use[node.index] = block if known is None else _common_ancestor(known, block)
 
@@ -230,5 +245,6 @@ def _op(node: _Node) -> str:
 
 def _common_ancestor(one: Block, other: Block) -> Block:
     """Return the innermost block that contains both blocks."""
+    # Go up from the other block until a block that is around the first one, too.
     around = set(map(id, one.ancestors()))
     return next(block for block in other.ancestors() if id(block) in around)
