@@ -25,7 +25,8 @@ from onekernel.background import in_background
 from onekernel.trusted_files import distrust, read_trusted, write_private
 
 _UNUSED_DAYS = 30
-# Python traces one program at a time anyway: finish one, and XLA compiles it meanwhile.
+# Two threads that trace only take turns in Python. With a lock, one program is finished first, and
+# XLA compiles it while the next one is traced.
 _tracing = threading.Lock()
 
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
@@ -104,6 +105,7 @@ class ProgramCache:
         if self._folder is None:
             return
         for name in names:
+            # Each program has a thread of its own, so that all load at the same time.
             pool = ThreadPoolExecutor(1)
             self._prefetched[name] = pool.submit(_load, self._path(name))
             pool.shutdown(wait=False)
@@ -120,10 +122,12 @@ class ProgramCache:
         """
         if self._folder is None:
             return None
+        # A program is loaded once: wait for the thread that loads it, or load it now.
         prefetched = self._prefetched.pop(name, None)
         stored = prefetched.result() if prefetched else _load(self._path(name))
         if stored is None:
             return None
+        # Tell the user what tracing told, since a cached program is not traced.
         for notice in stored.notices:
             self._notices.report(notice)
         return stored.program
@@ -154,6 +158,7 @@ class ProgramCache:
         if program is not None:
             return program
         lowered = self._lower(trace)
+        # Check and compile at once. Nothing is written to the cache unless the check has passed.
         checked = in_background(check).result
         try:
             program = self._compile(name, lowered, lambda: checked() is None, tune=tune)
@@ -165,6 +170,8 @@ class ProgramCache:
         otherwise = checked()
         if program is not None and otherwise is None:
             return program
+        # The check was not passed: compile the other program (or, if compiling failed, the same
+        # once more).
         return self._compile(name, self._lower(otherwise or trace), tune=tune)
 
     def compile_later(
@@ -220,11 +227,14 @@ class ProgramCache:
         began = time.perf_counter()
         program, loaded = _compiled(lowered.program, options)
         if self._folder and loaded and (unseen := unseen_options()):
-            # Compile it once, instead of at every start: JAX finds nothing under other options.
+            # A program that JAX has loaded from its own cache cannot be written to this one. So
+            # compile it once more, under options that JAX's cache does not have; from now on this
+            # cache has the program.
             program, loaded = _compiled(lowered.program, {**options, **unseen})
         if self._folder and not loaded and usable():
             seconds = lowered.seconds + time.perf_counter() - began
-            # Only programs for CPUs call kernels by name, and their text takes a while to write.
+            # A program for a CPU calls kernels by name, so they are saved beside it. Writing its
+            # text takes a while; a program for a GPU contains its PTX.
             text = lowered.program.as_text() if jax.default_backend() == "cpu" else ""
             kernels = cpu.kernels_in(text)
             _save(self._path(name), _Stored(program, lowered.notices), kernels, seconds)
@@ -239,6 +249,7 @@ class ProgramCache:
 def processor() -> str:
     """Return a short name for this processor's instruction set."""
     try:
+        # Linux lists the features of each core: programs may use all of them.
         lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
     except OSError:
         lines = [platform.machine(), platform.processor()]
@@ -270,6 +281,7 @@ class _CacheHits:
 
     def __enter__(self) -> Self:
         self.count = 0
+        # JAX tells all listeners of all threads.
         self._thread = threading.get_ident()
         jax.monitoring.register_event_listener(self._listen)
         return self
@@ -282,9 +294,9 @@ class _CacheHits:
 
 
 def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages.Compiled, bool]:
-    """Compile a program; return also whether XLA loaded it and cannot serialize it.
+    """Compile a program; return also whether it must not be serialized.
 
-    On a CPU, functions of a program that JAX found in its own cache would be missing.
+    That is so on a CPU if JAX took it from its own cache: XLA would leave out some functions.
     """
     # Tracing may have found small programs in JAX's cache, which do not count.
     with _CacheHits() as hits:
@@ -298,13 +310,16 @@ def _load(path: Path) -> _Stored | None:
     content = read_trusted(path)
     if content is None:
         return None
+    # `read_trusted` has checked that nobody else can have written this pickle. Register the kernels
+    # first: XLA looks for them when it loads the program.
     seconds, kernels, notices, ids, serialized = pickle.loads(content)
     cpu.register(kernels)
+    # Programs name their devices by number.
     devices = {device.id: device for device in jax.devices()}
     try:
         program = serialize_executable.deserialize_and_load(
-            # Without these, JAX would load it as one program for all devices.
             *serialized,
+            # Without these devices, JAX would load it as one program for all devices.
             execution_devices=[devices[number] for number in ids],
         )
     except jax.errors.JaxRuntimeError:
@@ -337,6 +352,7 @@ def _save(path: Path, stored: _Stored, kernels: dict[str, bytes], seconds: float
         return
     content = pickle.dumps((seconds, kernels, stored.notices, ids, serialized))
     with contextlib.suppress(OSError):
+        # Remove programs that nobody has loaded for a month (`_load` touches what it loads).
         for other in path.parent.glob("program-*"):
             if time.time() - other.stat().st_mtime > _UNUSED_DAYS * 86_400:
                 other.unlink(missing_ok=True)

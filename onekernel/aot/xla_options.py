@@ -20,6 +20,8 @@ def untuned_options() -> Options:
 
 def unseen_options() -> Options:
     """Return an option that changes nothing on CPUs, with a value that JAX's cache has not seen."""
+    # The option means nothing on a CPU, but is part of JAX's cache key: a value that was never used
+    # before makes JAX compile the program.
     return known_options(
         {"xla_gpu_nccl_termination_timeout_seconds": time.time_ns() % 1_000_000_000}
     )
@@ -39,6 +41,7 @@ def known_options(options: Options) -> Options:
 def _is_known(name: str, value: Any) -> bool:
     """Return whether XLA knows an option; XLA refuses to compile with an unknown one."""
     try:
+        # Compile a program that does nothing with this option.
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
     except jax.errors.JaxRuntimeError as error:
         if "No such compile option" not in str(error):

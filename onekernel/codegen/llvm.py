@@ -77,6 +77,8 @@ def tile_function(
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
+    # `noalias` promises LLVM that no other address reaches this memory, so it may reorder loads and
+    # stores.
     w = LlvmWriter(name, "ptr noalias tile", lanes=lanes)
     (tile,) = w.parameters
     arguments = [tile.at(row, w.vector).load(w.vector, align=4 * lanes) for row in rows]
@@ -116,6 +118,7 @@ def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWrite
     with w.repeat(w.constant(0, "u64")) as loop:
         (group,) = loop.carried
         item = w.select(group > items - lanes, items - lanes, group)
+        # Neighbouring items of a row are neighbours in memory: one load fills all lanes.
         columns = [(table + j * items + item).load(w.vector) for j in range(row)]
         results = body.finish(columns)
         out.at(item * len(results), "u8").store(_interleaved(w, results))
@@ -127,12 +130,14 @@ def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWrite
 def _interleaved(w: LlvmWriter, results: Sequence[Value]) -> Value:
     """Convert vectors of floats from 0 to 255 to bytes, those of a lane one after the other."""
     lanes, count = w.lanes, len(results)
+    # Join two vectors at a time; then bring the bytes of each lane together.
     joined, *others = (result.to("u8") for result in results)
     for i, part in enumerate(others, start=1):
         # Both operands of a shuffle have one length.
         padding = [None] * ((i - 1) * lanes)
         part = w.shuffle(part, None, [*range(lanes), *padding])
         joined = w.shuffle(joined, part, range((i + 1) * lanes))
+    # The joined vector has all first results, then all second ones, and so on: read across it.
     places = [i * lanes + lane for lane in range(lanes) for i in range(count)]
     return w.shuffle(joined, None, places) if others else joined
 
@@ -143,6 +148,8 @@ def require(program: ScalarProgram) -> None:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
+    # Write the program once and throw the text away: what cannot be written raises its error here,
+    # before JAX traces a program that calls it.
     w = LlvmWriter("unused")
     count = sum(array.size for array in program.inputs)
     run_program(w, program, [w.constant(0.0)] * count)
@@ -190,6 +197,8 @@ class ProgramWriter:
         """
         for x, value in zip(self._inputs, arguments, strict=False):
             self._values[x.index] = value
+        # Items stand behind what they depend on, so one pass finds all of them. A loop or branch
+        # stays.
         rest: list[Item] = []
         for item in self._rest:
             if isinstance(item, Expr) and all(
@@ -209,6 +218,8 @@ class ProgramWriter:
         Returns:
           The scalars of the program's results.
         """
+        # The other arguments are known only now, such as the columns of a table in a loop over its
+        # items.
         others = [x for x in self._inputs if x.index not in self._values]
         self._values |= {x.index: value for x, value in zip(others, arguments, strict=True)}
         self._block(Block(items=list(self._rest)))
@@ -222,7 +233,8 @@ class ProgramWriter:
         if not is_constant(x):
             return self._values[x.index]
         if x.dtype.kind == "f" and np.isnan(x):
-            # Bits of whole numbers may be such a float, which LLVM's text would change.
+            # The bits of an integer that is passed as a float may be those of a NaN. LLVM's text of
+            # a NaN would not keep all of them: write the integer, and reinterpret it.
             whole = self.writer.constant(int(x.view(np.int32)), self.type("i"))
             return whole.bits_as(self.type("f"))
         return self.writer.constant(x.item(), self.type(x.dtype.kind))
@@ -248,13 +260,14 @@ class ProgramWriter:
     def _masked_block(self, block: Block, mask: Value) -> None:
         """Append a block that only some of the active lanes execute."""
         enclosing = self._mask
-        # With a single lane the block is executed by that lane or skipped: no mask is needed.
+        # With a single lane, the block is run for that lane or skipped, so no mask is needed.
         self._mask = mask if self.writer.lanes > 1 else None
         self._block(block)
         self._mask = enclosing
 
     def _loop(self, item: PlacedLoop) -> None:
-        # Begin the block of the condition with one phi for each carry and one for the active lanes.
+        # The loop has two blocks of code: `head` computes the condition, and `body` an iteration.
+        # Begin the head with one phi for each carry, and one for the lanes that are still active.
         w, loop = self.writer, item.loop
         carries = [loop.carries[place] for place in item.places]
         initial = [self._operand(loop.initial[place]) for place in item.places]
@@ -271,11 +284,14 @@ class ProgramWriter:
         w.branch(self._any(active), body, end)
         w.begin(body)
         self._masked_block(item.body, active)
+        # A lane that has ended keeps its values: the vector goes on until all lanes have ended.
         updated = [self._operand(loop.updated[place]) for place in item.places]
         if w.lanes > 1:
             updated = [
                 w.select(active, new, phi.value) for phi, new in zip(phis, updated, strict=False)
             ]
+        # At the head, the values are the initial ones on the way from before the loop, and the
+        # updated ones on the way back.
         for phi, first, following in zip(phis, initial, [*updated, active], strict=True):
             phi.joins(first, before)
             phi.joins(following)
@@ -291,11 +307,14 @@ class ProgramWriter:
         if_true = [branch.if_true[x.place] for x in item.results]
         if_false = [branch.if_false[x.place] for x in item.results]
         if not item.if_false.items:
-            # One side computes nothing: its values remain, and are chosen where the other is taken.
+            # One side computes nothing: run the other one, and take the ready values in all lanes
+            # that do not take it.
             values = self._side(item.if_true, condition, if_true, if_false)
         elif not item.if_true.items:
             values = self._side(item.if_false, ~condition, if_false, if_true)
         else:
+            # Both sides compute: run one and then the other, each skipped if no lane takes it. The
+            # first leaves its values for the lanes that did not take the second.
             there = self._side(item.if_true, condition, if_true, None)
             values = self._side(item.if_false, ~condition, if_false, there)
         for result, value in zip(item.results, values, strict=True):
@@ -314,16 +333,18 @@ class ProgramWriter:
           block: the operations of this side.
           condition: the condition under which a lane takes this side.
           scalars: the values of this side.
-          others: the values of lanes that do not take it; None: any.
+          others: the values of the lanes that do not take it; None: they may have any values.
 
         Returns:
           The values after the branch.
         """
         w = self.writer
+        # Lanes that do not execute the enclosing block take no side.
         taking = condition if self._mask is None else condition & self._mask
         absent = [Value(w, "zeroinitializer", self.type(x.dtype.kind)) for x in scalars]
         if others is not None:
             absent = [x if isinstance(x, Value) else self._operand(x) for x in others]
+        # Jump over the side if no lane takes it; behind it, both ways meet.
         taken, end = w.labels("taken", "end")
         before = w.label
         w.branch(self._any(taking), taken, end)
@@ -335,6 +356,8 @@ class ProgramWriter:
         after = w.label
         w.jump(end)
         w.begin(end)
+        # The values depend on the way: computed on this side, or those of the lanes that did not
+        # take it.
         phis = [w.phi(value.type) for value in values]
         for phi, value, other in zip(phis, values, absent, strict=True):
             phi.joins(value, after)
@@ -342,6 +365,8 @@ class ProgramWriter:
         return [phi.value for phi in phis]
 
     def _operation(self, value: Expr) -> None:
+        # The instruction depends on the operands' dtype; the first operand of a selection is its
+        # condition.
         kind = value.operands[0].dtype.kind if value.op != "select" else value.dtype.kind
         write = _OPERATIONS.get((value.op, kind))
         if write is None:
@@ -368,7 +393,9 @@ def _approximation(on: ProgramWriter, value: Expr, operands: list[Value]) -> Val
     if not on.for_gpu:
         raise UnsupportedError(f"an approximate {value.op} on a CPU")
     (x,) = operands
-    # The instructions of GPUs have the base 2.
+    # The instructions are 2^x and log₂ x: exp(x) is 2^(x / ln 2), and log(x) is log₂(x) · ln 2.
+    # LLVM has no function for them that is compiled to one instruction, so write it as assembly:
+    # `$0` is the result and `$1` the operand, both in registers of floats ("=f,f").
     x = x * (1 / math.log(2)) if value.op == "exp" else x
     instruction = f"{_APPROXIMATIONS[value.op]}.approx.ftz.f32"
     result = on.writer.let(f'call float asm "{instruction} $0, $1;", "=f,f"({x.typed})', x.type)
@@ -379,14 +406,19 @@ def _quotient(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
     x, y = operands
     if not on.flags:
         return x / y
+    # `afn` allows an approximate division, for which the plain operator has no flag.
     return on.writer.let(f"fdiv {on.flags} contract {x.typed}, {y.text}", x.type)
 
 
 def _extreme(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
     w = on.writer
     if w.lanes == 1:
+        # `llvm.maximum` returns NaN if either operand is NaN, as JAX does. GPUs compute it in one
+        # instruction, CPUs do not.
         return w.intrinsic(_EXTREMES[value.op], *operands)
-    # This is one instruction on x86, which returns the second operand if either is NaN.
+    # A comparison and a selection are one instruction on x86, which returns the second operand if
+    # either is NaN. So NaN in the second operand is kept, and NaN in the first one is selected. A
+    # constant is no NaN (the graph has simplified that): put it first, and save that selection.
     ordered = sorted(
         zip(value.operands, operands, strict=True), key=lambda x: not is_constant(x[0])
     )
@@ -401,6 +433,7 @@ def _larger(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
 
 
 def _finite(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
+    # Neither infinity nor NaN is less than infinity.
     return on.writer.intrinsic("fabs", *operands) < math.inf
 
 
@@ -422,11 +455,12 @@ def _word_sum(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
 
 def _rotation(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
     x, by = operands
+    # A funnel shift of a number with itself is a rotation.
     return on.writer.intrinsic("fshl", x, x, by)
 
 
 def _angle(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    """Write an angle's whole quarter turns modulo 4, or the rest, with numbers of 64 bits."""
+    """Write `quarter_turns` or `angle_rest` of an angle (see `EVALUATE`), computed in `double`."""
     w = on.writer
     angle = operands[0].to("double")
 
@@ -459,6 +493,8 @@ def _convert(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
     (x,), to = operands, value.dtype.kind
     if value.operands[0].dtype.kind != "f":
         return x.to(_ELEMENTS[to])
+    # Saturating conversions: numbers beyond the range become its ends and NaN becomes 0, as in JAX,
+    # where the plain instruction would be undefined.
     name = "fptoui.sat" if to == "u" else "fptosi.sat"
     return on.writer.intrinsic(name, x, result=on.type(to))
 

@@ -1,10 +1,21 @@
 """Write functions in LLVM IR, the input of the LLVM compiler, with Python's operators.
 
-LLVM IR is a typed assembly language with any number of registers, each of which is written once. An
-`LlvmWriter` appends the instructions of one function. A `Value` is a number in a register: it is
+LLVM IR is a typed assembly language with any number of registers. What a reader of its text needs:
+
+- `%v3 = fadd float %v1, %v2` adds two registers. Each register is written by one instruction only.
+- A function is a list of blocks. A block begins with a label, and ends with `br`, a jump to one of
+  one or two labels, or with `ret`. There are no other loops and branches.
+- Where two ways meet in a block, `%v5 = phi float [%v3, %here], [%v4, %there]` is `%v3` if the
+  block `here` was run last, and `%v4` if it was `there`. So a loop carries a value.
+- `load` and `store` access memory; `getelementptr` only computes an address.
+- `llvm.sqrt.f32` and the like are LLVM's own functions (intrinsics), which the compiler replaces by
+  instructions. Their names contain the types of their operands.
+- `poison` is a value that nobody uses.
+
+An `LlvmWriter` appends the instructions of one function. A `Value` is a number in a register: it is
 known when the function runs, not when it is written. An operator on a `Value` appends the
-instruction that computes it, so that formulas look as they do in Python. This function multiplies
-the numbers of an array by a factor, up to a limit of 1:
+instruction that computes it, so that formulas look as they do in Python, like those on JAX's
+tracers. This function multiplies the numbers of an array by a factor, up to a limit of 1:
 
     w = LlvmWriter("scale", "ptr array", "float factor", "i64 count")
     array, factor, count = w.parameters
@@ -56,8 +67,9 @@ _OPERATIONS = {
 }
 """LLVM's instructions, by the operator and the kind of its operands: `f` a float, `i` an integer
 with a sign, `u` one without, `b` a truth value. `contract` allows a fused multiply-add, which
-rounds once instead of twice; a `double` is there for its digits and goes without. A NaN differs
-from every number and is neither less nor greater."""
+rounds once instead of twice; it is left out for `double`, whose digits the formulas count on. The
+comparisons of floats are false for NaN, except `!=` (`olt`: ordered and less than; `une`: unordered
+or not equal)."""
 
 
 @functools.cache
@@ -103,7 +115,7 @@ def _instruction(operator: str, type: str) -> tuple[str, str]:
 
 @functools.cache
 def _conversion(source: str, to: str) -> str:
-    """Return the instruction that converts an element; empty if only the sign's meaning changes."""
+    """Return the instruction that converts an element; empty if the bits stay as they are."""
     one, other = _kind(source), _kind(to)
     if "p" in (one, other):
         raise TypeError(f"there is no conversion from {source} to {to}")
@@ -142,6 +154,7 @@ class Value:
         raise TypeError("a Value is known when the function runs: use select or when")
 
     def _apply(self, operator: str, other: "Value | Number", *, swapped: bool = False) -> "Value":
+        # A number of Python takes the type of the other operand.
         if not isinstance(other, Value):
             other = self.writer.constant(other, self.type)
         elif other.type != self.type:
@@ -213,6 +226,7 @@ class Value:
         return self._apply(">=", other)
 
     def __neg__(self) -> "Value":
+        # Not 0 - x, which of 0 would be 0 instead of -0.
         if _kind(self.type) == "f":
             return self.writer.let(f"fneg {self.typed}", self.type)
         return self._apply("-", 0, swapped=True)
@@ -287,26 +301,30 @@ class Value:
 
 def _aligned(type: str, align: int | None) -> str:
     element, lanes = parts(type)
-    # LLVM would take a vector for aligned to its whole size.
+    # Without `align`, LLVM assumes that a vector is aligned to its whole size, and a load from
+    # another address may crash.
     if align is None and lanes > 1:
         align = max(1, _width(element) // 8)
     return f", align {align}" if align else ""
 
 
 class Phi:
-    """A `Phi` is the instruction at the start of a block whose result depends on the way there."""
+    """A `Phi` is an instruction at the start of a block that selects a value by the block before.
+
+    The ways into the block are added later, because the way back of a loop is written after it.
+    """
 
     def __init__(self, value: Value) -> None:
-        """Begin without a way."""
+        """Begin without a way into the block."""
         self.value = value
         self._ways: list[str] = []
 
     def joins(self, value: Value, label: str | None = None) -> None:
-        """Add a way.
+        """Add a way into the block.
 
         Args:
-          value: the result of who comes this way.
-          label: the block that the way comes from; None: the one that the writer is in.
+          value: the result if the function came this way.
+          label: the block that the way comes from; None: the one that the writer appends to.
         """
         self._ways.append(f"[{value.text}, %{label or value.writer.label}]")
 
@@ -383,7 +401,8 @@ class LlvmWriter:
         given = [text.rpartition(" ")[::2] for text in parameters]
         self.parameters = [Value(self, f"%{name}", _parameter_type(kind)) for kind, name in given]
         texts = ", ".join(f"{llvm_type(kind)} %{name}" for kind, name in given)
-        # Inlined into each other, the functions of a kernel would take far longer to compile.
+        # Forbid LLVM to inline the functions of a kernel: one large function takes far longer to
+        # compile than several small ones.
         attributes = " noinline" if convention == "internal" else ""
         self._head = f"define {convention} {llvm_type(result)} @{name}({texts}){attributes} {{"
 
@@ -415,7 +434,8 @@ class LlvmWriter:
         element, lanes = parts(type)
         kind = _kind(type)
         if kind == "f":
-            # LLVM writes numbers of every size by the bits of the double that has their value.
+            # LLVM writes floats of all sizes as the hexadecimal bits of the `double` of the same
+            # value. So round the number to a float32 first.
             number = (
                 struct.unpack("f", struct.pack("f", number))[0] if _width(element) < 64 else number
             )
@@ -425,7 +445,7 @@ class LlvmWriter:
         elif kind == "p":
             raise TypeError(f"there is no number {number} of type {type}")
         else:
-            # LLVM writes integers with a sign.
+            # LLVM writes integers with a sign: 2³² - 1 is -1.
             half = 1 << (_width(element) - 1)
             text = str((int(number) + half) % (2 * half) - half)
         return Value(self, text if lanes == 1 else f"splat ({llvm_type(element)} {text})", type)
@@ -485,6 +505,7 @@ class LlvmWriter:
           flags: fast-math flags, such as `afn`.
           suffix: attributes of the call.
         """
+        # Operands are written with their types.
         kind, given = llvm_type(result), ", ".join(x.typed for x in operands)
         # Functions of the module need no declaration.
         if name.startswith("llvm."):
@@ -508,12 +529,15 @@ class LlvmWriter:
           result: the type of the result; None: that of the first argument.
           flags: fast-math flags, such as `afn`.
         """
+        # The full name has the types that vary, that of the result first:
+        # `llvm.fptosi.sat.i32.f32`.
         types = [operands[0].type] if result is None else [result, operands[0].type]
         names = ".".join(_mangled(type) for type in types)
         return self.call(f"llvm.{name}.{names}", *operands, result=types[0], flags=flags)
 
     def declare(self, line: str) -> None:
         """Add a line to the module that the function is in, unless it has the same line."""
+        # A dict keeps the order in which lines came, and each of them once.
         self.declared[line] = None
 
     # Control flow: a function is a list of blocks, of which each ends where it jumps to others.
@@ -558,6 +582,7 @@ class LlvmWriter:
         self.branch(condition, then, end)
         self.begin(then)
         yield
+        # A block that returns from the function does not go on at `end`.
         if not self._has_ended():
             self.jump(end)
         self.begin(end)
@@ -583,6 +608,8 @@ class LlvmWriter:
         self.branch(index.value < count, body, end)
         self.begin(body)
         yield index.value
+        # What was appended inside may have begun other blocks: the way back comes from the last
+        # one.
         index.joins(index.value + 1)
         self.jump(head)
         self.begin(end)
@@ -606,6 +633,7 @@ class LlvmWriter:
 
 def _parameter_type(text: str) -> str:
     """Return the type of a parameter from its type and attributes."""
+    # An address in another memory has a type of two words.
     space = re.match(r"ptr addrspace\(\d+\)", text)
     return space[0] if space else text.split()[0]
 
@@ -625,6 +653,7 @@ def module_text(functions: Iterable[LlvmWriter], *others: str) -> str:
       *others: more text of the module.
     """
     functions = list(functions)
+    # Declarations first, then the functions; a dict leaves out what comes twice.
     lines = [line for function in functions for line in function.declared]
     texts = [function.text() for function in functions]
     return "\n".join(dict.fromkeys([*lines, *texts, *others]))

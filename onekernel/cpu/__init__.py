@@ -1,8 +1,10 @@
 """Compile and launch kernels on CPUs; this module is a `onekernel.kernel.Backend`.
 
-`llvmlite` compiles a kernel for the present processor, and XLA calls it through its foreign
-function interface; `obstacle` tries both with a small kernel. The name of a kernel is a hash of
-its content, so a cached program always finds the kernel that it was compiled with.
+`llvmlite`, the Python binding of LLVM, compiles a kernel for the present processor, and XLA calls
+it through its foreign function interface (FFI): `jax.ffi.register_ffi_target` tells XLA the address
+of a C function under a name, and `jax.ffi.ffi_call` puts a call of this name into a program.
+`obstacle` tries both with a small kernel. The name of a kernel is a hash of its content, so a
+cached program always finds the kernel that it was compiled with.
 """
 
 import ctypes
@@ -27,6 +29,7 @@ from onekernel.cpu.xla_call import step_functions as step_functions
 from onekernel.kernel import Kernel, probe
 from onekernel.trusted_files import cached_bytes
 
+# What `onekernel.kernel.Backend` asks for.
 IMPL: str = "llvm"
 PLATFORM: str = "cpu"
 
@@ -63,6 +66,7 @@ class Host(NamedTuple):
 def obstacle() -> str | None:
     """Return why XLA cannot call kernels compiled by llvmlite on CPUs, or None if it can."""
     try:
+        # Whatever fails here is an answer, not an error: callers then use XLA.
         device = jax.local_devices(backend=PLATFORM)[0]
         host = host_processor()
     except (ImportError, OSError, RuntimeError, AttributeError, TypeError) as error:
@@ -72,6 +76,7 @@ def obstacle() -> str | None:
     if host.machine not in xla_call.MACHINES:
         known = " and ".join(xla_call.MACHINES)
         return f"there are kernels for {known} processors, not for {host.machine}"
+    # An odd number of instances, so that the last block is not full.
     return probe(launch, device, instances=2 * host.lanes + 1)
 
 
@@ -131,6 +136,8 @@ def registered(text: str) -> str:
     Args:
       text: an LLVM module with the function `NAME`, from `xla_call`.
     """
+    # The hash covers the text, the processor and the version of LLVM: the same name is the same
+    # code.
     name = f"onekernel_{hashlib.sha256(_key(text)).hexdigest()}"
     # Programs are traced in several threads.
     with _lock:
@@ -140,6 +147,8 @@ def registered(text: str) -> str:
 
 
 def _register(name: str, code: bytes) -> None:
+    # XLA finds the function by its name in the program, and calls it at its address. The engine
+    # owns the memory of the code, so it must not be collected.
     engine = _load(code)
     address = ctypes.c_void_p(engine.get_function_address(NAME))
     jax.ffi.register_ffi_target(name, jax.ffi.pycapsule(address), platform="cpu")
@@ -183,6 +192,7 @@ def _machine_code(text: str) -> bytes:
 
 def _compile(text: str) -> bytes:
     binding = _binding()
+    # From text to LLVM's own form, and from that to an object file for this processor.
     module = binding.parse_assembly(text, binding.create_context())
     module.triple = binding.get_process_triple()
     return _target_machine().emit_object(module)
@@ -190,6 +200,7 @@ def _compile(text: str) -> bytes:
 
 def _load(code: bytes) -> Any:
     binding = _binding()
+    # llvmlite loads object files into an engine, which begins with a module; this one is empty.
     empty = binding.parse_assembly("", binding.create_context())
     engine = binding.create_mcjit_compiler(empty, _target_machine())
     engine.add_object_file(binding.ObjectFileRef.from_data(code))
@@ -211,6 +222,7 @@ def _binding() -> Any:
     binding = importlib.import_module("llvmlite.binding")
     binding.initialize_native_target()
     binding.initialize_native_asmprinter()
+    # LLVM must find the C functions that a kernel calls: tell it their addresses in this process.
     process = ctypes.CDLL(None)
     for name in xla_call.SYMBOLS:
         address = ctypes.cast(getattr(process, name), ctypes.c_void_p).value
@@ -223,9 +235,11 @@ def host_processor() -> Host:
     """Return a description of this machine's processor."""
     binding = _binding()
     features = binding.get_host_cpu_features()
+    # A vector register holds 16 floats with AVX-512, 8 with AVX2, and 4 with SSE or NEON.
     lanes = 16 if features.get("avx512f") else 8 if features.get("avx2") else 4
     machine = binding.get_process_triple().partition("-")[0]
     version = f"{importlib.import_module('llvmlite').__version__} {binding.llvm_version_info}"
+    # Apple's name for the same instruction set.
     machine = "aarch64" if machine == "arm64" else machine
     return Host(
         machine=machine,

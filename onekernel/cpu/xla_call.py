@@ -1,6 +1,7 @@
 """Wrap a kernel as a function that XLA calls on a CPU, written as LLVM IR.
 
-XLA passes the address of a call frame. `kernel_text` writes a function that reads the frame,
+XLA passes the address of a call frame, a C structure with the addresses and shapes of all arguments
+and results. `kernel_text` writes a function that reads the frame,
 distributes blocks of instances to XLA's own threads, and copies each block between XLA's arrays and
 a tile, whose rows hold one scalar of every instance of the block. A block has as many instances as
 a vector register has lanes, and `step` advances all of them. No Python runs during the call.
@@ -88,13 +89,13 @@ def call_text(
       scratch: bytes of scratch memory, a multiple of 64.
       machine: the processor, one of `MACHINES`.
     """
-    # Without another order, no block waits for another one.
+    # Unless the caller gives an order, no block waits for another one.
     functions = list(functions)
     if all(function.name != "needed" for function in functions):
         at_once = LlvmWriter("needed", "ptr job", "u64 index", result="u64")
         at_once.ret(at_once.constant(0, "u64"))
         functions.append(at_once)
-    # What `xla_call.ll` reads.
+    # Constants that `xla_call.ll` reads.
     constants = {
         "blocks_per_instance": blocks_per_instance,
         "blocks_per_thread": blocks_per_thread,
@@ -108,11 +109,14 @@ def call_text(
 
 def instance_count(job: Value) -> Value:
     """Return the number of instances of a job."""
+    # %Job in `xla_call.ll` begins with five numbers of 64 bits; the fifth is the number of
+    # instances.
     return job.at(4, "u64").load("u64")
 
 
 def array_of(job: Value, place: int) -> Value:
     """Return the address of one of the arrays of a job: first the arguments, then the results."""
+    # Behind these numbers come the addresses of the arrays.
     return job.at(5 + place, "u64").load("ptr")
 
 
@@ -122,6 +126,7 @@ def _step_block(kernel: Kernel, lanes: int) -> LlvmWriter:
     job, index, _ = w.parameters
     instances = instance_count(job)
     first = index * lanes
+    # `block` reads the addresses from the job; `instances` does the work and knows nothing of jobs.
     arrays = range(len(kernel.argument_shapes) + len(kernel.results()))
     w.call("instances", *(array_of(job, i) for i in arrays), first, instances)
     return w
@@ -149,12 +154,16 @@ def step_functions(kernel: Kernel, lanes: int) -> list[LlvmWriter]:
     stepped = range(sum(array.size for array in kernel.program.outputs))
     start = 0 if kernel.before is None else max(len(step_rows), len(stepped))
     rows = range(start, start + sum(sizes))
+    # One function for each part; each reads its arguments from rows of the tile, and writes its
+    # results to the first rows. So `after` finds the results of the step in the first rows, and its
+    # arguments behind.
     functions = [tile_function(kernel.program, lanes=lanes, name=STEP, rows=step_rows)]
     if kernel.before is not None:
         functions.append(tile_function(kernel.before, lanes=lanes, name="before", rows=rows))
     if kernel.after is not None:
         own = [*rows, *stepped]
         functions.append(tile_function(kernel.after, lanes=lanes, name="after", rows=own))
+    # The tile must hold whatever any part reads or writes.
     height = max(1, rows.stop, sum(results), len(stepped))
     return [*functions, _instances(kernel, lanes, start, height)]
 
@@ -180,7 +189,7 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
     with w.repeat(zero) as loop:
         (lane,) = loop.carried
         wanted = first + lane
-        # Lanes beyond the last instance do what it does.
+        # Lanes beyond the last instance step a copy of it, so that they compute valid numbers.
         instance = w.select(wanted < instances, wanted, last)
         row = start
         for array, size in zip(arrays, sizes, strict=False):
@@ -195,6 +204,8 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
     if kernel.before is not None:
         w.call("before", tile)
     with w.repeat(zero) as loop:
+        # The results overwrite the rows of the carried arguments; the other arguments stay for the
+        # next step.
         w.call(STEP, tile)
         following = loop.carried[0] + 1
         loop.again(following < kernel.steps, following)
@@ -211,6 +222,7 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
                 array[begin + i] = value
                 row += 1
         following = lane + 1
+        # Do not store the lanes beyond the last instance.
         loop.again((following < lanes) & (instance + 1 < instances), following)
     return w
 
@@ -220,6 +232,7 @@ def _map_functions(kernel: Kernel, items: int, lanes: int) -> list[LlvmWriter]:
     w = LlvmWriter("block", *BLOCK_PARAMETERS)
     job, index, _ = w.parameters
     # All instances share the table, which stands between the arguments and the results.
+    # Bytes from one instance to the next in each array: float32 arguments, the table, the results.
     rows = [*(4 * math.prod(shape) for shape in kernel.argument_shapes), 0]
     rows.append(items * len(kernel.program.outputs))
     arrays = [array_of(job, i) for i in range(len(rows))]

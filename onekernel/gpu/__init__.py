@@ -4,6 +4,10 @@ LLVM compiles a kernel to PTX, NVIDIA's portable assembly, and XLA passes the PT
 through its custom call for PTX kernels. That call is internal to XLA, so `obstacle` tries
 whether the installed version has it. Each thread runs the whole program for one instance, with all
 intermediate values in registers.
+
+In NVIDIA's terms, a launch runs a grid of blocks. The threads of a block run on one multiprocessor,
+share a small fast memory (shared memory), and can wait for each other (a barrier). 32 threads of a
+block, a warp, execute the same instruction at the same time.
 """
 
 import contextlib
@@ -36,22 +40,25 @@ PLATFORM: str = "cuda"
 _MIN_THREADS = 32
 
 _DIRECT_WORDS = 32
-"""Number of words of an instance that its thread reads where they are. Of longer rows, the threads
-of a block copy their part of an array to shared memory and back, each the word beside that of the
-next thread: threads that each read a row of their own wait 70 µs for 65,536 rows of 77 words."""
+"""Largest number of words of an instance that its thread reads from the arrays directly. If rows
+are longer, the threads of a block copy them to shared memory and back together: neighbouring
+threads copy neighbouring words, which a GPU does in one access. If each thread read its own row,
+the threads would wait 70 µs for 65,536 rows of 77 words."""
 
 _SHARED_MEMORY = {70: 49_152, 80: 98_304, 90: 98_304}
-"""Bytes of shared memory for that, by target architecture; all GPUs that run its code have it."""
+"""Bytes of shared memory for these rows, by target architecture: all GPUs that can run code for the
+architecture have as much."""
 
 _BLOCKS = 128
-"""Number of blocks above which blocks grow: a GPU has about as many multiprocessors."""
+"""Number of blocks from which on blocks grow instead: a GPU has about as many multiprocessors."""
 
 _TARGET = "__gpu$xla.gpu.ptx"
 _TRIPLE = "nvptx64-nvidia-cuda"
 _LEVEL = 3
 _FULL_BLOCKS = 2**31 - 1
-"""Number of instances in the PTX if the blocks have no more threads than instances: the same text
-serves all these numbers, and the driver assembles it once."""
+"""Number of instances in the PTX of a launch that has exactly as many threads as instances. No
+thread reaches this number, so one text serves all such launches, and the driver assembles it once.
+"""
 
 _ARCHITECTURES = (70, 80, 90)
 """Target architectures, as ten times the compute capability; newer GPUs run PTX of older ones."""
@@ -78,6 +85,8 @@ def prepare(kernel: Kernel) -> None:
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `onekernel.kernel.Backend`."""
+    # Run one thread for each instance. If the last block has threads left over, the PTX must
+    # contain the number of instances, so that they store nothing.
     instances = leaves[0].shape[0]
     words = _shared_words(kernel, target_architecture())
     threads = threads_in_block(instances, words)
@@ -95,8 +104,10 @@ def _shared_words(kernel: Kernel, architecture: int) -> int:
     """Return how many words of an instance are in shared memory; 0: it reads them directly."""
     if kernel.table is not None:
         return 0
+    # Shared memory holds the arguments first, and the results later.
     shapes = kernel.argument_shapes, [x.shape for x in kernel.results()]
     words = max(sum(map(math.prod, one)) for one in shapes)
+    # Even the smallest block must fit.
     fits = 4 * _MIN_THREADS * words <= _SHARED_MEMORY[architecture]
     return words if words > _DIRECT_WORDS and fits else 0
 
@@ -134,6 +145,7 @@ def launch_ptx(
       The results.
     """
     assemble_ahead(text)
+    # XLA's custom call takes these attributes: the PTX, the kernel's name in it, and the launch.
     sizes = {f"grid_{axis}": np.int64(n) for axis, n in zip("xyz", grid, strict=True)}
     sizes |= {f"block_{axis}": np.int64(n) for axis, n in zip("xyz", (threads, 1, 1), strict=True)}
     return list(
@@ -144,6 +156,7 @@ def launch_ptx(
             kernel_data=text,
             **sizes,
             shared_mem_bytes=np.int64(shared_memory),
+            # Which parameters of the kernel are results.
             output_indices=tuple(range(len(arguments), len(arguments) + len(results))),
         )
     )
@@ -162,6 +175,8 @@ def assemble_ahead(text: str) -> None:
     def load() -> None:
         # If this fails, or there is no GPU here, the first launch takes longer.
         with contextlib.suppress(OSError, AttributeError, RuntimeError):
+            # Load the PTX with the driver into the context that JAX uses, and unload it: what stays
+            # is the entry in the driver's cache.
             device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
             cuda = ctypes.CDLL("libcuda.so.1")
             context, module = ctypes.c_void_p(), ctypes.c_void_p()
@@ -182,9 +197,11 @@ def threads_in_block(instances: int, words: int = 0) -> int:
       instances: the number of all instances.
       words: how many words of an instance are in shared memory.
     """
+    # Let blocks grow only once there are `_BLOCKS` of them: fewer would leave processors idle.
     wanted = 2 ** math.ceil(math.log2(max(1, instances / _BLOCKS)))
     most = MAX_THREADS
     if words:
+        # As many instances as fit into the shared memory of a block.
         fitting = _SHARED_MEMORY[target_architecture()] // (4 * words)
         most = min(most, 2 ** int(math.log2(fitting)))
     return min(max(wanted, _MIN_THREADS), most)
@@ -217,10 +234,12 @@ def assembled(text: str, architecture: int, version: int | None = None) -> str:
       architecture: the target architecture, as ten times the compute capability.
       version: ten times the version of PTX; None: the oldest that knows the architecture.
     """
+    # A version of PTX knows the architectures that were there when it was defined.
     version = version or (70 if architecture < 90 else 80)
     binding = _binding()
     module = binding.parse_assembly(text, binding.create_context())
     module.triple = _TRIPLE
+    # LLVM's NVPTX back end writes assembly text, which the driver assembles for the GPU at hand.
     target = binding.Target.from_triple(_TRIPLE)
     machine = target.create_target_machine(
         cpu=f"sm_{architecture}", features=f"+ptx{version}", opt=_LEVEL
@@ -244,6 +263,7 @@ def processor_count() -> int:
 
 def target_architecture() -> int:
     """Return the newest supported architecture that all present GPUs can run."""
+    # PTX for an architecture also runs on all newer ones, but not the other way round.
     supported = [x for x in _ARCHITECTURES if x <= compute_capability()]
     return max(supported, default=_ARCHITECTURES[0])
 

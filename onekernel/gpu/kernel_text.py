@@ -38,13 +38,15 @@ def kernel_text(kernel: Kernel, *, shares: bool = False) -> str:
     sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     stored = [math.prod(result.shape) for result in kernel.results()]
     w = _writer(len(sizes) + len(stored))
+    # Shared memory (address space 3) whose size the launch gives: an array of length 0.
     w.declare("@shared = external addrspace(3) global [0 x float], align 16")
     given, returned = w.parameters[: len(sizes)], w.parameters[len(sizes) :]
-    # Find the instance of the thread. Threads beyond the last instance step the last instance too,
-    # without storing it: so no thread of a warp leaves early.
+    # Find the instance of the thread. Threads beyond the last instance step the last one, too, but
+    # do not store it: all threads must reach the barriers.
     thread, block, threads = (_register(w, name) for name in ("tid.x", "ctaid.x", "ntid.x"))
     first = block * threads
     wanted = first + thread
+    # Inline assembly puts a placeholder into the PTX, which the launch replaces by the number.
     instances = w.let(f'call i32 asm "mov.u32 $0, {INSTANCES};", "=r"()', "u32")
     is_there = wanted < instances
     instance = w.select(is_there, wanted, instances - 1)
@@ -56,8 +58,8 @@ def kernel_text(kernel: Kernel, *, shares: bool = False) -> str:
     if kernel.before is not None:
         arguments = run_program(w, kernel.before, arguments, for_gpu=True)
     results = _steps(w, kernel, arguments)
-    # Compute what comes after the last step. Load the arguments again, because registers that held
-    # them meanwhile would be missing in the steps.
+    # Compute what comes after the last step. Load the arguments again instead of keeping them in
+    # registers, which the steps need.
     if kernel.after is not None:
         again = [address.load() for address in rows.addresses(given, sizes)]
         results = run_program(w, kernel.after, [*again, *results], for_gpu=True)
@@ -77,6 +79,7 @@ def _steps(w: LlvmWriter, kernel: Kernel, arguments: Sequence[Value]) -> list[Va
         sum(array.size for array in arrays)
         for arrays in (program.inputs[: kernel.carried], program.outputs)
     )
+    # A function that runs once may return other arrays than it takes.
     carried = min(read, written)
     with w.repeat(w.constant(0, "u32"), *arguments[:carried]) as loop:
         step, *now = loop.carried
@@ -119,6 +122,8 @@ def map_kernel_text(kernel: Kernel) -> str:
         (item,) = loop.carried
         place = item.to("u64")
         byte = (first + place) * count
+        # Neighbouring threads read neighbouring words of a row, which a GPU does in one
+        # transaction.
         columns = [(table + j * items + place).load() for j in range(row)]
         for i, result in enumerate(body.finish(columns)):
             out.at(byte + i, "u8").store(result.to("u8"))
@@ -129,6 +134,7 @@ def map_kernel_text(kernel: Kernel) -> str:
 
 def module_text(kernel: LlvmWriter, threads: int) -> str:
     """Return the module of a kernel, whose blocks have at most so many threads."""
+    # Metadata with which LLVM tells the driver the largest block, for its allocation of registers.
     annotations = "!nvvm.annotations = !{!0}"
     most = f'!0 = !{{ptr @{kernel.name}, !"maxntidx", i32 {threads}}}\n'
     return codegen.module_text([kernel], annotations, most)
@@ -136,6 +142,7 @@ def module_text(kernel: LlvmWriter, threads: int) -> str:
 
 def _writer(arrays: int) -> LlvmWriter:
     """Begin a kernel, whose parameters are the addresses of so many arrays."""
+    # Address space 1 is the GPU's main memory, where XLA's arrays are.
     parameters = (f"ptr addrspace(1) a{i}" for i in range(arrays))
     return LlvmWriter(NAME, *parameters, convention="ptx_kernel")
 
@@ -146,7 +153,10 @@ def _register(w: LlvmWriter, name: str) -> Value:
 
 
 class _Rows:
-    """A `_Rows` finds the rows of a thread's instance where they are."""
+    """A `_Rows` gives a thread the rows of its instance, directly in XLA's arrays.
+
+    The methods `fetch`, `release` and `deliver` do nothing here; `_SharedRows` copies rows in them.
+    """
 
     def __init__(self, instance: Value) -> None:
         self._instance = instance
@@ -168,6 +178,7 @@ class _Rows:
           sizes: the number of scalars of an instance in each array.
         """
         for array, size in zip(arrays, sizes, strict=True):
+            # An array holds the rows of all instances, one after the other.
             row = array.at(self._instance * (4 * size), "u8")
             for i in range(size):
                 yield row.at(i)
@@ -197,15 +208,18 @@ class _SharedRows(_Rows):
         """
         self._shared = Value(w, "@shared", "ptr addrspace(3)")
         self._writer, self._thread, self._threads, self._first = w, thread, threads, first
+        # The row of the thread within the block, and how many rows of the block exist.
         self._local = instance - first
         self._rows = w.minimum(threads, instances - first)
 
     def fetch(self, arrays: Sequence[Value], sizes: Sequence[int]) -> None:
+        # After the barrier, each thread finds its row whole, whichever threads have copied it.
         self._copy(arrays, sizes, to_shared=True)
         self._writer.call(_BARRIER)
 
     def release(self) -> None:
-        # The results take the place of the arguments, which all threads have read by then.
+        # The results overwrite the arguments in shared memory: wait until all threads of the block
+        # have read theirs.
         self._writer.call(_BARRIER)
 
     def deliver(self, arrays: Sequence[Value], sizes: Sequence[int]) -> None:

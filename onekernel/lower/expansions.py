@@ -31,7 +31,7 @@ _BIG = 1e9
 
 
 def _asin(x: Array) -> Array:
-    # tan(y / 2) = sin y / (1 + cos y) with sin y = x. The factors of 1 - x² keep the digits that the
+    # tan(y / 2) = sin y / (1 + cos y) with sin y = x. The factors of 1 - x² keep digits that the
     # difference would lose near ±1.
     return 2.0 * jnp.arctan2(x, 1.0 + jnp.sqrt((1.0 - x) * (1.0 + x)))
 
