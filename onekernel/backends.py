@@ -1,7 +1,5 @@
 """Register the back ends that compile kernels."""
 
-from typing import Any
-
 import jax
 
 from onekernel import cpu, gpu
@@ -23,8 +21,9 @@ def default_backend() -> Backend | None:
 
     Its `obstacle` tells whether it can run kernels in this process.
     """
-    settings: Any = jax.config
-    device = settings.jax_default_device or jax.local_devices()[0]
+    # JAX adds its options to the class at run time.
+    default = jax.config.jax_default_device  # pyright: ignore[reportAttributeAccessIssue]
+    device = default or jax.local_devices()[0]
     platform = device if isinstance(device, str) else device.platform
     platform = _PLATFORMS.get(platform, platform)
     return next((x for x in BACKENDS if platform == x.PLATFORM), None)

@@ -22,18 +22,19 @@ Protocol: JAX sees the kernel as a primitive.
 4. Differentiation raises a `KernelError`.
 """
 
+import contextlib
 import dataclasses
 import math
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import NoReturn, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.extend.core import Primitive
+from jax.extend.core import JaxprEqn, Primitive
 from jax.interpreters import ad, batching, mlir
 from jaxtyping import Array, Float, PyTree, UInt8
 
@@ -89,7 +90,9 @@ class Kernel:
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
     """Texts that back ends have written of the kernel, by a name of their choice."""
     # Programs are lowered in several threads, and each text is written once.
-    _lock: Any = dataclasses.field(default_factory=threading.Lock, init=False)
+    _lock: contextlib.AbstractContextManager[bool] = dataclasses.field(
+        default_factory=threading.Lock, init=False
+    )
 
     def __post_init__(self) -> None:
         """Check that the programs can be written as LLVM IR.
@@ -187,7 +190,7 @@ class Backend(Protocol):
         ...
 
 
-def called_by(equation: Any) -> Kernel | None:
+def called_by(equation: JaxprEqn) -> Kernel | None:
     """Return the kernel that an equation of a jaxpr calls; None: it does something else."""
     return equation.params["kernel"] if equation.primitive is _kernel_p else None
 
@@ -209,13 +212,13 @@ def make_primitive(name: str, static: str) -> Primitive:
     compiled = jax.jit(primitive.bind, static_argnames=static)
 
     @primitive.def_impl
-    def run(*arrays: Array, **parameters: Any) -> list[Array]:
+    def run(*arrays: Array, **parameters: object) -> list[Array]:
         # Enable jit here: within `jax.disable_jit` this function would call itself.
         with jax.disable_jit(False):
             return compiled(*arrays, **parameters)
 
     def batch(
-        arrays: Sequence[Array], axes: Sequence[int | None], **parameters: Any
+        arrays: Sequence[Array], axes: Sequence[int | None], **parameters: object
     ) -> tuple[list[Array], list[int]]:
         # All arguments that have the batch axis agree on its size. Move it to the front of these,
         # and repeat the others along it.
@@ -236,7 +239,7 @@ def make_primitive(name: str, static: str) -> Primitive:
 _kernel_p = make_primitive("onekernel", "kernel")
 
 
-def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
+def _batch_shape(kernel: Kernel, leaves: Sequence[Array | ShapedArray]) -> tuple[int, ...]:
     """Return the batch axes that all arguments have in front of the axes of one instance.
 
     Raises:
@@ -256,12 +259,12 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Any]) -> tuple[int, ...]:
 
 
 @_kernel_p.def_abstract_eval
-def _abstract(*leaves: Any, kernel: Kernel) -> list[ShapedArray]:
+def _abstract(*leaves: ShapedArray, kernel: Kernel) -> list[ShapedArray]:
     batch = _batch_shape(kernel, leaves)
     return [ShapedArray(result.shape, result.dtype) for result in kernel.results(*batch)]
 
 
-def _differentiate(primals: Any, tangents: Any, *, kernel: Kernel) -> Any:
+def _differentiate(primals: object, tangents: object, *, kernel: Kernel) -> NoReturn:
     raise kernel.explain(KernelError("one kernel cannot be differentiated", "derivative"))
 
 
@@ -269,13 +272,13 @@ ad.primitive_jvps[_kernel_p] = _differentiate
 
 
 def probe(
-    launch: Callable[[Kernel, Sequence[Array]], list[Array]], device: Any, instances: int
+    launch: Callable[[Kernel, Sequence[Array]], list[Array]], device: object, instances: int
 ) -> str | None:
     """Run a small kernel, and return why it failed, or None if its result is correct.
 
     Args:
       launch: the back end's function.
-      device: the device to run on.
+      device: the `jax.Device` to run on.
       instances: the number of instances.
     """
     kernel = Kernel(

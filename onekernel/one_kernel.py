@@ -14,15 +14,15 @@ several kernels, stays as it is.
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Sequence
+from typing import cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray, Tracer
-from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
-from jaxtyping import Array
+from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
+from jaxtyping import Array, PyTree
 
 from onekernel.backends import default_backend
 from onekernel.errors import KernelError, UnsupportedError
@@ -42,7 +42,7 @@ class OneKernel:
 
     def __init__(
         self,
-        function: Callable[..., Any],
+        function: Callable[..., PyTree],
         may_be_kernel: Callable[[], bool] = lambda: True,
         on_unsupported: Callable[[UnsupportedError], None] = lambda error: None,
         explain: Callable[[KernelError], Exception] = lambda error: error,
@@ -64,9 +64,9 @@ class OneKernel:
         self._function, self._may_be_kernel = function, may_be_kernel
         self._on_unsupported = on_unsupported
         self._explain, self._on_fallback = explain, on_fallback
-        self._known: dict[Any, _Lowered] = {}
+        self._known: dict[tuple[Hashable, ...], _Lowered] = {}
 
-    def __call__(self, *arguments: Any) -> Any:
+    def __call__(self, *arguments: PyTree) -> PyTree:
         """Compute the function."""
         if not self._is_allowed():
             return self._function(*arguments)
@@ -78,7 +78,7 @@ class OneKernel:
             self._on_unsupported(lowered.one)
         return jax.tree.unflatten(lowered.structure, lowered.launch(*leaves))
 
-    def kernel_for(self, *arguments: Any) -> Kernel | None:
+    def kernel_for(self, *arguments: PyTree) -> Kernel | None:
         """Return the kernel that a call launches, without compiling it.
 
         Args:
@@ -109,7 +109,9 @@ class OneKernel:
         # With `jax_disable_jit` the user wants to see every operation.
         return not jax.config.values["jax_disable_jit"] and self._may_be_kernel()
 
-    def _find(self, structure: Any, avals: Sequence[Any], arguments: Sequence[Any]) -> "_Lowered":
+    def _find(
+        self, structure: Hashable, avals: Sequence[ShapedArray], arguments: Sequence[PyTree]
+    ) -> "_Lowered":
         """Return the function for arguments like these, traced and lowered if it is not yet."""
         # The same function lowers differently under other settings of JAX.
         settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
@@ -140,8 +142,8 @@ class _Lowered:
     """A `_Lowered` is a function for arguments of some shapes, traced and lowered."""
 
     traced: ClosedJaxpr
-    structure: Any
-    """Structure of the results."""
+    structure: Hashable
+    """Tree structure of the results, a `PyTreeDef`."""
     places: list[int]
     """Places of the constants that the kernel takes as arguments, before the others."""
     one: Kernel | UnsupportedError
@@ -216,13 +218,13 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     )
 
 
-def _arguments(traced: ClosedJaxpr, places: Sequence[int]) -> list[Any]:
+def _arguments(traced: ClosedJaxpr, places: Sequence[int]) -> list[Var]:
     """Return the variables of a jaxpr that are arguments of its kernel."""
     return [*(traced.jaxpr.constvars[i] for i in places), *traced.jaxpr.invars]
 
 
-def _dtypes(atoms: Sequence[Any]) -> list[np.dtype]:
-    return [np.dtype(atom.aval.dtype) for atom in atoms]
+def _dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
+    return [np.dtype(cast(ShapedArray, atom.aval).dtype) for atom in atoms]
 
 
 def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:

@@ -31,6 +31,9 @@ _tracing = threading.Lock()
 
 _CACHE_HIT = "/jax/compilation_cache/cache_hits"
 
+Notice = Any
+"""Something that users were told. Only `Notices` knows its type, which must be picklable."""
+
 
 class _Lowered(NamedTuple):
     """A `_Lowered` holds a program before it is compiled."""
@@ -38,7 +41,7 @@ class _Lowered(NamedTuple):
     program: jax.stages.Lowered
     seconds: float
     """Time that it took to trace and lower it [s]."""
-    notices: list[Any]
+    notices: list[Notice]
     """What was reported meanwhile."""
 
 
@@ -46,18 +49,18 @@ class _Stored(NamedTuple):
     """A `_Stored` holds a compiled program as a file does."""
 
     program: jax.stages.Compiled
-    notices: list[Any]
+    notices: list[Notice]
     """What was reported when it was traced."""
 
 
 class Notices(Protocol):
     """A `Notices` knows what users are told while a program is traced, to repeat it later."""
 
-    def collect(self) -> contextlib.AbstractContextManager[list[Any]]:
+    def collect(self) -> contextlib.AbstractContextManager[list[Notice]]:
         """Return a context that yields a list of all that is reported inside it."""
         ...
 
-    def report(self, notice: Any, /) -> None:
+    def report(self, notice: Notice, /) -> None:
         """Report again what was reported when a program was traced."""
         ...
 
@@ -65,10 +68,10 @@ class Notices(Protocol):
 class _NoNotices:
     """A `_NoNotices` is for callers that tell their users nothing."""
 
-    def collect(self) -> contextlib.AbstractContextManager[list[Any]]:
+    def collect(self) -> contextlib.AbstractContextManager[list[Notice]]:
         return contextlib.nullcontext([])
 
-    def report(self, notice: Any, /) -> None:
+    def report(self, notice: Notice, /) -> None:
         pass
 
 
@@ -178,7 +181,7 @@ class ProgramCache:
         self,
         name: str,
         trace: Callable[[], jax.stages.Traced],
-        inside: contextlib.AbstractContextManager[Any] | None = None,
+        inside: contextlib.AbstractContextManager[object] | None = None,
     ) -> Callable[[], jax.stages.Compiled]:
         """Trace a program now if it is not cached, and compile it in a thread.
 
@@ -200,7 +203,7 @@ class ProgramCache:
     def _lower(
         self,
         trace: Callable[[], jax.stages.Traced],
-        inside: contextlib.AbstractContextManager[Any] | None = None,
+        inside: contextlib.AbstractContextManager[object] | None = None,
     ) -> "_Lowered":
         around = inside or contextlib.nullcontext()
         with _tracing, around, self._notices.collect() as notices:
@@ -300,7 +303,8 @@ def _compiled(lowered: jax.stages.Lowered, options: Options) -> tuple[jax.stages
     """
     # Tracing may have found small programs in JAX's cache, which do not count.
     with _CacheHits() as hits:
-        program = lowered.compile(compiler_options=options)
+        # JAX passes numbers on, too, although its annotation does not say so.
+        program = lowered.compile(compiler_options=options)  # pyright: ignore[reportArgumentType]
     return program, hits.count > 0 and jax.default_backend() == "cpu"
 
 
@@ -345,7 +349,8 @@ def _save(path: Path, stored: _Stored, kernels: dict[str, bytes], seconds: float
     """
     try:
         serialized = serialize_executable.serialize(stored.program)
-        loaded: Any = stored.program.runtime_executable()
+        loaded = stored.program.runtime_executable()
+        assert loaded is not None
         ids = [device.id for device in loaded.local_devices()]
     except (NotImplementedError, ValueError):
         # Devices of this kind cannot serialize programs.

@@ -3,11 +3,10 @@
 import functools
 import os
 import time
-from typing import Any
 
 import jax
 
-Options = dict[str, Any]
+Options = dict[str, bool | int | float | str]
 
 # Choose no kernels by timing them.
 _UNTUNED: Options = {"xla_gpu_autotune_level": 0}
@@ -38,7 +37,7 @@ def known_options(options: Options) -> Options:
 
 
 @functools.cache
-def _is_known(name: str, value: Any) -> bool:
+def _is_known(name: str, value: bool | int | float | str) -> bool:
     """Return whether XLA knows an option; XLA refuses to compile with an unknown one."""
     try:
         # Compile a program that does nothing with this option.

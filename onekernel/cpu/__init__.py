@@ -14,7 +14,8 @@ import importlib
 import re
 import threading
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from types import ModuleType
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 from jaxtyping import Array
@@ -28,6 +29,10 @@ from onekernel.cpu.xla_call import instance_count as instance_count
 from onekernel.cpu.xla_call import step_functions as step_functions
 from onekernel.kernel import Kernel, probe
 from onekernel.trusted_files import cached_bytes
+
+if TYPE_CHECKING:
+    # At run time, `_binding` imports it late.
+    from llvmlite.binding import ExecutionEngine, TargetMachine
 
 # What `onekernel.kernel.Backend` asks for.
 IMPL: str = "llvm"
@@ -43,7 +48,7 @@ _XLA_NAME = re.compile(r"onekernel_[0-9a-f]{64}")
 
 
 _lock = threading.Lock()
-_loaded: dict[str, tuple[Any, bytes]] = {}
+_loaded: dict[str, tuple["ExecutionEngine", bytes]] = {}
 """The engine and machine code of loaded kernels, by the name under which XLA calls them. XLA may
 call them until the process ends."""
 
@@ -198,7 +203,7 @@ def _compile(text: str) -> bytes:
     return _target_machine().emit_object(module)
 
 
-def _load(code: bytes) -> Any:
+def _load(code: bytes) -> "ExecutionEngine":
     binding = _binding()
     # llvmlite loads object files into an engine, which begins with a module; this one is empty.
     empty = binding.parse_assembly("", binding.create_context())
@@ -208,7 +213,7 @@ def _load(code: bytes) -> Any:
     return engine
 
 
-def _target_machine() -> Any:
+def _target_machine() -> "TargetMachine":
     binding, host = _binding(), host_processor()
     target = binding.Target.from_triple(binding.get_process_triple())
     return target.create_target_machine(
@@ -217,7 +222,7 @@ def _target_machine() -> Any:
 
 
 @functools.cache
-def _binding() -> Any:
+def _binding() -> ModuleType:
     """Return the LLVM binding, which is imported late because it takes a while to load."""
     binding = importlib.import_module("llvmlite.binding")
     binding.initialize_native_target()

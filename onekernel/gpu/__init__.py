@@ -16,7 +16,7 @@ import functools
 import importlib
 import math
 from collections.abc import Mapping, Sequence
-from typing import Any
+from types import ModuleType
 
 import jax
 import numpy as np
@@ -269,7 +269,7 @@ def target_architecture() -> int:
 
 
 @functools.cache
-def _binding() -> Any:
+def _binding() -> ModuleType:
     """Return the LLVM binding with its target for NVIDIA's GPUs.
 
     Raises:

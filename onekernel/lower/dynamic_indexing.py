@@ -10,14 +10,16 @@ A rule is a function of the graph, the equation and its operands.
 import functools
 import math
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from onekernel.errors import UnsupportedError
 from onekernel.lower.indexing import (
+    Rule,
     ScalarArray,
+    dtype_of,
     fill_value,
     scalar_array,
     shape_of,
@@ -93,7 +95,7 @@ def _read_along(
 
 
 def _dynamic_slice(
-    graph: ExprGraph, equation: Any, x: ScalarArray, *starts: ScalarArray
+    graph: ExprGraph, equation: JaxprEqn, x: ScalarArray, *starts: ScalarArray
 ) -> ScalarArray:
     # JAX moves a window that would reach beyond the array back inside.
     sizes = equation.params["slice_sizes"]
@@ -101,7 +103,7 @@ def _dynamic_slice(
 
 
 def _dynamic_update_slice(
-    graph: ExprGraph, equation: Any, x: ScalarArray, update: ScalarArray, *starts: ScalarArray
+    graph: ExprGraph, equation: JaxprEqn, x: ScalarArray, update: ScalarArray, *starts: ScalarArray
 ) -> ScalarArray:
     lasts = [n - size for n, size in zip(x.shape, update.shape, strict=True)]
     places = [
@@ -173,7 +175,9 @@ def _windows(
     return found
 
 
-def gather(graph: ExprGraph, equation: Any, x: ScalarArray, indices: ScalarArray) -> ScalarArray:
+def gather(
+    graph: ExprGraph, equation: JaxprEqn, x: ScalarArray, indices: ScalarArray
+) -> ScalarArray:
     """Read windows at indices that may depend on the program's inputs.
 
     Source: the semantics of gather and scatter in the StableHLO specification.
@@ -182,7 +186,7 @@ def gather(graph: ExprGraph, equation: Any, x: ScalarArray, indices: ScalarArray
     # In the mode FILL, a window that reaches beyond the array is read as the fill value; otherwise
     # it is moved inside.
     is_filled = "FILL" in str(equation.params["mode"])
-    fill = equation.outvars[0].aval.dtype.type(fill_value(equation)) if is_filled else None
+    fill = dtype_of(equation.outvars[0]).type(fill_value(equation)) if is_filled else None
     fixed = (*dims.collapsed_slice_dims, *dims.operand_batching_dims)
     window_shape = [size for axis, size in enumerate(sizes) if axis not in fixed]
     result = np.empty((*indices.shape[:-1], *window_shape), object)
@@ -215,7 +219,7 @@ def _all_inside(
 
 def _scatter(
     graph: ExprGraph,
-    equation: Any,
+    equation: JaxprEqn,
     x: ScalarArray,
     indices: ScalarArray,
     updates: ScalarArray,
@@ -248,7 +252,7 @@ def _scatter(
     return x
 
 
-def _sort(graph: ExprGraph, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+def _sort(graph: ExprGraph, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
     """Sort with a sorting network, which exchanges neighbours.
 
     The sort is stable: rows with equal keys keep their order. Keys are compared as in
@@ -318,10 +322,10 @@ def _is_before(graph: ExprGraph, a: Sequence[Scalar], b: Sequence[Scalar]) -> Sc
     return result
 
 
-def _top_k(graph: ExprGraph, equation: Any, x: ScalarArray) -> list[ScalarArray]:
+def _top_k(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> list[ScalarArray]:
     """Sort the last axis from the largest number to the smallest, and keep the first ones."""
     count = equation.params["k"]
-    kind = equation.outvars[1].aval.dtype.type
+    kind = dtype_of(equation.outvars[1]).type
     found = []
     for numbers in x.reshape(-1, x.shape[-1]):
         # Sort the numbers together with their places, which are the second result.
@@ -332,7 +336,7 @@ def _top_k(graph: ExprGraph, equation: Any, x: ScalarArray) -> list[ScalarArray]
     return [scalar_array((row[i] for row in found), shape) for i in range(2)]
 
 
-DYNAMIC_RULES: dict[str, Callable[..., Any]] = {
+DYNAMIC_RULES: dict[str, Rule] = {
     "dynamic_slice": _dynamic_slice,
     "dynamic_update_slice": _dynamic_update_slice,
     "gather": gather,

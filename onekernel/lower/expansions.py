@@ -12,8 +12,7 @@ H. S. Warren, Hacker's Delight, chapters 5 and 9. The polynomials are interpolat
 
 import functools
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -182,8 +181,10 @@ def _positive_erfc(x: Array) -> Array:
 
 
 def _horner(coefficients: list[float], x: Array) -> Array:
-    total: Any = coefficients[0]
-    for coefficient in coefficients[1:]:
+    """Return the value of a polynomial, whose coefficients are given highest power first."""
+    highest, following, *others = coefficients
+    total = highest * x + following
+    for coefficient in others:
         total = total * x + coefficient
     return total
 
@@ -279,11 +280,11 @@ def _conv_general_dilated(
     x: Array,
     kernel: Array,
     *,
-    window_strides: Any,
-    padding: Any,
-    lhs_dilation: Any,
-    rhs_dilation: Any,
-    dimension_numbers: Any,
+    window_strides: Sequence[int],
+    padding: Sequence[tuple[int, int]],
+    lhs_dilation: Sequence[int],
+    rhs_dilation: Sequence[int],
+    dimension_numbers: jax.lax.ConvDimensionNumbers,
     feature_group_count: int,
     batch_group_count: int,
 ) -> Array:
@@ -316,7 +317,7 @@ def _conv_general_dilated(
     return result.transpose(np.argsort(dimension_numbers.out_spec))
 
 
-EXPANSIONS: dict[str, Callable[..., Any]] = {
+EXPANSIONS: dict[str, Callable[..., Array]] = {
     "acos": _acos,
     "acosh": _acosh,
     "asin": _asin,

@@ -5,15 +5,22 @@ They cost nothing in the program, because every index is a constant when the fun
 
 import math
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from typing import cast
 
 import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import JaxprEqn, Literal, Var
+from numpy.typing import ArrayLike, DTypeLike
 
 from onekernel.errors import UnsupportedError
 from onekernel.lower.scalar_ir import Scalar, is_constant
 
 ScalarArray = np.ndarray
 """An array of `Scalar`, dtype object."""
+
+Rule = Callable[..., ScalarArray | list[ScalarArray]]
+"""A function that lowers an equation: of the equation and its operands, one array of scalars each.
+It returns the result, or a list of them. Some rules take the graph before the equation."""
 
 
 def full_array(shape: Sequence[int], make: Callable[[], Scalar]) -> ScalarArray:
@@ -30,13 +37,13 @@ def scalar_array(scalars: Iterable[Scalar], shape: Sequence[int]) -> ScalarArray
     return array.reshape(shape)
 
 
-def constant_array(array: Any) -> ScalarArray:
+def constant_array(array: ArrayLike) -> ScalarArray:
     """Convert an array of constants to an array of scalars."""
     array = np.asarray(array)
     return scalar_array(array.ravel(), array.shape)
 
 
-def constant_values(array: ScalarArray, dtype: Any) -> np.ndarray:
+def constant_values(array: ScalarArray, dtype: DTypeLike) -> np.ndarray:
     """Convert scalars that are all constants to a plain NumPy array.
 
     Args:
@@ -54,26 +61,31 @@ def constant_values(array: ScalarArray, dtype: Any) -> np.ndarray:
     return np.asarray(list(array.ravel()), dtype).reshape(array.shape)
 
 
-def shape_of(variable: Any) -> tuple[int, ...]:
-    """Return the shape of a jaxpr variable."""
-    return tuple(variable.aval.shape)
+def shape_of(variable: Var | Literal) -> tuple[int, ...]:
+    """Return the shape of a variable or literal of a jaxpr."""
+    return tuple(cast(ShapedArray, variable.aval).shape)
 
 
-def fill_value(equation: Any) -> float:
+def dtype_of(variable: Var | Literal) -> np.dtype:
+    """Return the dtype of a variable or literal of a jaxpr."""
+    return cast(ShapedArray, variable.aval).dtype
+
+
+def fill_value(equation: JaxprEqn) -> float:
     """Return the value that a gather returns for a window outside of its operand."""
     given = equation.params.get("fill_value")
-    dtype = equation.outvars[0].aval.dtype
+    dtype = dtype_of(equation.outvars[0])
     if given is not None:
         return given
     # JAX's defaults: NaN, the smallest integer with a sign, or all bits set.
     return np.nan if dtype.kind == "f" else np.iinfo(dtype).min if dtype.kind == "i" else True
 
 
-def _reshape(equation: Any, x: ScalarArray) -> ScalarArray:
+def _reshape(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
     return x.reshape(shape_of(equation.outvars[0]))
 
 
-def _slice(equation: Any, x: ScalarArray) -> ScalarArray:
+def _slice(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
     params = equation.params
     # No strides stand for strides of 1.
     strides = params["strides"] or [1] * x.ndim
@@ -81,7 +93,7 @@ def _slice(equation: Any, x: ScalarArray) -> ScalarArray:
     return x[tuple(slice(*bound) for bound in bounds)]
 
 
-def _broadcast_in_dim(equation: Any, x: ScalarArray) -> ScalarArray:
+def _broadcast_in_dim(equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
     # Put the operand's axes where they belong, with axes of length 1 between them.
     shape = [1] * len(equation.params["shape"])
     for axis, size in zip(equation.params["broadcast_dimensions"], x.shape, strict=True):
@@ -89,12 +101,12 @@ def _broadcast_in_dim(equation: Any, x: ScalarArray) -> ScalarArray:
     return np.broadcast_to(x.reshape(shape), equation.params["shape"])
 
 
-def _unstack(equation: Any, x: ScalarArray) -> list[ScalarArray]:
+def _unstack(equation: JaxprEqn, x: ScalarArray) -> list[ScalarArray]:
     parts = np.split(x, x.shape[equation.params["axis"]], equation.params["axis"])
     return [part.reshape(shape_of(equation.outvars[0])) for part in parts]
 
 
-def _pad(equation: Any, x: ScalarArray, padding: ScalarArray) -> ScalarArray:
+def _pad(equation: JaxprEqn, x: ScalarArray, padding: ScalarArray) -> ScalarArray:
     widths = equation.params["padding_config"]
     # Pad between and around the numbers, and then cut off where a width is negative.
     spread = [
@@ -118,17 +130,17 @@ def _pad(equation: Any, x: ScalarArray, padding: ScalarArray) -> ScalarArray:
     ]
 
 
-def _iota(equation: Any) -> ScalarArray:
+def _iota(equation: JaxprEqn) -> ScalarArray:
     params = equation.params
     return constant_array(np.indices(params["shape"], params["dtype"])[params["dimension"]])
 
 
-def _empty(equation: Any) -> ScalarArray:
+def _empty(equation: JaxprEqn) -> ScalarArray:
     variable = equation.outvars[0]
-    return constant_array(np.zeros(shape_of(variable), variable.aval.dtype))
+    return constant_array(np.zeros(shape_of(variable), dtype_of(variable)))
 
 
-RULES: dict[str, Callable[..., Any]] = {
+RULES: dict[str, Rule] = {
     "broadcast_in_dim": _broadcast_in_dim,
     "concatenate": lambda equation, *xs: np.concatenate(xs, equation.params["dimension"]),
     "copy": lambda equation, x: x,

@@ -31,29 +31,32 @@ import contextlib
 import dataclasses
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Sequence
-from typing import Any
+from collections.abc import Callable, Hashable, Iterable, Sequence
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.extend import source_info_util
-from jax.extend.core import ClosedJaxpr, Literal
+from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
+from jaxtyping import Array, PyTree
+from numpy.typing import ArrayLike
 
 from onekernel.errors import UnsupportedError
 from onekernel.lower.dynamic_indexing import DYNAMIC_RULES
 from onekernel.lower.expansions import EXPANSIONS, power, round_away_from_zero
 from onekernel.lower.indexing import (
     RULES,
+    Rule,
     ScalarArray,
     constant_array,
+    dtype_of,
     full_array,
     scalar_array,
     shape_of,
 )
 from onekernel.lower.linear_algebra import MAX_ROWS, expansion
-from onekernel.lower.random_rules import RANDOM_RULES, like, words_of
+from onekernel.lower.random_rules import RANDOM_RULES, Key, like, words_of
 from onekernel.lower.scalar_ir import (
     EVALUATE,
     SIMPLE_POWERS,
@@ -83,6 +86,7 @@ _GRAPH_RULES = {**RANDOM_RULES, **DYNAMIC_RULES}
 """Lowering rules that take the graph before the equation and its operands."""
 
 _FLOAT = np.dtype(np.float32)
+_PairKey = tuple[Hashable, ...]
 _WORDS = {_FLOAT, np.dtype(np.int32), np.dtype(np.uint32), np.dtype(bool)}
 
 
@@ -104,7 +108,7 @@ class ScalarProgram:
 
 
 def scalarize(
-    function: Callable[..., Any], *arguments: Any, approximate: bool = False
+    function: Callable[..., PyTree], *arguments: PyTree, approximate: bool = False
 ) -> ScalarProgram:
     """Lower a function to a program on scalars; the module states the protocol.
 
@@ -126,8 +130,8 @@ def scalarize(
 
 def scalarize_part(
     closed: ClosedJaxpr,
-    arguments: Sequence[Any],
-    results: Sequence[Any],
+    arguments: Sequence[Var],
+    results: Sequence[Var | Literal],
     *,
     words: bool = False,
     finite: bool = True,
@@ -158,13 +162,13 @@ def scalarize_part(
     # Start with the program's arguments, each split into scalars of the graph.
     graph = ExprGraph(finite=finite, approximate=approximate)
     lowering = _JaxprLowering(graph)
-    env: dict[Any, ScalarArray] = {}
+    env: dict[Var, ScalarArray] = {}
     inputs = []
     for variable in [*arguments, *results]:
-        if jnp.issubdtype(variable.aval.dtype, jax.dtypes.extended):
-            raise UnsupportedError(f"an argument or result of {variable.aval.dtype}")
+        if jnp.issubdtype(dtype_of(variable), jax.dtypes.extended):
+            raise UnsupportedError(f"an argument or result of {dtype_of(variable)}")
     for variable in arguments:
-        dtype = np.dtype(variable.aval.dtype)
+        dtype = np.dtype(dtype_of(variable))
         given = _FLOAT if words else dtype
         inputs.append(full_array(shape_of(variable), lambda dtype=given: graph.input(dtype)))
         env[variable] = lowering.bitcast(inputs[-1], given, dtype)
@@ -172,7 +176,7 @@ def scalarize_part(
     outputs = lowering.lower_part(closed, env, results)
     if words:
         outputs = [
-            lowering.bitcast(x, np.dtype(atom.aval.dtype), _FLOAT)
+            lowering.bitcast(x, np.dtype(dtype_of(atom)), _FLOAT)
             for x, atom in zip(outputs, results, strict=True)
         ]
     # Arrange the recorded operations, without those on which no result depends.
@@ -200,7 +204,7 @@ class _JaxprLowering:
         return self.lower_part(closed, env, closed.jaxpr.outvars)
 
     def lower_part(
-        self, closed: ClosedJaxpr, env: dict[Any, ScalarArray], results: Sequence[Any]
+        self, closed: ClosedJaxpr, env: dict[Var, ScalarArray], results: Sequence[Var | Literal]
     ) -> list[ScalarArray]:
         """Lower the equations that some results need.
 
@@ -210,10 +214,9 @@ class _JaxprLowering:
           results: variables or literals of the jaxpr.
         """
 
-        def read(atom: Any) -> ScalarArray:
+        def read(atom: Var | Literal) -> ScalarArray:
             if isinstance(atom, Literal):
-                aval: Any = atom.aval
-                return constant_array(np.asarray(atom.val, aval.dtype))
+                return constant_array(np.asarray(atom.val, dtype_of(atom)))
             return env[atom]
 
         # Walk backwards from the results to find the equations that they need. A variable of `env`
@@ -236,7 +239,7 @@ class _JaxprLowering:
             env |= dict(zip(equation.outvars, values, strict=True))
         return [read(atom) for atom in results]
 
-    def _lower_eqn(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
+    def _lower_eqn(self, equation: JaxprEqn, operands: list[ScalarArray]) -> list[ScalarArray]:
         try:
             return self._apply_rule(equation, operands)
         except UnsupportedError as error:
@@ -244,7 +247,7 @@ class _JaxprLowering:
             error.place = error.place or source_info_util.summarize(equation.source_info)
             raise
 
-    def _apply_rule(self, equation: Any, operands: list[ScalarArray]) -> list[ScalarArray]:
+    def _apply_rule(self, equation: JaxprEqn, operands: list[ScalarArray]) -> list[ScalarArray]:
         name = equation.primitive.name
         # Most operations on single elements have the same name in JAX and in the graph, and need
         # no rule of their own.
@@ -265,7 +268,7 @@ class _JaxprLowering:
         result = rule(equation, *operands)
         return result if isinstance(result, list) else [result]
 
-    def _expand_by(self, function: Callable[..., Any], equation: Any) -> Callable[..., Any]:
+    def _expand_by(self, function: Callable[..., Array], equation: JaxprEqn) -> Rule:
         """Return the rule that lowers an operation as a function of its operands.
 
         Args:
@@ -279,10 +282,10 @@ class _JaxprLowering:
         closed = jax.make_jaxpr(called)(*(x.aval for x in equation.invars))
         return lambda _, *operands: self.lower(closed, operands)
 
-    def _expand(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _expand(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         """Lower an operation that JAX itself expands into others (see `_is_expandable`)."""
 
-        def expanded(*arrays: Any) -> Any:
+        def expanded(*arrays: Array) -> PyTree:
             with equation.ctx.manager:
                 return equation.primitive.to_lojax(*arrays, **equation.params)
 
@@ -308,38 +311,40 @@ class _JaxprLowering:
         rows = zip(*(array.ravel() for array in arrays), strict=True)
         return scalar_array((self._select(*row) for row in rows), if_false.shape)
 
-    def _select(self, condition: Scalar, if_false: Any, if_true: Any) -> Any:
+    def _select(
+        self, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
+    ) -> Scalar | Key:
         """Select between two scalars, or the words of two random keys."""
         pairs = zip(words_of(if_false), words_of(if_true), strict=True)
         return like(if_true, (self._graph.select(condition, *pair) for pair in pairs))
 
     # Rules of primitives that call functions: jit, scan, while, cond.
 
-    def _jit(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _jit(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         return self.lower(equation.params["jaxpr"], operands)
 
     _pjit = _jit
 
-    def _custom_jvp_call(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _custom_jvp_call(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         return self.lower(equation.params["call_jaxpr"], operands)
 
     _custom_vjp_call = _custom_jvp_call
 
-    def _platform_index(self, equation: Any) -> ScalarArray:
+    def _platform_index(self, equation: JaxprEqn) -> ScalarArray:
         # `jax.lax.platform_dependent`: choose the case that is written for all platforms, whose
         # names are None. A scalar program does not know which platform it is for.
         platforms = equation.params["platforms"]
         index = next((i for i, names in enumerate(platforms) if names is None), len(platforms) - 1)
         return constant_array(np.int32(index))
 
-    def _remat2(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _remat2(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         # `jax.checkpoint` computes values again in the backward pass instead of storing them. Here
         # all values are registers, and equal operations are recorded once.
         return self.lower(ClosedJaxpr(equation.params["jaxpr"], ()), operands)
 
     _checkpoint = _remat2
 
-    def _custom_linear_solve(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _custom_linear_solve(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         # The operands are the constants of four functions (matvec, vecmat, solve, transpose_solve),
         # then the right-hand sides. Only `solve` runs here; the others serve checks and
         # derivatives.
@@ -348,7 +353,7 @@ class _JaxprLowering:
         right = operands[first + lengths.solve + lengths.transpose_solve :]
         return self.lower(solve, [*operands[first : first + lengths.solve], *right])
 
-    def _scan(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _scan(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         body, length = equation.params["jaxpr"], equation.params["length"]
         # Split the operands into constants, carry and sequences, which have one axis less inside.
         scanned, stacked = (
@@ -405,7 +410,7 @@ class _JaxprLowering:
         # For example, an index depends on the loop counter, which is constant once unrolled.
         return None
 
-    def _while(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _while(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         # The operands are the constants of the condition, those of the body, and the carried
         # values.
         first = equation.params["cond_nconsts"]
@@ -529,7 +534,9 @@ class _JaxprLowering:
         end = [results[k] if k in carried else x for k, x in enumerate(initial)]
         return _unflatten(state, end)
 
-    def _cond(self, equation: Any, index: ScalarArray, *operands: ScalarArray) -> list[ScalarArray]:
+    def _cond(
+        self, equation: JaxprEqn, index: ScalarArray, *operands: ScalarArray
+    ) -> list[ScalarArray]:
         branches, selected = equation.params["branches"], index.item()
         if is_constant(selected):
             return self.lower(branches[min(max(int(selected), 0), len(branches) - 1)], operands)
@@ -553,12 +560,12 @@ class _JaxprLowering:
 
     # Rules of primitives with arithmetic on more than single elements.
 
-    def _convert_element_type(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _convert_element_type(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         dtype = np.dtype(equation.params["new_dtype"])
         return scalar_array((self._graph.convert(one, dtype) for one in x.ravel()), x.shape)
 
-    def _bitcast_convert_type(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        source, to = equation.invars[0].aval.dtype, equation.params["new_dtype"]
+    def _bitcast_convert_type(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+        source, to = dtype_of(equation.invars[0]), equation.params["new_dtype"]
         if bool in (source, to):
             raise UnsupportedError("a bitcast of truth values")
         return self.bitcast(x, np.dtype(source), np.dtype(to))
@@ -587,7 +594,7 @@ class _JaxprLowering:
 
         return scalar_array(map(cast, x.ravel()), x.shape)
 
-    def _select_n(self, equation: Any, which: ScalarArray, *cases: ScalarArray) -> ScalarArray:
+    def _select_n(self, equation: JaxprEqn, which: ScalarArray, *cases: ScalarArray) -> ScalarArray:
         result = cases[-1]
         for i in reversed(range(len(cases) - 1)):
             # The index of a case is a bool or an integer.
@@ -599,20 +606,20 @@ class _JaxprLowering:
         return result
 
     def _clamp(
-        self, equation: Any, low: ScalarArray, x: ScalarArray, high: ScalarArray
+        self, equation: JaxprEqn, low: ScalarArray, x: ScalarArray, high: ScalarArray
     ) -> ScalarArray:
         return self._elementwise("min", self._elementwise("max", x, low), high)
 
-    def _round(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _round(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         if equation.params["rounding_method"] == jax.lax.RoundingMethod.TO_NEAREST_EVEN:
             return self._elementwise("round", x)
         return self._expand_by(round_away_from_zero, equation)(equation, x)[0]
 
-    def _square(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _square(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         return self._elementwise("mul", x, x)
 
-    def _integer_pow(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        one = constant_array(np.ones(x.shape, equation.outvars[0].aval.dtype))
+    def _integer_pow(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+        one = constant_array(np.ones(x.shape, dtype_of(equation.outvars[0])))
         # x⁻ⁿ is (1/x)ⁿ. Where a derivative needs it, the function mostly has 1/x already.
         base = x if equation.params["y"] >= 0 else self._elementwise("div", one, x)
         result = one
@@ -620,21 +627,21 @@ class _JaxprLowering:
             result = self._elementwise("mul", result, base)
         return result
 
-    def _pow(self, equation: Any, x: ScalarArray, y: ScalarArray) -> ScalarArray:
+    def _pow(self, equation: JaxprEqn, x: ScalarArray, y: ScalarArray) -> ScalarArray:
         exponents = {float(one) if is_constant(one) else None for one in y.ravel()}
         if exponents <= SIMPLE_POWERS:
             return self._elementwise("pow", x, y)
         return self._expand_by(power, equation)(equation, x, y)[0]
 
-    def _logistic(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _logistic(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         one = constant_array(np.float32(1))
         exp = self._elementwise("exp", self._elementwise("neg", x))
         return self._elementwise("div", one, self._elementwise("add", one, exp))
 
-    def _rsqrt(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _rsqrt(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         return self._elementwise("div", constant_array(np.float32(1)), self._elementwise("sqrt", x))
 
-    def _reduce(self, op: str, initial: Scalar, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _reduce(self, op: str, initial: Scalar, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         # Each group holds the scalars of one result, which are combined in their order.
         (groups,) = _group_axes(x, (), equation.params["axes"])
         scalars = (self._fold(op, initial, group) for group in groups)
@@ -644,27 +651,27 @@ class _JaxprLowering:
         """Combine scalars by an operation, one after the other."""
         return functools.reduce(functools.partial(self._graph.apply, op), scalars, initial)
 
-    def _reduce_sum(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("add", equation.outvars[0].aval.dtype.type(0), equation, x)
+    def _reduce_sum(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+        return self._reduce("add", dtype_of(equation.outvars[0]).type(0), equation, x)
 
-    def _reduce_prod(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("mul", equation.outvars[0].aval.dtype.type(1), equation, x)
+    def _reduce_prod(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+        return self._reduce("mul", dtype_of(equation.outvars[0]).type(1), equation, x)
 
-    def _reduce_and(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        zero = equation.outvars[0].aval.dtype.type(0)
+    def _reduce_and(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+        zero = dtype_of(equation.outvars[0]).type(0)
         return self._reduce("and", np.bitwise_not(zero), equation, x)
 
-    def _reduce_or(self, equation: Any, x: ScalarArray) -> ScalarArray:
-        return self._reduce("or", equation.outvars[0].aval.dtype.type(0), equation, x)
+    def _reduce_or(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+        return self._reduce("or", dtype_of(equation.outvars[0]).type(0), equation, x)
 
-    def _reduce_max(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _reduce_max(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         # Start with the number that changes nothing: max(-inf, x) is x.
         return self._reduce("max", _lowest(equation), equation, x)
 
-    def _reduce_min(self, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _reduce_min(self, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         return self._reduce("min", -_lowest(equation), equation, x)
 
-    def _cumulate(self, op: str, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _cumulate(self, op: str, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         # Go along the axis, and combine each entry with the one before it (behind it, if reversed).
         result = np.moveaxis(x.copy(), equation.params["axis"], 0)
         order = range(1, len(result))
@@ -679,11 +686,11 @@ class _JaxprLowering:
     _cumprod = functools.partialmethod(_cumulate, "mul")
     _cumsum = functools.partialmethod(_cumulate, "add")
 
-    def _arg_extreme(self, better: str, equation: Any, x: ScalarArray) -> ScalarArray:
+    def _arg_extreme(self, better: str, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
         (axis,) = equation.params["axes"]
-        kind = equation.outvars[0].aval.dtype.type
+        kind = dtype_of(equation.outvars[0]).type
         # The graph cannot compare truth values.
-        if equation.invars[0].aval.dtype == bool:
+        if dtype_of(equation.invars[0]) == np.dtype(bool):
             x = scalar_array(
                 (self._graph.convert(one, np.dtype(np.int32)) for one in x.ravel()), x.shape
             )
@@ -707,7 +714,7 @@ class _JaxprLowering:
     _argmin = functools.partialmethod(_arg_extreme, "lt")
     _argmax = functools.partialmethod(_arg_extreme, "gt")
 
-    def _linear_algebra(self, equation: Any, *operands: ScalarArray) -> list[ScalarArray]:
+    def _linear_algebra(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         function = expansion(equation)
         if function is None:
             rows = shape_of(equation.invars[0])[-1]
@@ -718,13 +725,13 @@ class _JaxprLowering:
 
     _cholesky = _lu = _qr = _triangular_solve = _linear_algebra
 
-    def _dot_general(self, equation: Any, a: ScalarArray, b: ScalarArray) -> ScalarArray:
+    def _dot_general(self, equation: JaxprEqn, a: ScalarArray, b: ScalarArray) -> ScalarArray:
         # Group the axes of both operands as (batch, free, summed); the result has (batch, free a,
         # free b).
         (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
         rows = _group_axes(a, batch_a, sum_a)
         columns = _group_axes(b, batch_b, sum_b)
-        dtype = np.dtype(equation.outvars[0].aval.dtype)
+        dtype = np.dtype(dtype_of(equation.outvars[0]))
         sums = []
         for row_group, column_group in zip(rows, columns, strict=True):
             for row in row_group:
@@ -751,7 +758,7 @@ def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, 
       How each derived value is computed from the others, by its place.
     """
     derived: dict[int, Scalar] = {}
-    known: dict[Any, Scalar] = {}
+    known: dict[_PairKey, Scalar] = {}
     # Begin with the values that were recorded first, because others may be derived from them.
     for place in sorted(carried, key=lambda k: _index(loop.updated[k])):
         # If an earlier place has the same two values, take its value; otherwise try to rebuild both
@@ -768,7 +775,7 @@ def _find_derived(graph: ExprGraph, loop: Loop, carried: set[int]) -> dict[int, 
 
 
 def _matched(
-    graph: ExprGraph, known: dict[Any, Scalar], before: Scalar, after: Scalar
+    graph: ExprGraph, known: dict[_PairKey, Scalar], before: Scalar, after: Scalar
 ) -> Scalar | None:
     """Return one expression for both `before` and `after`; None if there is none.
 
@@ -782,7 +789,7 @@ def _matched(
     # Walk down both expressions at once, with a stack instead of recursion: they may be thousands
     # of operations deep. A pair stays on the stack until all pairs of its operands are found.
     pending = [(before, after)]
-    found: dict[Any, Scalar | None] = {}
+    found: dict[_PairKey, Scalar | None] = {}
     while pending:
         pair = pending[-1]
         key = _pair_key(pair)
@@ -825,7 +832,7 @@ def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
     return list(zip(before.operands, after.operands, strict=True))
 
 
-def _pair_key(pair: tuple[Scalar, Scalar]) -> tuple[Any, ...]:
+def _pair_key(pair: tuple[Scalar, Scalar]) -> _PairKey:
     """Return a key that two pairs share if they are the same operations or equal constants."""
     return tuple((x.dtype.str, x.tobytes()) if is_constant(x) else x.index for x in pair)
 
@@ -849,19 +856,19 @@ def _unflatten(arrays: Sequence[ScalarArray], flat: Sequence[Scalar]) -> list[Sc
     ]
 
 
-def _constants(array: Any) -> ScalarArray:
+def _constants(array: ArrayLike) -> ScalarArray:
     """Convert a constant of a jaxpr to scalars.
 
     Raises:
       UnsupportedError: it is not known yet, or an array of random keys.
     """
-    dtype: Any = getattr(array, "dtype", None)
+    dtype = getattr(array, "dtype", float)
     if isinstance(array, Tracer) or jnp.issubdtype(dtype, jax.dtypes.extended):
         raise UnsupportedError(f"a constant {array}")
     return constant_array(array)
 
 
-def _is_expandable(equation: Any) -> bool:
+def _is_expandable(equation: JaxprEqn) -> bool:
     """Return whether JAX has an expansion of an operation, as of `jnp.nonzero` since JAX 0.12.
 
     JAX calls these primitives high: it traces them to one equation, and replaces that by their
@@ -876,8 +883,8 @@ def _at(array: ScalarArray, i: int) -> ScalarArray:
     return array[i : i + 1].reshape(array.shape[1:])
 
 
-def _lowest(equation: Any) -> Any:
-    dtype = equation.outvars[0].aval.dtype
+def _lowest(equation: JaxprEqn) -> Scalar:
+    dtype = dtype_of(equation.outvars[0])
     if dtype.kind != "f":
         raise UnsupportedError(f"the extreme of {dtype}")
     return dtype.type(-np.inf)

@@ -10,19 +10,23 @@ scalar operations they compile like all other arithmetic. Kernels always compute
 import functools
 import inspect
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import TypeVar, cast, overload
 
 import jax
 import jax.numpy as jnp
+from jax.core import ShapedArray
 from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, jaxpr_as_fun
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from onekernel.errors import UnsupportedError
 
 MAX_ROWS = 16
 """Largest number of rows that is unrolled, since the program grows with its cube."""
 
-_F = TypeVar("_F", bound=Callable[..., Any])
+_F = TypeVar("_F", bound=Callable[..., PyTree])
+
+Expansion = Callable[..., Array | tuple[Array, ...]]
+"""A function of the operands of an operation on matrices that returns its result or results."""
 
 
 def unroll_linear_algebra(function: _F) -> _F:
@@ -36,7 +40,7 @@ def unroll_linear_algebra(function: _F) -> _F:
     """
 
     @functools.wraps(function)
-    def unrolled(*arguments: Any) -> Any:
+    def unrolled(*arguments: PyTree) -> PyTree:
         # Trace, replace the operations, and evaluate the new jaxpr, which JAX may be tracing
         # itself.
         closed, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
@@ -46,7 +50,7 @@ def unroll_linear_algebra(function: _F) -> _F:
     return unrolled  # pyright: ignore[reportReturnType]  # the same signature
 
 
-def expansion(equation: JaxprEqn) -> Callable[..., Any] | None:
+def expansion(equation: JaxprEqn) -> Expansion | None:
     """Return a function of an equation's operands that computes it in scalar arithmetic.
 
     Args:
@@ -58,7 +62,7 @@ def expansion(equation: JaxprEqn) -> Callable[..., Any] | None:
     function = _EXPANSIONS.get(equation.primitive.name)
     if function is None:
         return None
-    matrix: Any = equation.invars[0].aval
+    matrix = cast(ShapedArray, equation.invars[0].aval)
     if matrix.shape[-1] > MAX_ROWS or not jnp.issubdtype(matrix.dtype, jnp.floating):
         return None
     # Pass the parameters that the formula has; others do not change the result.
@@ -242,7 +246,7 @@ def _subtract_products(start: Array, pairs: list[tuple[Array, Array]]) -> Array:
     return start
 
 
-_EXPANSIONS: dict[str, Callable[..., Any]] = {
+_EXPANSIONS: dict[str, Expansion] = {
     "cholesky": cholesky,
     "lu": lu,
     "qr": qr,
@@ -251,7 +255,15 @@ _EXPANSIONS: dict[str, Callable[..., Any]] = {
 """Functions that compute the JAX primitive of a name, with its parameters as keywords."""
 
 
-def _unroll(jaxpr: Any) -> Any:
+@overload
+def _unroll(jaxpr: ClosedJaxpr) -> ClosedJaxpr: ...
+
+
+@overload
+def _unroll(jaxpr: object) -> object: ...
+
+
+def _unroll(jaxpr: object) -> object:
     """Return a jaxpr with a call of its expansion in place of each operation that has one.
 
     Anything but a jaxpr is returned as it is.

@@ -9,14 +9,14 @@ doi:10.1145/2063384.2063405 (Threefry-2x32 with 20 rounds, which JAX uses).
 import dataclasses
 import functools
 import math
-from collections.abc import Callable, Iterable
-from typing import Any
+from collections.abc import Iterable
 
 import jax
 import numpy as np
+from jax.extend.core import JaxprEqn
 
 from onekernel.errors import UnsupportedError
-from onekernel.lower.indexing import ScalarArray, scalar_array, shape_of
+from onekernel.lower.indexing import Rule, ScalarArray, scalar_array, shape_of
 from onekernel.lower.scalar_ir import ExprGraph, Scalar
 
 _ROTATIONS = ((13, 15, 26, 6), (17, 29, 16, 24))
@@ -32,12 +32,12 @@ class Key:
     second: Scalar
 
 
-def words_of(x: Any) -> tuple[Scalar, ...]:
+def words_of(x: Scalar | Key) -> tuple[Scalar, ...]:
     """Return the words of a key, or a scalar as the only one."""
     return (x.first, x.second) if isinstance(x, Key) else (x,)
 
 
-def like(x: Any, words: Iterable[Scalar]) -> Any:
+def like(x: Scalar | Key, words: Iterable[Scalar]) -> Scalar | Key:
     """Return a key if `x` is a key, else a scalar, from the next of some words."""
     words = iter(words)
     return Key(next(words), next(words)) if isinstance(x, Key) else next(words)
@@ -63,7 +63,7 @@ def threefry(graph: ExprGraph, key: Key, first: Scalar, second: Scalar) -> Key:
 
 def _threefry2x32(
     graph: ExprGraph,
-    equation: Any,
+    equation: JaxprEqn,
     key: ScalarArray,
     other: ScalarArray,
     first: ScalarArray,
@@ -79,7 +79,7 @@ def _threefry2x32(
     ]
 
 
-def _wrap(graph: ExprGraph, equation: Any, words: ScalarArray) -> ScalarArray:
+def _wrap(graph: ExprGraph, equation: JaxprEqn, words: ScalarArray) -> ScalarArray:
     pairs = words.reshape(-1, words.shape[-1])
     # Keys of other generators have more words.
     if words.shape[-1] != 2:
@@ -87,7 +87,7 @@ def _wrap(graph: ExprGraph, equation: Any, words: ScalarArray) -> ScalarArray:
     return scalar_array((Key(*pair) for pair in pairs), words.shape[:-1])
 
 
-def _unwrap(graph: ExprGraph, equation: Any, keys: ScalarArray) -> ScalarArray:
+def _unwrap(graph: ExprGraph, equation: JaxprEqn, keys: ScalarArray) -> ScalarArray:
     words = [word for key in keys.ravel() for word in words_of(key)]
     return scalar_array(words, (*keys.shape, 2))
 
@@ -102,13 +102,13 @@ def _hashes(graph: ExprGraph, key: Key, shape: tuple[int, ...]) -> list[Key]:
     return [threefry(graph, key, np.uint32(0), np.uint32(count)) for count in counts]
 
 
-def _split(graph: ExprGraph, equation: Any, keys: ScalarArray) -> ScalarArray:
+def _split(graph: ExprGraph, equation: JaxprEqn, keys: ScalarArray) -> ScalarArray:
     shape = equation.params["shape"]
     split = [child for key in keys.ravel() for child in _hashes(graph, key, shape)]
     return scalar_array(split, shape_of(equation.outvars[0]))
 
 
-def _bits(graph: ExprGraph, equation: Any, keys: ScalarArray) -> ScalarArray:
+def _bits(graph: ExprGraph, equation: JaxprEqn, keys: ScalarArray) -> ScalarArray:
     if equation.params["bit_width"] != 32:
         raise UnsupportedError("random bits other than words of 32")
     shape = equation.params["shape"]
@@ -118,7 +118,9 @@ def _bits(graph: ExprGraph, equation: Any, keys: ScalarArray) -> ScalarArray:
     return scalar_array(bits, shape_of(equation.outvars[0]))
 
 
-def _fold_in(graph: ExprGraph, equation: Any, keys: ScalarArray, data: ScalarArray) -> ScalarArray:
+def _fold_in(
+    graph: ExprGraph, equation: JaxprEqn, keys: ScalarArray, data: ScalarArray
+) -> ScalarArray:
     pairs = zip(*(x.ravel() for x in np.broadcast_arrays(keys, data)), strict=True)
     folded = (
         threefry(graph, key, np.uint32(0), graph.convert(number, _WORD)) for key, number in pairs
@@ -126,7 +128,7 @@ def _fold_in(graph: ExprGraph, equation: Any, keys: ScalarArray, data: ScalarArr
     return scalar_array(folded, shape_of(equation.outvars[0]))
 
 
-RANDOM_RULES: dict[str, Callable[..., Any]] = {
+RANDOM_RULES: dict[str, Rule] = {
     "random_bits": _bits,
     "random_fold_in": _fold_in,
     "random_split": _split,

@@ -15,7 +15,7 @@ an approximate graph records these (see `_APPROXIMATE`).
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -86,7 +86,7 @@ _UINT = np.dtype(np.uint32)
 _DTYPES = (_FLOAT, _INT, _UINT, _BOOL)
 
 
-def _divide(a: Any, b: Any) -> Any:
+def _divide(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if a.dtype.kind == "f":
         return np.divide(a, b)
     # By 0, JAX returns the number whose bits are all set.
@@ -94,7 +94,7 @@ def _divide(a: Any, b: Any) -> Any:
     return quotient.astype(np.int64).astype(a.dtype)
 
 
-def _rest(a: Any, b: Any) -> Any:
+def _rest(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     if a.dtype.kind == "f":
         return np.fmod(a, b)
     return np.where(b == 0, a, np.fmod(a, np.where(b == 0, 1, b))).astype(a.dtype)
@@ -109,11 +109,11 @@ def convert_constant(x: np.ndarray, dtype: np.dtype) -> np.ndarray:
     return x.astype(dtype)
 
 
-def _bitcast(x: Any) -> Any:
+def _bitcast(x: np.ndarray) -> np.ndarray:
     return x.view(_INT if x.dtype == _FLOAT else _FLOAT)
 
 
-def _reduced(x: Any) -> tuple[Any, Any]:
+def _reduced(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return how many quarter turns, modulo 4, are nearest to an angle, and what is left."""
     # In float64, π/2 is exact to far more digits than the result needs.
     wide = x.astype(np.float64)
@@ -122,13 +122,13 @@ def _reduced(x: Any) -> tuple[Any, Any]:
     return np.mod(turns, 4).astype(x.dtype), (angle - turns * (np.pi / 2)).astype(x.dtype)
 
 
-def _erf_inv(x: Any) -> Any:
+def _erf_inv(x: np.ndarray) -> np.ndarray:
     from scipy import special
 
     return special.erfinv(x)
 
 
-EVALUATE: dict[str, Callable[..., Any]] = {
+EVALUATE: dict[str, Callable[..., np.ndarray]] = {
     "abs": np.abs,
     "add": np.add,
     "add_any": np.add,
@@ -196,7 +196,7 @@ class ExprGraph:
         """
         self.finite = finite
         self._simplifications = _SIMPLIFY | _APPROXIMATE if approximate else _SIMPLIFY
-        self._values: dict[tuple[Any, ...], Expr] = {}
+        self._values: dict[tuple[Hashable, ...], Expr] = {}
         self.count = 0
         """Number of recorded operations."""
 
@@ -322,8 +322,15 @@ class ExprGraph:
             self._values[key] = self._new(op, operands, dtype)
         return self._values[key]
 
-    def _new(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype, *owner: Any) -> Expr:
-        return Expr(op, operands, dtype, self._next(), *owner)
+    def _new(
+        self,
+        op: str,
+        operands: tuple[Scalar, ...],
+        dtype: np.dtype,
+        owner: Loop | Branch | None = None,
+        place: int = 0,
+    ) -> Expr:
+        return Expr(op, operands, dtype, self._next(), owner, place)
 
     def _next(self) -> int:
         if self.count >= MAX_OPERATIONS:
@@ -332,7 +339,7 @@ class ExprGraph:
         return self.count - 1
 
 
-def check_scalars(values: Iterable[Any]) -> None:
+def check_scalars(values: Iterable[object]) -> None:
     """Raise an `UnsupportedError` if something is not a scalar, such as a random key."""
     for value in values:
         if not isinstance(value, Expr | np.generic):
@@ -344,7 +351,7 @@ def is_same(x: Scalar, y: Scalar) -> bool:
     return x is y or (_are_constant(x, y) and _identity(x) == _identity(y))
 
 
-def _identity(x: Scalar) -> Any:
+def _identity(x: Scalar) -> Hashable:
     # Compare bits: 0.0 == -0.0 although they differ, and NaN != NaN although they are the same.
     return x.index if isinstance(x, Expr) else (x.dtype.str, x.tobytes())
 
