@@ -1,10 +1,10 @@
 from .aot import ProgramCache as ProgramCache
 from .aot import cache_folder as cache_folder
 from .aot import known_options as known_options
-from .backends import BACKENDS as BACKENDS
 from .backends import Kernel as Kernel
 from .backends import default_backend as default_backend
 from .errors import KernelError as KernelError
 from .errors import UnsupportedError as UnsupportedError
-from .lower import scalarize as scalarize
-from .one_kernel import OneKernel as OneKernel
+from .explanation import explain as explain
+from .fused import Fused as Fused
+from .fused import fuse as fuse

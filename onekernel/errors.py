@@ -2,7 +2,7 @@
 
 from typing import Literal
 
-Kind = Literal["dtype", "platform", "derivative", "operation"]
+Kind = Literal["dtype", "platform", "derivative", "operation", "check"]
 
 
 class KernelError(Exception):
@@ -15,7 +15,7 @@ class KernelError(Exception):
           message: what is wrong, in one line.
           kind: `dtype`: an argument is not float32. `platform`: another back end must run the
             kernel. `derivative`: the kernel is differentiated. `operation`: the function cannot be
-            lowered.
+            lowered. `check`: its results are not those of XLA.
         """
         super().__init__(message)
         self.kind: Kind = kind

@@ -28,7 +28,7 @@ import math
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import NoReturn, Protocol
+from typing import NamedTuple, NoReturn, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -160,6 +160,19 @@ class Kernel:
         return [jax.ShapeDtypeStruct((*batch, *shape), np.float32) for shape in shapes]
 
 
+class Compiled(NamedTuple):
+    """A `Compiled` tells what the compiler made of a kernel, in words for the user."""
+
+    target: str
+    """The processor."""
+    seconds: float
+    """How long it took [s]."""
+    registers: str
+    """The registers that it uses."""
+    spilled: str
+    """What did not fit into them."""
+
+
 class Backend(Protocol):
     """A `Backend` compiles and launches kernels for one platform."""
 
@@ -174,6 +187,10 @@ class Backend(Protocol):
 
     def prepare(self, kernel: Kernel) -> None:
         """Begin to compile a kernel in a thread, before a program is lowered that launches it."""
+        ...
+
+    def inspect(self, kernel: Kernel) -> Compiled:
+        """Compile a kernel, whatever the caches hold, and return what the compiler made of it."""
         ...
 
     def launch(self, kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:

@@ -20,7 +20,7 @@ import numpy as np
 from jax.extend.random import define_prng_impl, threefry2x32_p
 from jaxtyping import Array, Key, PRNGKeyArray, UInt32
 
-from onekernel import OneKernel, default_backend
+from onekernel import default_backend, fuse
 
 Keys = Key[Array, " keys"] | UInt32[Array, "keys 2"]
 """Several keys, as `PRNGKeyArray` is one."""
@@ -98,12 +98,16 @@ def _one(is_split: bool) -> Callable[[Array, Array], Array]:
         words = threefry2x32_p.bind(key[0], key[1], jnp.uint32(0), place)
         return jnp.stack(words) if is_split else words[0] ^ words[1]
 
-    return OneKernel(hash_of)
+    return fuse(hash_of, on_unsupported="xla")
 
 
 def _kernel(function: Callable[..., Array]) -> Callable[..., Array]:
     """Return a function of a key's words and others as a kernel; a resulting key is words, too."""
-    return OneKernel(lambda key, *others: raw_key(function(_threefry(key), *others)))
+
+    def draw(key: Array, *others: Array) -> Array:
+        return raw_key(function(_threefry(key), *others))
+
+    return fuse(draw, on_unsupported="xla")
 
 
 def _threefry(key: UInt32[Array, "2"]) -> PRNGKeyArray:

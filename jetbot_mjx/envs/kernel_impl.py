@@ -7,8 +7,8 @@ from collections.abc import Callable, Hashable
 
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.fallbacks import Fallback, report
-from onekernel import BACKENDS, Kernel, KernelError, UnsupportedError, default_backend
-from onekernel.build import Backend
+from onekernel import Kernel, KernelError, UnsupportedError, default_backend
+from onekernel.build import BACKENDS, Backend
 
 
 @dataclasses.dataclass(frozen=True)

@@ -18,8 +18,8 @@ from jetbot_mjx.envs import line_search, mjx
 from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.robot_model import mocap_ids
 from jetbot_mjx.envs.state import PhysicsState
-from onekernel import Kernel, scalarize
-from onekernel.build import unroll_linear_algebra
+from onekernel import Kernel
+from onekernel.build import scalarize, unroll_linear_algebra
 
 
 class Physics:

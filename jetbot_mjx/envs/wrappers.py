@@ -24,7 +24,7 @@ from jetbot_mjx.envs.state import State
 from jetbot_mjx.fallbacks import Fallback, report
 from jetbot_mjx.mjx_import import Env, Wrapper
 from jetbot_mjx.packed import Packed, PackedStep, pack
-from onekernel import Kernel, OneKernel, UnsupportedError
+from onekernel import Fused, Kernel, UnsupportedError, fuse
 
 RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 """A function from one model to (batch of models, their `in_axes` for `jax.vmap`), as in Brax."""
@@ -280,12 +280,12 @@ class KernelWrapper(Wrapper):
 
         # Pyright would want the names of the methods' arguments.
         def compiled(function: Callable[..., Any]) -> Any:
-            return OneKernel(
+            return fuse(
                 function,
-                lambda: physics.may_be_kernel,
-                report_unsupported,
-                physics.kernel_impl.explain,
-                physics.kernel_impl.report_fallback,
+                on_unsupported=report_unsupported,
+                may_be_kernel=lambda: physics.may_be_kernel,
+                explain=physics.kernel_impl.explain,
+                on_fallback=physics.kernel_impl.report_fallback,
             )
 
         self.reset = compiled(env.reset)
@@ -331,7 +331,7 @@ class BatchWrapper(Wrapper):
     def _packed_kernel(self, packed: Packed) -> Kernel | None:
         """Return the kernel of a step, as `PackedStep.kernel`."""
         step = self.env.step_packed
-        if packed.others or not isinstance(step, OneKernel):
+        if packed.others or not isinstance(step, Fused):
             return None
         one = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), packed)
         return step.kernel_for(one, jax.ShapeDtypeStruct((self.action_size,), jnp.float32))

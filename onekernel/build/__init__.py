@@ -1,12 +1,20 @@
 """Write kernels around a lowered function, as LLVM IR that the back ends compile and launch."""
 
 from onekernel import cpu, gpu
+from onekernel.backends import BACKENDS
 from onekernel.background import in_background
 from onekernel.codegen import LlvmWriter, Repeat, Value, run_program
 from onekernel.kernel import Backend, make_primitive
-from onekernel.lower import ScalarProgram, evaluate, scalarize_part, unroll_linear_algebra
+from onekernel.lower import (
+    ScalarProgram,
+    evaluate,
+    scalarize,
+    scalarize_part,
+    unroll_linear_algebra,
+)
 
 __all__ = [
+    "BACKENDS",
     "Backend",
     "LlvmWriter",
     "Repeat",
@@ -18,6 +26,7 @@ __all__ = [
     "in_background",
     "make_primitive",
     "run_program",
+    "scalarize",
     "scalarize_part",
     "unroll_linear_algebra",
 ]

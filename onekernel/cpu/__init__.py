@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import re
 import threading
+import time
 from collections.abc import Mapping, Sequence
 from types import ModuleType
 from typing import TYPE_CHECKING, NamedTuple
@@ -27,12 +28,12 @@ from onekernel.cpu.xla_call import array_of as array_of
 from onekernel.cpu.xla_call import call_text as call_text
 from onekernel.cpu.xla_call import instance_count as instance_count
 from onekernel.cpu.xla_call import step_functions as step_functions
-from onekernel.kernel import Kernel, probe
+from onekernel.kernel import Compiled, Kernel, probe
 from onekernel.trusted_files import cached_bytes
 
 if TYPE_CHECKING:
     # At run time, `_binding` imports it late.
-    from llvmlite.binding import ExecutionEngine, TargetMachine
+    from llvmlite.binding import ExecutionEngine, ModuleRef, TargetMachine
 
 # What `onekernel.kernel.Backend` asks for.
 IMPL: str = "llvm"
@@ -104,6 +105,25 @@ def kernel_text(kernel: Kernel) -> str:
 def prepare(kernel: Kernel) -> None:
     """Begin to compile a kernel, as specified by `onekernel.kernel.Backend`."""
     in_background(lambda: registered(kernel.text(IMPL, lambda: kernel_text(kernel))))
+
+
+def inspect(kernel: Kernel) -> Compiled:
+    """Compile a kernel, as specified by `onekernel.kernel.Backend`."""
+    text, host = kernel_text(kernel), host_processor()
+    begin = time.perf_counter()
+    _compile(text)
+    seconds = time.perf_counter() - begin
+    # The compiler marks in its assembly where it stores a register and loads it again.
+    machine = _target_machine()
+    machine.set_asm_verbosity(True)
+    assembly = machine.emit_assembly(_module(text))
+    stores, loads = assembly.count(" Spill"), assembly.count(" Reload")
+    return Compiled(
+        f"{host.name}, {host.lanes} instances side by side",
+        seconds,
+        f"{host.registers} of {host.lanes} numbers",
+        f"{stores:,} times stored, {loads:,} times loaded",
+    )
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
@@ -196,11 +216,15 @@ def _machine_code(text: str) -> bytes:
 
 
 def _compile(text: str) -> bytes:
-    binding = _binding()
     # From text to LLVM's own form, and from that to an object file for this processor.
+    return _target_machine().emit_object(_module(text))
+
+
+def _module(text: str) -> "ModuleRef":
+    binding = _binding()
     module = binding.parse_assembly(text, binding.create_context())
     module.triple = binding.get_process_triple()
-    return _target_machine().emit_object(module)
+    return module
 
 
 def _load(code: bytes) -> "ExecutionEngine":

@@ -15,7 +15,8 @@ import ctypes
 import functools
 import importlib
 import math
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterator, Mapping, Sequence
 from types import ModuleType
 
 import jax
@@ -32,7 +33,7 @@ from onekernel.gpu.kernel_text import (
     map_kernel_text,
 )
 from onekernel.gpu.kernel_text import module_text as module_text
-from onekernel.kernel import Kernel, probe
+from onekernel.kernel import Compiled, Kernel, probe
 
 IMPL: str = "ptx"
 PLATFORM: str = "cuda"
@@ -60,6 +61,9 @@ _FULL_BLOCKS = 2**31 - 1
 thread reaches this number, so one text serves all such launches, and the driver assembles it once.
 """
 
+_NUM_REGS, _LOCAL_SIZE_BYTES = 4, 3
+"""Attributes of a function, by their numbers in CUDA's driver API (`CUfunction_attribute`)."""
+
 _ARCHITECTURES = (70, 80, 90)
 """Target architectures, as ten times the compute capability; newer GPUs run PTX of older ones."""
 
@@ -81,6 +85,20 @@ def obstacle() -> str | None:
 def prepare(kernel: Kernel) -> None:
     """Begin to compile a kernel, as specified by `onekernel.kernel.Backend`."""
     in_background(lambda: assemble_ahead(_text(kernel, _FULL_BLOCKS)))
+
+
+def inspect(kernel: Kernel) -> Compiled:
+    """Compile a kernel, as specified by `onekernel.kernel.Backend`."""
+    architecture = target_architecture()
+    begin = time.perf_counter()
+    text = compiled(kernel, architecture).replace(INSTANCES, str(_FULL_BLOCKS))
+    registers, local = _attributes(text)
+    return Compiled(
+        f"an NVIDIA GPU of compute capability {compute_capability() / 10}",
+        time.perf_counter() - begin,
+        f"{registers} of 255 a thread",
+        f"{local:,} bytes of memory a thread",
+    )
 
 
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
@@ -174,20 +192,48 @@ def assemble_ahead(text: str) -> None:
 
     def load() -> None:
         # If this fails, or there is no GPU here, the first launch takes longer.
-        with contextlib.suppress(OSError, AttributeError, RuntimeError):
-            # Load the PTX with the driver into the context that JAX uses, and unload it: what stays
-            # is the entry in the driver's cache.
-            device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
-            cuda = ctypes.CDLL("libcuda.so.1")
-            context, module = ctypes.c_void_p(), ctypes.c_void_p()
-            if cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device):
-                return
-            cuda.cuCtxSetCurrent(context)
-            if not cuda.cuModuleLoadData(ctypes.byref(module), text.encode()):
-                cuda.cuModuleUnload(module)
-            cuda.cuDevicePrimaryCtxRelease_v2(device)
+        with contextlib.suppress(OSError, AttributeError, RuntimeError), _loaded(text):
+            pass
 
     in_background(load)
+
+
+@contextlib.contextmanager
+def _loaded(text: str) -> Iterator[tuple[ctypes.CDLL, ctypes.c_void_p]]:
+    """Load PTX with the driver into the context that JAX uses, and unload it at the end.
+
+    What stays is the entry in the driver's cache.
+
+    Raises:
+      RuntimeError: the driver refuses the PTX.
+    """
+    device = jax.local_devices(backend=PLATFORM)[0].local_hardware_id
+    cuda = ctypes.CDLL("libcuda.so.1")
+    context, module = ctypes.c_void_p(), ctypes.c_void_p()
+    if cuda.cuDevicePrimaryCtxRetain(ctypes.byref(context), device):
+        raise RuntimeError("the driver has no context for the GPU")
+    try:
+        cuda.cuCtxSetCurrent(context)
+        if cuda.cuModuleLoadData(ctypes.byref(module), text.encode()):
+            raise RuntimeError("the driver does not load the kernel")
+        yield cuda, module
+        cuda.cuModuleUnload(module)
+    finally:
+        cuda.cuDevicePrimaryCtxRelease_v2(device)
+
+
+def _attributes(text: str) -> tuple[int, int]:
+    """Return how many registers and how many bytes of local memory a kernel's thread has."""
+    with _loaded(text) as (cuda, module):
+        function = ctypes.c_void_p()
+        cuda.cuModuleGetFunction(ctypes.byref(function), module, NAME.encode())
+        found = ctypes.c_int()
+        values = []
+        for attribute in (_NUM_REGS, _LOCAL_SIZE_BYTES):
+            cuda.cuFuncGetAttribute(ctypes.byref(found), attribute, function)
+            values.append(found.value)
+    registers, local = values
+    return registers, local
 
 
 def threads_in_block(instances: int, words: int = 0) -> int:

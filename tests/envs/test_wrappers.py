@@ -13,7 +13,7 @@ from jetbot_mjx.envs.robot_model import make_mj_model
 from jetbot_mjx.envs.state import PhysicsState, State
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
 from jetbot_mjx.packed import pack
-from onekernel import BACKENDS
+from onekernel.build import BACKENDS
 
 ENVS = 64
 EPISODES = 20

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from onekernel import UnsupportedError, scalarize
-from onekernel.build import evaluate
+from onekernel import UnsupportedError
+from onekernel.build import evaluate, scalarize
 
 VECTOR = jax.ShapeDtypeStruct((3,), jnp.float32)
 X = np.random.default_rng(0).normal(size=(3, 20)).astype(np.float32)

@@ -14,7 +14,8 @@ EXAMPLE = textwrap.dedent(re.search(r"\n((?:    .*\n|\n)+)\nA `Kernel`", onekern
 
 BY_HAND = """
 import jax, jax.numpy as jnp
-from onekernel import Kernel, scalarize
+from onekernel import Kernel
+from onekernel.build import scalarize
 step = lambda state, control: state + 0.5 * control
 shape = jax.ShapeDtypeStruct((3,), jnp.float32)
 program = scalarize(step, shape, shape)

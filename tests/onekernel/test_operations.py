@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from jax.scipy import linalg, special
 
-from onekernel import OneKernel, UnsupportedError, default_backend, scalarize
+from onekernel import UnsupportedError, default_backend, fuse
+from onekernel.build import scalarize
 
 pytestmark = pytest.mark.skipif(default_backend() is None, reason="no back end for kernels")
 
@@ -212,7 +213,7 @@ def both(functions, arguments):
         return {name: function(*x) for name, function in functions.items()}
 
     reasons = []
-    kernel = OneKernel(together, on_unsupported=reasons.append)
+    kernel = fuse(together, on_unsupported=reasons.append)
     found = jax.jit(jax.vmap(kernel))(*arguments)
     assert not reasons
     return found, jax.jit(jax.vmap(together))(*arguments)

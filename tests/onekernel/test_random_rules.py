@@ -8,9 +8,9 @@ from scipy import special
 
 from helpers.run_program import evaluate
 from helpers.small_kernels import launches
+from onekernel import fuse
 from onekernel.errors import UnsupportedError
 from onekernel.lower.jaxpr import scalarize
-from onekernel.one_kernel import OneKernel
 
 KEY = jax.ShapeDtypeStruct((2,), jnp.uint32)
 
@@ -83,7 +83,7 @@ def test_they_are_those_of_jax_to_the_bit(name):
 
 def both(draw):
     """What a function of a key draws in NumPy and as a kernel."""
-    compiled = jax.vmap(OneKernel(draw))
+    compiled = jax.vmap(fuse(draw))
     assert launches(compiled, KEYS) == 1
     return evaluate(scalarize(draw, KEY), [KEYS]), jax.tree.leaves(jax.jit(compiled)(KEYS))
 
@@ -92,7 +92,7 @@ def test_none_are_drawn_where_none_are_wanted():
     def draw(key):
         return jax.random.bits(key, (0, 3)), jax.random.split(key, 0), jax.random.uniform(key)
 
-    compiled = jax.vmap(OneKernel(draw))
+    compiled = jax.vmap(fuse(draw))
     assert launches(compiled, KEYS) == 1
     bits, keys, number = compiled(KEYS)
     assert (bits.shape, bits.dtype) == ((len(KEYS), 0, 3), np.uint32)
@@ -141,7 +141,7 @@ OTHERS = {
 
 
 def check_as_it_is(draw, keys):
-    run = jax.vmap(OneKernel(draw))
+    run = jax.vmap(fuse(draw))
     assert launches(run, keys) == 0
     theirs = jax.vmap(draw)(keys)
     for one, other in zip(jax.tree.leaves(run(keys)), jax.tree.leaves(theirs), strict=True):

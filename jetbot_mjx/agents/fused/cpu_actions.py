@@ -15,8 +15,7 @@ from jetbot_mjx.agents.fused.cpu_product import rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Call, sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
 from jetbot_mjx.agents.fused.shapes import UpdateShape
-from onekernel import scalarize
-from onekernel.build import LlvmWriter, Value
+from onekernel.build import LlvmWriter, Value, scalarize
 
 _PART_ROWS = 2 * TILE_ROWS
 """Environments of a part if there are no more than `MOST_PARTS` times as many; each part copies the

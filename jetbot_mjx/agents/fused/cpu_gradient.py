@@ -28,8 +28,7 @@ from jetbot_mjx.agents.fused.shapes import (
     Minibatch,
     UpdateShape,
 )
-from onekernel import scalarize
-from onekernel.build import LlvmWriter, Value
+from onekernel.build import LlvmWriter, Value, scalarize
 
 _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""

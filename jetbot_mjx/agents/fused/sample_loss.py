@@ -25,8 +25,7 @@ from jaxtyping import Array, Float
 
 from jetbot_mjx.agents.fused.shapes import LossTerms, UpdateShape
 from jetbot_mjx.agents.gae import gae_step, td_error
-from onekernel import scalarize
-from onekernel.build import ScalarProgram
+from onekernel.build import ScalarProgram, scalarize
 
 _MIN_STD = 0.001
 _HALF_LOG_TWO_PI = 0.5 * math.log(2 * math.pi)

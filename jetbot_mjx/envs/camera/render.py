@@ -27,7 +27,8 @@ from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, with_clutter
 from jetbot_mjx.envs.kernel_impl import KernelImpl
 from jetbot_mjx.envs.robot_model import mocap_ids
-from onekernel import Kernel, scalarize
+from onekernel import Kernel
+from onekernel.build import scalarize
 
 GREY = (0.299, 0.587, 0.114)  # weights of red, green and blue; source: ITU-R BT.601
 

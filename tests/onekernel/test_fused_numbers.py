@@ -10,7 +10,7 @@ from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.task import GoalTask
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
-from onekernel.one_kernel import OneKernel
+from onekernel import fuse
 
 EVERY_KIND = np.float32([1.0, -2.5, 0.0, 3e7, -1e9, 1e14, np.nan, np.inf, -np.inf])
 
@@ -31,7 +31,7 @@ OF_ANY_NUMBER = {
 
 @pytest.mark.parametrize("name", OF_ANY_NUMBER)
 def test_what_is_not_finite_stays_so(name):
-    function = jax.vmap(OneKernel(OF_ANY_NUMBER[name]))
+    function = jax.vmap(fuse(OF_ANY_NUMBER[name]))
     assert launches(function, EVERY_KIND) == 1
     expected = jax.vmap(OF_ANY_NUMBER[name])(EVERY_KIND)
     np.testing.assert_allclose(jax.jit(function)(EVERY_KIND), expected, rtol=1e-6, atol=1e-6)
@@ -41,7 +41,7 @@ def test_what_is_not_finite_stays_so(name):
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32])
 def test_the_bits_of_whole_numbers_are_combined(reduce, dtype):
     numbers = np.random.default_rng(0).integers(0, 2**31, (17, 5)).astype(dtype)
-    ours = jax.jit(jax.vmap(OneKernel(lambda x: reduce.reduce(x))))(numbers)
+    ours = jax.jit(jax.vmap(fuse(lambda x: reduce.reduce(x))))(numbers)
     np.testing.assert_array_equal(ours, jax.vmap(lambda x: reduce.reduce(x))(numbers))
 
 
@@ -68,7 +68,7 @@ WITH_KEYS = {
 @pytest.mark.parametrize("name", WITH_KEYS)
 def test_what_chooses_between_keys_stays_as_it_is(name):
     keys = np.random.default_rng(1).integers(0, 2**32, (9, 2), np.uint32)
-    ours = jax.jit(jax.vmap(OneKernel(WITH_KEYS[name])))(keys)
+    ours = jax.jit(jax.vmap(fuse(WITH_KEYS[name])))(keys)
     theirs = jax.jit(jax.vmap(WITH_KEYS[name]))(keys)
     if name == "a key as a result":
         ours, theirs = jax.random.key_data(ours), jax.random.key_data(theirs)
@@ -77,7 +77,7 @@ def test_what_chooses_between_keys_stays_as_it_is(name):
 
 def test_a_key_as_an_argument_stays_as_it_is():
     keys = jax.random.split(jax.random.key(3), 9)
-    ours = jax.jit(jax.vmap(OneKernel(jax.random.bits)))(keys)
+    ours = jax.jit(jax.vmap(fuse(jax.random.bits)))(keys)
     np.testing.assert_array_equal(ours, jax.vmap(jax.random.bits)(keys))
 
 
@@ -106,33 +106,33 @@ def test_a_reward_that_is_no_number_ends_the_episode():
 def test_whole_numbers_keep_their_bits_where_those_are_no_number():
     """As floats, some are NaNs of the kind that a conversion would change."""
     numbers = np.int32([-5_000_000, 0x7F800001, 0x7FBFFFFF, -1])
-    ours = jax.jit(jax.vmap(OneKernel(lambda x: (x, jnp.asarray(numbers)))))(np.ones(5))
+    ours = jax.jit(jax.vmap(fuse(lambda x: (x, jnp.asarray(numbers)))))(np.ones(5))
     np.testing.assert_array_equal(ours[1], np.tile(numbers, (5, 1)))
 
 
 def test_a_zero_keeps_its_sign_in_a_choice():
-    one = OneKernel(lambda x: jnp.where(x > 0, -0.0, 0.0))
+    one = fuse(lambda x: jnp.where(x > 0, -0.0, 0.0))
     np.testing.assert_array_equal(np.signbit(jax.vmap(one)(np.float32([1, -1]))), [True, False])
 
 
 def test_nothing_divided_by_a_whole_number_is_what_jax_makes_of_it():
-    one = OneKernel(lambda n: jax.lax.div(jnp.int32(0), n))
+    one = fuse(lambda n: jax.lax.div(jnp.int32(0), n))
     np.testing.assert_array_equal(jax.vmap(one)(np.int32([0, 3])), [-1, 0])
 
 
 def test_other_settings_and_weak_types_are_lowered_anew():
     key = jax.random.PRNGKey(1)
-    draw = OneKernel(lambda key: jax.random.bits(key, (2,)))
+    draw = fuse(lambda key: jax.random.bits(key, (2,)))
     draw(key)
     with jax.threefry_partitionable(False):
         np.testing.assert_array_equal(draw(key), jax.random.bits(key, (2,)))
-    product = OneKernel(lambda a, b: a * b)
+    product = fuse(lambda a, b: a * b)
     assert product(jnp.uint32(5), 3).dtype == jnp.uint32
     assert product(jnp.uint32(5), jnp.int32(3)).dtype == jnp.int32
 
 
 def test_a_function_of_nothing_stays_as_it_is():
-    np.testing.assert_array_equal(OneKernel(lambda: jnp.ones(3))(), np.ones(3))
+    np.testing.assert_array_equal(fuse(lambda: jnp.ones(3))(), np.ones(3))
 
 
 def test_a_kernel_for_several_robots_stays_as_it_is():
@@ -142,5 +142,5 @@ def test_a_kernel_for_several_robots_stays_as_it_is():
         return jax.vmap(lambda row: step({"x": row, "n": row[0]}, jnp.float32(2))["x"])(x)
 
     robots = np.random.default_rng(0).normal(size=(4, 2, 3)).astype(np.float32)
-    ours = jax.jit(jax.vmap(OneKernel(each)))(robots)
+    ours = jax.jit(jax.vmap(fuse(each)))(robots)
     np.testing.assert_allclose(ours, robots * 4, rtol=1e-6)

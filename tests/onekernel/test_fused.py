@@ -15,9 +15,8 @@ from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.wrappers import EpisodeWrapper, NewEpisodeWrapper, wrap_for_training
 from jetbot_mjx.packed import pack
-from onekernel import KernelError, cpu, gpu, kernel, one_kernel
+from onekernel import KernelError, cpu, fuse, fused, gpu, kernel
 from onekernel.lower.jaxpr import scalarize
-from onekernel.one_kernel import OneKernel
 
 LANES = cpu.host_processor().lanes
 STEPS = 3
@@ -92,14 +91,14 @@ FUNCTIONS = {
         robots(17),
     ),
     "a place that depends": (lambda x: x[x[0].astype(int) % 3], robots(17, 3) ** 2),
-    "another such function": (lambda x: OneKernel(jnp.tanh)(x + 1) * x, robots(17, 3)),
+    "another such function": (lambda x: fuse(jnp.tanh)(x + 1) * x, robots(17, 3)),
 }
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
 def test_a_function_is_one_kernel_that_does_what_it_did(name):
     function, *arguments = FUNCTIONS[name]
-    one = OneKernel(function)
+    one = fuse(function)
     for batched in (jax.vmap(one), jax.jit(jax.vmap(one))):
         agree(batched(*arguments), jax.vmap(function)(*arguments))
     assert is_one_kernel(jax.vmap(one), *arguments)
@@ -108,7 +107,7 @@ def test_a_function_is_one_kernel_that_does_what_it_did(name):
 
 
 def test_numbers_that_are_no_arrays_will_do():
-    one = OneKernel(lambda x, n, flag: (x * n, n + 1, ~flag))
+    one = fuse(lambda x, n, flag: (x * n, n + 1, ~flag))
     agree(one(1.5, 2, np.bool_(True)), (jnp.float32(3), jnp.int32(3), jnp.bool_(False)))
 
 
@@ -184,7 +183,7 @@ def situations(*batch):
 
 @pytest.fixture(scope="module")
 def drive():
-    return OneKernel(driving(made()))
+    return fuse(driving(made()))
 
 
 @pytest.mark.parametrize("count", [0, 1, LANES + 1, 1000])
@@ -209,7 +208,7 @@ def test_where_nothing_is_to_be_compiled_the_function_itself_is_called(drive):
         return x / 2 if x > 0 else x
 
     with jax.disable_jit():
-        assert OneKernel(halved)(jnp.float32(3)) == 1.5
+        assert fuse(halved)(jnp.float32(3)) == 1.5
         given = situations()
         agree(drive(*given), driving(stepped)(*given))
 
@@ -287,14 +286,14 @@ def test_what_another_function_traces_is_an_argument_too(how):
         "jit of vmap": lambda f: jax.jit(jax.vmap(f)),
         "vmap of jit": lambda f: jax.vmap(jax.jit(f)),
     }[how]
-    ours = transform(closed_over(made(), OneKernel))
+    ours = transform(closed_over(made(), fuse))
     agree(ours(*given), transform(closed_over(stepped, lambda f: f))(*given))
     assert is_one_kernel(ours, *given)
 
 
 def test_what_another_function_traces_may_be_used_twice():
     def outer(gain, x):
-        one = OneKernel(lambda x: gain * x)
+        one = fuse(lambda x: gain * x)
         return one(x), one(x + 1)
 
     for gain in (2.0, 3.0):
@@ -335,7 +334,7 @@ def with_one_inside_that_has_a_kernel(step):
     def inner(x):
         return step({"angle": x + 1, "speed": x * 2}, (x, x[0] ** 2 + 1))["speed"] - 1
 
-    return lambda x: (OneKernel(inner) if step is not stepped else inner)(2 * x) * x
+    return lambda x: (fuse(inner) if step is not stepped else inner)(2 * x) * x
 
 
 PHYSICS = {
@@ -350,7 +349,7 @@ PHYSICS = {
 @pytest.mark.parametrize("name", PHYSICS)
 def test_around_physics_what_no_kernel_can_do_stays_as_it_is(name):
     function, kernels = PHYSICS[name]
-    one, x = OneKernel(function(made())), robots(LANES + 1, 2)
+    one, x = fuse(function(made())), robots(LANES + 1, 2)
     agree(jax.jit(jax.vmap(one))(x), jax.vmap(function(stepped))(x), atol=5e-6)
     assert launches(jax.vmap(one), x) == kernels
     agree(one(x[0]), function(stepped)(x[0]), atol=5e-6)
@@ -369,7 +368,7 @@ OTHERS = {
 @pytest.mark.parametrize("name", OTHERS)
 def test_what_no_kernel_can_do_stays_as_it_is(name):
     function, *arguments = OTHERS[name]
-    one = OneKernel(function)
+    one = fuse(function)
     agree(jax.jit(jax.vmap(one))(*arguments), jax.jit(jax.vmap(function))(*arguments))
     assert launches(jax.vmap(one), *arguments) == 0
     alone = jax.tree.map(lambda x: jnp.asarray(x[0]), arguments)
@@ -387,7 +386,7 @@ def test_a_function_that_does_more_than_return_results_stays_as_it_is(kernels):
         jax.debug.callback(lambda x: told.append(x.shape), x)
         return x + 1
 
-    one, x = jax.vmap(OneKernel(function)), robots(17, 2)
+    one, x = jax.vmap(fuse(function)), robots(17, 2)
     agree(jax.jit(one)(x), jax.vmap(function)(x))
     jax.effects_barrier()
     assert told == [(2,)] * 17 * 2
@@ -399,9 +398,9 @@ def test_what_is_no_kernel_can_be_differentiated_and_what_is_one_cannot():
         return jnp.abs(jnp.fft.rfft(x)).sum()
 
     x = robots(1, 3)[0]
-    agree(jax.grad(OneKernel(function))(x), jax.grad(function)(x))
+    agree(jax.grad(fuse(function))(x), jax.grad(function)(x))
     with pytest.raises(KernelError, match="cannot be differentiated"):
-        jax.grad(OneKernel(jnp.sum))(x)
+        jax.grad(fuse(jnp.sum))(x)
 
 
 NO_NUMBERS = np.float32([[1, np.nan], [np.inf, 2], [-np.inf, np.nan], [0.5, -2], [30.0, 1e-3]])
@@ -415,7 +414,7 @@ def test_what_is_no_number_reaches_the_results():
         rest = -x, x + 1, x * 2.5, jnp.abs(x), x.sum(), jnp.nan_to_num(x), jnp.exp(x), x @ x
         return guarded, extremes, tests, rest, x.astype(jnp.int32), x
 
-    one = jax.vmap(OneKernel(function))
+    one = jax.vmap(fuse(function))
     assert is_one_kernel(one, NO_NUMBERS)
     agree(one(NO_NUMBERS), jax.vmap(function)(NO_NUMBERS))
 
@@ -441,7 +440,7 @@ def test_what_is_no_number_reaches_what_comes_after_physics(drive, where):
 
         return run
 
-    ours = jax.vmap(OneKernel(guarded(driving(made()))))
+    ours = jax.vmap(fuse(guarded(driving(made()))))
     theirs = jax.vmap(guarded(driving(stepped)))(*given)
     assert is_one_kernel(ours, *given)
     agree(ours(*given), theirs)
@@ -451,19 +450,19 @@ def test_what_is_no_number_reaches_what_comes_after_physics(drive, where):
 def counted(monkeypatch):
     """What is lowered to scalars, one after the other."""
     lowered = []
-    part = one_kernel.scalarize_part
+    part = fused.scalarize_part
 
     def count(*arguments, **options):
         lowered.append(arguments)
         return part(*arguments, **options)
 
-    monkeypatch.setattr(one_kernel, "scalarize_part", count)
+    monkeypatch.setattr(fused, "scalarize_part", count)
     return lowered
 
 
 def test_the_same_shapes_are_lowered_once_and_others_anew(monkeypatch):
     lowered = counted(monkeypatch)
-    run = OneKernel(lambda tree, n: (tree["x"] * n, tree["flag"]))
+    run = fuse(lambda tree, n: (tree["x"] * n, tree["flag"]))
 
     def tree(*shape, dtype=np.float32):
         return {"x": np.ones(shape, dtype), "flag": np.bool_(True)}
@@ -481,7 +480,7 @@ def test_the_same_shapes_are_lowered_once_and_others_anew(monkeypatch):
     assert number_after(tree(3, dtype=np.int32), TWO) == 3
     assert number_after({**tree(3), "flag": np.float32(1)}, TWO) == 4
     assert number_after({**tree(3), "more": 1.0}, TWO) == 5
-    other = OneKernel(lambda tree: tree["a"] if "a" in tree else -tree["b"])
+    other = fuse(lambda tree: tree["a"] if "a" in tree else -tree["b"])
     assert [float(other({name: 1.0})) for name in "abab"] == [1, -1, 1, -1]
     assert len(lowered) == 7
     for shape, dtype in ((3, np.int32), (4, np.float32), (3, np.float32)):
@@ -492,7 +491,7 @@ def test_the_same_shapes_are_lowered_once_and_others_anew(monkeypatch):
 
 
 def test_physics_is_lowered_with_what_comes_before_and_after_once(monkeypatch):
-    run, given = OneKernel(driving(made())), situations(3)
+    run, given = fuse(driving(made())), situations(3)
     lowered = counted(monkeypatch)
     for _ in range(3):
         jax.vmap(run)(*given)
@@ -501,7 +500,7 @@ def test_physics_is_lowered_with_what_comes_before_and_after_once(monkeypatch):
 
 def test_what_cannot_be_lowered_is_not_tried_again(monkeypatch):
     lowered = counted(monkeypatch)
-    run = OneKernel(jnp.sort)
+    run = fuse(jnp.sort)
     for _ in range(3):
         run(np.ones(3, np.float32))
     assert len(lowered) == 1
@@ -515,11 +514,11 @@ def prepared(case):
     """A function as one kernel and as it is, and what is given to it."""
     robot, action, mass = given = situations(5)
     if case == "with physics":
-        return OneKernel(driving(made())), driving(stepped), given
+        return fuse(driving(made())), driving(stepped), given
     if case == "without physics":
-        return OneKernel(drawing), drawing, given
+        return fuse(drawing), drawing, given
     given = np.stack([mass, mass], axis=1), robot.is_on, robot.key, robot, action
-    return closed_over(made(), OneKernel), closed_over(stepped, lambda f: f), given
+    return closed_over(made(), fuse), closed_over(stepped, lambda f: f), given
 
 
 @pytest.mark.filterwarnings("ignore:a kernel is computed by XLA")
@@ -548,7 +547,7 @@ def test_a_programs_platform_decides(drive, monkeypatch):
 
 
 def test_a_kernel_that_was_asked_for_is_not_replaced():
-    one = OneKernel(driving(made(impl="llvm")))
+    one = fuse(driving(made(impl="llvm")))
     with pytest.raises(KernelError, match=r"^this program is for cuda"):
         launches(one, *situations(), platforms=("cuda",))
 

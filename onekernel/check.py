@@ -1,0 +1,120 @@
+"""Compare a kernel with XLA on random numbers before its first use.
+
+Two correct programs of one function differ by round-off, and a function may enlarge that: a test
+such as x > 0.3 goes one way here and the other way there, and a solver stops an iteration earlier.
+So the measure of what is allowed comes from the function itself: XLA computes it also for arguments
+that are shaken by some units in their last place, and a result may differ from XLA's by a few times
+what the shaken ones differ by. A whole number or truth value that the shaking does not change must
+be the same.
+"""
+
+from collections.abc import Callable, Sequence
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from onekernel.errors import KernelError
+from onekernel.kernel import Kernel
+
+_INSTANCES = 65
+_SHAKES = 6
+_SHAKE = 4 * float(np.finfo(np.float32).eps)
+"""Largest relative change of a shaken number: 4 to 8 units in the last place."""
+
+_ROUNDING = 1e-5
+"""Difference that is always allowed, as a part of the largest magnitude of a result's scalar."""
+
+_AMPLIFICATION = 8.0
+"""Multiple of the largest difference between shaken results that is allowed beside that."""
+
+
+def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dtype]) -> None:
+    """Compare a kernel with its fallback on random arguments, on JAX's default device.
+
+    Floats are normal, with each instance on a scale of its own; whole numbers with a sign are small
+    (they may be indices), and those without are random bits (they may be the words of a key).
+
+    Args:
+      kernel: the kernel, which steps.
+      arguments: the dtypes of its arguments, which travel as float32 with the same bits.
+      results: likewise.
+
+    Raises:
+      KernelError: a result differs from XLA's by more than round-off. Its kind is "check".
+    """
+    random = np.random.default_rng(0)
+    shapes = kernel.argument_shapes
+    drawn = [_draw(random, dtype, shape) for dtype, shape in zip(arguments, shapes, strict=True)]
+    # The caller may be tracing another function.
+    with jax.ensure_compile_time_eval():
+        by_xla = jax.jit(jax.vmap(lambda *words: kernel.fallback(*words)))
+        ours = _run(jax.jit(jax.vmap(lambda *words: kernel.as_function()(words))), drawn, results)
+        theirs = _run(by_xla, drawn, results)
+        shaken = [
+            _run(by_xla, [_shaken(random, x) for x in drawn], results) for _ in range(_SHAKES)
+        ]
+    for place, (one, other) in enumerate(zip(ours, theirs, strict=True)):
+        wrong = _differ(one, other, [x[place] for x in shaken])
+        if wrong.any():
+            # Name the worst instance, and what it returned.
+            i = int(np.argmax(wrong.reshape(_INSTANCES, -1).any(axis=1)))
+            message = (
+                f"result {place} of a kernel is not XLA's: {_brief(one[i])} instead of"
+                f" {_brief(other[i])} in {int(wrong.reshape(_INSTANCES, -1).any(axis=1).sum())} of"
+                f" {_INSTANCES} random instances"
+            )
+            raise KernelError(message, "check")
+
+
+def _draw(random: np.random.Generator, dtype: np.dtype, shape: tuple[int, ...]) -> np.ndarray:
+    full = (_INSTANCES, *shape)
+    if dtype.kind == "f":
+        scale = np.exp(random.normal(size=(_INSTANCES, *[1] * len(shape))))
+        return np.float32(random.normal(size=full) * scale)
+    if dtype.kind == "b":
+        return random.random(full) < 0.5
+    if dtype.kind == "u":
+        return random.integers(0, 2**32, full, np.uint32)
+    return random.integers(0, 8, full, np.int32)
+
+
+def _shaken(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
+    if x.dtype.kind != "f":
+        return x
+    return np.float32(x * (1 + _SHAKE * random.uniform(-1, 1, x.shape)))
+
+
+def _run(
+    function: Callable[..., list[Array]],
+    arguments: Sequence[np.ndarray],
+    dtypes: Sequence[np.dtype],
+) -> list[np.ndarray]:
+    """Run a function of words, with arguments and results of other dtypes."""
+    words = [x.astype(np.float32) if x.dtype == bool else x.view(np.float32) for x in arguments]
+    found = zip(map(np.asarray, function(*words)), dtypes, strict=True)
+    return [x != 0 if dtype == bool else x.view(dtype) for x, dtype in found]
+
+
+def _differ(one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:
+    """Return which numbers differ by more than round-off, as an array of truth values."""
+    if one.dtype.kind != "f":
+        # What the shaking changes may go either way.
+        steady = np.all([x == other for x in shaken], axis=0)
+        return steady & (one != other)
+    with np.errstate(invalid="ignore", over="ignore"):
+        spread = np.max([np.abs(x.astype(np.float64) - other) for x in shaken], axis=0)
+        size = np.max(np.abs(np.where(np.isfinite(other), other, 0)), axis=0, initial=1e-30)
+        allowed = _ROUNDING * np.maximum(np.abs(other), 1e-3 * size) + _AMPLIFICATION * spread
+        close = np.abs(one.astype(np.float64) - other) <= allowed
+    same = (one == other) | (np.isnan(one) & np.isnan(other))
+    # A result that is finite in some shaken instances only is as unsteady as one that varies.
+    steady = np.all([np.isfinite(x) == np.isfinite(other) for x in shaken], axis=0)
+    return steady & ~close & ~same
+
+
+def _brief(x: np.ndarray) -> str:
+    """Return the first numbers of an array as text."""
+    flat = x.ravel()
+    text = " ".join(f"{number:.6g}" for number in flat[:4])
+    return text + (" …" if flat.size > 4 else "")

@@ -1,0 +1,458 @@
+"""Compile a function of one instance as one kernel, with another kernel inside it.
+
+Motivation: around a simulation's physics, a step of a training computes observation, reward, the
+end of the episode, and the first state of the next one. XLA compiles that to forty small kernels,
+in which a GPU mostly waits for the next launch, and of which a CPU compiles each for 16 ms.
+
+Protocol:
+
+1. `Fused` traces the function for the shapes that it is called with. Random keys travel as their
+   words, Python's numbers as arrays.
+2. Where the function calls one kernel that steps (`Kernel.as_step`), the equations divide into
+   those that the arguments of that kernel need and those that the results need. Both are lowered to
+   scalars, and run in the kernel before its first step and after its last. What both need is
+   computed twice, so that no register holds it during the steps. A function that calls no kernel
+   becomes a kernel as it is. A fused function that is called inside is traced as the function that
+   it is made of.
+3. A function that cannot be lowered, or calls several kernels, stays as it is, and `on_unsupported`
+   decides what is said.
+4. JAX differentiates what was traced, in place of the kernel, and a warning says so.
+5. With `ONEKERNEL_CHECK=1` in the environment, each new kernel is compared with XLA on random
+   numbers before its first use (`onekernel.check`).
+"""
+
+import contextlib
+import contextvars
+import dataclasses
+import functools
+import os
+import warnings
+from collections.abc import Callable, Hashable, Iterator, Sequence
+from typing import Literal as Choice
+from typing import cast, overload
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray, Tracer
+from jax.extend.core import ClosedJaxpr, Literal, Var, jaxpr_as_fun
+from jaxtyping import Array, PyTree
+
+from onekernel.backends import default_backend
+from onekernel.check import check
+from onekernel.errors import KernelError, UnsupportedError
+from onekernel.kernel import Kernel, called_by
+from onekernel.lower import scalarize_part
+
+CHECK = "ONEKERNEL_CHECK"
+"""Environment variable: with `1`, kernels are checked before their first use."""
+
+_SETTINGS = ("jax_threefry_partitionable", "jax_enable_x64", "jax_default_matmul_precision")
+"""JAX's settings on which the kernel of a function depends."""
+
+_is_inside: contextvars.ContextVar[bool] = contextvars.ContextVar("is_inside", default=False)
+"""Whether a fused function is being traced: those that it calls become parts of it."""
+
+OnUnsupported = Choice["warn", "xla", "raise"] | Callable[[UnsupportedError], None]
+"""What happens where there is no kernel: a warning once for each reason, nothing, an
+`UnsupportedError`, or a call of the function with that error. Unless it raises, XLA computes."""
+
+
+@overload
+def fuse(
+    function: Callable[..., PyTree],
+    *,
+    on_unsupported: OnUnsupported = "warn",
+    may_be_kernel: Callable[[], bool] = ...,
+    explain: Callable[[KernelError], Exception] = ...,
+    on_fallback: Callable[[str], None] | None = None,
+) -> "Fused": ...
+
+
+@overload
+def fuse(
+    function: None = None, *, on_unsupported: OnUnsupported = "warn"
+) -> Callable[[Callable[..., PyTree]], "Fused"]: ...
+
+
+def fuse(
+    function: Callable[..., PyTree] | None = None,
+    *,
+    on_unsupported: OnUnsupported = "warn",
+    may_be_kernel: Callable[[], bool] = lambda: True,
+    explain: Callable[[KernelError], Exception] = lambda error: error,
+    on_fallback: Callable[[str], None] | None = None,
+) -> "Fused | Callable[[Callable[..., PyTree]], Fused]":
+    """Return a function of one instance as one kernel, which `jax.vmap` runs for many instances.
+
+    It is a function like any other to `jax.jit`, `jax.vmap`, `jax.lax.scan` and `jax.shard_map`.
+    Results differ from XLA's by round-off. JAX differentiates the function itself, with a warning:
+    a derivative is no kernel. Also usable as a decorator, with or without arguments.
+
+    Args:
+      function: a pure JAX function of one instance. Its arguments and results are pytrees of
+        float32, int32, uint32, bool and random keys. It is traced once for all arguments of the
+        same shapes.
+      on_unsupported: what to do if the function cannot be one kernel: "warn" says once why, and
+        XLA computes it; "xla" is silent; "raise" raises the error; a function is called with it.
+      may_be_kernel: returns whether there may be a kernel. It is asked when the function is called:
+        to try a back end takes a GPU 0.3 s, which a program from the cache saves.
+      explain: returns the exception to raise for a `KernelError`, in the caller's words.
+      on_fallback: is called with the reason where a platform cannot run kernels; None: as
+        `on_unsupported` says.
+
+    Raises:
+      ValueError: `on_unsupported` is none of these.
+    """
+    if not callable(on_unsupported) and on_unsupported not in ("warn", "xla", "raise"):
+        choices = "'warn', 'xla', 'raise' or a function"
+        raise ValueError(f"on_unsupported = {on_unsupported!r}: choose {choices}")
+    wrap = functools.partial(
+        Fused,
+        on_unsupported=on_unsupported,
+        may_be_kernel=may_be_kernel,
+        explain=explain,
+        on_fallback=on_fallback,
+    )
+    return wrap if function is None else wrap(function)
+
+
+class Fused:
+    """A `Fused` is a function of one instance, as one kernel if it can be; `fuse` makes it."""
+
+    def __init__(
+        self,
+        function: Callable[..., PyTree],
+        on_unsupported: OnUnsupported,
+        may_be_kernel: Callable[[], bool],
+        explain: Callable[[KernelError], Exception],
+        on_fallback: Callable[[str], None] | None,
+    ) -> None:
+        """Wrap a function; the arguments are those of `fuse`."""
+        functools.update_wrapper(self, function)
+        self._function, self._may_be_kernel = function, may_be_kernel
+        self._on_unsupported, self._explain = on_unsupported, explain
+        self._on_fallback = on_fallback or self._no_back_end
+        self._known: dict[tuple[Hashable, ...], _Lowered] = {}
+        self._told: set[str] = set()
+
+    def __call__(self, *arguments: PyTree, **keywords: PyTree) -> PyTree:
+        """Compute the function.
+
+        Raises:
+          UnsupportedError: there is no kernel, and `on_unsupported` is "raise".
+        """
+        if _is_inside.get() or not self._is_allowed():
+            return self._function(*arguments, **keywords)
+        # A kernel takes flat arrays: it is found by the tree, shapes and dtypes of the arguments.
+        leaves, structure = jax.tree.flatten((arguments, keywords))
+        arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
+        lowered = self._find(structure, [x.aval for x in arrays])
+        if isinstance(lowered.one, UnsupportedError):
+            self._report(lowered.one)
+        results = lowered.launch(*map(_without_key, arrays))
+        return jax.tree.unflatten(lowered.structure, map(_with_key, lowered.results, results))
+
+    def __get__(self, instance: object, owner: type | None = None) -> "Callable[..., PyTree]":
+        """Return the method of an object, if the function is decorated in a class."""
+        return self if instance is None else functools.partial(self, instance)
+
+    def kernel_for(self, *arguments: PyTree) -> Kernel | None:
+        """Return the kernel that a call launches, without compiling it.
+
+        Args:
+          arguments: the shapes and dtypes of the arguments.
+
+        Returns:
+          The kernel. Its arguments are the leaves of the function's arguments, and its results have
+          the shapes of the first argument's leaves. None: a call launches no kernel, takes or
+          returns other numbers than float32, or returns another structure or other shapes than its
+          first argument has.
+        """
+        if not self._is_allowed():
+            return None
+        lowered = self.lowered(*arguments)
+        jaxpr = lowered.traced.jaxpr
+        if lowered.places or any(x != np.float32 for x in _dtypes([*jaxpr.invars, *jaxpr.outvars])):
+            return None
+        # A caller repeats the kernel: its results must look like its first argument.
+        carried, tree = jax.tree.flatten(arguments[0])
+        results = [x.aval.shape for x in jaxpr.outvars]
+        if lowered.structure != tree or results != [x.shape for x in carried]:
+            return None
+        return lowered.one if isinstance(lowered.one, Kernel) else None
+
+    def lowered(self, *arguments: PyTree, **keywords: PyTree) -> "_Lowered":
+        """Return the function for arguments like these, traced and lowered if it is not yet.
+
+        Args:
+          arguments: arrays, or shapes and dtypes.
+          keywords: likewise.
+        """
+        leaves, structure = jax.tree.flatten((arguments, keywords))
+        return self._find(structure, [_shape(x) for x in leaves])
+
+    def _is_allowed(self) -> bool:
+        # With `jax_disable_jit` the user wants to see every operation.
+        return not jax.config.values["jax_disable_jit"] and self._may_be_kernel()
+
+    def _report(self, error: UnsupportedError) -> None:
+        """Do what the user wants where there is no kernel."""
+        if callable(self._on_unsupported):
+            self._on_unsupported(error)
+        elif self._on_unsupported == "raise":
+            raise error
+        else:
+            self._tell(f"it has {error}")
+
+    def _no_back_end(self, reason: str) -> None:
+        if self._on_unsupported == "raise":
+            raise KernelError(reason, "platform")
+        self._tell(reason)
+
+    def _tell(self, reason: str) -> None:
+        """Warn once that XLA computes the function, unless the user wants no warning."""
+        if self._on_unsupported != "xla" and reason not in self._told:
+            self._told.add(reason)
+            name = getattr(self, "__name__", "a function")
+            warnings.warn(f"{name} is no kernel, and slower by XLA: {reason}", stacklevel=4)
+
+    def _find(self, structure: jax.tree_util.PyTreeDef, avals: Sequence[ShapedArray]) -> "_Lowered":
+        # The same function lowers differently under other settings of JAX.
+        settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
+        key = (structure, settings, *((x.shape, x.dtype, x.weak_type) for x in avals))
+        if key in self._known:
+            return self._known[key]
+        lowered = self._trace_and_lower(structure, avals)
+        # A tracer is valid only while that other function is traced: do not remember such a kernel.
+        if not lowered.places:
+            self._known[key] = lowered
+        return lowered
+
+    def _trace_and_lower(
+        self, structure: jax.tree_util.PyTreeDef, avals: Sequence[ShapedArray]
+    ) -> "_Lowered":
+        def flat(*words: Array) -> list[Array]:
+            # Random keys are arguments as the words that they consist of.
+            arguments, keywords = jax.tree.unflatten(structure, map(_with_key, avals, words))
+            return self._function(*arguments, **keywords)
+
+        def without_keys(*words: Array) -> PyTree:
+            results = flat(*words)
+            kinds.append(jax.tree.map(jax.typeof, results))
+            return jax.tree.map(_without_key, results)
+
+        kinds: list[PyTree] = []
+        with _inside():
+            traced = jax.make_jaxpr(without_keys)(*map(_shape_without_key, avals))
+        results, tree = jax.tree.flatten(kinds[-1])
+        # A constant that is a tracer comes from a function that is being traced around this one.
+        # Its value is not known now, so the kernel takes it as one more argument.
+        places = [i for i, x in enumerate(traced.consts) if isinstance(x, Tracer)]
+        try:
+            one = _lower(traced, places)
+            # A step inside has brought its own messages; a kernel without one takes those of this
+            # object.
+            if not one.before:
+                one.explain, one.on_fallback = self._explain, self._on_fallback
+        except UnsupportedError as error:
+            one = error
+        return _Lowered(traced, tree, results, places, one, self._warn_of_derivative)
+
+    def _warn_of_derivative(self) -> None:
+        if "derivative" not in self._told:
+            self._told.add("derivative")
+            name = getattr(self, "__name__", "a function")
+            warnings.warn(f"the derivative of {name} is no kernel: XLA computes it", stacklevel=2)
+
+
+@contextlib.contextmanager
+def _inside() -> Iterator[None]:
+    """Trace fused functions as the functions that they are made of."""
+    token = _is_inside.set(True)
+    try:
+        yield
+    finally:
+        _is_inside.reset(token)
+
+
+@dataclasses.dataclass
+class _Lowered:
+    """A `_Lowered` is a function for arguments of some shapes, traced and lowered."""
+
+    traced: ClosedJaxpr
+    structure: jax.tree_util.PyTreeDef
+    """Tree structure of the results."""
+    results: list[ShapedArray]
+    """Shapes and dtypes of the results, with random keys."""
+    places: list[int]
+    """Places of the constants that the kernel takes as arguments, before the others."""
+    one: Kernel | UnsupportedError
+    """The kernel, or why there is none."""
+    on_derivative: Callable[[], None]
+    """Is called where JAX differentiates the function."""
+
+    @functools.cached_property
+    def launch(self) -> Callable[..., list[Array]]:
+        """Return the function of flat arguments, whose kernel begins to be compiled."""
+        if isinstance(self.one, UnsupportedError):
+            return jaxpr_as_fun(self.traced)
+        # Compile the kernel in a thread, while XLA compiles the program around it.
+        backend = default_backend()
+        if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
+            backend.prepare(self.one)
+            if os.environ.get(CHECK) == "1":
+                check(self.one, _dtypes(_arguments(self.traced, self.places)), self._result_dtypes)
+        constants = [self.traced.consts[i] for i in self.places]
+        return lambda *leaves: self._differentiable(*constants, *leaves)
+
+    @property
+    def _result_dtypes(self) -> list[np.dtype]:
+        return _dtypes(self.traced.jaxpr.outvars)
+
+    @functools.cached_property
+    def _differentiable(self) -> Callable[..., list[Array]]:
+        """Return the kernel as a function of all its arguments that JAX can differentiate."""
+        assert isinstance(self.one, Kernel)
+        launch = self.one.as_function()
+        arguments, results = _dtypes(_arguments(self.traced, self.places)), self._result_dtypes
+
+        @jax.custom_jvp
+        def run(*leaves: Array) -> list[Array]:
+            # Kernels take and return float32 only, so numbers of other dtypes travel as their bits.
+            pairs = zip(leaves, arguments, strict=True)
+            words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
+            return _from_words(launch(words), results)
+
+        @run.defjvp
+        def differentiate(
+            primals: Sequence[Array], tangents: Sequence[Array]
+        ) -> tuple[list[Array], list[Array]]:
+            self.on_derivative()
+            return jax.jvp(_as_function(self.traced, self.places), primals, tangents)
+
+        return run
+
+
+def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
+    """Lower a traced function to a kernel.
+
+    Args:
+      traced: the function.
+      places: the places of those of its constants that are arguments of the kernel, before others.
+
+    Raises:
+      UnsupportedError: an operation cannot be lowered, or there are several kernels in it.
+    """
+    # A kernel without arguments has no instances.
+    arguments, results = _arguments(traced, places), traced.jaxpr.outvars
+    if not arguments:
+        raise UnsupportedError("a function of nothing")
+    # Functions around a step test whether its state is finite, so here NaN must stay NaN.
+    lower = functools.partial(scalarize_part, traced, words=True, finite=False)
+    calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
+    # Without a kernel inside, the whole function becomes one that runs once.
+    if not calls:
+        program = lower(arguments, results)
+        return Kernel(program, carried=0, steps=1, fallback=_fallback(traced, places))
+    # Otherwise cut the function at the call. The one step must be plain: not a map, not itself made
+    # of three parts, and called for one instance.
+    step = called_by(calls[0])
+    if len(calls) > 1 or step is None or step.table is not None or step.before or step.after:
+        raise UnsupportedError("more than one kernel")
+    if [tuple(x.aval.shape) for x in calls[0].invars] != step.argument_shapes:
+        raise UnsupportedError("a kernel for several instances")
+    # The part in front computes the arguments of the call; the part behind computes the results
+    # from the arguments of the function and the results of the call. `scalarize_part` lowers only
+    # what its results need, so the cut needs no list of equations.
+    before = lower(arguments, calls[0].invars)
+    after = lower([*arguments, *calls[0].outvars], results)
+    return Kernel(
+        step.program,
+        carried=step.carried,
+        steps=step.steps,
+        fallback=_fallback(traced, places),
+        impl=step.impl,
+        explain=step.explain,
+        on_fallback=step.on_fallback,
+        before=before,
+        after=after,
+    )
+
+
+def _arguments(traced: ClosedJaxpr, places: Sequence[int]) -> list[Var]:
+    """Return the variables of a jaxpr that are arguments of its kernel."""
+    return [*(traced.jaxpr.constvars[i] for i in places), *traced.jaxpr.invars]
+
+
+def _dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
+    return [np.dtype(cast(ShapedArray, atom.aval).dtype) for atom in atoms]
+
+
+def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
+    """Return the same computation in JAX, whose arguments and results are words as in the kernel.
+
+    A word is a float32 with the bits of a number of another dtype (see `_to_word`).
+    """
+    dtypes = _dtypes(_arguments(traced, places))
+    function = _as_function(traced, places)
+    return lambda *words: [_to_word(x) for x in function(*_from_words(words, dtypes))]
+
+
+def _as_function(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
+    """Return a traced function as one of all arguments of its kernel, which XLA computes."""
+
+    def run(*arguments: Array) -> list[Array]:
+        constants = list(traced.consts)
+        # The first arguments are constants; `zip` stops after these.
+        for place, argument in zip(places, arguments, strict=False):
+            constants[place] = argument
+        closed = ClosedJaxpr(traced.jaxpr, constants)
+        return jaxpr_as_fun(closed)(*arguments[len(places) :])
+
+    return run
+
+
+def _to_word(x: Array) -> Array:
+    """Return an array's bits as float32; a bool is 0 or 1."""
+    return x.astype(jnp.float32) if x.dtype.kind == "b" else x.view(jnp.float32)
+
+
+def _from_words(words: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
+    """Return the arrays of some dtypes from their bits."""
+    pairs = zip(words, dtypes, strict=True)
+    return [x != 0 if dtype.kind == "b" else x.view(dtype) for x, dtype in pairs]
+
+
+def _is_key(x: Array | ShapedArray) -> bool:
+    return jnp.issubdtype(x.dtype, jax.dtypes.prng_key)
+
+
+def _without_key(x: Array) -> Array:
+    """Return an array, or the words of an array of random keys."""
+    return jax.random.key_data(x) if _is_key(x) else x
+
+
+def _with_key(kind: ShapedArray, x: Array) -> Array:
+    """Return an array as it is of a kind; the inverse of `_without_key`."""
+    return jax.random.wrap_key_data(x, impl=_key_kind(kind.dtype)) if _is_key(kind) else x
+
+
+@functools.cache
+def _key_kind(dtype: np.dtype) -> Hashable:
+    """Return the kind of the random keys of a dtype, such as "threefry2x32"."""
+    found: list[Hashable] = []
+    # Only a key can be asked for its kind, and a traced one will do.
+    jax.eval_shape(
+        lambda key: found.append(jax.random.key_impl(key)), jax.ShapeDtypeStruct((), dtype)
+    )
+    return found[0]
+
+
+def _shape_without_key(x: ShapedArray) -> ShapedArray:
+    return jax.eval_shape(_without_key, x) if _is_key(x) else x
+
+
+def _shape(x: PyTree) -> ShapedArray:
+    """Return shape and dtype of a leaf, which may be a number of Python."""
+    return ShapedArray(x.shape, x.dtype) if hasattr(x, "shape") else jnp.asarray(x).aval
