@@ -91,9 +91,9 @@ def _run(
     dtypes: Sequence[np.dtype],
 ) -> list[np.ndarray]:
     """Run a function of words, with arguments and results of other dtypes."""
-    words = [x.astype(np.float32) if x.dtype == bool else x.view(np.float32) for x in arguments]
+    words = [x.astype(np.float32) if x.dtype.kind == "b" else x.view(np.float32) for x in arguments]
     found = zip(map(np.asarray, function(*words)), dtypes, strict=True)
-    return [x != 0 if dtype == bool else x.view(dtype) for x, dtype in found]
+    return [x != 0 if dtype.kind == "b" else x.view(dtype) for x, dtype in found]
 
 
 def _differ(one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:

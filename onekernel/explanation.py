@@ -31,7 +31,7 @@ def explain(function: Callable[..., PyTree], *arguments: PyTree, **keywords: PyT
     seconds = time.perf_counter() - begin
     name = getattr(one, "__name__", "function")
     if isinstance(kernel, UnsupportedError):
-        print(f"{name} is no kernel: it has {kernel}")
+        print(f"{name} is no kernel: one kernel cannot do {kernel}")
         return
     rows = [
         ("operations", f"{_operations(kernel):,}"),

@@ -50,6 +50,8 @@ CHECK = "ONEKERNEL_CHECK"
 _SETTINGS = ("jax_threefry_partitionable", "jax_enable_x64", "jax_default_matmul_precision")
 """JAX's settings on which the kernel of a function depends."""
 
+_DTYPES = tuple(map(np.dtype, ("float32", "int32", "uint32", "bool")))
+
 _is_inside: contextvars.ContextVar[bool] = contextvars.ContextVar("is_inside", default=False)
 """Whether a fused function is being traced: those that it calls become parts of it."""
 
@@ -203,7 +205,7 @@ class Fused:
         elif self._on_unsupported == "raise":
             raise error
         else:
-            self._tell(f"it has {error}")
+            self._tell(f"one kernel cannot do {error}")
 
     def _no_back_end(self, reason: str) -> None:
         if self._on_unsupported == "raise":
@@ -215,7 +217,7 @@ class Fused:
         if self._on_unsupported != "xla" and reason not in self._told:
             self._told.add(reason)
             name = getattr(self, "__name__", "a function")
-            warnings.warn(f"{name} is no kernel, and slower by XLA: {reason}", stacklevel=4)
+            warnings.warn(f"XLA computes {name}, slower: {reason}", stacklevel=4)
 
     def _find(self, structure: jax.tree_util.PyTreeDef, avals: Sequence[ShapedArray]) -> "_Lowered":
         # The same function lowers differently under other settings of JAX.
@@ -255,15 +257,16 @@ class Fused:
             # object.
             if not one.before:
                 one.explain, one.on_fallback = self._explain, self._on_fallback
+                one.on_derivative = self._warn_of_derivative
         except UnsupportedError as error:
             one = error
-        return _Lowered(traced, tree, results, places, one, self._warn_of_derivative)
+        return _Lowered(traced, tree, results, places, one)
 
     def _warn_of_derivative(self) -> None:
         if "derivative" not in self._told:
             self._told.add("derivative")
             name = getattr(self, "__name__", "a function")
-            warnings.warn(f"the derivative of {name} is no kernel: XLA computes it", stacklevel=2)
+            warnings.warn(f"XLA computes the derivative of {name}, slower", stacklevel=2)
 
 
 @contextlib.contextmanager
@@ -289,8 +292,6 @@ class _Lowered:
     """Places of the constants that the kernel takes as arguments, before the others."""
     one: Kernel | UnsupportedError
     """The kernel, or why there is none."""
-    on_derivative: Callable[[], None]
-    """Is called where JAX differentiates the function."""
 
     @functools.cached_property
     def launch(self) -> Callable[..., list[Array]]:
@@ -303,35 +304,21 @@ class _Lowered:
             backend.prepare(self.one)
             if os.environ.get(CHECK) == "1":
                 check(self.one, _dtypes(_arguments(self.traced, self.places)), self._result_dtypes)
+        launch = self.one.as_function()
+        # Kernels take and return float32 only, so numbers of other dtypes travel as their bits.
         constants = [self.traced.consts[i] for i in self.places]
-        return lambda *leaves: self._differentiable(*constants, *leaves)
+        arguments = _dtypes(_arguments(self.traced, self.places))
+
+        def run(*leaves: Array) -> list[Array]:
+            pairs = zip((*constants, *leaves), arguments, strict=True)
+            words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
+            return _from_words(launch(words), self._result_dtypes)
+
+        return run
 
     @property
     def _result_dtypes(self) -> list[np.dtype]:
         return _dtypes(self.traced.jaxpr.outvars)
-
-    @functools.cached_property
-    def _differentiable(self) -> Callable[..., list[Array]]:
-        """Return the kernel as a function of all its arguments that JAX can differentiate."""
-        assert isinstance(self.one, Kernel)
-        launch = self.one.as_function()
-        arguments, results = _dtypes(_arguments(self.traced, self.places)), self._result_dtypes
-
-        @jax.custom_jvp
-        def run(*leaves: Array) -> list[Array]:
-            # Kernels take and return float32 only, so numbers of other dtypes travel as their bits.
-            pairs = zip(leaves, arguments, strict=True)
-            words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
-            return _from_words(launch(words), results)
-
-        @run.defjvp
-        def differentiate(
-            primals: Sequence[Array], tangents: Sequence[Array]
-        ) -> tuple[list[Array], list[Array]]:
-            self.on_derivative()
-            return jax.jvp(_as_function(self.traced, self.places), primals, tangents)
-
-        return run
 
 
 def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
@@ -348,6 +335,9 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     arguments, results = _arguments(traced, places), traced.jaxpr.outvars
     if not arguments:
         raise UnsupportedError("a function of nothing")
+    for dtype in _dtypes([*arguments, *results]):
+        if dtype not in _DTYPES:
+            raise UnsupportedError(f"arguments or results of {dtype}")
     # Functions around a step test whether its state is finite, so here NaN must stay NaN.
     lower = functools.partial(scalarize_part, traced, words=True, finite=False)
     calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
@@ -415,13 +405,21 @@ def _as_function(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., li
 
 def _to_word(x: Array) -> Array:
     """Return an array's bits as float32; a bool is 0 or 1."""
+    if x.dtype == np.float32:
+        # Not as bits, which JAX would not differentiate.
+        return x
     return x.astype(jnp.float32) if x.dtype.kind == "b" else x.view(jnp.float32)
 
 
 def _from_words(words: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
     """Return the arrays of some dtypes from their bits."""
-    pairs = zip(words, dtypes, strict=True)
-    return [x != 0 if dtype.kind == "b" else x.view(dtype) for x, dtype in pairs]
+    return [_from_word(x, dtype) for x, dtype in zip(words, dtypes, strict=True)]
+
+
+def _from_word(x: Array, dtype: np.dtype) -> Array:
+    if dtype == np.float32:
+        return x
+    return x != 0 if dtype.kind == "b" else x.view(dtype)
 
 
 def _is_key(x: Array | ShapedArray) -> bool:

@@ -19,7 +19,7 @@ Protocol: JAX sees the kernel as a primitive.
    process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
    (`onekernel.cpu` or `onekernel.gpu`) compiles and launches the kernel. Without a back end, a
    kernel with `impl = auto` runs its fallback in JAX, and any other one raises a `KernelError`.
-4. Differentiation raises a `KernelError`.
+4. Differentiation raises a `KernelError`, or differentiates the fallback (`on_derivative`).
 """
 
 import contextlib
@@ -28,7 +28,7 @@ import math
 import threading
 import warnings
 from collections.abc import Callable, Sequence
-from typing import NamedTuple, NoReturn, Protocol
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -80,6 +80,9 @@ class Kernel:
     on_fallback: Callable[[str], None] = warn_of_fallback
     """A function that is called with the reason where the fallback runs although the platform has a
     back end."""
+    on_derivative: Callable[[], None] | None = None
+    """A function that is called where JAX differentiates the kernel: the derivative of the fallback
+    takes its place. None: the kernel cannot be differentiated."""
     before: ScalarProgram | None = None
     """A function from the arguments to those of the first step; None: they are the same."""
     after: ScalarProgram | None = None
@@ -281,8 +284,18 @@ def _abstract(*leaves: ShapedArray, kernel: Kernel) -> list[ShapedArray]:
     return [ShapedArray(result.shape, result.dtype) for result in kernel.results(*batch)]
 
 
-def _differentiate(primals: object, tangents: object, *, kernel: Kernel) -> NoReturn:
-    raise kernel.explain(KernelError("one kernel cannot be differentiated", "derivative"))
+def _differentiate(
+    primals: Sequence[Array], tangents: Sequence[Array | ad.Zero], *, kernel: Kernel
+) -> tuple[list[Array], list[Array]]:
+    """Compute a kernel's results and their directional derivatives by its fallback."""
+    if kernel.on_derivative is None:
+        raise kernel.explain(KernelError("one kernel cannot be differentiated", "derivative"))
+    kernel.on_derivative()
+    # The fallback is a function of one instance: batch it over all axes in front.
+    function = kernel.fallback
+    for _ in _batch_shape(kernel, primals):
+        function = jax.vmap(function)
+    return jax.jvp(function, tuple(primals), tuple(map(ad.instantiate_zeros, tangents)))
 
 
 ad.primitive_jvps[_kernel_p] = _differentiate
@@ -334,7 +347,8 @@ def _lowered(backend: Backend | None) -> Callable[..., list[Array]]:
             table = [] if kernel.table is None else [jnp.asarray(kernel.table)]
             results = backend.launch(kernel, [*flat, *table])
         elif kernel.impl == "auto":
-            if backend and (obstacle := backend.obstacle()):
+            obstacle = backend.obstacle() if backend else "there are no kernels for this platform"
+            if obstacle:
                 kernel.on_fallback(obstacle)
             # The fallback is written for one instance.
             results = jax.vmap(lambda *leaves: kernel.fallback(*leaves))(*flat)

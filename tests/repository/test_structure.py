@@ -42,20 +42,8 @@ which are for others' programs, or `startup`, which is for commands."""
 
 
 ENGINE_ORDER = (
-    *("errors", "background", "trusted_files"),
-    *(
-        "lower",
-        "codegen",
-        "kernel",
-        "cpu",
-        "gpu",
-        "backends",
-        "check",
-        "fused",
-        "explanation",
-        "aot",
-        "build",
-    ),
+    *("errors", "background", "trusted_files", "lower", "codegen", "kernel", "cpu", "gpu"),
+    *("backends", "check", "fused", "explanation", "aot", "build"),
 )
 """Modules and rooms of the engine: each imports only itself and those before it."""
 

@@ -1,0 +1,243 @@
+"""The public function `fuse`: what it takes, what it says, and what JAX may do with it."""
+
+import re
+import warnings
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import onekernel
+from helpers.small_kernels import launches
+from onekernel import KernelError, UnsupportedError, cpu, fuse, fused
+
+pytestmark = [
+    pytest.mark.skipif(cpu.obstacle() is not None, reason="there are no kernels here"),
+]
+
+
+@pytest.fixture(autouse=True)
+def checked(monkeypatch):
+    """Compare each kernel with XLA before its first use."""
+    monkeypatch.setenv(fused.CHECK, "1")
+
+
+def lorenz(state, sigma=10.0, rho=28.0, beta=8 / 3):
+    x, y, z = state
+    return jnp.stack([sigma * (y - x), x * (rho - z) - y, x * y - beta * z])
+
+
+def states(count=21, size=3):
+    return np.float32(np.random.default_rng(0).normal(size=(count, size)))
+
+
+class Walk(NamedTuple):
+    place: jax.Array
+    key: jax.Array
+    count: jax.Array
+    is_done: jax.Array
+
+
+def walk(one, length):
+    key, drawn = jax.random.split(one.key)
+    place = one.place + length * jax.random.normal(drawn, (2,))
+    return Walk(place, key, one.count + 1, one.is_done | (jnp.abs(place).max() > 1)), drawn
+
+
+def walks(count):
+    return Walk(
+        jnp.zeros((count, 2)),
+        jax.random.split(jax.random.key(3), count),
+        jnp.arange(count, dtype=jnp.uint32),
+        jnp.zeros(count, bool),
+    )
+
+
+def same(one, other):
+    assert jax.tree.structure(one) == jax.tree.structure(other)
+    for x, y in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+        assert (x.shape, x.dtype) == (y.shape, y.dtype)
+        if jnp.issubdtype(x.dtype, jax.dtypes.prng_key):
+            x, y = jax.random.key_data(x), jax.random.key_data(y)
+        np.testing.assert_allclose(np.asarray(x), np.asarray(y), rtol=1e-5, atol=1e-6)
+
+
+def test_trees_with_random_keys_numbers_and_truths_are_one_kernel():
+    step = jax.vmap(fuse(walk), in_axes=(0, None))
+    same(step(walks(7), 0.5), jax.vmap(walk, in_axes=(0, None))(walks(7), 0.5))
+    assert launches(step, walks(7), 0.5) == 1
+
+
+def test_keywords_and_defaults_are_arguments():
+    one = fuse(lorenz)
+    ours, theirs = (jax.vmap(lambda x, f=f: f(x, rho=20.0))(states()) for f in (one, lorenz))
+    same(ours, theirs)
+    same(one(states()[0], beta=np.float32(2)), lorenz(states()[0], beta=2.0))
+
+
+def test_it_is_a_decorator_of_functions_and_methods():
+    @fuse
+    def double(x):
+        """Double it."""
+        return 2 * x
+
+    @fuse(on_unsupported="raise")
+    def triple(x):
+        return 3 * x
+
+    class Scale:
+        factor = 4.0
+
+        @fuse
+        def apply(self, x):
+            return self.factor * x
+
+    assert double.__doc__ == "Double it."
+    assert [float(double(1.0)), float(triple(1.0))] == [2.0, 3.0]
+    # An object that is no pytree of arrays cannot be an argument.
+    with pytest.raises(TypeError):
+        Scale().apply(1.0)
+
+
+def test_jit_scan_and_vmap_take_it():
+    step = fuse(lambda x: x + 0.01 * lorenz(x))
+
+    def run(one):
+        trips = lambda x, _: (jax.vmap(one)(x), None)  # noqa: E731
+        return jax.jit(lambda x: jax.lax.scan(trips, x, length=50)[0])
+
+    same(run(step)(states()), run(lambda x: x + 0.01 * lorenz(x))(states()))
+
+
+def test_a_fused_function_inside_another_is_part_of_its_kernel():
+    slope = fuse(lorenz)
+    step = fuse(lambda x: x + 0.01 * slope(x) + 0.01 * slope(x + 1))
+    assert launches(jax.vmap(step), states()) == 1
+
+
+def test_several_devices_take_it_by_shard_map():
+    mesh = jax.make_mesh((1,), ("x",), axis_types=(jax.sharding.AxisType.Auto,))
+    spec = jax.sharding.PartitionSpec("x")
+    run = jax.shard_map(jax.vmap(fuse(lorenz)), mesh=mesh, in_specs=spec, out_specs=spec)
+    same(jax.jit(run)(states()), jax.vmap(lorenz)(states()))
+
+
+@pytest.mark.parametrize("way", ["grad", "jacfwd", "jvp of vmap", "vmap of grad", "twice"])
+def test_derivatives_are_those_of_the_function_with_one_warning(way):
+    def loss(one):
+        return lambda x: (one(x) ** 2).sum()
+
+    def differentiated(one):
+        ways = {
+            "grad": lambda: jax.grad(loss(one))(states()[0]),
+            "jacfwd": lambda: jax.jacfwd(one)(states()[0]),
+            "jvp of vmap": lambda: jax.jvp(jax.vmap(one), (states(),), (states(),)),
+            "vmap of grad": lambda: jax.jit(jax.vmap(jax.grad(loss(one))))(states()),
+            "twice": lambda: jax.hessian(loss(one))(states()[0]),
+        }
+        return ways[way]()
+
+    one = fuse(lorenz)
+    with pytest.warns(UserWarning, match="^XLA computes the derivative of lorenz, slower$") as told:
+        ours = differentiated(one)
+    assert len(told) == 1
+    same(ours, differentiated(lorenz))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        differentiated(one)
+
+
+def test_derivatives_by_some_arguments_of_several_types():
+    def function(n, x, flag):
+        return jnp.where(flag, x * n, -x).sum()
+
+    one = fuse(function)
+    arguments = jnp.int32(3), jnp.ones(2), jnp.array(True)
+    with pytest.warns(UserWarning, match="derivative"):
+        same(jax.grad(one, argnums=1)(*arguments), jnp.full(2, 3.0))
+
+
+def spectrum(x):
+    return jnp.abs(jnp.fft.rfft(x))
+
+
+def test_what_no_kernel_can_do_is_told_once_with_its_line():
+    one = fuse(spectrum)
+    x = np.ones(4, np.float32)
+    reason = r"one kernel cannot do the operation fft \(.*test_fuse.py:\d+.*\)$"
+    with pytest.warns(UserWarning, match=f"^XLA computes spectrum, slower: {reason}") as told:
+        results = [one(x) for _ in range(2)]
+    assert len(told) == 1
+    same(results[1], spectrum(x))
+
+
+def test_it_can_be_silent_an_error_or_the_callers_business():
+    x = np.ones(4, np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fuse(spectrum, on_unsupported="xla")(x)
+    with pytest.raises(UnsupportedError, match="the operation fft"):
+        fuse(spectrum, on_unsupported="raise")(x)
+    reasons = []
+    fuse(spectrum, on_unsupported=reasons.append)(x)
+    assert [str(x)[:17] for x in reasons] == ["the operation fft"]
+    with pytest.raises(ValueError, match=re.escape("on_unsupported = 'never': choose 'warn', ")):
+        fuse(spectrum, on_unsupported="never")
+
+
+@pytest.mark.parametrize("dtype", ["float16", "int8"])
+def test_numbers_of_another_width_are_named(dtype):
+    with pytest.raises(UnsupportedError, match=f"arguments or results of {dtype}"):
+        fuse(lambda x: x * 2, on_unsupported="raise")(jnp.ones(2, dtype))
+
+
+def test_a_platform_without_kernels_is_told(monkeypatch):
+    monkeypatch.setattr(cpu, "obstacle", lambda: "it is broken")
+    with pytest.warns(UserWarning, match="^XLA computes lorenz, slower: it is broken$"):
+        same(jax.vmap(fuse(lorenz))(states()), jax.vmap(lorenz)(states()))
+    with pytest.raises(KernelError, match="it is broken"):
+        jax.vmap(fuse(lorenz, on_unsupported="raise"))(states())
+
+
+def test_a_wrong_kernel_is_found_before_its_first_use(monkeypatch):
+    lowered = fused.scalarize_part
+
+    def wrong(traced, arguments, results, **options):
+        # The kernel returns its first result twice.
+        return lowered(traced, arguments, [results[0]] * len(results), **options)
+
+    monkeypatch.setattr(fused, "scalarize_part", wrong)
+    both = fuse(lambda x: (x.sum(), x.max()))
+    with pytest.raises(KernelError, match="result 1 of a kernel is not XLA's: ") as raised:
+        both(np.ones(3, np.float32))
+    assert raised.value.kind == "check"
+
+
+def test_what_the_function_itself_makes_unsteady_is_not_called_wrong():
+    # Neighbouring numbers have other sines, signs and places.
+    fuse(lambda x: (jnp.sin(1e6 * x), jnp.sign(x - 1e-8), jnp.argmax(x * 0 + 1)))(states()[0])
+
+
+def test_explain_tells_what_a_kernel_is(capsys):
+    onekernel.explain(fuse(lorenz), jax.ShapeDtypeStruct((3,), np.float32))
+    out = capsys.readouterr().out
+    assert out.startswith("lorenz is one kernel\n")
+    found = dict(re.findall(r"^  (\S.*?)  +(.*)$", out, re.MULTILINE))
+    # σ (y - x), x (ρ - z) - y and x y - β z
+    assert found["operations"] == "8"
+    assert found["reads"] == "12 bytes an instance"
+    assert found["writes"] == "12 bytes an instance"
+    assert found["spilled"] == "0 times stored, 0 times loaded"
+    assert set(found) == {
+        *("operations", "reads", "writes", "traced and lowered in", "compiled in"),
+        *("registers", "spilled"),
+    }
+
+
+def test_explain_tells_what_stands_in_the_way(capsys):
+    onekernel.explain(spectrum, np.ones(4, np.float32))
+    out = capsys.readouterr().out
+    line = r"spectrum is no kernel: one kernel cannot do the operation fft \(.*test_fuse.py:\d+"
+    assert re.match(line, out)
