@@ -7,7 +7,7 @@
     def step(state, control):  # one instance
         return jnp.sin(state) + 0.1 * control
 
-    step = onekernel.OneKernel(step)  # the same function, as one kernel where that can be
+    step = onekernel.fuse(step)  # the same function, as one kernel where that can be
     states = jax.jit(jax.vmap(step))(jnp.zeros((4096, 3)), jnp.ones((4096, 3)))
 
 A `Kernel` is made by hand where more is known: how often a step is repeated inside the kernel,
@@ -22,7 +22,8 @@ The parts, each of which imports only from those before it:
 - `codegen`: these blocks to LLVM IR
 - `kernel`: a kernel as a JAX primitive; `errors`: what it raises
 - `cpu`, `gpu`: machine code and PTX, and who launches it; `backends`: both
-- `one_kernel`: a function of one instance with a kernel inside
+- `fused`: a function of one instance as one kernel, with another kernel inside
+- `check`, `explanation`: whether a kernel computes what XLA does, and what the compiler made of it
 - `aot`: compiled programs from one process to the next
 
 `onekernel.build` has what one needs to write a kernel around a lowered function.

@@ -41,7 +41,7 @@ from jaxtyping import Array, PyTree
 from onekernel.backends import default_backend
 from onekernel.check import check
 from onekernel.errors import KernelError, UnsupportedError
-from onekernel.kernel import Kernel, called_by
+from onekernel.kernel import Kernel, called_by, varying_axes
 from onekernel.lower import scalarize_part
 
 CHECK = "ONEKERNEL_CHECK"
@@ -149,9 +149,15 @@ class Fused:
         # A kernel takes flat arrays: it is found by the tree, shapes and dtypes of the arguments.
         leaves, structure = jax.tree.flatten((arguments, keywords))
         arrays = [x if isinstance(x, jax.Array) else jnp.asarray(x) for x in leaves]
-        lowered = self._find(structure, [x.aval for x in arrays])
+        avals = [x.aval for x in arrays]
+        lowered = self._find(structure, avals)
         if isinstance(lowered.one, UnsupportedError):
             self._report(lowered.one)
+            return self._function(*arguments, **keywords)
+        if os.environ.get(CHECK) == "1":
+            # Inside of `jax.shard_map`, an array varies along axes of the mesh. A check runs
+            # outside, where there are none.
+            self._find(structure, [ShapedArray(x.shape, x.dtype) for x in avals]).check()
         results = lowered.launch(*map(_without_key, arrays))
         return jax.tree.unflatten(lowered.structure, map(_with_key, lowered.results, results))
 
@@ -222,7 +228,9 @@ class Fused:
     def _find(self, structure: jax.tree_util.PyTreeDef, avals: Sequence[ShapedArray]) -> "_Lowered":
         # The same function lowers differently under other settings of JAX.
         settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
-        key = (structure, settings, *((x.shape, x.dtype, x.weak_type) for x in avals))
+        # Inside of `jax.shard_map`, JAX traces another jaxpr for arrays that vary along its axes.
+        described = [(x.shape, x.dtype, x.weak_type, varying_axes(x)) for x in avals]
+        key = (structure, settings, *described)
         if key in self._known:
             return self._known[key]
         lowered = self._trace_and_lower(structure, avals)
@@ -292,18 +300,16 @@ class _Lowered:
     """Places of the constants that the kernel takes as arguments, before the others."""
     one: Kernel | UnsupportedError
     """The kernel, or why there is none."""
+    _is_checked: bool = dataclasses.field(default=False, init=False)
 
     @functools.cached_property
     def launch(self) -> Callable[..., list[Array]]:
-        """Return the function of flat arguments, whose kernel begins to be compiled."""
-        if isinstance(self.one, UnsupportedError):
-            return jaxpr_as_fun(self.traced)
+        """Return the kernel as a function of flat arguments; it begins to be compiled."""
+        assert isinstance(self.one, Kernel)
         # Compile the kernel in a thread, while XLA compiles the program around it.
         backend = default_backend()
         if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
             backend.prepare(self.one)
-            if os.environ.get(CHECK) == "1":
-                check(self.one, _dtypes(_arguments(self.traced, self.places)), self._result_dtypes)
         launch = self.one.as_function()
         # Kernels take and return float32 only, so numbers of other dtypes travel as their bits.
         constants = [self.traced.consts[i] for i in self.places]
@@ -315,6 +321,17 @@ class _Lowered:
             return _from_words(launch(words), self._result_dtypes)
 
         return run
+
+    def check(self) -> None:
+        """Compare the kernel with XLA on random numbers, once.
+
+        Raises:
+          KernelError: a result differs.
+        """
+        # What another traced function computes is not known.
+        if isinstance(self.one, Kernel) and not (self._is_checked or self.places):
+            check(self.one, _dtypes(_arguments(self.traced, self.places)), self._result_dtypes)
+            self._is_checked = True
 
     @property
     def _result_dtypes(self) -> list[np.dtype]:

@@ -27,7 +27,7 @@ import dataclasses
 import math
 import threading
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from typing import NamedTuple, Protocol
 
 import jax
@@ -280,8 +280,28 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Array | ShapedArray]) -> tuple
 
 @_kernel_p.def_abstract_eval
 def _abstract(*leaves: ShapedArray, kernel: Kernel) -> list[ShapedArray]:
-    batch = _batch_shape(kernel, leaves)
-    return [ShapedArray(result.shape, result.dtype) for result in kernel.results(*batch)]
+    shapes = [(x.shape, x.dtype) for x in kernel.results(*_batch_shape(kernel, leaves))]
+    # Inside of `jax.shard_map`, results vary along the axes of the mesh along which arguments do.
+    axes = frozenset().union(*map(varying_axes, leaves))
+    if not axes:
+        return [ShapedArray(shape, dtype) for shape, dtype in shapes]
+    kind = jax.sharding.ManualAxisType(varying=axes)
+    mesh = next(x.sharding.mesh for x in leaves if varying_axes(x))
+    return [
+        ShapedArray(
+            shape,
+            dtype,
+            sharding=jax.NamedSharding(mesh, jax.P(*[None] * len(shape))),
+            manual_axis_type=kind,
+        )
+        for shape, dtype in shapes
+    ]
+
+
+def varying_axes(x: ShapedArray) -> frozenset[Hashable]:
+    """Return the axes of a mesh along which an array varies; none outside of `jax.shard_map`."""
+    kind = getattr(x, "mat", None)
+    return frozenset() if kind is None else kind.varying
 
 
 def _differentiate(
