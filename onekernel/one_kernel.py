@@ -7,9 +7,9 @@ in which a GPU mostly waits for the next launch, and of which a CPU compiles eac
 Protocol: `OneKernel` traces the function. Where it calls one kernel that steps
 (`Kernel.as_step`), the equations divide into those that the arguments of that kernel need and those
 that the results need. Both are lowered to scalars, and run in the kernel before its first step and
-after its last. What both need is computed twice, so that no register holds it during the steps. A
-function that calls no kernel becomes a kernel as it is. A function that cannot be lowered, or calls
-several kernels, stays as it is.
+after its last. Values that both need are computed twice, so that no register holds them during the
+steps. A function that calls no kernel is lowered whole. A function that cannot be lowered, or calls
+several kernels, is left to XLA.
 """
 
 import dataclasses

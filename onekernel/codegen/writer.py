@@ -1,6 +1,6 @@
 """Write functions in LLVM IR, the input of the LLVM compiler, with Python's operators.
 
-LLVM IR is a typed assembly language with any number of registers. What a reader of its text needs:
+LLVM IR is a typed assembly language with any number of registers. To read its text:
 
 - `%v3 = fadd float %v1, %v2` adds two registers. Each register is written by one instruction only.
 - A function is a list of blocks. A block begins with a label, and ends with `br`, a jump to one of

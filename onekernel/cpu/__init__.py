@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     # At run time, `_binding` imports it late.
     from llvmlite.binding import ExecutionEngine, TargetMachine
 
-# What `onekernel.kernel.Backend` asks for.
+# Constants of `onekernel.kernel.Backend`.
 IMPL: str = "llvm"
 PLATFORM: str = "cpu"
 

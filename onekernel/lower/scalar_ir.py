@@ -120,7 +120,7 @@ def _bitcast(x: np.ndarray) -> np.ndarray:
 
 
 def _reduced(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many quarter turns, modulo 4, are nearest to an angle, and what is left."""
+    """Return an angle's nearest number of quarter turns, modulo 4, and the angle that is left."""
     # In float64, π/2 is exact to far more digits than the result needs.
     wide = x.astype(np.float64)
     angle = np.arctan2(np.sin(wide), np.cos(wide))
@@ -829,7 +829,7 @@ _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
 
 def _approximate_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     """Divide by a product with the reciprocal, which all quotients of one divisor share."""
-    # Keep what needs no reciprocal at all, such as a quotient by a constant.
+    # Some quotients need no reciprocal at all, such as those by a constant.
     simplified = _simplify_div(graph, dtype, x, y)
     if simplified is not None or dtype != _FLOAT:
         return simplified
