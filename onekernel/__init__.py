@@ -10,10 +10,10 @@
     step = onekernel.OneKernel(step)  # the same function, as one kernel where that can be
     states = jax.jit(jax.vmap(step))(jnp.zeros((4096, 3)), jnp.ones((4096, 3)))
 
-To say more about a function, make a `Kernel` yourself: how often a step is repeated inside the
-kernel, that all numbers are finite (`scalarize` assumes it, so that 0·x is 0), which function runs
-where there is no back end (`fallback`, from flat arguments to flat results, all steps), or that the
-function is computed for each column of a table, such as the pixels of an image (`Kernel.as_map`).
+A `Kernel` that you make yourself can say more: how often a step is repeated inside the kernel, that
+all numbers are finite (`scalarize` assumes it, so that 0·x is 0), which function runs where there
+is no back end (`fallback`, from flat arguments to flat results, all steps), or that the function is
+computed for each column of a table, such as the pixels of an image (`Kernel.as_map`).
 
 The way of `x * c + 1.0` through the package, with an x of two numbers and a scalar c:
 
