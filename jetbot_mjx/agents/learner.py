@@ -79,8 +79,8 @@ class Learner(Protocol):
     """A `Learner` computes the actions of a collection and the update of the networks.
 
     The order of the calls: `obstacle` and `prepare` before `PPO.advance` is traced; `begin` at its
-    start; `unroll` and `update` in each training step; `end` at its end. Beside XLA, `failure`
-    compares what was traced with other computations. No call changes the learner.
+    start; `unroll` and `update` in each training step; `end` at its end. While XLA compiles,
+    `failure` checks the kernels. No call changes the learner.
     """
 
     # What others ask of it without knowing which it is.
