@@ -104,7 +104,7 @@ class Learner(Protocol):
         return None
 
     def prepare(self, policies: int) -> None:
-        """Begin to compile what tracing does not depend on, for policies that train at once."""
+        """Begin to compile kernels in threads, for a number of policies that train at once."""
 
     # Inside the program: once around all steps, and in each step.
 

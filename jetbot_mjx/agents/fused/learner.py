@@ -365,6 +365,8 @@ class FusedLearner(Learner):
             rates=0.0,
             applied=0.0,
         )
+        # A row before each step and one after the last: a kernel writes the next row while some of
+        # its threads still read the present one.
         row = _array(jax.tree.leaves(progress))
         rows = jnp.zeros((self.rule.steps, len(row)))
         return params, state.mu, state.nu, jnp.concatenate([row[None], rows])
