@@ -136,7 +136,7 @@ def epoch_keys(seed):
 VARIANTS = [
     (Gliding, "ADAPTIVE_KL", None),
     pytest.param((Gliding, "NONE", None), marks=pytest.mark.slow),
-    # Through the real robot, which compiles so long.
+    # With the real robot, which takes long to compile.
     pytest.param((JetBotEnv, "ADAPTIVE_KL", 1.0), marks=pytest.mark.slow),
 ]
 

@@ -170,7 +170,7 @@ def test_mjx_follows_c_mujoco(driver, on_floor):
 
 
 def single_steps_agree(case, env, mjx_model, theirs, ctrl):
-    """From every state of the converged path one control step ends where it does there."""
+    """Check single control steps, from each state of the converged path to the next one."""
     states = jax.tree.map(lambda x: jnp.float32(x[:-1].reshape(-1, *x.shape[2:])), theirs)
     step = env.with_model(mjx_model).step_physics
     ahead = jax.jit(jax.vmap(step))(states, ctrl[1:].reshape(-1, 2))

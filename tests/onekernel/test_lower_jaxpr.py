@@ -1,4 +1,4 @@
-"""Functions taken apart into numbers do what JAX does with them."""
+"""Functions lowered to scalars compute what JAX computes."""
 
 import jax
 import jax.numpy as jnp

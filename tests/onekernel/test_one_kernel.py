@@ -39,7 +39,7 @@ MOVES = {
     *("bitcast_convert", "broadcast_in_dim", "reshape", "transpose"),
     *("compare", "constant", "convert", "custom_call"),
 }
-"""What brings numbers to a kernel and from it, by the name of the operation."""
+"""Operations that only move numbers to a kernel and from it, by name."""
 
 
 def is_one_kernel(function, *arguments, platforms=None):

@@ -1,4 +1,4 @@
-"""Compiled programs that outlive their process: found untraced, and only where they belong."""
+"""Compiled programs that outlive their process: found without tracing, by their own key only."""
 
 import os
 import shutil

@@ -1,4 +1,4 @@
-"""Arithmetic that is written down: what is known is done, what is shared is shared."""
+"""Recorded arithmetic: constants are folded, and a repeated operation is recorded once."""
 
 import math
 
