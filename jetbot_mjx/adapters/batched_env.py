@@ -43,7 +43,7 @@ class Steps(NamedTuple):
 
 
 def unwrap_single(parts: Any) -> Any:
-    """Return the part of an observation that has one part only, and any other one as it is."""
+    """Return the only part of an observation, or the observation if it is none of several parts."""
     if isinstance(parts, Mapping) and len(parts) == 1:
         return next(iter(parts.values()))
     return parts

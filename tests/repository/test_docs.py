@@ -116,6 +116,14 @@ def test_files_that_are_named_exist(page):
     assert [name for name in named if not (ROOT / name).is_file()] == []
 
 
+def test_the_design_page_counts_and_lists_the_rooms():
+    rooms = {path.parent.name for path in (ROOT / "jetbot_mjx").glob("*/__init__.py")}
+    page = PAGES["design.md"]
+    (count,) = re.findall(r"is (\d+) rooms", page)
+    assert int(count) == len(rooms)
+    assert set(re.findall(r"^\| \[`(\w+)`\]", page, re.MULTILINE)) == rooms | {"onekernel"}
+
+
 def test_the_stages_of_a_training_step_are_where_the_page_says():
     """Each path, and each function or class behind it, of the last table on the kernels' page."""
     table = PAGES["kernels.md"].partition("## Where it is")[2]
