@@ -187,7 +187,7 @@ def run_command(
 
 
 def tell(text: str) -> None:
-    """Print a result, which may name files: a terminal shows all of its characters and obeys none.
+    """Print a result; control characters, as in the name of a file, are printed as escapes.
 
     Args:
       text: one line or several.

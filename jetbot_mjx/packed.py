@@ -21,10 +21,10 @@ _Shape = tuple[tuple[int, ...], Any]
 
 
 def _is_packed(shape: tuple[int, ...], dtype: object) -> bool:
-    """Return whether an array is packed: its numbers have 32 bits, and there are some.
+    """Return whether an array is packed: its numbers have 32 bits, and it is not empty.
 
-    Random keys are no numbers. XLA aborts where it slices nothing from an array that it made of
-    others and an empty one.
+    JAX's random keys are not numbers. XLA aborts when it slices an empty array out of the
+    concatenation of all.
     """
     return isinstance(dtype, np.dtype) and dtype.itemsize == 4 and math.prod(shape) > 0
 
@@ -58,7 +58,7 @@ class Packed(struct.PyTreeNode):
         return jax.tree.unflatten(self.structure, leaves)
 
     def places(self) -> PyTree:
-        """Return in place of each array the columns of `words` that hold it; -1: none does."""
+        """Return a tree of the columns of `words` that hold each array; -1 where none does."""
         leaves, start = [], 0
         for shape, dtype in self.shapes:
             size = math.prod(shape) if _is_packed(shape, dtype) else 0

@@ -1,4 +1,4 @@
-"""Compute in a thread of its own what the process need not wait for."""
+"""Run a function in a thread that the process does not wait for."""
 
 import contextvars
 import threading

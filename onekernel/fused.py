@@ -10,12 +10,12 @@ Protocol:
    words, Python's numbers as arrays.
 2. Where the function calls one kernel that steps (`Kernel.as_step`), the equations divide into
    those that the arguments of that kernel need and those that the results need. Both are lowered to
-   scalars, and run in the kernel before its first step and after its last. What both need is
-   computed twice, so that no register holds it during the steps. A function that calls no kernel
-   becomes a kernel as it is. A fused function that is called inside is traced as the function that
-   it is made of.
-3. A function that cannot be lowered, or calls several kernels, stays as it is, and `on_unsupported`
-   decides what is said.
+   scalars, and run in the kernel before its first step and after its last. Values that both need
+   are computed twice, so that no register holds them during the steps. A function that calls no
+   kernel is lowered whole. A fused function that is called inside is traced as the function that it
+   is made of.
+3. A function that cannot be lowered, or calls several kernels, is left to XLA, and `on_unsupported`
+   says what is told.
 4. JAX differentiates what was traced, in place of the kernel, and a warning says so.
 5. With `ONEKERNEL_CHECK=1` in the environment, each new kernel is compared with XLA on random
    numbers before its first use (`onekernel.check`).

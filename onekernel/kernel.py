@@ -5,10 +5,10 @@ value that passes from one kernel to the next goes through memory. Lowered to sc
 (`onekernel.lower`), the same function is one kernel that reads the state of an instance, runs any
 number of steps, and writes the state back.
 
-An image is the other case: a function of what all of its pixels share, and of what differs between
-them. With `Kernel.table` the program runs once for every column of a table, an item, for every
-instance. What depends on the instance only is computed once per instance (CPU) or thread (GPU), and
-the results are bytes.
+An image is the other case: the pixels of an instance share some arguments, such as the camera's
+pose, and each has others of its own, such as its ray. `Kernel.table` holds the latter, a column for
+each pixel (an item). The program runs for every item of every instance. Operations on shared
+arguments alone are computed once per instance (CPU) or thread (GPU), and the results are bytes.
 
 Protocol: JAX sees the kernel as a primitive.
 
@@ -63,8 +63,8 @@ class Kernel:
 
     program: ScalarProgram
     """The step. Its results have the shapes of its first `carried` arguments, unless it runs only
-    once; with a table, its last argument is a column of it, and its results are scalars from 0 to
-    255, which are rounded down to bytes."""
+    once. With a table, its last argument is a column of the table, and its results are scalars from
+    0 to 255, which are rounded down to bytes."""
     carried: int
     """Number of argument leaves that are carried from step to step."""
     steps: int
@@ -89,7 +89,7 @@ class Kernel:
     """A function from the arguments and the results of the last step to the results; None: they
     are those of the last step."""
     table: Float[np.ndarray, "rows items"] | None = None
-    """What differs between the items of an instance; None: the kernel is a step."""
+    """The arguments that differ between the items of an instance; None: the kernel is a step."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
     """Texts that back ends have written of the kernel, by a name of their choice."""
     # Programs are lowered in several threads, and each text is written once.

@@ -30,7 +30,7 @@ class Robot(NamedTuple):
 
 
 def drawn(*batch, seed=0):
-    """Robots of whose floats many are no numbers."""
+    """Robots with many NaN among their floats."""
     rng = np.random.default_rng(seed)
 
     def bits(*shape):
@@ -143,7 +143,7 @@ def test_a_loop_carries_it_and_what_it_has_stored_is_unpacked_at_once():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.int32, np.uint32])
 @pytest.mark.parametrize("where", ["host", "device", "compiled", "batched"])
-def test_bits_that_are_no_number_or_too_small_survive(dtype, where):
+def test_the_bits_of_nan_and_of_subnormal_numbers_survive(dtype, where):
     def there_and_back(x):
         return pack([x, np.zeros(3, np.float32)]).unpack()[0]
 

@@ -11,7 +11,7 @@ import lazy_loader
 
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
-# Without Gymnasium there is nobody to tell.
+# Without Gymnasium there is no registry to add the environment to.
 with contextlib.suppress(ModuleNotFoundError):
     from gymnasium import register
 

@@ -79,8 +79,8 @@ class Learner(Protocol):
     """A `Learner` computes the actions of a collection and the update of the networks.
 
     The order of the calls: `obstacle` and `prepare` before `PPO.advance` is traced; `begin` at its
-    start; `unroll` and `update` in each training step; `end` at its end. Beside XLA, `failure`
-    compares what was traced with other computations. No call changes the learner.
+    start; `unroll` and `update` in each training step; `end` at its end. While XLA compiles,
+    `failure` checks the kernels. No call changes the learner.
     """
 
     # What others ask of it without knowing which it is.
@@ -104,7 +104,7 @@ class Learner(Protocol):
         return None
 
     def prepare(self, policies: int) -> None:
-        """Begin to compile what tracing does not depend on, for policies that train at once."""
+        """Begin to compile kernels in threads, for a number of policies that train at once."""
 
     # Inside the program: once around all steps, and in each step.
 

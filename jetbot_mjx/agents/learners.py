@@ -53,7 +53,7 @@ def xla_instead(
     """
     if config.update not in ("auto", XlaLearner.name):
         raise UserError(f"ppo.update = {config.update}: {reason}: choose auto or xla")
-    # Say so now, and whenever a program is loaded that was traced so.
+    # Report it now, and again whenever a program is loaded that was traced with this learner.
     fallback = Fallback("ppo.update", reason)
     report(fallback)
     return XlaLearner(config, networks, devices, layout, fallback)

@@ -49,7 +49,7 @@ class Networks:
 
     def __getattr__(self, name: str) -> Any:
         if name.startswith("_"):
-            # What copies an object asks for such names before it has any.
+            # `copy` and `pickle` ask for such names before the object has attributes.
             raise AttributeError(name)
         return getattr(self._built(), name)
 

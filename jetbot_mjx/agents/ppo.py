@@ -26,7 +26,7 @@ Protocol of a training step:
    and its gradient, and applies one step of Adam.
 
 Who computes actions and update is a `Learner`: `XlaLearner` is the algorithm in JAX's functions,
-and the kernels that docs/update.md explains do the same faster.
+and the kernels that docs/kernels.md explains do the same faster.
 
 Networks, action distribution, running statistics, steps, gradients and the ADAPTIVE_KL rule
 are Brax's. On one device and with `normalizer: brax` and `update: xla`, the order of the random

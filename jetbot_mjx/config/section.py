@@ -11,7 +11,7 @@ class Section(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
 
     def __repr_args__(self) -> Iterator[tuple[str | None, object]]:
-        """Yield the settings that differ from the defaults, which are few of them."""
+        """Yield only the settings that differ from the defaults, so that the text stays short."""
         for name, field in type(self).model_fields.items():
             if (value := getattr(self, name)) != field.get_default(call_default_factory=True):
                 yield name, value

@@ -29,7 +29,7 @@ _YAML_PROBLEMS = {
         "it is indented neither as the line above it nor as the section it belongs to"
     ),
 }
-"""What is meant by messages that speak of a parser's inner life."""
+"""Messages of the parser that name its internals, and what to say in their place."""
 
 
 def read_yaml(path: Path, what: str = "config") -> dict[str, object]:

@@ -104,7 +104,7 @@ def read_log(path: Path) -> DriveLog:
             if "latency" in period:
                 latencies.append(float(period["latency"]))
     except (ValueError, TypeError, LookupError, AttributeError) as error:
-        text = " ".join(str(error).split())  # a wrong camera is told in several lines
+        text = " ".join(str(error).split())  # that of a camera's settings has several lines
         reason = f"lacks {text}" if isinstance(error, KeyError) else text
         raise UserError(
             f"{path} is not a log of deploy/drive.py: line {number}: {reason}"

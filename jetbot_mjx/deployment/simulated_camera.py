@@ -58,7 +58,7 @@ def camera_config(image: JsonObject) -> CameraConfig:
 
 
 class SimulatedCamera:
-    """A simulated camera on a simulated robot; it looks once the robot's clock goes on."""
+    """A simulated camera on a simulated robot; it takes pictures while the robot's clock runs."""
 
     def __init__(
         self,

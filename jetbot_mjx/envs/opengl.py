@@ -122,7 +122,7 @@ class SceneRenderer:
         self.end()
 
     def end(self) -> None:
-        """End the context, from any thread, while Python still has all that this calls."""
+        """End the context, from any thread, before Python's exit removes what this calls."""
         _open.discard(self)
         self._gl.free()
         del self._gl

@@ -273,7 +273,7 @@ class KernelWrapper(Wrapper):
         physics = env.unwrapped.physics
 
         def report_unsupported(error: UnsupportedError) -> None:
-            # If physics is no kernel, it has told the reason.
+            # If physics is not a kernel, it has reported the reason already.
             if physics.may_be_kernel:
                 reason = f"one kernel cannot do {error}: the page on own tasks says what to avoid"
                 report(Fallback("environment step", reason))

@@ -257,7 +257,7 @@ class _Reporter:
         self._built_for: tuple[object, ...] = ()
 
     def _build(self, checkpoint: Checkpoint, setup: Setup, ranges: RandomizationConfig) -> None:
-        """Build the evaluators and evaluate the baselines, unless those that there are fit."""
+        """Build the evaluators and evaluate the baselines, unless the present ones fit."""
         config, params = checkpoint.config, checkpoint.params
         env, networks, programs = setup.env, setup.networks, setup.programs
         # The parts of a configuration that the compiled episodes depend on.

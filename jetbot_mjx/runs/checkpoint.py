@@ -168,7 +168,7 @@ def load_checkpoint(path: str | Path, which: Which = "best") -> Checkpoint:
         )
     except UserError as error:
         raise CheckpointError(f"checkpoint {folder} has unusable metadata: {error}") from None
-    # JAX and Flax report sizes that make no network by many kinds of exception.
+    # JAX and Flax raise many kinds of exception for sizes of which no network can be built.
     except Exception:
         raise CheckpointError(
             f"checkpoint {folder} has unusable metadata: observation_size = {shown(size)} and"

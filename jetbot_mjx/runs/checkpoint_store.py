@@ -416,7 +416,7 @@ def _read_arrays(folder: Path, wanted: Mapping[str, _Typed]) -> dict[str, np.nda
         place = {**files, "path": f"{name}/"}
         stored[name] = ts.open({"driver": "zarr", "kvstore": place}, read=True).result()
     _compare(folder, wanted, stored)
-    # A chunk is read as a whole, and one that no file holds is filled. A scalar has none.
+    # TensorStore reads whole chunks, and fills those that no file holds. A scalar has no chunk.
     needed = sum(
         array.dtype.numpy_dtype.itemsize * max(math.prod(array.shape), math.prod(chunk))
         for array in stored.values()

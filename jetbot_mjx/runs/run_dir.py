@@ -99,7 +99,7 @@ def read_config(run_dir: Path) -> Config:
         text = read_text(run_dir / CONFIG)
         if not text.strip():
             raise ConfigError(f"{CONFIG} is empty")
-        # A training writes all settings. Those after a cut would be read as the defaults.
+        # A training writes all settings. If the end is missing, its settings would become defaults.
         if not text.endswith("\n"):
             raise ConfigError(f"{CONFIG} was cut off: its last line is not complete")
         values = parse_yaml(text, CONFIG)
@@ -258,7 +258,7 @@ def atomic_folder(folder: Path) -> Iterator[Path]:
 
 
 def remove(path: Path) -> None:
-    """Remove a leftover of an earlier process, whatever it is, if there is one and it can be."""
+    """Remove a file or folder that an earlier process left, if it exists and can be removed."""
     if path.is_dir() and not path.is_symlink():
         shutil.rmtree(path, ignore_errors=True)
         return

@@ -9,7 +9,7 @@ PLAIN_START = "JETBOT_MJX_PLAIN_START"
 
 
 def is_plain() -> bool:
-    """Return whether a command shall start without the tricks of this package.
+    """Return whether a command should start without the tricks of this package.
 
     Raises:
       InvalidError: the environment variable is neither 0 nor 1.

@@ -174,7 +174,7 @@ class CompiledTrainer:
         return self._trace(ppo)
 
     def _check(self) -> Callable[[], jax.stages.Traced] | None:
-        """Return None if this machine computes what was traced, or what traces XLA's update."""
+        """Return None if the kernels passed their check, or a function that traces XLA's update."""
         failure = self._launchable.learner.failure()
         return None if failure is None else lambda: self._trace(self._launchable.with_xla(failure))
 

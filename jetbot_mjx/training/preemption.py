@@ -37,7 +37,7 @@ _WITHOUT_SAVING = "leaving without another save; the last complete checkpoint is
 
 
 class StopRequest:
-    """A `StopRequest` says whether a training was asked to stop; this base class is never asked."""
+    """A `StopRequest` says whether a training was asked to stop; this base class never was."""
 
     def __init__(self, notice: float) -> None:
         """Prepare to be asked.

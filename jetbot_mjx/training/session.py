@@ -299,7 +299,7 @@ def _train(training: Training, stop: StopRequest) -> Result:
             recorder = stack.enter_context(open_recorder(training, clock, resumption))
             stored = resumption.states if resumption else []
             if recorder.complete:
-                # Of the messages, the last one would say that the training resumes.
+                # Leave out the last message, which would say that the training resumes.
                 for line in (*messages[:-1], _complete_message(config, recorder.standings)):
                     recorder.say(line)
                 return _Stored.COMPLETE

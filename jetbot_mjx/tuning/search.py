@@ -53,7 +53,7 @@ _CONFIRM_SEED = 1_000_000
 _STATES = optuna.trial.TrialState
 _STORAGE_ERRORS = optuna.exceptions.StorageInternalError, sqlalchemy.exc.SQLAlchemyError
 _OPENING_ERRORS = ImportError, ValueError, RuntimeError
-"""For a driver that is not installed, a port that is not a number, or another Optuna's database."""
+"""Raised for a missing driver, an invalid port, or the database of another version of Optuna."""
 
 _Static = tuple[tuple[str, Value], ...]
 """Names and values of the static settings of trials that one program trains."""

@@ -148,7 +148,7 @@ def make_viewer_fns(env: envs.JetBotEnv, networks: Networks) -> ViewerFns:
 
 
 def _move_goal(env: envs.JetBotEnv, state: envs.State, position_w: Float[Array, "3"]) -> envs.State:
-    """Return the state of a robot whose goal is moved; its episode's time begins anew."""
+    """Return the state of a robot whose goal is moved; its episode's time restarts."""
     assert isinstance(env.task, envs.MovesGoal)
     goal = env.task.move_goal(state.goal, position_w)
     obs = env.blind().observe(envs.robot_state(state.pipeline_state), goal)

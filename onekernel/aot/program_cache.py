@@ -42,7 +42,7 @@ class _Lowered(NamedTuple):
     seconds: float
     """Time that it took to trace and lower it [s]."""
     notices: list[Notice]
-    """What was reported meanwhile."""
+    """Notices to users from the time of tracing."""
 
 
 class _Stored(NamedTuple):
@@ -50,18 +50,21 @@ class _Stored(NamedTuple):
 
     program: jax.stages.Compiled
     notices: list[Notice]
-    """What was reported when it was traced."""
+    """Notices to users from the time of tracing."""
 
 
 class Notices(Protocol):
-    """A `Notices` knows what users are told while a program is traced, to repeat it later."""
+    """A `Notices` collects the notices to users while a program is traced, and repeats them later.
+
+    Tracing may warn users, and a program from the cache is not traced: so its notices are stored.
+    """
 
     def collect(self) -> contextlib.AbstractContextManager[list[Notice]]:
         """Return a context that yields a list of all that is reported inside it."""
         ...
 
     def report(self, notice: Notice, /) -> None:
-        """Report again what was reported when a program was traced."""
+        """Report a notice again, when a program is loaded that was traced in another process."""
         ...
 
 
@@ -91,8 +94,8 @@ class ProgramCache:
           options: the compiler options of the programs.
           folder: an existing folder; None: programs are not cached.
           key: everything that the programs depend on, but for the options and the processor.
-          notices: who tells users about the programs; what is told while a program is traced is
-            stored with it, and told again where it is loaded.
+          notices: collects notices to users; those from the tracing of a program are stored with
+            it, and reported again where it is loaded.
         """
         self.options = options
         """The compiler options of the programs."""
@@ -130,7 +133,7 @@ class ProgramCache:
         stored = prefetched.result() if prefetched else _load(self._path(name))
         if stored is None:
             return None
-        # Tell the user what tracing told, since a cached program is not traced.
+        # A cached program is not traced, so repeat the notices of its tracing.
         for notice in stored.notices:
             self._notices.report(notice)
         return stored.program
@@ -166,7 +169,7 @@ class ProgramCache:
         try:
             program = self._compile(name, lowered, lambda: checked() is None, tune=tune)
         except jax.errors.JaxRuntimeError:
-            # What fails its check may also fail to compile.
+            # If the check fails, too, compile the other program; otherwise this error counts.
             if checked() is None:
                 raise
             program = None

@@ -1,10 +1,13 @@
 """Write a scalar program as LLVM IR, for CPUs and GPUs.
 
-On a CPU every scalar is a vector register, and each lane runs the whole program for one instance.
-On a GPU each thread runs it for one instance, with plain scalars. A loop ends when it has ended for
-all lanes; a lane that ends earlier keeps its values, so they do not depend on the other lanes. A
-side of a branch is skipped if no lane takes it. Lanes that have left an enclosing loop, or took the
-other side of an enclosing branch, do not count for either.
+On a CPU every scalar of the program is a vector register of, say, 8 numbers. Each place in the
+vector, a lane, runs the whole program for one instance. On a GPU each thread runs it for one
+instance, with plain scalars.
+
+The lanes of a vector cannot jump on their own. So a loop goes on until it has ended for all lanes.
+A lane that ends earlier keeps its values, and its results do not depend on the other lanes. A side
+of a branch is skipped only if no lane takes it. A mask says which lanes execute a block: those that
+have left an enclosing loop, or took the other side of an enclosing branch, do not count.
 
 Source: LLVM Language Reference Manual.
 """
@@ -107,7 +110,7 @@ def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWrite
     names = (*(f"in{i}" for i in range(len(shared))), "table", "out")
     w = LlvmWriter(STEP, *(f"ptr noalias {name}" for name in names), lanes=lanes)
     *arrays, table, out = w.parameters
-    # Load what the items share, and compute what follows from it alone.
+    # Load the arguments that the items share, and compute the operations on these alone, once.
     body = ProgramWriter(w, program)
     body.hoist(
         array[j].splat(lanes)
@@ -148,8 +151,8 @@ def require(program: ScalarProgram) -> None:
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
-    # Write the program once and throw the text away: what cannot be written raises its error here,
-    # before JAX traces a program that calls it.
+    # Write the program once and drop the text: an operation that cannot be written raises its error
+    # here, before JAX traces a program that calls the kernel.
     w = LlvmWriter("unused")
     count = sum(array.size for array in program.inputs)
     run_program(w, program, [w.constant(0.0)] * count)
@@ -186,7 +189,7 @@ class ProgramWriter:
         self._program = program
         self._rest: list[Item] = program.block.items
         self._values: dict[int, Value] = {}
-        # What is true in the lanes that execute the current block; None: all lanes do.
+        # A vector of truth values: the lanes that execute the current block; None: all lanes.
         self._mask: Value | None = None
 
     def hoist(self, arguments: Iterable[Value]) -> None:

@@ -1,10 +1,10 @@
 """Write functions in LLVM IR, the input of the LLVM compiler, with Python's operators.
 
-LLVM IR is a typed assembly language with any number of registers. What a reader of its text needs:
+LLVM IR is a typed assembly language with any number of registers. To read its text:
 
 - `%v3 = fadd float %v1, %v2` adds two registers. Each register is written by one instruction only.
-- A function is a list of blocks. A block begins with a label, and ends with `br`, a jump to one of
-  one or two labels, or with `ret`. There are no other loops and branches.
+- A function is a list of blocks. A block begins with a label, and ends with `br`, a jump to one
+  label or to one of two, or with `ret`. There are no other loops and branches.
 - Where two ways meet in a block, `%v5 = phi float [%v3, %here], [%v4, %there]` is `%v3` if the
   block `here` was run last, and `%v4` if it was `there`. So a loop carries a value.
 - `load` and `store` access memory; `getelementptr` only computes an address.

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     # At run time, `_binding` imports it late.
     from llvmlite.binding import ExecutionEngine, ModuleRef, TargetMachine
 
-# What `onekernel.kernel.Backend` asks for.
+# Constants of `onekernel.kernel.Backend`.
 IMPL: str = "llvm"
 PLATFORM: str = "cpu"
 

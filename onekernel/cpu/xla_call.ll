@@ -1,12 +1,24 @@
-; What XLA calls on a CPU, around a function `block`. It reads the call frame, and XLA's own threads take
-; blocks from a job as long as there are any. Offsets are those of XLA's xla/ffi/api/c_api.h, version 0.3.
+; The function `kernel`, which XLA calls on a CPU, around a function `block`. It reads the call frame, and XLA's
+; own threads take blocks from a job as long as there are any. Offsets are those of XLA's xla/ffi/api/c_api.h,
+; version 0.3. The steps of a call:
+;
+; 1. `kernel` checks the call frame, makes a job of it, and asks XLA's thread pool for helpers (`ask_for_help`).
+; 2. The calling thread and its helpers (`task`) each take the next block that nobody has begun (`work`).
+; 3. `kernel` waits until all blocks have ended, and returns to XLA.
+; 4. A helper may come later still. So a job counts who holds it, and the last one frees it (`release`).
+;
+; To read the text: `getelementptr` computes an address, here mostly that of a field so many bytes behind the
+; start of a C structure, and the `load` after it reads the field. `atomicrmw` changes a number in memory as one
+; step, whatever other threads do, and returns the number before. `acq_rel` and `acquire` let a thread see all
+; that others wrote before; `monotonic` does not.
 ;
 ; `onekernel.cpu.xla_call` puts in front of this text what differs between kernels: the functions `block` and
 ; `needed`, the constants @instances_per_block, @blocks_per_instance, @blocks_per_thread and @scratch_bytes,
 ; and for the processor `begin`, `end` and `relax`.
 
-; What threads share of one call: blocks that are begun, blocks that are ended, who holds the job, blocks in all,
-; instances in all, the addresses of arguments and results.
+; The state of one call, which its threads share. The fields: 0 number of blocks that were begun, 1 of blocks that
+; have ended, 2 of threads that hold the job, 3 of all blocks, 4 of all instances, 5 the addresses of the
+; arguments and then of the results.
 %Job = type { i64, i64, i64, i64, i64, [0 x ptr] }
 declare ptr @malloc(i64)
 declare ptr @aligned_alloc(i64, i64)
@@ -26,7 +38,7 @@ done:
   ret void
 }
 
-; Waits until so many blocks have ended; those are in other threads' hands, and begun.
+; Waits until so many blocks have ended. Other threads have begun them, so they will end without this thread.
 define internal void @wait_for(ptr %job, i64 %count) {
 entry:
   %ended.at = getelementptr %Job, ptr %job, i32 0, i32 1
@@ -36,8 +48,8 @@ check:
   %enough = icmp uge i64 %ended, %count
   br i1 %enough, label %done, label %wait
 wait:
-  ; A block takes microseconds: who gives the core away at once has it back later than that. After so many
-  ; rounds, about 20 µs, it does.
+  ; A block takes microseconds. A thread that gives its core away gets it back later than that, so it first waits
+  ; in a loop, and gives the core away after 1000 rounds, about 20 µs.
   %round = phi i64 [0, %check], [%round.next, %relax]
   %round.next = add i64 %round, 1
   %long = icmp uge i64 %round, 1000
@@ -81,7 +93,7 @@ done:
   ret void
 }
 
-; What XLA's other threads run. They may come late, when all is done and the call is over.
+; The function that XLA's other threads run. They may begin when the work is done and the call is over.
 define internal void @task(ptr %job) {
   call void @work(ptr %job)
   call void @release(ptr %job)
@@ -113,7 +125,8 @@ done:
   ret void
 }
 
-; XLA's threads (XLA_FFI_ThreadPool_NumThreads); one if it has none.
+; Each function of XLA's interface takes the address of a structure: its size, an unused pointer, then the
+; arguments. Returns the number of XLA's threads (XLA_FFI_ThreadPool_NumThreads); one if it has none.
 define internal i64 @thread_count(ptr %api, ptr %context) {
   %count = alloca i64
   store i64 1, ptr %count
@@ -177,14 +190,15 @@ done:
   ret void
 }
 
-; XLA's handler: a call frame in, no error out.
+; The function that XLA calls: it takes a call frame and returns no error. The frame's fields, by their offsets in
+; bytes: 8 extensions, 16 the interface, 24 the context, 40 the arguments, 80 the results.
 define ptr @kernel(ptr %frame) {
 entry:
   %extension.at = getelementptr i8, ptr %frame, i64 8
   %extension = load ptr, ptr %extension.at
   %plain = icmp eq ptr %extension, null
   br i1 %plain, label %call, label %question
-; Asked for the version of the interface (XLA_FFI_Metadata_Extension).
+; XLA asks for the version of the interface (XLA_FFI_Metadata_Extension) when the function is registered: answer 0.3.
 question:
   %kind.at = getelementptr i8, ptr %extension, i64 8
   %kind = load i32, ptr %kind.at
@@ -205,7 +219,8 @@ call:
   %results = getelementptr i8, ptr %frame, i64 80
   %frame.fits = call i1 @has_size(ptr %frame, i64 168)
   br i1 %frame.fits, label %look, label %refuse
-; Arguments, results, the first buffer and the interface's major version: other than expected, nothing is done.
+; Check the sizes of arguments, results and the first buffer, and the interface's major version. If one differs, do
+; nothing: XLA is another version, and the probe of `obstacle` finds wrong numbers.
 look:
   %arguments.fit = call i1 @has_size(ptr %arguments, i64 40)
   %results.fit = call i1 @has_size(ptr %results, i64 40)
@@ -224,6 +239,7 @@ look:
   br i1 %fit, label %prepare, label %refuse
 refuse:
   ret ptr null
+; The first size of the first argument is the number of instances. Round up to whole blocks.
 prepare:
   %context.at = getelementptr i8, ptr %frame, i64 24
   %context = load ptr, ptr %context.at
@@ -241,6 +257,7 @@ prepare:
   %result.count.at = getelementptr i8, ptr %results, i64 16
   %result.count = load i64, ptr %result.count.at
   %count = add i64 %argument.count, %result.count
+  ; Make the job. Its size in bytes is the address behind its last array, in a job at address 0.
   %end = getelementptr %Job, ptr null, i32 0, i32 5, i64 %count
   %bytes = ptrtoint ptr %end to i64
   %job = call ptr @malloc(i64 %bytes)
@@ -255,6 +272,7 @@ prepare:
   call void @copy_addresses(ptr %buffers, i64 %argument.count, ptr %given.at)
   %returned.at = getelementptr %Job, ptr %job, i32 0, i32 5, i64 %argument.count
   call void @copy_addresses(ptr %outputs, i64 %result.count, ptr %returned.at)
+  ; Ask for as many threads as XLA has, but not for more than the blocks are worth.
   %threads = call i64 @thread_count(ptr %api, ptr %context)
   %per.thread = load i64, ptr @blocks_per_thread
   %useful = udiv i64 %blocks, %per.thread
@@ -268,6 +286,7 @@ ask:
   call void @ask_for_help(ptr %api, ptr %context, ptr %job)
   %helpers.next = add i64 %helpers, 1
   br label %help
+; Work like the others, and return when all blocks have ended.
 start:
   call void @work(ptr %job)
   call void @wait_for(ptr %job, i64 %blocks)

@@ -31,7 +31,7 @@ MACHINES = ("x86_64", "aarch64")
 """Processors that a kernel can be written for."""
 
 TEXT = _ASSETS.joinpath("xla_call.ll").read_text("utf-8")
-"""What all kernels share: the function that XLA calls, and what its threads run."""
+"""The text that all kernels share: the function that XLA calls, and the work of its threads."""
 
 BLOCK_PARAMETERS = ("ptr job", "u64 index", "ptr scratch")
 """Parameters of the function that computes a block."""
@@ -148,8 +148,8 @@ def step_functions(kernel: Kernel, lanes: int) -> list[LlvmWriter]:
     """
     sizes = [math.prod(shape) for shape in kernel.argument_shapes]
     results = [math.prod(result.shape) for result in kernel.results()]
-    # The tile begins with the rows of the step, or its results; the arguments follow, if what comes
-    # before or after the step reads them too.
+    # The tile begins with the rows of the step's arguments, where it also leaves its results. If
+    # there are parts before the first step and after the last, the kernel's own arguments follow.
     step_rows = range(sum(array.size for array in kernel.program.inputs))
     stepped = range(sum(array.size for array in kernel.program.outputs))
     start = 0 if kernel.before is None else max(len(step_rows), len(stepped))

@@ -104,7 +104,7 @@ def inspect(kernel: Kernel) -> Compiled:
 def launch(kernel: Kernel, leaves: Sequence[Array]) -> list[Array]:
     """Run a kernel, as specified by `onekernel.kernel.Backend`."""
     # Run one thread for each instance. If the last block has threads left over, the PTX must
-    # contain the number of instances, so that they store nothing.
+    # contain the number of instances, so that the threads beyond it store nothing.
     instances = leaves[0].shape[0]
     words = _shared_words(kernel, target_architecture())
     threads = threads_in_block(instances, words)

@@ -38,7 +38,7 @@ def _check_places(count: int) -> None:
 def _clipped(graph: ExprGraph, start: Scalar, last: int) -> Scalar:
     """Return a start index, moved into 0 ... last."""
     if is_constant(start):
-        return min(max(int(start), 0), last)
+        return np.int32(min(max(int(start), 0), last))
     kind = start.dtype.type
     return graph.apply("min", graph.apply("max", start, kind(0)), kind(last))
 
@@ -46,7 +46,7 @@ def _clipped(graph: ExprGraph, start: Scalar, last: int) -> Scalar:
 def _is_inside(graph: ExprGraph, start: Scalar, last: int) -> Scalar:
     """Return whether a start index is in 0 ... last."""
     if is_constant(start):
-        return np.bool_(0 <= start <= last)
+        return np.bool_(0 <= int(start) <= last)
     kind = start.dtype.type
     above = graph.apply("ge", start, kind(0))
     return graph.apply("and", above, graph.apply("le", start, kind(last)))
@@ -68,7 +68,7 @@ def _read_window(
         at = _clipped(graph, start, last)
         # The usual case: a constant index only picks scalars.
         if is_constant(at):
-            x = np.take(x, range(at, at + size), axis)
+            x = np.take(x, range(int(at), int(at) + size), axis)
             continue
         x = _read_along(graph, x, axis, at, last, size)
     return x
@@ -147,9 +147,9 @@ def _write_window(
             if not is_constant(start):
                 is_here = graph.apply("and", is_here, graph.apply("eq", start, start.dtype.type(i)))
         # Each number under the window is chosen between old and new.
-        for index in np.ndindex(*update.shape):
-            at = tuple(a + b for a, b in zip(offset, index, strict=True))
-            new = combine(x[at], update[index])
+        for index, number in zip(np.ndindex(*update.shape), update.ravel(), strict=True):
+            at: tuple[int, ...] = tuple(a + b for a, b in zip(offset, index, strict=True))
+            new = combine(x[at], number)
             result[at] = graph.select(is_here, result[at], new)
     return result
 

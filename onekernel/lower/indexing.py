@@ -28,8 +28,8 @@ def full_array(shape: Sequence[int], make: Callable[[], Scalar]) -> ScalarArray:
     return scalar_array((make() for _ in range(math.prod(shape))), shape)
 
 
-def scalar_array(scalars: Iterable[Scalar], shape: Sequence[int]) -> ScalarArray:
-    """Return an array of the given shape from its elements in row-major order."""
+def scalar_array(scalars: Iterable[object], shape: Sequence[int]) -> ScalarArray:
+    """Return an array of the given shape from its elements, scalars or random keys, row by row."""
     elements = list(scalars)
     array = np.empty(len(elements), object)
     # Assigned to a slice, the elements stay objects; `np.array` would look into them.

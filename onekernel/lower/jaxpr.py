@@ -708,7 +708,7 @@ class _JaxprLowering:
                     is_first = self._graph.apply("eq", best, best)
                     wins = self._graph.apply("or", wins, self._graph.apply("and", is_nan, is_first))
                 best = self._graph.select(wins, best, scalar)
-                places[row] = self._graph.select(wins, places[row], kind(i))
+                places[row] = self._graph.select(wins, places.item(*row), kind(i))
         return places
 
     _argmin = functools.partialmethod(_arg_extreme, "lt")
@@ -818,7 +818,9 @@ def _matched(
             pending += missing
             continue
         # All operands are there: record the operation once more, on them.
-        found[key] = graph.repeat(pair[1], operands)
+        _, operation = pair
+        assert not is_constant(operation)
+        found[key] = graph.repeat(operation, operands)
         pending.pop()
     return found[_pair_key((before, after))]
 
@@ -883,7 +885,7 @@ def _at(array: ScalarArray, i: int) -> ScalarArray:
     return array[i : i + 1].reshape(array.shape[1:])
 
 
-def _lowest(equation: JaxprEqn) -> Scalar:
+def _lowest(equation: JaxprEqn) -> np.floating:
     dtype = dtype_of(equation.outvars[0])
     if dtype.kind != "f":
         raise UnsupportedError(f"the extreme of {dtype}")

@@ -33,7 +33,8 @@ def unroll_linear_algebra(function: _F) -> _F:
     """Return a function whose small Cholesky factors and triangular systems are not library calls.
 
     The function is traced, the operations are replaced wherever they are, also in loops, branches
-    and calls, and what results is evaluated. It can be transformed like the function itself.
+    and calls, and the new jaxpr is evaluated. The result can be transformed (`jax.jit`, `jax.vmap`,
+    `jax.grad`) like the function itself.
 
     Args:
       function: a function of pytrees of arrays that returns such a pytree.

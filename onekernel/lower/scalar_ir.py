@@ -16,13 +16,19 @@ an approximate graph records these (see `_APPROXIMATE`).
 import dataclasses
 import functools
 from collections.abc import Callable, Hashable, Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple, Union, cast
 
 import numpy as np
 
 from onekernel.errors import UnsupportedError
 
-Scalar = Any
+if TYPE_CHECKING:
+    from typing_extensions import TypeIs
+
+Constant = np.bool_ | np.integer | np.floating
+"""A scalar whose value is known while the program is recorded."""
+
+Scalar = Union["Expr", Constant]
 """An `Expr`, or a NumPy scalar if the value is a constant."""
 
 
@@ -56,7 +62,7 @@ class Loop:
     """The carried values at the start of the first iteration."""
     updated: list[Scalar] = dataclasses.field(default_factory=list)
     """The carried values at the end of an iteration, as functions of `carries`."""
-    condition: Scalar = None
+    condition: Scalar = dataclasses.field(init=False)
     """Whether there is another iteration, as a function of `carries`."""
     results: list[Scalar] = dataclasses.field(default_factory=list)
     """The results of the loop, as functions of the `carries` for which `condition` is false."""
@@ -74,7 +80,7 @@ class Branch:
     if_true: list[Scalar]
 
 
-def is_constant(x: Scalar) -> bool:
+def is_constant(x: Scalar) -> "TypeIs[Constant]":
     """Return whether a scalar is a constant."""
     return not isinstance(x, Expr)
 
@@ -114,7 +120,7 @@ def _bitcast(x: np.ndarray) -> np.ndarray:
 
 
 def _reduced(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return how many quarter turns, modulo 4, are nearest to an angle, and what is left."""
+    """Return an angle's nearest number of quarter turns, modulo 4, and the angle that is left."""
     # In float64, π/2 is exact to far more digits than the result needs.
     wide = x.astype(np.float64)
     angle = np.arctan2(np.sin(wide), np.cos(wide))
@@ -227,7 +233,7 @@ class ExprGraph:
         # NumPy computes an operation on constants at once.
         if not recorded:
             with np.errstate(all="ignore"):
-                return np.asarray(EVALUATE[op](*operands))[()]
+                return cast(Constant, np.asarray(EVALUATE[op](*operands))[()])
         operand_dtype = recorded[0].dtype
         # All operands have one dtype: jaxprs convert numbers explicitly, and the generated code
         # cannot.
@@ -267,7 +273,7 @@ class ExprGraph:
     def convert(self, x: Scalar, dtype: np.dtype) -> Scalar:
         """Convert a scalar to another dtype."""
         if is_constant(x):
-            return convert_constant(np.asarray(x), dtype)[()]
+            return cast(Constant, convert_constant(np.asarray(x), dtype)[()])
         # JAX has no 64-bit types by default, so no other dtypes occur.
         if dtype not in _DTYPES:
             raise UnsupportedError(f"a conversion to {dtype}")
@@ -303,7 +309,7 @@ class ExprGraph:
         ]
 
     def branch(
-        self, condition: Expr, if_false: Sequence[Scalar], if_true: Sequence[Scalar]
+        self, condition: Scalar, if_false: Sequence[Scalar], if_true: Sequence[Scalar]
     ) -> list[Scalar]:
         """Record a branch, of which only the selected side is computed, and return its results."""
         # The callers have recorded both sides, so the branch has a larger index than they have.
@@ -514,10 +520,10 @@ def _simplify_inverse(op: str) -> Callable[..., Scalar | None]:
     return lambda graph, dtype, x: x.operands[0] if x.op == op else None
 
 
-def _simplify_not(graph: ExprGraph, dtype: np.dtype, x: Scalar) -> Scalar | None:
+def _simplify_not(graph: ExprGraph, dtype: np.dtype, x: Expr) -> Scalar | None:
     if dtype == _BOOL:
         return x.operands[0] if x.op == "not" else None
-    return graph.apply("xor", x, np.array(-1).astype(dtype)[()])
+    return graph.apply("xor", x, cast(Constant, np.array(-1).astype(dtype)[()]))
 
 
 SIMPLE_POWERS = {1.0, 2.0, 0.5}
@@ -823,7 +829,7 @@ _SIMPLIFY: dict[str, Callable[..., Scalar | None]] = {
 
 def _approximate_div(graph: ExprGraph, dtype: np.dtype, x: Scalar, y: Scalar) -> Scalar | None:
     """Divide by a product with the reciprocal, which all quotients of one divisor share."""
-    # Keep what needs no reciprocal at all, such as a quotient by a constant.
+    # Some quotients need no reciprocal at all, such as those by a constant.
     simplified = _simplify_div(graph, dtype, x, y)
     if simplified is not None or dtype != _FLOAT:
         return simplified

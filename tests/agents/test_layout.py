@@ -1,4 +1,4 @@
-"""Parameters and moments as vectors: all of them are there once, on devices and on the host."""
+"""Parameters and moments as vectors: each is in them once, on devices and on the host."""
 
 import jax
 import jax.numpy as jnp

@@ -118,7 +118,7 @@ def test_in_the_place_of_kernels_xla_takes_and_returns_their_vectors():
 
     with collect() as found:
         ours, totals = update(vectors)
-    # With every program that contains it, for the cache of programs keeps what was reported.
+    # Tracing a program reports the fallback, so that the cache can store it with the program.
     assert found == [("ppo.update", "of a test")]
     assert jax.tree.structure(ours) == jax.tree.structure(vectors)
     *theirs, expected = jax.jit(xla.learner.update)(*tree, statistics, data, key)

@@ -1,4 +1,4 @@
-"""The training step: stock Brax's, number by number, and what it does where a number is none."""
+"""The training step: stock Brax's, number by number, and what it does with NaN."""
 
 import contextlib
 import functools
@@ -136,7 +136,7 @@ def epoch_keys(seed):
 VARIANTS = [
     (Gliding, "ADAPTIVE_KL", None),
     pytest.param((Gliding, "NONE", None), marks=pytest.mark.slow),
-    # Through the real robot, which compiles so long.
+    # With the real robot, which takes long to compile.
     pytest.param((JetBotEnv, "ADAPTIVE_KL", 1.0), marks=pytest.mark.slow),
 ]
 
@@ -404,7 +404,7 @@ def test_where_every_gradient_is_bad_nothing_moves_by_a_bit():
     assert all(np.isfinite(float(value)) for value in metrics.values())
 
 
-# Worlds that blow up, a falling step size, and sums that outlive a call.
+# Non-finite states, a falling step size, and sums over several calls.
 
 FUSE = 5  # environment steps that a brittle world lasts; too few to reach a goal
 
@@ -505,10 +505,10 @@ def test_how_steps_are_cut_into_calls_does_not_matter(brittle, begun, at_once):
 def test_a_restart_empties_the_tally_and_nothing_else(brittle, begun):
     earlier, _ = brittle.advance(begun, 2)
     added, _ = brittle.advance(earlier, 1)
-    anew, _ = brittle.advance(earlier, 1, restart=True)
-    assert_same_bits(anew.replace(tally=0), added.replace(tally=0))
-    assert float(anew.sums["training_steps"]) == 1
-    for name, value in anew.sums.items():
+    restarted, _ = brittle.advance(earlier, 1, restart=True)
+    assert_same_bits(restarted.replace(tally=0), added.replace(tally=0))
+    assert float(restarted.sums["training_steps"]) == 1
+    for name, value in restarted.sums.items():
         total = float(earlier.sums[name]) + float(value)
         assert float(added.sums[name]) == pytest.approx(total, rel=1e-6), name
     no_steps, nan_dump = brittle.advance(earlier, 0, restart=True)
@@ -523,7 +523,7 @@ BAD_UPDATES = 1 / 50
 
 
 class Doomed(GoalTask):
-    """The goal task, in which the reward of some goals, once the robot is off, is no number."""
+    """The goal task; the reward of some goals is NaN once the robot has left the start."""
 
     def reward(self, before, after, goal, action):
         reward, terms = super().reward(before, after, goal, action)

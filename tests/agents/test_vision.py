@@ -82,7 +82,7 @@ HIDDEN = (16, 8)
 
 
 class Sizes(Wrapper):
-    """Stands where the loss needs no environment but its sizes."""
+    """A stand-in for an environment, of which the loss needs the sizes only."""
 
     observation_min_std, action_size = None, 2
 

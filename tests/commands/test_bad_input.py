@@ -24,7 +24,7 @@ from jetbot_mjx.runs.run_dir import stored_config
 from jetbot_mjx.training import ppo_trainer
 
 HEX = "0x" + "f" * 5000
-"""A number that Python reads, and refuses to write."""
+"""An integer that Python parses, but refuses to print for its length."""
 
 
 def laughs(levels, alias=", &a{n} [{list}]", first="&a0 [x, x]"):

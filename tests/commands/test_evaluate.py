@@ -267,7 +267,7 @@ def test_ranges_of_a_file_are_evaluated_beside_the_preset(judged, tmp_path):
     values = json.loads((tmp_path / "report" / "report.json").read_text())
     assert values["ranges"] == {"motor_gain": [0.1, 0.11]}
     assert values["policy"] == json.loads(first["report.json"])["policy"]
-    # A tenth of the speed is not enough for any of the ways.
+    # A robot with a tenth of the speed reaches no goal in time.
     assert values["randomized"]["success_rate"] == 0.0 < values["policy"]["success_rate"]
     there = values["mujoco"]
     assert there["randomized"]["success_rate"] == 0.0 < there["policy"]["success_rate"]

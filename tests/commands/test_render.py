@@ -300,9 +300,7 @@ def test_a_wanted_backend_is_the_only_one_tried(monkeypatch):
         ("software", "'software': there is no such back end"),
     ],
 )
-def test_a_backend_that_is_not_there_keeps_nobody_from_what_needs_none(
-    tmp_path, monkeypatch, wanted, said
-):
+def test_what_needs_no_opengl_works_without_a_back_end(tmp_path, monkeypatch, wanted, said):
     (tmp_path / "OpenGL.py").write_text("None.glGetError", "utf-8")  # what PyOpenGL does
     monkeypatch.setenv("MUJOCO_GL", wanted)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path), prepend=os.pathsep)

@@ -1,4 +1,4 @@
-"""`replay` refuses what is no NaN dump."""
+"""`replay` refuses files that are not NaN dumps."""
 
 import json
 import os

@@ -75,7 +75,7 @@ def test_environments_that_devices_cannot_share_are_refused(num_envs, batch_size
 def test_brax_s_trainer_takes_every_configuration_of_the_package(name):
     config = load_config(name, ["trainer=brax"])
     assert (config.ppo.normalizer, config.ppo.network.shared_cnn) == ("brax", False)
-    # What is given stays: a default is none.
+    # A setting that is given is not replaced by a default.
     with pytest.raises(ConfigError, match=r"ppo\.normalizer = 'physical' is not supported"):
         load_config(name, ["trainer=brax", "ppo.normalizer=physical"])
     assert load_config(name).ppo.normalizer == "physical"

@@ -363,7 +363,7 @@ def test_a_tracker_takes_no_repeats_and_no_rubbish():
         inbox.append(content)
         assert tracker.read(0.01 * (index + 1)) == first
     assert tracker.rejected == len(rubbish)
-    # One that was restarted counts its time anew.
+    # A restarted tracker counts its time from zero.
     inbox.append(datagram(0.1, x=0.4))
     assert tracker.read(0.7).x == 0.4
 
@@ -442,7 +442,7 @@ def test_poses_stay_finite_under_random_datagrams(signs, key):
         inbox.append(mutated(rng, index))
         if signs and index % 2:
             inbox[0] = signed(inbox[0])
-        # So long apart now and then that time is counted anew.
+        # Sometimes so long apart that the clock counts as restarted.
         pose = tracker.read(0.02 * index + index // 50)
         changes += pose is not last
         last = pose

@@ -53,7 +53,7 @@ TRAININGS = (
     "jetbot --run-dir runs/mine",
     "jetbot --seeds 5 --run-dir runs/five",
 )
-"""Of which the others speak."""
+"""The trainings whose runs the other commands name."""
 
 
 DOCUMENTED = {
@@ -361,7 +361,7 @@ def test_no_kind_of_command_is_left_out():
     elsewhere |= {("scp",), ("git", "clone"), ("cd",)}
     covered = {"train", "evaluate", "render", "replay", "play", "plan", "export", "sim2real"}
     covered |= {"new_task", "check_env", "pretrained", "jetbot_mjx"}
-    # Listed and searched by tests of their own: test_find_run.py, test_tune_command.py.
+    # Tested by test_list_configs.py, test_list_runs.py and test_tune.py.
     covered |= {"configs", "runs", "tune"}
     for text, (_, words) in DOCUMENTED.items():
         bare = [word for word in words if not re.fullmatch(r"[A-Z_]+=.*", word)]

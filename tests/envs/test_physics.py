@@ -154,7 +154,8 @@ def test_mjx_follows_c_mujoco(driver, on_floor):
         assert distance.max() < POSITION_TOLERANCE
         assert turned.max() < YAW_TOLERANCE
     else:
-        # Some robots slide so that noise alone decides where they end: no more of ours may part.
+        # Where some robots slide to depends on noise alone: count those that end elsewhere, of ours
+        # and of C MuJoCo's own under noise.
         noisy, _ = apart(drive_in_c(reference, first, ctrl, substeps, NOISE).qpos, theirs.qpos)
         astray, allowed = (int((x > ASTRAY).sum()) for x in (distance, noisy))
         print(
@@ -169,7 +170,7 @@ def test_mjx_follows_c_mujoco(driver, on_floor):
 
 
 def single_steps_agree(case, env, mjx_model, theirs, ctrl):
-    """From every state of the converged path one control step ends where it does there."""
+    """Check single control steps, from each state of the converged path to the next one."""
     states = jax.tree.map(lambda x: jnp.float32(x[:-1].reshape(-1, *x.shape[2:])), theirs)
     step = env.with_model(mjx_model).step_physics
     ahead = jax.jit(jax.vmap(step))(states, ctrl[1:].reshape(-1, 2))
@@ -234,7 +235,8 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     reason="XLA takes no kernels here",
 )
 def test_another_solver_is_another_kernel():
-    # Iterations are no array of MJX's model: what only compares arrays takes them for the same.
+    # The number of iterations is not among the arrays of MJX's model, so that a key made of the
+    # arrays alone would be the same.
     env = make_env(parse_config({}))
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
     option = env.mjx_model.opt

@@ -47,7 +47,7 @@ def pytest_terminal_summary(terminalreporter):
     costs = collections.Counter()
     for reports in terminalreporter.stats.values():
         for report in reports:
-            # Of setting up, running and tearing down; other entries are no reports of tests.
+            # The reports on setting up, running and tearing down; other entries lack `cpu_seconds`.
             if hasattr(report, "cpu_seconds"):
                 costs[report.nodeid] += report.cpu_seconds
     if costs:

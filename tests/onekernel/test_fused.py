@@ -38,7 +38,7 @@ MOVES = {
     *("bitcast_convert", "broadcast_in_dim", "reshape", "transpose"),
     *("compare", "constant", "convert", "custom_call"),
 }
-"""What brings numbers to a kernel and from it, by the name of the operation."""
+"""Operations that only move numbers to a kernel and from it, by name."""
 
 
 def is_one_kernel(function, *arguments, platforms=None):
@@ -404,7 +404,7 @@ def test_what_is_no_kernel_can_be_differentiated():
 NO_NUMBERS = np.float32([[1, np.nan], [np.inf, 2], [-np.inf, np.nan], [0.5, -2], [30.0, 1e-3]])
 
 
-def test_what_is_no_number_reaches_the_results():
+def test_nan_reaches_the_results():
     def function(x):
         guarded = jnp.where(jnp.isfinite(x), x, 7.0)
         extremes = jnp.maximum(x[0], x[1]), jnp.minimum(x, 0.25), jnp.clip(x, -1, 1), x.max()
@@ -418,7 +418,7 @@ def test_what_is_no_number_reaches_the_results():
 
 
 @pytest.mark.parametrize("where", ["angle", "action", "mass"])
-def test_what_is_no_number_reaches_what_comes_after_physics(drive, where):
+def test_nan_reaches_what_comes_after_physics(drive, where):
     robot, action, mass = situations(len(NO_NUMBERS))
     robot = robot._replace(is_on=np.ones(len(NO_NUMBERS), bool))
     if where == "angle":
@@ -458,7 +458,7 @@ def counted(monkeypatch):
     return lowered
 
 
-def test_the_same_shapes_are_lowered_once_and_others_anew(monkeypatch):
+def test_each_set_of_shapes_is_lowered_once(monkeypatch):
     lowered = counted(monkeypatch)
     run = fuse(lambda tree, n: (tree["x"] * n, tree["flag"]))
 
@@ -563,7 +563,7 @@ def environment(name, root):
 
 
 def spoilt(state):
-    """A batch of states in which the state of one robot is no number, and the goal of another."""
+    """A batch of states in which one robot's state is NaN, and the goal of another one."""
     physics, goal = state.pipeline_state, state.goal
     return state.replace(
         pipeline_state=physics.replace(qpos=physics.qpos.at[3, 1].set(jnp.inf)),

@@ -1,4 +1,4 @@
-"""What one kernel may not assume: that numbers are finite, that values are numbers."""
+"""What one kernel may not assume: that numbers are finite, or that bits are those of numbers."""
 
 import jax
 import jax.numpy as jnp
@@ -89,7 +89,7 @@ class WeighsWithZero(GoalTask):
         return reward + 0.0 * jnp.log(action[0]), terms
 
 
-def test_a_reward_that_is_no_number_ends_the_episode():
+def test_a_nan_reward_ends_the_episode():
     config = parse_config({"task": {"observation": "egocentric"}})
     env = make_env(config, task_class=WeighsWithZero)
     batch = wrap_for_training(env, 40)
@@ -103,7 +103,7 @@ def test_a_reward_that_is_no_number_ends_the_episode():
     np.testing.assert_array_equal(ours.key, theirs.key)
 
 
-def test_whole_numbers_keep_their_bits_where_those_are_no_number():
+def test_integers_keep_their_bits_where_these_are_a_nan():
     """As floats, some are NaNs of the kind that a conversion would change."""
     numbers = np.int32([-5_000_000, 0x7F800001, 0x7FBFFFFF, -1])
     ours = jax.jit(jax.vmap(fuse(lambda x: (x, jnp.asarray(numbers)))))(np.ones(5))
@@ -120,7 +120,7 @@ def test_nothing_divided_by_a_whole_number_is_what_jax_makes_of_it():
     np.testing.assert_array_equal(jax.vmap(one)(np.int32([0, 3])), [-1, 0])
 
 
-def test_other_settings_and_weak_types_are_lowered_anew():
+def test_other_settings_and_weak_types_are_lowered_again():
     key = jax.random.PRNGKey(1)
     draw = fuse(lambda key: jax.random.bits(key, (2,)))
     draw(key)

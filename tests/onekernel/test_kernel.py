@@ -1,4 +1,4 @@
-"""One kernel for all robots: its batches, its types, its platforms. What it computes: test_llvm."""
+"""One kernel for all robots: its batches, its types, its platforms."""
 
 import jax
 import jax.numpy as jnp

@@ -1,4 +1,4 @@
-"""Kernels that XLA calls on a CPU: batches, devices, files kept. What one computes: test_llvm."""
+"""Kernels that XLA calls on a CPU: batches, devices, and files that are kept of them."""
 
 import functools
 import json

@@ -1,4 +1,4 @@
-"""What is written for CPUs, compiled and called as XLA does it; XLA itself: test_cpu."""
+"""Kernels for CPUs, compiled and called as XLA does it; `test_llvm_backend` has XLA call them."""
 
 import ctypes
 

@@ -1,4 +1,4 @@
-"""Functions taken apart into numbers do what JAX does with them."""
+"""Functions lowered to scalars compute what JAX computes."""
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,7 @@ VECTOR = jax.ShapeDtypeStruct((4,), jnp.float32)
 
 def in_full_precision(function, x):
     """What JAX makes of it for every robot, without a GPU's TF32."""
-    # Without these, XLA writes an operand out anew for every use of it: in `large`, without end.
+    # Without these, XLA writes an operand out again for every use of it: in `large`, without end.
     emitters = ("xla_cpu_use_fusion_emitters", True)
     options = dict([emitters]) if xla_options._is_known(*emitters) else {}
     with jax.default_matmul_precision("highest"):
@@ -425,7 +425,7 @@ def test_loops_of_whole_numbers_and_truths():
     assert {loop.loop.carries[place].dtype.kind for place in loop.places} == set("fib")
 
 
-def test_a_loop_in_a_loop_makes_its_trips_anew_each_time():
+def test_a_loop_in_a_loop_begins_again_in_each_trip():
     def function(x):
         def body(y):
             (inner,) = repeated(lambda z: (z * 0.5 + y,), x[1:] + y[0], y)
@@ -496,8 +496,8 @@ def test_of_many_cases_each_is_a_side_of_its_own():
     assert branches[2] in branches[1].if_true.items
 
 
-def test_a_loop_holds_up_nobody_who_does_not_need_it():
-    # Below zero it would never end: with a branch around it no robot comes to that.
+def test_a_loop_is_skipped_by_robots_that_do_not_need_it():
+    # The loop would never end for a number below zero; a branch around it skips those robots.
     def doubled(x):
         doubling = jax.lax.while_loop(lambda y: (y < 100).all(), lambda y: 2 * y, x)
         return jax.lax.cond(x[1] > 2, large, lambda x: x, doubling)
@@ -514,8 +514,8 @@ def test_a_loop_holds_up_nobody_who_does_not_need_it():
     )
 
 
-def test_a_loop_in_a_loop_holds_up_nobody_who_is_done():
-    # For y = 0 the inner loop would never end: who comes to that is done with the outer one.
+def test_a_robot_that_is_done_does_not_enter_an_inner_loop():
+    # The inner loop would never end for y = 0; a robot that reaches 0 has left the outer loop.
     def body(y):
         return y - (jax.lax.while_loop(lambda z: z < 8, lambda z: z + y, 0.0) >= 8)
 

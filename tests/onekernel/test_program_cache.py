@@ -1,4 +1,4 @@
-"""Compiled programs that outlive their process: found untraced, and only where they belong."""
+"""Compiled programs that outlive their process: found without tracing, by their own key only."""
 
 import os
 import shutil
@@ -167,7 +167,7 @@ def test_another_program_is_not_taken_for_it(kept, options, key, name):
         lambda content: b"\0" * len(content),
     ],
 )
-def test_a_damaged_file_is_compiled_anew_and_replaced(kept, damage):
+def test_a_damaged_file_is_compiled_again_and_replaced(kept, damage):
     whole = kept.read_bytes()
     kept.write_bytes(damage(whole))
     again = ProgramCache({}, kept.parent, KEY)
@@ -176,7 +176,7 @@ def test_a_damaged_file_is_compiled_anew_and_replaced(kept, damage):
     assert twice(again.compile("double", never)) == [0.0, 2.0, 4.0]
 
 
-def test_one_that_the_device_no_longer_loads_is_compiled_anew(kept, monkeypatch):
+def test_a_program_that_the_device_cannot_load_is_compiled_again(kept, monkeypatch):
     def refuse(*kept, **devices):
         raise jax.errors.JaxRuntimeError("INVALID_ARGUMENT: another driver")
 

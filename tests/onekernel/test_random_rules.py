@@ -160,7 +160,7 @@ def test_others_are_refused_and_drawn_by_jax(name):
 @pytest.mark.parametrize("impl", ["rbg", "unsafe_rbg"])
 def test_keys_of_other_generators_are_refused_and_used_by_jax(name, impl):
     def draw(key):
-        # Of one function JAX itself would take what it traced for the generator before.
+        # A function of its own: JAX would reuse its trace of a function with another generator.
         return EXACT[name](key)
 
     with jax.default_prng_impl(impl):

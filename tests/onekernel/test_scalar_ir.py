@@ -1,4 +1,4 @@
-"""Arithmetic that is written down: what is known is done, what is shared is shared."""
+"""Recorded arithmetic: constants are folded, and a repeated operation is recorded once."""
 
 import math
 
@@ -135,7 +135,7 @@ def test_approximate_quotients_share_the_reciprocal():
     given = (x, np.float32([6])), (y, np.float32([-3])), (z, np.float32([4]))
     assert [evaluate(one, *given)[0] for one in quotients] == [1.5, -0.75, 0.25]
     assert graph.count == 3 + 3
-    # Whole numbers are divided as ever, and so is what is known.
+    # Integers are still divided, and a division by a constant still becomes a product.
     whole = graph.input(np.int32)
     assert evaluate(graph.apply("div", whole, np.int32(4)), (whole, np.int32([-7]))) == [-1]
     assert graph.apply("div", x, TWO).op == "mul"

@@ -1,4 +1,4 @@
-"""Where operations are done: before loops that do not matter, in branches that need them."""
+"""Where operations are placed: before loops that do not change them, in branches that use them."""
 
 import numpy as np
 import pytest

@@ -116,6 +116,26 @@ def test_files_that_are_named_exist(page):
     assert [name for name in named if not (ROOT / name).is_file()] == []
 
 
+def test_the_design_page_counts_and_lists_the_rooms():
+    rooms = {path.parent.name for path in (ROOT / "jetbot_mjx").glob("*/__init__.py")}
+    page = PAGES["design.md"]
+    (count,) = re.findall(r"is (\d+) rooms", page)
+    assert int(count) == len(rooms)
+    assert set(re.findall(r"^\| \[`(\w+)`\]", page, re.MULTILINE)) == rooms | {"onekernel"}
+
+
+def test_the_stages_of_a_training_step_are_where_the_page_says():
+    """Each path, and each function or class behind it, of the last table on the kernels' page."""
+    table = PAGES["kernels.md"].partition("## Where it is")[2]
+    found = re.findall(r"`([\w/]+\.py)`(?:: ((?:`[\w.]+`(?:, )?)+))?", table)
+    assert len(found) > 20
+    for path, names in found:
+        folder = ROOT if path.startswith(("onekernel/", "tests/")) else ROOT / "jetbot_mjx/agents"
+        code = (folder / path).read_text("utf-8")
+        for name in re.findall(r"[\w.]+", names):
+            assert re.search(rf"(def|class) {name.rpartition('.')[2]}\b", code), f"{path}: {name}"
+
+
 @pytest.mark.parametrize("page", PAGES)
 def test_lines_are_short(page):
     long = [
@@ -563,6 +583,21 @@ def test_blocks_that_are_said_to_run_do(page, reader, monkeypatch, capsys):
         if block.startswith("# runs\n"):
             exec(compile(block, page, "exec"), namespace)
     assert capsys.readouterr().out
+
+
+def test_the_kernels_page_shows_what_its_first_block_prints(capsys):
+    page = PAGES["kernels.md"]
+    exec(compile(next(blocks(page, "python")), "kernels.md", "exec"), {})
+    (shown,) = blocks(page, "llvm")
+    assert capsys.readouterr().out.strip() == shown.strip()
+
+
+def test_the_change_of_the_loss_on_the_kernels_page_fits_the_code():
+    agents = ROOT / "jetbot_mjx/agents"
+    files = agents / "fused/sample_loss.py", agents / "loss.py"
+    for change, file in zip(blocks(PAGES["kernels.md"], "diff"), files, strict=True):
+        kept = [line[1:] for line in change.splitlines() if not line.startswith("+")]
+        assert "\n".join(kept) in file.read_text("utf-8")
 
 
 def test_the_steps_to_a_task_are_those_of_the_whole_file():

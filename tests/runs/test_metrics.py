@@ -147,7 +147,7 @@ def test_jsonl_goes_on_after_its_history_and_drops_the_rest(logged, last):
     assert again[-1].metrics == {"loss/total": 1.0}
 
 
-def test_a_file_that_is_its_history_is_not_written_anew(logged):
+def test_a_file_that_equals_its_history_is_not_written_again(logged):
     inode = logged.stat().st_ino
     JsonlSink(logged, read_history(logged, 1024)).close()
     assert logged.stat().st_ino == inode
@@ -269,7 +269,7 @@ def test_tensorboard_plays_the_videos_of_evaluations_and_keeps_them_on_resume(tm
     gifs = {steps: path.with_suffix(".gif").read_bytes() for steps, path in paths.items()}
     assert videos(folder) == [(steps, gif, (8, 4)) for steps, gif in gifs.items()]
     assert gifs[0].startswith(b"GIF")
-    # A training that resumes before the last one makes that anew.
+    # A training that resumes before the last evaluation makes that evaluation again.
     TensorBoardSink(folder, HISTORY).close()
     assert videos(folder) == [(steps, gifs[steps], (8, 4)) for steps in (0, 512)]
 
@@ -328,7 +328,7 @@ def test_compiling_is_counted_and_running_is_not(clock):
     clock.lap()
     double(one)
     assert clock.lap() > 0
-    assert clock.lap() == 0  # a lap starts anew
+    assert clock.lap() == 0  # a lap starts at zero
     double(two)
     assert clock.lap() == 0
 

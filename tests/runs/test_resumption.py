@@ -1,4 +1,4 @@
-"""Stopped and resumed is never stopped; what is damaged is skipped; what cannot go on says so.
+"""A resumed training equals one that was never stopped; damaged checkpoints are skipped.
 
 All trainings here are of the smoke configuration, 16 training steps of 4,096 environment steps,
 with a report after every fourth: each is compared to the smoke run, which was never stopped.

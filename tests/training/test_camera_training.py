@@ -102,7 +102,7 @@ def test_a_policy_takes_what_it_was_trained_on_and_nothing_else(run):
     assert actions.shape == (5, 2)
     one = policy({PIXELS: images[0], NUMBERS: numbers[0]})
     np.testing.assert_allclose(one, actions[0], rtol=1e-5, atol=1e-6)
-    # It looks.
+    # The action depends on the image.
     assert not np.array_equal(policy({PIXELS: images[:, ::-1], NUMBERS: numbers}), actions)
 
     wrong = {

@@ -73,7 +73,7 @@ class Ended:
             process.kill()
         self.code = process.returncode
         self.told = [json.loads(line) for line in re.findall(r"^told: (.*)$", self.out, re.M)]
-        # The collectives of a CPU tell of themselves.
+        # Gloo, which a CPU's collectives use, prints lines of its own.
         self.said = re.sub(r"^(told: |\[Gloo\]|Failed to import ).*\n", "", self.out, flags=re.M)
         self.complained = re.sub(r"^\[Gloo\].*\n", "", self.err, flags=re.M)
 

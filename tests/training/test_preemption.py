@@ -149,7 +149,7 @@ def test_compiling_before_the_first_checkpoint_it_does_not_wait_for_the_compiler
     assert process.stderr == f"\nSIGINT: ending\n{told}\n"
     assert (tmp_path / "run" / "train.log").read_text().endswith(f"  {told}\n")
     assert checkpoint_steps(tmp_path / "run") == []
-    # It is true.
+    # The same command does start from the beginning.
     assert torture.differences(undisturbed, finish(tmp_path / "run")) == []
 
 

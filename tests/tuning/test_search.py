@@ -68,7 +68,7 @@ def test_the_trials_of_a_dead_worker_are_run_again(tmp_path, monkeypatch):
     monkeypatch.setattr(search, "_STALE_SECONDS", 1)
     monkeypatch.setattr(search, "_BEAT_SECONDS", 1)
     dead = search.Search(CONFIG, SPACE, tmp_path / "s")
-    # It asks, beats once, and is gone.
+    # A worker that asks for two trials, sends one heartbeat for each, and dies.
     with search.quiet():
         trials = [dead.study.ask() for _ in range(2)]
     values = []

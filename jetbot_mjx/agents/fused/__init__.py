@@ -1,4 +1,4 @@
-"""Write and launch the kernels of PPO, as docs/update.md explains them.
+"""Write and launch the kernels of PPO; docs/kernels.md explains them and defines their words.
 
 - `shapes`: the networks and the minibatch
 - `sample_loss`: the action of one sample, and its loss with derivatives, as JAX functions

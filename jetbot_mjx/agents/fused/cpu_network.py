@@ -219,7 +219,7 @@ class NetworkStage(Stage):
         """Write what is known after the last tile."""
 
     def stored_rows(self, rows: Value) -> Value:
-        """Return a number of rows, rounded up to whole tiles of a product."""
+        """Return a number of rows, rounded up to whole register tiles of a product."""
         return rounded_up(rows, ROWS) * ROWS
 
     def load_observation(self, source: Value, row: Value) -> None:

@@ -1,6 +1,6 @@
 """Write products of matrices on CPUs, and other loops over numbers in memory.
 
-A product keeps a tile of the result in registers, four rows of a few vectors each, and adds one
+A product keeps a register tile of the result, four rows of a few vectors each, and adds one
 column of the left matrix times one row of the right matrix to it at each step.
 """
 
@@ -10,7 +10,7 @@ from typing import NamedTuple
 from onekernel.build import LlvmWriter, Value
 
 ROWS = 4
-"""Rows of a tile of the result."""
+"""Rows of a register tile."""
 
 _PRODUCT = "product"
 

@@ -222,7 +222,7 @@ class _GradientKernel(NetworkKernel):
     def _store_errors(self, slopes: list[Value], sums: list[Value]) -> None:
         """Store a sample's derivatives by the outputs, and add them and the sums to their slots."""
         ir = self.ir
-        # What is no sample adds nothing.
+        # Rows beyond the last sample add nothing.
         kept = [ir.select(self.is_there, x, 0.0) for x in (*slopes, *sums)]
         # The derivatives, as the operand of a product.
         errors = ir.shared(self.thread * (2 * (TILE + PAD)), self.bytes_of("errors"))

@@ -1,9 +1,9 @@
-"""Learn by kernels of this package, for whom parameters and moments are vectors.
+"""Learn by kernels of this package, which take parameters and moments as vectors.
 
 Motivation: XLA passes the activations of every layer through memory between its kernels. It
 launches 140 of them for a minibatch, and takes seconds to compile them. Here one kernel runs the
 policy in all environments, and three compute advantages, the gradient of both networks and Adam's
-step on GPUs, or one all minibatches on CPUs; docs/update.md explains them.
+step on GPUs, or one all minibatches on CPUs; docs/kernels.md explains them.
 
 On GPUs, products round their operands to float16; everything else is float32.
 """
@@ -140,8 +140,8 @@ class FusedLearner(Learner):
         return launch.backend().obstacle()
 
     def failure(self) -> str | None:
-        """Return that the kernels compute something else than NumPy on this GPU, or None."""
-        # A CPU's kernels are compiled by what compiled the probe of its back end.
+        """Return that the kernels of this GPU failed their comparison with NumPy, or None."""
+        # On a CPU, `obstacle` has tried the same compiler with a small kernel.
         if jax.default_backend() != "gpu" or probe.runs_correctly():
             return None
         return "its kernels failed their check on this machine"
@@ -267,7 +267,7 @@ class FusedLearner(Learner):
             made = launch.adam(self.rule, gradient, params, mu, nu, progress, index, terms)
             return index + 1, *made
 
-        # One counter, unlike that of `scan` beside its own, which would be another launch.
+        # `scan` would carry a counter of its own beside `index`, which would be another launch.
         begun = jnp.zeros((), jnp.int32), *state
         ended = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
         return self.results(ended[1:], optimizer_state)
@@ -365,6 +365,8 @@ class FusedLearner(Learner):
             rates=0.0,
             applied=0.0,
         )
+        # A row before each step and one after the last: a kernel writes the next row while some of
+        # its threads still read the present one.
         row = _array(jax.tree.leaves(progress))
         rows = jnp.zeros((self.rule.steps, len(row)))
         return params, state.mu, state.nu, jnp.concatenate([row[None], rows])

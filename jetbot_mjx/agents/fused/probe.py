@@ -51,7 +51,7 @@ def runs_correctly() -> bool:
     # Beside the gradient, the vector has the sums of the metrics, which are no derivatives.
     ours[_RULE.places] = 0.0
     errors.append(np.linalg.norm(ours - gradient) / np.linalg.norm(gradient))
-    # What is no number is not smaller.
+    # A comparison with NaN is false, so that NaN fails the check.
     return all(bool(error <= _MOST_ERROR) for error in errors)
 
 

@@ -122,7 +122,7 @@ class GpuWriter(LlvmWriter):
     def pack(self, low: Value, high: Value) -> Value:
         """Round two floats to a pair of float16, the first in the lower half.
 
-        What is too large becomes the largest number; what is no number stays so.
+        A number too large for float16 becomes the largest one; NaN stays NaN.
         """
         return self.assembly("cvt.rn.satfinite.f16x2.f32", high, low, result="u32")
 

@@ -152,7 +152,7 @@ def _undistort(
     step = 1e-6
     wanted_x, wanted_y = np.broadcast_arrays(x, y)
     x, y = wanted_x, wanted_y
-    # What is no lens may overflow, which the check finds.
+    # Coefficients that describe no lens may overflow here; the check of the error refuses them.
     with np.errstate(all="ignore"):
         for _ in range(50):
             at_x, at_y = distort(x, y)

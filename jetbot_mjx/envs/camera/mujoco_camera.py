@@ -300,7 +300,7 @@ def _render_threads() -> list[_RenderThread]:
 
 
 def _discard(stages: "dict[int, _Stage]") -> None:
-    """Leave the stages of a camera that is collected to their threads."""
+    """Hand the stages of a garbage-collected camera to their threads, which free them."""
     for thread, stage in stages.items():
         _render_threads()[thread].discarded.append(stage)
 

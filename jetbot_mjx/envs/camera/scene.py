@@ -62,7 +62,7 @@ class SceneGeom(NamedTuple):
     rotation: Float[np.ndarray, "3 3"]
     """Axes of the geom, as columns, in the axes of the world."""
     yaw: Scalar | None = None
-    """Further turn about the vertical through the body [rad]; None: none."""
+    """Further turn about the vertical through the body [rad]; None: it is not turned."""
 
     @property
     def axes_key(self) -> bytes:

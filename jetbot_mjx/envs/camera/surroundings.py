@@ -1,4 +1,4 @@
-"""Draw and place what stands around in one episode: four walls and objects that are no goal."""
+"""Draw and place what stands around in one episode: four walls, and objects other than the goal."""
 
 import functools
 import math
@@ -21,7 +21,7 @@ _SHAPES = (
     ("box", (0.09, 0.03, 0.03)),
     ("sphere", (0.05, 0.05, 0.05)),
 )
-"""Kinds and sizes [m] of the objects around, over and over."""
+"""Kinds and sizes [m] of the objects around; the fifth object is like the first, and so on."""
 
 _NEAREST, _FARTHEST = 0.5, 2.5
 """Distances of the objects around from the origin, where episodes begin [m]."""

@@ -1,4 +1,4 @@
-"""Run the text of a GPU's kernel in NumPy, and refuse what a GPU would not forgive.
+"""Run the text of a GPU's kernel in NumPy, and raise an error for races and bad addresses.
 
 The model: the blocks of the grid run one after the other. A register is an array over the threads
 of a block, and all threads that wait at one place of the text run on together, up to the end of the
@@ -67,7 +67,7 @@ def replace_gpu(monkeypatch, capability=90, processors=5):
     def launch(name, text, arguments, results, grid, threads, shared_memory=0, aliases=None):
         assert f"void @{name}(" in text
         given = [np.array(x) for x in arguments]
-        # What is not written is not a number, or the largest.
+        # What no thread has written is NaN, or the largest byte.
         made = [
             np.full(x.shape, np.nan if x.dtype == np.float32 else 255, x.dtype) for x in results
         ]

@@ -67,7 +67,7 @@ _COMPARISONS = {
 
 
 def compare_floats(name, a, b):
-    """Return `fcmp`: what begins with `o` is false of what is no number, with `u` true."""
+    """Return `fcmp`: for NaN, names that begin with `o` return false, those with `u` true."""
     unordered = np.isnan(a) | np.isnan(b)
     if name in ("ord", "uno"):
         return unordered == (name == "uno")

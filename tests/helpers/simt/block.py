@@ -47,7 +47,7 @@ class Block:
         bases = [np.full(threads, (i + 1) << 48, np.uint64) for i in range(len(memories))]
         self.values = dict(zip(program.parameters, bases, strict=True))
         self.values["@shared"] = np.zeros(threads, np.uint64)
-        # What nobody has written is not a number.
+        # What no thread has written is NaN.
         self.shared = Memory(np.full(shared_memory // 4, 0x7FFF7FFF, np.uint32))
         self.clocks = Clocks(threads // WARP)
         # Where each thread is, the basic block from which it came, and the barrier it waits at.
