@@ -32,8 +32,9 @@ The parts, each of which imports only from those before it:
 - `codegen`: these blocks to LLVM IR
 - `kernel`: a kernel as a JAX primitive; `errors`: what it raises
 - `cpu`, `gpu`: these to machine code and PTX, and its launch by XLA; `backends`: both
+- `check`: a kernel's results beside XLA's
 - `fused`: a function of one instance as one kernel, with another kernel inside
-- `check`: a kernel's results beside XLA's; `explanation`: what the compiler made of it
+- `explanation`: what the compiler made of it
 - `aot`: compiled programs from one process to the next
 
 `onekernel.build` exports the functions with which to write a kernel around a lowered function.
