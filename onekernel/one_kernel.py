@@ -166,8 +166,8 @@ class _Lowered:
 
         def run(*leaves: Array) -> list[Array]:
             pairs = zip((*constants, *leaves), arguments, strict=True)
-            words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
-            return _from_words(launch(words), results)
+            passed = [_to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
+            return _received(launch(passed), results)
 
         return run
 
@@ -191,8 +191,14 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
     # Without a kernel inside, the whole function becomes one that runs once.
     if not calls:
-        program = lower(arguments, results)
-        return Kernel(program, carried=0, steps=1, fallback=_fallback(traced, places))
+        return Kernel(
+            lower(arguments, results),
+            carried=0,
+            steps=1,
+            fallback=_fallback(traced, places),
+            argument_dtypes=_passed_dtypes(arguments),
+            result_dtypes=_passed_dtypes(results),
+        )
     # Otherwise cut the function at the call. The one step must be plain: not a map, not itself made
     # of three parts, and called for one instance.
     step = called_by(calls[0])
@@ -215,6 +221,8 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
         on_fallback=step.on_fallback,
         before=before,
         after=after,
+        argument_dtypes=_passed_dtypes(arguments),
+        result_dtypes=_passed_dtypes(results),
     )
 
 
@@ -228,30 +236,32 @@ def _dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
 
 
 def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
-    """Return the same computation in JAX, whose arguments and results are words as in the kernel.
-
-    A word is a float32 with the bits of a number of another dtype (see `_to_word`).
-    """
+    """Return the same computation in JAX, of what is passed to the kernel."""
     dtypes = _dtypes(_arguments(traced, places))
 
-    def run(*words: Array) -> list[Array]:
-        arguments = _from_words(words, dtypes)
+    def run(*passed: Array) -> list[Array]:
+        arguments = _received(passed, dtypes)
         constants = list(traced.consts)
-        # The first words are constants; `zip` stops after these.
+        # The first arguments are constants; `zip` stops after these.
         for place, argument in zip(places, arguments, strict=False):
             constants[place] = argument
         closed = ClosedJaxpr(traced.jaxpr, constants)
-        return [_to_word(x) for x in jaxpr_as_fun(closed)(*arguments[len(places) :])]
+        return [_to_pass(x) for x in jaxpr_as_fun(closed)(*arguments[len(places) :])]
 
     return run
 
 
-def _to_word(x: Array) -> Array:
-    """Return an array's bits as float32; a bool is 0 or 1."""
-    return x.astype(jnp.float32) if x.dtype.kind == "b" else x.view(jnp.float32)
+# A kernel takes and returns numbers of 32 bits as they are, and a bool as 0.0 or 1.0.
 
 
-def _from_words(words: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
-    """Return the arrays of some dtypes from their bits."""
-    pairs = zip(words, dtypes, strict=True)
-    return [x != 0 if dtype.kind == "b" else x.view(dtype) for x, dtype in pairs]
+def _passed_dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
+    return [np.dtype(np.float32) if dtype.kind == "b" else dtype for dtype in _dtypes(atoms)]
+
+
+def _to_pass(x: Array) -> Array:
+    return x.astype(jnp.float32) if x.dtype.kind == "b" else x
+
+
+def _received(passed: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
+    pairs = zip(passed, dtypes, strict=True)
+    return [x != 0 if dtype.kind == "b" else x for x, dtype in pairs]

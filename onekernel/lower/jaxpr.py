@@ -315,8 +315,12 @@ class _JaxprLowering:
         self, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
     ) -> Scalar | Key:
         """Select between two scalars, or the words of two random keys."""
-        pairs = zip(words_of(if_false), words_of(if_true), strict=True)
-        return like(if_true, (self._graph.select(condition, *pair) for pair in pairs))
+        if not isinstance(if_true, Key):
+            return self._graph.select(condition, if_false, if_true)
+        return Key(
+            self._graph.select(condition, if_false.first, if_true.first),
+            self._graph.select(condition, if_false.second, if_true.second),
+        )
 
     # Rules of primitives that call functions: jit, scan, while, cond.
 
