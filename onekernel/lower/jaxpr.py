@@ -316,12 +316,8 @@ class _JaxprLowering:
         self, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
     ) -> Scalar | Key:
         """Select between two scalars, or the words of two random keys."""
-        if not isinstance(if_true, Key):
-            return self._graph.select(condition, if_false, if_true)
-        return Key(
-            self._graph.select(condition, if_false.first, if_true.first),
-            self._graph.select(condition, if_false.second, if_true.second),
-        )
+        pairs = zip(words_of(if_false), words_of(if_true), strict=True)
+        return like(if_true, (self._graph.select(condition, *pair) for pair in pairs))
 
     # Rules of primitives that call functions: jit, scan, while, cond.
 
