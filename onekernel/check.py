@@ -37,7 +37,7 @@ def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dt
 
     Args:
       kernel: the kernel, which steps.
-      arguments: the dtypes of its arguments, which travel as float32 with the same bits.
+      arguments: the dtypes of its arguments; a truth value is passed as a float32.
       results: likewise.
 
     Raises:
@@ -48,8 +48,8 @@ def check(kernel: Kernel, arguments: Sequence[np.dtype], results: Sequence[np.dt
     drawn = [_draw(random, dtype, shape) for dtype, shape in zip(arguments, shapes, strict=True)]
     # The caller may be tracing another function.
     with jax.ensure_compile_time_eval():
-        by_xla = jax.jit(jax.vmap(lambda *words: kernel.fallback(*words)))
-        ours = _run(jax.jit(jax.vmap(lambda *words: kernel.as_function()(words))), drawn, results)
+        by_xla = jax.jit(jax.vmap(lambda *passed: kernel.fallback(*passed)))
+        ours = _run(jax.jit(jax.vmap(lambda *passed: kernel.as_function()(passed))), drawn, results)
         theirs = _run(by_xla, drawn, results)
         shaken = [
             _run(by_xla, [_shaken(random, x) for x in drawn], results) for _ in range(_SHAKES)
@@ -90,10 +90,10 @@ def _run(
     arguments: Sequence[np.ndarray],
     dtypes: Sequence[np.dtype],
 ) -> list[np.ndarray]:
-    """Run a function of words, with arguments and results of other dtypes."""
-    words = [x.astype(np.float32) if x.dtype.kind == "b" else x.view(np.float32) for x in arguments]
-    found = zip(map(np.asarray, function(*words)), dtypes, strict=True)
-    return [x != 0 if dtype.kind == "b" else x.view(dtype) for x, dtype in found]
+    """Run a function whose truth values are passed as 0.0 and 1.0."""
+    passed = [x.astype(np.float32) if x.dtype.kind == "b" else x for x in arguments]
+    found = zip(map(np.asarray, function(*passed)), dtypes, strict=True)
+    return [x != 0 if dtype.kind == "b" else x for x, dtype in found]
 
 
 def _differ(one: np.ndarray, other: np.ndarray, shaken: Sequence[np.ndarray]) -> np.ndarray:

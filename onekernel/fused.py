@@ -311,14 +311,13 @@ class _Lowered:
         if backend and self.one.impl in ("auto", backend.IMPL) and not backend.obstacle():
             backend.prepare(self.one)
         launch = self.one.as_function()
-        # Kernels take and return float32 only, so numbers of other dtypes travel as their bits.
         constants = [self.traced.consts[i] for i in self.places]
         arguments = _dtypes(_arguments(self.traced, self.places))
 
         def run(*leaves: Array) -> list[Array]:
             pairs = zip((*constants, *leaves), arguments, strict=True)
-            words = [_to_word(jnp.asarray(x, dtype)) for x, dtype in pairs]
-            return _from_words(launch(words), self._result_dtypes)
+            passed = [_to_pass(jnp.asarray(x, dtype)) for x, dtype in pairs]
+            return _received(launch(passed), self._result_dtypes)
 
         return run
 
@@ -360,8 +359,14 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
     calls = [x for x in traced.jaxpr.eqns if called_by(x) is not None]
     # Without a kernel inside, the whole function becomes one that runs once.
     if not calls:
-        program = lower(arguments, results)
-        return Kernel(program, carried=0, steps=1, fallback=_fallback(traced, places))
+        return Kernel(
+            lower(arguments, results),
+            carried=0,
+            steps=1,
+            fallback=_fallback(traced, places),
+            argument_dtypes=_passed_dtypes(arguments),
+            result_dtypes=_passed_dtypes(results),
+        )
     # Otherwise cut the function at the call. The one step must be plain: not a map, not itself made
     # of three parts, and called for one instance.
     step = called_by(calls[0])
@@ -384,6 +389,8 @@ def _lower(traced: ClosedJaxpr, places: Sequence[int]) -> Kernel:
         on_fallback=step.on_fallback,
         before=before,
         after=after,
+        argument_dtypes=_passed_dtypes(arguments),
+        result_dtypes=_passed_dtypes(results),
     )
 
 
@@ -397,13 +404,10 @@ def _dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
 
 
 def _fallback(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
-    """Return the same computation in JAX, whose arguments and results are words as in the kernel.
-
-    A word is a float32 with the bits of a number of another dtype (see `_to_word`).
-    """
+    """Return the same computation in JAX, of what is passed to the kernel."""
     dtypes = _dtypes(_arguments(traced, places))
     function = _as_function(traced, places)
-    return lambda *words: [_to_word(x) for x in function(*_from_words(words, dtypes))]
+    return lambda *passed: [_to_pass(x) for x in function(*_received(passed, dtypes))]
 
 
 def _as_function(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., list[Array]]:
@@ -420,23 +424,20 @@ def _as_function(traced: ClosedJaxpr, places: Sequence[int]) -> Callable[..., li
     return run
 
 
-def _to_word(x: Array) -> Array:
-    """Return an array's bits as float32; a bool is 0 or 1."""
-    if x.dtype == np.float32:
-        # Not as bits, which JAX would not differentiate.
-        return x
-    return x.astype(jnp.float32) if x.dtype.kind == "b" else x.view(jnp.float32)
+# A kernel takes and returns numbers of 32 bits as they are, and a bool as 0.0 or 1.0.
 
 
-def _from_words(words: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
-    """Return the arrays of some dtypes from their bits."""
-    return [_from_word(x, dtype) for x, dtype in zip(words, dtypes, strict=True)]
+def _passed_dtypes(atoms: Sequence[Var | Literal]) -> list[np.dtype]:
+    return [np.dtype(np.float32) if dtype.kind == "b" else dtype for dtype in _dtypes(atoms)]
 
 
-def _from_word(x: Array, dtype: np.dtype) -> Array:
-    if dtype == np.float32:
-        return x
-    return x != 0 if dtype.kind == "b" else x.view(dtype)
+def _to_pass(x: Array) -> Array:
+    return x.astype(jnp.float32) if x.dtype.kind == "b" else x
+
+
+def _received(passed: Sequence[Array], dtypes: Sequence[np.dtype]) -> list[Array]:
+    pairs = zip(passed, dtypes, strict=True)
+    return [x != 0 if dtype.kind == "b" else x for x, dtype in pairs]
 
 
 def _is_key(x: Array | ShapedArray) -> bool:

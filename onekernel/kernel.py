@@ -13,7 +13,8 @@ arguments alone are computed once per instance (CPU) or thread (GPU), and the re
 Protocol: JAX sees the kernel as a primitive.
 
 1. `Kernel.as_step` binds the primitive to the leaves of (carry, consts) of one instance,
-   `Kernel.as_map` to those that all items of an instance share; all are float32.
+   `Kernel.as_map` to those that all items of an instance share; all are float32, or what
+   `Kernel.argument_dtypes` states.
 2. The batching rule of `jax.vmap` puts any number of batch axes into one launch.
 3. The primitive is lowered for the platform that a program is compiled for, whatever the
    process's default is, so that programs for CPUs and GPUs can exist side by side. The back end
@@ -90,6 +91,12 @@ class Kernel:
     are those of the last step."""
     table: Float[np.ndarray, "rows items"] | None = None
     """The arguments that differ between the items of an instance; None: the kernel is a step."""
+    argument_dtypes: Sequence[np.dtype] | None = None
+    """Dtypes of 32 bits of the arguments, whose bits the program takes as float32. XLA passes the
+    arrays as they are: for a CPU it would compile every conversion to a kernel of its own. None:
+    all are float32."""
+    result_dtypes: Sequence[np.dtype] | None = None
+    """Those of the results, likewise; with a table there are none."""
     _texts: dict[str, str] = dataclasses.field(default_factory=dict, init=False)
     """Texts that back ends have written of the kernel, by a name of their choice."""
     # Programs are lowered in several threads, and each text is written once.
@@ -127,8 +134,7 @@ class Kernel:
         """Return a kernel without a table as a JAX function of one instance; `jax.vmap` batches it.
 
         Returns:
-          A function from the kernel's arguments, which must be float32, to its results. It cannot
-          be differentiated.
+          A function from the kernel's arguments to its results. It cannot be differentiated.
         """
         return lambda leaves: _kernel_p.bind(*leaves, kernel=self)
 
@@ -160,7 +166,11 @@ class Kernel:
             size = self.table.shape[1] * len(self.program.outputs)
             return [jax.ShapeDtypeStruct((*batch, size), np.uint8)]
         shapes = [array.shape for array in (self.after or self.program).outputs]
-        return [jax.ShapeDtypeStruct((*batch, *shape), np.float32) for shape in shapes]
+        dtypes = self.result_dtypes or [np.dtype(np.float32)] * len(shapes)
+        return [
+            jax.ShapeDtypeStruct((*batch, *shape), dtype)
+            for shape, dtype in zip(shapes, dtypes, strict=True)
+        ]
 
 
 class Compiled(NamedTuple):
@@ -201,8 +211,8 @@ class Backend(Protocol):
 
         Args:
           kernel: the kernel.
-          leaves: its arguments, float32 arrays of shape (instances, ...), and its table if it has
-            one.
+          leaves: its arguments, arrays of 32 bits of shape (instances, ...), and its table if it
+            has one.
 
         Returns:
           The results, as in `Kernel.results(instances)`.
@@ -263,15 +273,16 @@ def _batch_shape(kernel: Kernel, leaves: Sequence[Array | ShapedArray]) -> tuple
     """Return the batch axes that all arguments have in front of the axes of one instance.
 
     Raises:
-      KernelError: an argument is not float32.
+      KernelError: an argument does not have the dtype that the kernel expects, mostly float32.
       ValueError: an argument does not have the shape that the kernel expects.
     """
     shapes = kernel.argument_shapes
     # The first argument tells the batch axes, and all others must have the same.
     batch = leaves[0].shape[: leaves[0].ndim - len(shapes[0])]
-    for leaf, shape in zip(leaves, shapes, strict=True):
-        if leaf.dtype != np.float32:
-            error = KernelError(f"one kernel takes float32 only, not {leaf.dtype}", "dtype")
+    dtypes = kernel.argument_dtypes or [np.dtype(np.float32)] * len(shapes)
+    for leaf, shape, dtype in zip(leaves, shapes, dtypes, strict=True):
+        if leaf.dtype != dtype:
+            error = KernelError(f"one kernel takes {dtype} only, not {leaf.dtype}", "dtype")
             raise kernel.explain(error)
         if leaf.shape != (*batch, *shape):
             raise ValueError(f"an argument of shape {leaf.shape}, not {(*batch, *shape)}")

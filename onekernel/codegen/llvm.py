@@ -146,16 +146,26 @@ def _interleaved(w: LlvmWriter, results: Sequence[Value]) -> Value:
 
 
 def require(program: ScalarProgram) -> None:
-    """Check that a program can be written as LLVM IR.
+    """Check that a program can be written as LLVM IR for CPUs, without writing it.
 
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
-    # Write the program once and drop the text: an operation that cannot be written raises its error
-    # here, before JAX traces a program that calls the kernel.
-    w = LlvmWriter("unused")
-    count = sum(array.size for array in program.inputs)
-    run_program(w, program, [w.constant(0.0)] * count)
+    _inputs(program)
+    for value in program.block.values():
+        _write_of(value)
+
+
+def _inputs(program: ScalarProgram) -> list[Expr]:
+    """Return the scalars of a program's arguments.
+
+    Raises:
+      UnsupportedError: one of them is not float32.
+    """
+    inputs = [x for array in program.inputs for x in array.ravel()]
+    if any(x.dtype != np.float32 for x in inputs):
+        raise UnsupportedError("an argument that is not float32")
+    return inputs
 
 
 class ProgramWriter:
@@ -181,9 +191,7 @@ class ProgramWriter:
         Raises:
           UnsupportedError: an argument is not float32.
         """
-        self._inputs = [x for array in program.inputs for x in array.ravel()]
-        if any(x.dtype != np.float32 for x in self._inputs):
-            raise UnsupportedError("an argument that is not float32")
+        self._inputs = _inputs(program)
         self.writer, self.for_gpu = writer, for_gpu
         self.flags = "afn" if approximate else ""
         self._program = program
@@ -368,12 +376,7 @@ class ProgramWriter:
         return [phi.value for phi in phis]
 
     def _operation(self, value: Expr) -> None:
-        # The instruction depends on the operands' dtype; the first operand of a selection is its
-        # condition.
-        kind = value.operands[0].dtype.kind if value.op != "select" else value.dtype.kind
-        write = _OPERATIONS.get((value.op, kind))
-        if write is None:
-            raise UnsupportedError(f"{value.op} of {value.operands[0].dtype}")
+        write = _write_of(value, for_gpu=self.for_gpu)
         operands = [self._operand(x) for x in value.operands]
         self._values[value.index] = write(self, value, operands)
 
@@ -393,8 +396,6 @@ def _intrinsic(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
 
 
 def _approximation(on: ProgramWriter, value: Expr, operands: list[Value]) -> Value:
-    if not on.for_gpu:
-        raise UnsupportedError(f"an approximate {value.op} on a CPU")
     (x,) = operands
     # The instructions are 2^x and log₂ x: exp(x) is 2^(x / ln 2), and log(x) is log₂(x) · ln 2.
     # LLVM has no function for them that is compiled to one instruction, so write it as assembly:
@@ -544,3 +545,20 @@ _OPERATIONS: dict[tuple[str, str], _Write] = {
     **{("shift_right_logical", kind): _logical_shift for kind in "iu"},
 }
 """Functions that write an operation, by its name and the kind of its operands."""
+
+
+def _write_of(value: Expr, *, for_gpu: bool = False) -> _Write:
+    """Return the function that writes an operation.
+
+    Raises:
+      UnsupportedError: there is none for numbers of this type, or on this device.
+    """
+    # The instruction depends on the operands' dtype; the first operand of a selection is its
+    # condition.
+    kind = value.operands[0].dtype.kind if value.op != "select" else value.dtype.kind
+    write = _OPERATIONS.get((value.op, kind))
+    if write is None:
+        raise UnsupportedError(f"{value.op} of {value.operands[0].dtype}")
+    if write is _approximation and not for_gpu:
+        raise UnsupportedError(f"an approximate {value.op} on a CPU")
+    return write

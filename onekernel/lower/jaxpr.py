@@ -64,6 +64,7 @@ from onekernel.lower.scalar_ir import (
     Loop,
     Scalar,
     check_scalars,
+    identity,
     is_constant,
     is_same,
 )
@@ -836,7 +837,8 @@ def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
 
 def _pair_key(pair: tuple[Scalar, Scalar]) -> _PairKey:
     """Return a key that two pairs share if they are the same operations or equal constants."""
-    return tuple((x.dtype.str, x.tobytes()) if is_constant(x) else x.index for x in pair)
+    before, after = pair
+    return identity(before), identity(after)
 
 
 def _index(x: Scalar) -> int:

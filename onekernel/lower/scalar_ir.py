@@ -320,7 +320,7 @@ class ExprGraph:
         ]
 
     def _record(self, op: str, operands: tuple[Scalar, ...], dtype: np.dtype) -> Expr:
-        names = [_identity(x) for x in operands]
+        names = [identity(x) for x in operands]
         # The key ignores the order of commutative operands, but the operation keeps the order in
         # which it was first recorded, so that the same function always lowers to the same text.
         key = (op, dtype, *(sorted(names, key=repr) if op in _COMMUTATIVE else names))
@@ -354,10 +354,11 @@ def check_scalars(values: Iterable[object]) -> None:
 
 def is_same(x: Scalar, y: Scalar) -> bool:
     """Return whether two scalars are the same operation, or constants with equal bits."""
-    return x is y or (_are_constant(x, y) and _identity(x) == _identity(y))
+    return x is y or (_are_constant(x, y) and identity(x) == identity(y))
 
 
-def _identity(x: Scalar) -> Hashable:
+def identity(x: Scalar) -> Hashable:
+    """Return a key that is shared only by the same operation, or by constants with equal bits."""
     # Compare bits: 0.0 == -0.0 although they differ, and NaN != NaN although they are the same.
     return x.index if isinstance(x, Expr) else (x.dtype.str, x.tobytes())
 

@@ -106,6 +106,14 @@ def test_a_function_is_one_kernel_that_does_what_it_did(name):
     agree(one(*alone), jax.tree.map(jnp.asarray, function(*jax.tree.map(jnp.asarray, alone))))
 
 
+def test_whole_numbers_reach_their_kernel_as_they_are():
+    # XLA would compile each conversion for a CPU to a kernel of its own.
+    one = OneKernel(lambda key, count: (key ^ key[::-1], count + 1))
+    text = jax.jit(jax.vmap(one)).lower(keys(17), np.arange(17, dtype=np.int32)).as_text()
+    assert text.count("custom_call") == 1
+    assert "bitcast_convert" not in text
+
+
 def test_numbers_that_are_no_arrays_will_do():
     one = fuse(lambda x, n, flag: (x * n, n + 1, ~flag))
     agree(one(1.5, 2, np.bool_(True)), (jnp.float32(3), jnp.int32(3), jnp.bool_(False)))

@@ -13,7 +13,7 @@ from helpers.call_frame import Pool
 from helpers.kernel_cases import FUNCTIONS, LOOPS, VECTOR, robots
 from helpers.run_program import evaluate
 from onekernel import cpu
-from onekernel.codegen import LlvmWriter, run_program
+from onekernel.codegen import LlvmWriter, require, run_program
 from onekernel.cpu import xla_call
 from onekernel.errors import UnsupportedError
 from onekernel.kernel import Kernel
@@ -102,6 +102,8 @@ def test_approximate_functions_are_instructions_of_gpus_and_no_others():
     assert sorted(called(program, for_gpu=True)) == names
     with pytest.raises(UnsupportedError, match="an approximate exp on a CPU"):
         called(program)
+    with pytest.raises(UnsupportedError, match="an approximate exp on a CPU"):
+        require(program)
     # With polynomials, the same function needs none of them.
     assert called(scalarize(function, jnp.zeros(())), for_gpu=True) == []
 
