@@ -7,7 +7,7 @@ import pytest
 from brax.envs import Wrapper
 
 from jetbot_mjx.agents.fused import launch
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll
+from jetbot_mjx.agents.fused.shapes import Unroll
 from jetbot_mjx.config import load_config
 from jetbot_mjx.packed import pack
 from jetbot_mjx.runs import Setup

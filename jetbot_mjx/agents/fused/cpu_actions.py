@@ -1,20 +1,14 @@
 """Write the kernel that draws the actions of all environments on CPUs."""
 
-import dataclasses
 from collections.abc import Iterator, Mapping
 
 from jetbot_mjx.agents.fused import sample_loss
-from jetbot_mjx.agents.fused.cpu_network import (
-    HEAD,
-    MOST_PARTS,
-    TILE_ROWS,
-    Division,
-    NetworkStage,
-)
+from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
+from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
 from jetbot_mjx.agents.fused.cpu_product import rounded_up
-from jetbot_mjx.agents.fused.cpu_stages import Call, sample_function
+from jetbot_mjx.agents.fused.cpu_stages import Stages, sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
-from jetbot_mjx.agents.fused.shapes import UpdateShape
+from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
 from onekernel import scalarize
 from onekernel.build import LlvmWriter, Value
 
@@ -23,69 +17,44 @@ _PART_ROWS = 2 * TILE_ROWS
 weights."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ActionDivision(Division):
-    """An `ActionDivision` divides the environments."""
-
-    shape: UpdateShape
-    environments: int
-    lanes: int
-    is_policy: bool = True
-
-    @property
-    def items(self) -> int:
-        """Return the number of environments."""
-        return self.environments
-
-    @property
-    def part_items(self) -> int:
-        """Return the number of environments of a part."""
-        return max(_PART_ROWS, -(-self.environments // MOST_PARTS))
-
-    @property
-    def steps(self) -> int:
-        """Return 1: an environment has one row."""
-        return 1
-
-    @property
-    def reads(self) -> int:
-        """Return how many numbers an action depends on."""
-        return self.outputs + 2 * self.shape.actions
-
-    def extra_sizes(self) -> dict[str, int]:
-        """Return the floats of what the sample reads and writes."""
-        lanes = self.lanes
-        return {"sample": self.reads * lanes, "drawn": sum(self.shape.drawn) * lanes}
-
-
-PARAMETERS = ("params", "mean", "scale")
-"""The arrays of `launch.actions` that all environments share."""
-
-DRAWN = ("action", "raw_action", "log_prob", "distribution_params")
-"""The arrays of `launch.Actions`."""
-
-_ARGUMENTS = (*PARAMETERS, "observations", "noise")
-
-
-def action_call(division: ActionDivision) -> Call:
-    """Return the call, which takes and returns the arrays of `launch.actions`.
+def action_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stage of `arrays.ACTIONS`.
 
     Args:
-      division: the division of the environments.
+      shape: the networks.
+      batch: the data, of which the number of environments is used.
+      lanes: the number of float32 values in a vector register.
     """
-    shape = division.shape
-    sizes = {"observations": shape.observations, "noise": shape.actions}
-    sizes |= zip(DRAWN, shape.drawn, strict=True)
-    sizes = {name: division.environments * size for name, size in sizes.items()}
-    sizes |= {"params": shape.size, "mean": shape.observations, "scale": shape.observations}
-    return Call(_ARGUMENTS, DRAWN, sizes, [ActionStage(division)])
+    return Stages([ActionStage(shape, batch.environments, lanes, _PART_ROWS)])
 
 
 class ActionStage(NetworkStage):
     """An `ActionStage` runs the policy network and draws an action from each distribution."""
 
     name = "actions"
-    arrays_of = (*_ARGUMENTS, *DRAWN)
+    arrays_of = (*ACTIONS.arguments, *ACTIONS.returns)
+
+    def __init__(self, shape: UpdateShape, environments: int, lanes: int, part_rows: int) -> None:
+        """Divide the environments.
+
+        Args:
+          shape: the networks.
+          environments: the number of environments.
+          lanes: the number of float32 values in a vector register.
+          part_rows: the environments of a part, unless there would be too many parts.
+        """
+        self.environments = environments
+        numbers = ACTIONS.counts(shape, Minibatch(environments=1))
+        self.drawn = {name: numbers[name] for name in Actions._fields}
+        """The numbers of an environment in each array of `Actions`."""
+        part_items = max(part_rows, -(-environments // MOST_PARTS))
+        super().__init__(shape, lanes, environments, part_items)
+
+    def scratch_sizes(self) -> dict[str, int]:
+        """Add what the samples read and write, a row of lanes for each number."""
+        reads = self.outputs + 2 * self.shape.actions
+        sizes = {"sample": reads * self.lanes, "drawn": sum(self.drawn.values()) * self.lanes}
+        return super().scratch_sizes() | sizes
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation and the sample."""
@@ -94,7 +63,7 @@ class ActionStage(NetworkStage):
         drawn = sample_loss.action_program(self.shape)
         return [
             self.on_layers("activate", activated, (0,), (0,)),
-            sample_function("draw", drawn, self.division.lanes),
+            sample_function("draw", drawn, self.lanes),
         ]
 
     def tile(self, first: Value, count: Value) -> None:
@@ -143,7 +112,7 @@ class ActionStage(NetworkStage):
         """
         w, shape, places = self.w, self.shape, self.places
         lanes, actions = w.lanes, shape.actions
-        deviations = self.params + (shape.hidden + (shape.width + 1) * self.division.outputs)
+        deviations = self.params + (shape.hidden + (shape.width + 1) * self.outputs)
         # Collect what the samples read, environment by environment.
         with w.loop(lanes) as lane:
             # Lanes beyond the last environment repeat it.
@@ -151,9 +120,9 @@ class ActionStage(NetworkStage):
             outputs = places["outputs"] + (start + within) * HEAD
             noise = (first + within) * actions
             sources = [
-                (outputs, self.division.outputs),
+                (outputs, self.outputs),
                 (deviations if shape.deviations else outputs, actions),
-                (arrays["noise"] + noise, actions),
+                (arrays["action_noise"] + noise, actions),
             ]
             target = places["sample"] + lane
             numbers = [(source, i) for source, count in sources for i in range(count)]
@@ -163,7 +132,7 @@ class ActionStage(NetworkStage):
         # Store what they draw.
         with w.loop(there) as lane:
             place = 0
-            for name, size in zip(DRAWN, shape.drawn, strict=True):
+            for name, size in self.drawn.items():
                 row = arrays[name] + (first + lane) * size
                 for i in range(size):
                     row[i] = (places["drawn"] + place * lanes)[lane]

@@ -5,97 +5,44 @@ arranged once, and no thread waits for another, while a call for each step would
 twice.
 """
 
-import dataclasses
-from typing import NamedTuple
-
-from jetbot_mjx.agents.fused.cpu_actions import DRAWN, PARAMETERS, ActionDivision, ActionStage
-from jetbot_mjx.agents.fused.cpu_network import MOST_PARTS, TILE_ROWS
-from jetbot_mjx.agents.fused.cpu_stages import Call
-from jetbot_mjx.agents.fused.shapes import UpdateShape
-from onekernel import Kernel
+from jetbot_mjx.agents.fused.arrays import UNROLL
+from jetbot_mjx.agents.fused.cpu_actions import ActionStage
+from jetbot_mjx.agents.fused.cpu_network import TILE_ROWS
+from jetbot_mjx.agents.fused.cpu_stages import Stages
+from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll
 from onekernel.build import LlvmWriter, Value, cpu
 
 
-class Unroll(NamedTuple):
-    """An `Unroll` describes a step of an unroll."""
-
-    shape: UpdateShape
-    kernel: Kernel
-    """The step of an environment, from the numbers of its state and an action to the next state."""
-    observation: int
-    """Where the observation begins among the numbers of a state."""
-    kept: tuple[int, ...]
-    """Places of the numbers that are kept of each state."""
-
-    @property
-    def state(self) -> int:
-        """Return how many numbers a state has."""
-        return self.kernel.argument_shapes[0][0]
-
-    @property
-    def ranges(self) -> list[tuple[int, int, int]]:
-        """Return of each range of adjacent kept numbers its place among them, its first and last.
-
-        The place is that among the kept ones.
-        """
-        ranges: list[tuple[int, int, int]] = []
-        for place, number in enumerate(self.kept):
-            if ranges and ranges[-1][2] == number - 1:
-                ranges[-1] = (*ranges[-1][:2], number)
-            else:
-                ranges.append((place, number, number))
-        return ranges
-
-
-@dataclasses.dataclass(frozen=True)
-class UnrollDivision(ActionDivision):
-    """An `UnrollDivision` divides the environments of an unroll."""
-
-    @property
-    def part_items(self) -> int:
-        """Return the number of environments of a part, which arranges the weights once."""
-        return max(TILE_ROWS, -(-self.environments // MOST_PARTS))
-
-
-def unroll_call(unroll: Unroll, environments: int, time: int, lanes: int) -> Call:
-    """Return the call, which takes and returns the arrays of `launch.unroll`.
+def unroll_stages(unroll: Unroll, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stage of `arrays.UNROLL`.
 
     Args:
       unroll: the networks and the environment.
-      environments: the number of environments.
-      time: the number of steps.
+      batch: the data, of which the number of environments and the time are used.
       lanes: the number of float32 values in a vector register.
     """
-    shape, states = unroll.shape, environments * unroll.state
-    stage = _UnrollStage(UnrollDivision(shape, environments, lanes), unroll, time)
-    sizes = {name: time * size for name, size in stage.sizes.items()}
-    sizes |= {"start": states, "end": states, "params": shape.size}
-    sizes |= {"mean": shape.observations, "scale": shape.observations}
-    return Call((*PARAMETERS, "start", "noise"), ("end", "kept", *DRAWN), sizes, [stage])
+    return Stages([_UnrollStage(unroll, batch, lanes)])
 
 
 class _UnrollStage(ActionStage):
     """Takes environments through all steps of an unroll."""
 
     name = "unroll"
-    arrays_of = (*PARAMETERS, "start", "noise", "end", "kept", *DRAWN)
+    arrays_of = (*UNROLL.arguments, *UNROLL.returns)
 
-    def __init__(self, division: UnrollDivision, unroll: Unroll, time: int) -> None:
-        super().__init__(division)
-        self._unroll, self._time = unroll, time
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Return how many numbers a step has in each array that holds all steps."""
-        sizes = {"kept": len(self._unroll.kept), "noise": self.shape.actions}
-        sizes |= zip(DRAWN, self.shape.drawn, strict=True)
-        return {name: self.division.environments * size for name, size in sizes.items()}
+    def __init__(self, unroll: Unroll, batch: Minibatch, lanes: int) -> None:
+        # The parts are smaller than those of one step: each arranges the weights for all steps.
+        super().__init__(unroll.shape, batch.environments, lanes, TILE_ROWS)
+        self._unroll, self._time = unroll, batch.time
+        numbers = {"kept": len(unroll.kept), "unroll_noise": self.shape.actions, **self.drawn}
+        self._step_sizes = {name: batch.environments * size for name, size in numbers.items()}
+        """The numbers of a step in each array that holds all steps."""
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation, the sample and the step of the environments."""
         return [
             *super().own_functions(),
-            *cpu.step_functions(self._unroll.kernel, self.division.lanes),
+            *cpu.step_functions(self._unroll.kernel, self.lanes),
         ]
 
     def tile(self, first: Value, count: Value) -> None:
@@ -104,9 +51,11 @@ class _UnrollStage(ActionStage):
         limit = first + count
         with w.loop(self._time) as step:
             # Find the step's part of each array, and the states before it.
-            here = {name: self.arrays[name] + step * size for name, size in self.sizes.items()}
+            sizes = self._step_sizes.items()
+            here = {name: self.arrays[name] + step * size for name, size in sizes}
             before = w.select(step.equals(0), self.arrays["start"], end)
             here["observations"] = before + unroll.observation
+            here["action_noise"] = here["unroll_noise"]
             # Draw the actions, and step the environments.
             self.act(first, count, here, unroll.state)
             for start in self.groups(count):

@@ -5,7 +5,7 @@ import functools
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, starts
+from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, places
 from jetbot_mjx.agents.fused.tensor_core import LANES, TILE
 
 MOST_OUTPUTS = 8
@@ -129,8 +129,7 @@ class Tiling:
             sizes["layer1"] = 2 * rows * stride
             sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
             sizes["statistics"] = 4 * 2 * (self.threads + LANES)
-        begins = starts({name: -(-size // 16) * 16 for name, size in sizes.items()})
-        return {**dict(zip(sizes, begins, strict=False)), "size": begins[-1]}
+        return places(sizes, 16)
 
 
 def gradient_tiling(shape: UpdateShape, shared_memory: int) -> Tiling | None:

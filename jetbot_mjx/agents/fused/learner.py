@@ -16,11 +16,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
 from jetbot_mjx.agents.brax_parts import Transition
-from jetbot_mjx.agents.fused import adam, launch, probe
+from jetbot_mjx.agents.fused import adam, arrays, launch, probe
 from jetbot_mjx.agents.fused.adam import AdamRule, AdamTerms, Progress
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll as UnrollSpec
 from jetbot_mjx.agents.fused.layout import VectorLayout
 from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import Unroll as UnrollSpec
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner, PackedEnv, Unroll
 from jetbot_mjx.agents.optimizer import read_adam, write_adam
 from jetbot_mjx.agents.random_keys import Keys
@@ -120,17 +120,20 @@ class FusedLearner(Learner):
         """The networks."""
         self._config, self._devices = config, devices
         # Each device has its share of the environments and of every minibatch.
-        self._environments = config.num_envs // devices.size
         unrolls, steps = config.batch_size // devices.size, config.num_minibatches
         self.batch = Minibatch(
-            unrolls * steps, unrolls, config.unroll_length, steps * config.num_updates_per_batch
+            collected=unrolls * steps,
+            unrolls=unrolls,
+            time=config.unroll_length,
+            minibatches=steps * config.num_updates_per_batch,
+            environments=config.num_envs // devices.size,
         )
         """A minibatch on one device."""
         schedule = config.learning_rate_schedule
-        self.rule = AdamRule(shape, self.batch.samples, schedule, self.batch.count)
+        self.rule = AdamRule(shape, self.batch.samples, schedule, self.batch.minibatches)
         """What the vectors hold, and how the step size changes."""
         # Several devices average each gradient before Adam's step.
-        self.at_once = devices.size == 1 and launch.computes_at_once()
+        self.at_once = devices.size == 1 and launch.has(arrays.UPDATE)
         """Whether one kernel computes all minibatches."""
 
     # Whether the kernels can be used.
@@ -148,7 +151,14 @@ class FusedLearner(Learner):
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        launch.prepare(self.rule, self.batch, self._environments, policies, at_once=self.at_once)
+        # An unroll is prepared as soon as its environment is known.
+        if not launch.has(arrays.UNROLL):
+            launch.prepare(arrays.ACTIONS, self.shape, self.batch, policies)
+        if self.at_once:
+            launch.prepare(arrays.UPDATE, self.rule, self.batch, policies)
+        else:
+            launch.prepare(arrays.GRADIENT, self.shape, self.batch, policies)
+            launch.prepare(arrays.ADAM, self.rule, self.batch, policies)
 
     # The collection.
 
@@ -159,7 +169,7 @@ class FusedLearner(Learner):
         if spec is None:
             return step_by_step(env, self.policy(state.params, state.normalizer), self.action_noise)
         # All steps by one kernel, which writes what is kept of each state as a row of numbers.
-        launch.prepare_unroll(spec, self._environments, self.batch.time)
+        launch.prepare(arrays.UNROLL, spec, self.batch)
         statistics = self._statistics(state.normalizer)
         kept_like = jax.eval_shape(
             lambda x: pack(kept_of(x.unpack()), batch_axes=1), state.env_state
@@ -184,7 +194,7 @@ class FusedLearner(Learner):
           start: its states.
         """
         step = env.step_packed
-        if not launch.unrolls_at_once() or not isinstance(step, PackedStep):
+        if not launch.has(arrays.UNROLL) or not isinstance(step, PackedStep):
             return None
         kernel = step.kernel(start)
         if kernel is None or jax.eval_shape(lambda x: x.unpack().obs, start).dtype != jnp.float32:
@@ -218,7 +228,9 @@ class FusedLearner(Learner):
 
     def action_noise(self, key: PRNGKeyArray) -> Float[Array, "time environments actions"]:
         """Draw the noise of all actions of an unroll."""
-        return jax.random.normal(key, (self.batch.time, self._environments, self.shape.actions))
+        return jax.random.normal(
+            key, (self.batch.time, self.batch.environments, self.shape.actions)
+        )
 
     def _extras(self, drawn: launch.Actions) -> dict[str, Any]:
         """Return what Brax keeps of actions."""
@@ -252,8 +264,8 @@ class FusedLearner(Learner):
         shuffle_key, noise_key = jax.random.split(key)
         shuffle_keys = jax.random.split(shuffle_key, self._config.num_updates_per_batch)
         orders = jax.vmap(lambda key: jax.random.permutation(key, self.batch.collected))
-        unrolls = orders(shuffle_keys).reshape(self.batch.count, -1)
-        noise = self.noise(jax.random.split(noise_key, self.batch.count))
+        unrolls = orders(shuffle_keys).reshape(self.batch.minibatches, -1)
+        noise = self.noise(jax.random.split(noise_key, self.batch.minibatches))
         state = self.first_vectors(params, optimizer_state)
         # All minibatches by one kernel.
         if self.at_once:
@@ -269,7 +281,7 @@ class FusedLearner(Learner):
 
         # One counter, unlike that of `scan` beside its own, which would be another launch.
         begun = jnp.zeros((), jnp.int32), *state
-        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
+        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.minibatches, step, begun)
         return self.results(ended[1:], optimizer_state)
 
     def collected(self, data: Transition, normalizer: Any) -> Collected:
