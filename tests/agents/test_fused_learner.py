@@ -13,13 +13,13 @@ from brax.training.agents.ppo.networks import PPONetworks
 from helpers import simt
 from helpers.kernel_ppo import ACTIONS, OBSERVATIONS, config, make_ppo, minibatch
 from jetbot_mjx.agents.fused import adam, launch, launch_gpu, probe
-from jetbot_mjx.agents.fused.actions import ActionKernel
-from jetbot_mjx.agents.fused.advantages import AdvantageKernel
 from jetbot_mjx.agents.fused.arrays import ACTIONS as ACTION_ARRAYS
 from jetbot_mjx.agents.fused.arrays import ADAM
+from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
 from jetbot_mjx.agents.fused.gpu_adam import AdamKernel
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
-from jetbot_mjx.agents.fused.gradient import GradientKernel
 from jetbot_mjx.agents.fused.learner import FusedLearner, make_fused_learner, shape_of
 from jetbot_mjx.agents.fused.shapes import Minibatch
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis

@@ -23,10 +23,10 @@ from helpers.update_cases import (
 )
 from jetbot_mjx.agents.fused import arrays as signatures
 from jetbot_mjx.agents.fused import gpu_tiling, launch, launch_cpu
-from jetbot_mjx.agents.fused.actions import ActionKernel
-from jetbot_mjx.agents.fused.advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
-from jetbot_mjx.agents.fused.gradient import GradientKernel
 from jetbot_mjx.agents.fused.launch_gpu import PTX_VERSION
 from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
 from onekernel import cpu, gpu

@@ -1,16 +1,21 @@
-"""Write the kernel that draws the actions of all environments on CPUs."""
+"""Write the kernels of a collection on CPUs: the actions of all environments, or whole unrolls.
+
+In an unroll, few environments at a time go through all steps, actions and physics in turns. Their
+states stay in the cache, the weights are arranged once, and no thread waits for another, while a
+call for each step would wake all threads twice.
+"""
 
 from collections.abc import Iterator, Mapping
 
 from jetbot_mjx.agents.fused import sample_loss
-from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
+from jetbot_mjx.agents.fused.arrays import ACTIONS, UNROLL, Actions
 from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
 from jetbot_mjx.agents.fused.cpu_product import rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Stages, sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel import scalarize
-from onekernel.build import LlvmWriter, Value
+from onekernel.build import LlvmWriter, Value, cpu
 
 _PART_ROWS = 2 * TILE_ROWS
 """Environments of a part if there are no more than `MOST_PARTS` times as many; each part copies the
@@ -137,3 +142,60 @@ class ActionStage(NetworkStage):
                 for i in range(size):
                     row[i] = (places["drawn"] + place * lanes)[lane]
                     place += 1
+
+
+def unroll_stages(unroll: Unroll, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stage of `arrays.UNROLL`.
+
+    Args:
+      unroll: the networks and the environment.
+      batch: the data, of which the number of environments and the time are used.
+      lanes: the number of float32 values in a vector register.
+    """
+    return Stages([_UnrollStage(unroll, batch, lanes)])
+
+
+class _UnrollStage(ActionStage):
+    """Takes environments through all steps of an unroll."""
+
+    name = "unroll"
+    arrays_of = (*UNROLL.arguments, *UNROLL.returns)
+
+    def __init__(self, unroll: Unroll, batch: Minibatch, lanes: int) -> None:
+        # The parts are smaller than those of one step: each arranges the weights for all steps.
+        super().__init__(unroll.shape, batch.environments, lanes, TILE_ROWS)
+        self._unroll, self._time = unroll, batch.time
+        numbers = {"kept": len(unroll.kept), "unroll_noise": self.shape.actions, **self.drawn}
+        self._step_sizes = {name: batch.environments * size for name, size in numbers.items()}
+        """The numbers of a step in each array that holds all steps."""
+
+    def own_functions(self) -> list[LlvmWriter]:
+        """Write the activation, the sample and the step of the environments."""
+        return [
+            *super().own_functions(),
+            *cpu.step_functions(self._unroll.kernel, self.lanes),
+        ]
+
+    def tile(self, first: Value, count: Value) -> None:
+        """Take some environments through all steps."""
+        w, unroll, end = self.w, self._unroll, self.arrays["end"]
+        limit = first + count
+        with w.loop(self._time) as step:
+            # Find the step's part of each array, and the states before it.
+            sizes = self._step_sizes.items()
+            here = {name: self.arrays[name] + step * size for name, size in sizes}
+            before = w.select(step.equals(0), self.arrays["start"], end)
+            here["observations"] = before + unroll.observation
+            here["action_noise"] = here["unroll_noise"]
+            # Draw the actions, and step the environments.
+            self.act(first, count, here, unroll.state)
+            for start in self.groups(count):
+                w.call("instances", before, here["action"], end, first + start, limit)
+            # Copy what is kept of the states.
+            with w.loop(count) as row:
+                environment = first + row
+                source = end + environment * unroll.state
+                target = here["kept"] + environment * len(unroll.kept)
+                for place, begin, last in unroll.ranges:
+                    with w.loop(last + 1 - begin) as i:
+                        (target + place)[i] = (source + begin)[i]

@@ -18,6 +18,7 @@ from jetbot_mjx.agents.fused.cpu_product import (
     multiply,
     rounded_up,
     transposed,
+    vectors_of,
 )
 from jetbot_mjx.agents.fused.cpu_stages import Stages, SumStage, integer_at, sample_function
 from jetbot_mjx.agents.fused.sample_loss import ValueStep, vector_of
@@ -298,25 +299,18 @@ class _PolicyStage(_GradientStage):
 
     def _mean_advantage(self, centre: Value | None) -> Value:
         """Return the mean of the advantages, or of their squared distances from a centre."""
-        w, samples, lanes = self.w, self.batch.samples, self.w.lanes
+        w, samples, lanes = self.w, self.batch.samples, self.lanes
         total = self.places["statistics"]
+        # A sum for each lane, and then one of all lanes.
         fill(total, lanes)
-
-        def add(place: Value, kind: str) -> None:
+        first, count = (w.constant(x, "u64") for x in (0, samples))
+        for place, kind in vectors_of(first, count):
             value = (self.arrays["advantages"] + place).load(kind)
             if centre is not None:
                 distance = value - (centre if kind == "float" else centre.splat(lanes))
                 value = distance * distance
             add_to(total, value)
-
-        # A sum for each lane, and then one of all lanes.
-        whole = samples // lanes
-        with w.loop(whole) as i:
-            add(i * lanes, w.vector)
-        with w.loop(samples % lanes) as i:
-            add(i + whole * lanes, "float")
-        with w.loop(lanes - 1) as i:
-            add_to(total, total[i + 1])
+        add_all(total + 1, lanes - 1, total)
         return total[0] * (1 / samples)
 
     def add_losses(self, first: Value, count: Value) -> None:

@@ -1,19 +1,18 @@
 """Launch the kernels of PPO on CPUs, of which one computes a whole update."""
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.agents.fused.arrays import UPDATE, Arrays, Signature, Spec
-from jetbot_mjx.agents.fused.cpu_actions import action_stages
+from jetbot_mjx.agents.fused.cpu_actions import action_stages, unroll_stages
 from jetbot_mjx.agents.fused.cpu_adam import adam_stages, update_stages
 from jetbot_mjx.agents.fused.cpu_gradient import gradient_stages
 from jetbot_mjx.agents.fused.cpu_network import HEAD
 from jetbot_mjx.agents.fused.cpu_stages import Call, Stages
-from jetbot_mjx.agents.fused.cpu_unroll import unroll_stages
 from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel.build import Backend, cpu, in_background
 
@@ -56,7 +55,7 @@ _STAGES: Mapping[str, Callable[..., Stages]] = {
 """Functions that return the stages of a kernel, by its name, from what it is written for, the data,
 and the number of float32 values in a vector register."""
 
-NAMES = frozenset(_STAGES)
+NAMES: Collection[str] = frozenset(_STAGES)
 """Names of the kernels, as in `launch.Launcher`."""
 
 

@@ -6,7 +6,7 @@ each, which XLA adds up in a fixed order.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
 from typing import NamedTuple
 
@@ -14,14 +14,13 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jetbot_mjx.agents.fused import advantages, gpu_tiling
-from jetbot_mjx.agents.fused import gradient as gradient_kernel
-from jetbot_mjx.agents.fused.actions import ActionKernel
+from jetbot_mjx.agents.fused import gpu_advantages, gpu_gradient, gpu_tiling
 from jetbot_mjx.agents.fused.adam import AdamRule
-from jetbot_mjx.agents.fused.advantages import AdvantageKernel
 from jetbot_mjx.agents.fused.arrays import ACTIONS, ADAM, Arrays, Signature, Spec
+from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
 from jetbot_mjx.agents.fused.gpu_adam import BLOCK_ELEMENTS, AdamKernel
-from jetbot_mjx.agents.fused.gradient import GradientKernel
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
 from jetbot_mjx.agents.fused.tensor_core import GpuKernel
 from onekernel.build import Backend, gpu, in_background
@@ -151,7 +150,7 @@ _KERNELS: Mapping[str, Callable[..., object]] = {
     "adam": _adam_kernel,
 }
 
-NAMES = frozenset(_KERNELS)
+NAMES: Collection[str] = frozenset(_KERNELS)
 """Names of the kernels, as in `launch.Launcher`."""
 
 
@@ -176,11 +175,11 @@ def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> l
     first, second = _gradient_kernels(spec, batch, policies)
     samples = policies, batch.samples
     estimates = first(
-        [arrays[name] for name in advantages.ARGUMENTS],
+        [arrays[name] for name in gpu_advantages.ARGUMENTS],
         *(samples, samples, (policies, first.blocks, 2)),
     )
-    all_arrays = {**arrays, **dict(zip(advantages.RESULTS, estimates, strict=True))}
-    given = [all_arrays[name] for name in gradient_kernel.ARGUMENTS]
+    all_arrays = {**arrays, **dict(zip(gpu_advantages.RESULTS, estimates, strict=True))}
+    given = [all_arrays[name] for name in gpu_gradient.ARGUMENTS]
     (vectors,) = second(given, (policies, second.blocks, spec.size))
     return [vectors.sum(1)]
 

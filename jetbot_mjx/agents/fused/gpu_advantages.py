@@ -8,8 +8,8 @@ all that their normalisation needs.
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import GRADIENT
+from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
-from jetbot_mjx.agents.fused.network import NetworkKernel
 from jetbot_mjx.agents.fused.shapes import Minibatch
 from jetbot_mjx.agents.fused.tensor_core import LANES, Value
 

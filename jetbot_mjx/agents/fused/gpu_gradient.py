@@ -10,8 +10,8 @@ from collections.abc import Iterator
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import GRADIENT
+from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import PAD, Tiling, padded, shares_of
-from jetbot_mjx.agents.fused.network import NetworkKernel
 from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, Minibatch
 from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Sums, Value
 

@@ -6,8 +6,8 @@ do, and then each thread draws the action of one environment.
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
+from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
-from jetbot_mjx.agents.fused.network import NetworkKernel
 from jetbot_mjx.agents.fused.shapes import Minibatch
 from jetbot_mjx.agents.fused.tensor_core import Value
 
