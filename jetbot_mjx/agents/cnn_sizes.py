@@ -5,7 +5,7 @@ needs it.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +85,7 @@ def check_size(cnn: str, shapes: Shapes) -> None:
             )
 
 
-def compute_dtype(name: str) -> Any:
+def compute_dtype(name: str) -> jax.typing.DTypeLike:
     """Return the type of number that `ppo.network.cnn_dtype` names, on JAX's default device."""
     if name == "auto":
         return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16

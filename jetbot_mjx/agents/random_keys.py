@@ -86,8 +86,7 @@ def _hashes(
 def _few(count: int, is_split: bool) -> Callable[[Array], Array]:
     """Return the kernel that draws that many numbers or keys."""
     draw = jax.random.split if is_split else jax.random.bits
-    shape: Any = count if is_split else (count,)
-    return _kernel(lambda key: draw(key, shape))
+    return _kernel(lambda key: draw(key, (count,)))
 
 
 @functools.cache

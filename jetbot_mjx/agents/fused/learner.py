@@ -9,13 +9,13 @@ On GPUs, products round their operands to float16; everything else is float32.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from jetbot_mjx.agents.brax_parts import Transition
+from jetbot_mjx.agents.brax_parts import Normalizer, Transition
 from jetbot_mjx.agents.fused import adam, arrays, launch, probe
 from jetbot_mjx.agents.fused.adam import AdamRule, AdamTerms, Progress
 from jetbot_mjx.agents.fused.layout import VectorLayout
@@ -28,6 +28,9 @@ from jetbot_mjx.agents.train_state import LOSSES, TrainState
 from jetbot_mjx.agents.unrolls import kept_of, step_by_step, transition
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.packed import Packed, PackedStep, pack
+
+Extras = dict[str, Array | tuple[Array, ...]]
+"""What Brax keeps of actions, by name."""
 
 
 class Collected(NamedTuple):
@@ -44,7 +47,7 @@ class Collected(NamedTuple):
 
 
 def shape_of(
-    config: PPOConfig, observation_size: int | Mapping[str, Any], action_size: int
+    config: PPOConfig, observation_size: int | Mapping[str, object], action_size: int
 ) -> UpdateShape | str:
     """Return the networks as the kernels know them, or why the kernels cannot compute them.
 
@@ -75,7 +78,7 @@ def shape_of(
 
 def make_fused_learner(
     config: PPOConfig,
-    observation_size: int | Mapping[str, Any],
+    observation_size: int | Mapping[str, object],
     action_size: int,
     devices: DeviceAxis = ONE_DEVICE,
 ) -> "FusedLearner | str":
@@ -205,8 +208,8 @@ class FusedLearner(Learner):
         return UnrollSpec(self.shape, kernel, int(places.obs[0]), tuple(map(int, kept)))
 
     def policy(
-        self, params: Float[Array, " size"], normalizer: Any
-    ) -> Callable[[Array, Array], tuple[Array, dict[str, Any]]]:
+        self, params: Float[Array, " size"], normalizer: Normalizer
+    ) -> Callable[[Array, Array], tuple[Array, Extras]]:
         """Return the policy of a collection.
 
         Args:
@@ -220,7 +223,7 @@ class FusedLearner(Learner):
         """
         statistics = self._statistics(normalizer)
 
-        def act(observations: Array, noise: Array) -> tuple[Array, dict[str, Any]]:
+        def act(observations: Array, noise: Array) -> tuple[Array, Extras]:
             drawn = launch.actions(self.shape, params, *statistics, observations, noise)
             return drawn.action, self._extras(drawn)
 
@@ -232,7 +235,7 @@ class FusedLearner(Learner):
             key, (self.batch.time, self.batch.environments, self.shape.actions)
         )
 
-    def _extras(self, drawn: launch.Actions) -> dict[str, Any]:
+    def _extras(self, drawn: launch.Actions) -> Extras:
         """Return what Brax keeps of actions."""
         extras = drawn._asdict()
         del extras["action"]
@@ -240,10 +243,11 @@ class FusedLearner(Learner):
             extras["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
         return extras
 
-    def _statistics(self, normalizer: Any) -> tuple[Array, Array]:
+    def _statistics(self, normalizer: Normalizer) -> tuple[Array, Array]:
         """Return the mean of the observations, and the inverse of their standard deviations."""
         if self._config.normalize_observations:
-            return normalizer.mean, 1.0 / normalizer.std
+            statistics: PyTree = normalizer
+            return statistics.mean, 1.0 / statistics.std
         size = self.shape.observations
         return jnp.zeros(size), jnp.ones(size)
 
@@ -253,7 +257,7 @@ class FusedLearner(Learner):
         self,
         params: Float[Array, " size"],
         optimizer_state: PyTree,
-        normalizer: Any,
+        normalizer: Normalizer,
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, " size"], PyTree, Float[Array, " totals"]]:
@@ -284,7 +288,7 @@ class FusedLearner(Learner):
         ended = jax.lax.while_loop(lambda state: state[0] < self.batch.minibatches, step, begun)
         return self.results(ended[1:], optimizer_state)
 
-    def collected(self, data: Transition, normalizer: Any) -> Collected:
+    def collected(self, data: Transition, normalizer: Normalizer) -> Collected:
         """Return the collected data as the kernels read it.
 
         Args:
@@ -292,7 +296,7 @@ class FusedLearner(Learner):
           normalizer: the statistics of the observations.
         """
         # A row for each step: what the policy saw and did, and what came of it.
-        extras: Any = data.extras
+        extras: PyTree = data.extras
         distribution = extras["policy_extras"]["distribution_params"]
         if self.shape.distribution == "normal":
             distribution = jnp.concatenate(distribution, axis=-1)
@@ -419,5 +423,5 @@ class FusedLearner(Learner):
         }
 
 
-def _array(numbers: Iterable[Any]) -> Float[Array, " numbers"]:
+def _array(numbers: Iterable[Array | float]) -> Float[Array, " numbers"]:
     return jnp.stack([jnp.asarray(x, jnp.float32) for x in numbers])
