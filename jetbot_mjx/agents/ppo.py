@@ -297,17 +297,11 @@ class PPO:
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
-        """Update the networks in several passes over the collected data, in minibatches.
+        """Let the learner update the networks, and average its metrics.
 
         Each minibatch applies one step of Adam along the gradient of the loss L that the module
-        states, clipped to the global norm `max_grad_norm`.
-
-        Args:
-          params: the parameters of the networks, from `Learner.begin`.
-          optimizer_state: the state of the optimizer, likewise.
-          normalizer: the statistics that normalise the observations.
-          data: the unrolls, shape (unrolls, time, ...); `next_observation` may hold only the last.
-          key: the random key of the shuffles and of the samples that estimate the entropy.
+        states, clipped to the global norm `max_grad_norm`. The arguments are those of
+        `Learner.update`.
 
         Returns:
           The new parameters, the new optimizer state, and the mean metrics of `LOSSES` over the

@@ -79,6 +79,7 @@ class _ObservationEncoder(NamedTuple):
     def __call__(
         self, normalizer: Normalizer, params: PyTree, obs: Mapping[str, Array]
     ) -> Float[Array, "*batch features"]:
+        # Encode all images at once, and join the features and the normalised numbers.
         images = {name: obs[name] for name in sorted(self.shapes) if is_image(name)}
         numbers = {name: obs[name] for name in sorted(self.shapes) if name not in images}
         values = self.normalize(numbers, normalizer)
@@ -106,6 +107,7 @@ def make_vision_networks(
     Returns:
       The networks.
     """
+    # An encoder, and Brax's networks behind it, which take features and numbers as one vector.
     layers = CNNS[config.cnn]
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
     encode_one = _ObservationEncoder(encoder, shapes, normalize)
@@ -128,6 +130,7 @@ def make_vision_networks(
         brax_heads.parametric_action_distribution,
     )
 
+    # For inference: encode and apply one network.
     def apply_policy(normalizer: Normalizer, params: PyTree, obs: Images) -> Array:
         encoded = {_POLICY: encode_one(normalizer, params, obs)}
         return heads.policy_network.apply(None, params, encoded)
@@ -199,6 +202,7 @@ class Encoder(nn.Module):
                 # Divide the few weights instead of the many pixels.
                 kernel = kernel / 255.0
             x = nn.relu(convolve(x, kernel.astype(dtype), stride) + bias.astype(dtype))
+        # All outputs of the last convolution to the features, in float32 for what follows.
         x = x.reshape(x.shape[0], -1)
         x = nn.relu(nn.Dense(self.features, dtype=dtype, name="dense")(x))
         return x.astype(jnp.float32).reshape(*batch, self.features)

@@ -84,11 +84,13 @@ class ActionStage(NetworkStage):
           arrays: the addresses of the observations, the noise and the results of all environments.
           stride: numbers from one observation to the next.
         """
+        # Take the observations through the network, a row for each environment,
         w = self.w
         with w.loop(count) as row:
             place = (first + row) * stride
             self.load_observation(arrays["observations"] + place, row)
         self.forward(self.stored_rows(count))
+        # and draw the actions, a lane for each environment.
         for start in self.groups(count):
             there = w.minimum(count - start, w.lanes)
             self._draw(first + start, start, there, arrays)
@@ -134,7 +136,7 @@ class ActionStage(NetworkStage):
             for place, (source, i) in enumerate(numbers):
                 target[place * lanes] = source[i]
         w.call("draw", places["sample"], places["drawn"])
-        # Store what they draw.
+        # Store what they draw, the numbers of each array behind those of the one before.
         with w.loop(there) as lane:
             place = 0
             for name, size in self.drawn.items():

@@ -63,6 +63,7 @@ class _AdamStage(VectorStage):
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function, and those that it calls."""
+        # Elements are updated a vector at a time, and those at the end one by one.
         factors, element = adam.programs(self.rule)
         elements = [_elements_function(element, n) for n in (self.lanes, 1)]
         return [sample_function("factors", factors, 1), *elements, self._step(call)]
@@ -103,6 +104,7 @@ def _elements_function(program: ScalarProgram, lanes: int) -> LlvmWriter:
     names = (f"ptr noalias {name}" for name in (*_VECTORS, "factors"))
     w = LlvmWriter(f"elements.{lanes}", *names, "u64 count", lanes=lanes)
     *vectors, factors, count = w.parameters
+    # All lanes have the same factors.
     common = [factors[i].splat(lanes) for i in range(len(Factors._fields))]
     with w.loop(count) as i:
         places = [vector + i * lanes for vector in vectors]

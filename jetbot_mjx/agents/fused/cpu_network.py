@@ -25,6 +25,7 @@ TILE_ROWS = 64
 """Rows of a tile, about, if there are as many."""
 
 MOST_PARTS = 32
+"""Parts of a stage at most: each has a gradient of its own, and arranges the weights."""
 
 _PAD = 16
 """Numbers between the rows of a matrix, so that they do not share few places of the cache."""

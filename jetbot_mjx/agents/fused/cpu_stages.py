@@ -77,6 +77,7 @@ class Call:
 
     def array(self, job: Value, policy: Value, name: str) -> Value:
         """Return the address of the array of a policy."""
+        # XLA passes the arguments and then the results, each with the policies as its first axis.
         place = (*self.arguments, *self.results).index(name)
         return cpu.array_of(job, place) + policy * self.sizes[name]
 
@@ -207,6 +208,7 @@ class SumStage(VectorStage):
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function."""
         w, (job, policy, part, *_) = self.begin(self._lanes)
+        # The array of each network has a vector for each part of its stage.
         gradient = call.array(job, policy, "gradient")
         for name, (count, places) in self._ranges.items():
             vectors, begin, size = call.array(job, policy, name), places[0], places[-1] - places[0]

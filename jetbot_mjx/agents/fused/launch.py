@@ -102,7 +102,7 @@ def actions(shape: UpdateShape, *given: Array) -> Actions:
       shape: the networks.
       *given: the arguments of `arrays.ACTIONS`.
     """
-    return Actions(*_actions_p.bind(*given, spec=shape))
+    return Actions(*_PRIMITIVES["actions"].bind(*given, spec=shape))
 
 
 def unroll(
@@ -118,7 +118,7 @@ def unroll(
       The states after the last step; what is kept of the states after each step; and the actions
       of all steps.
     """
-    end, kept, *drawn = _unroll_p.bind(*given, spec=spec)
+    end, kept, *drawn = _PRIMITIVES["unroll"].bind(*given, spec=spec)
     return end, kept, Actions(*drawn)
 
 
@@ -132,7 +132,7 @@ def gradient(shape: UpdateShape, *given: Array) -> Float[Array, " size"]:
     Returns:
       The gradient, with the sums of the metrics at their places.
     """
-    return _gradient_p.bind(*given, spec=shape)[0]
+    return _PRIMITIVES["gradient"].bind(*given, spec=shape)[0]
 
 
 def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
@@ -145,7 +145,7 @@ def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The next parameters, means and progress.
     """
-    params, mu, nu, progress = _adam_p.bind(*given, spec=rule)
+    params, mu, nu, progress = _PRIMITIVES["adam"].bind(*given, spec=rule)
     return params, mu, nu, progress
 
 
@@ -159,7 +159,7 @@ def update(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The parameters, means and progress after the last minibatch.
     """
-    params, mu, nu, progress = _update_p.bind(*given, spec=rule)
+    params, mu, nu, progress = _PRIMITIVES["update"].bind(*given, spec=rule)
     return params, mu, nu, progress
 
 
@@ -201,9 +201,8 @@ def _primitive(kernel: Signature) -> Primitive:
     return primitive
 
 
-# The kernels as JAX sees them.
-_actions_p = _primitive(arrays.ACTIONS)
-_unroll_p = _primitive(arrays.UNROLL)
-_gradient_p = _primitive(arrays.GRADIENT)
-_adam_p = _primitive(arrays.ADAM)
-_update_p = _primitive(arrays.UPDATE)
+_PRIMITIVES = {
+    kernel.name: _primitive(kernel)
+    for kernel in (arrays.ACTIONS, arrays.UNROLL, arrays.GRADIENT, arrays.ADAM, arrays.UPDATE)
+}
+"""The kernels as JAX sees them."""

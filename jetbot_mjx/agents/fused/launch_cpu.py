@@ -61,6 +61,7 @@ NAMES: Collection[str] = frozenset(_STAGES)
 
 def _call(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
     """Return the call of a kernel."""
+    # Behind the results come the arrays between the stages, for which XLA finds memory.
     stages = _STAGES[kernel.name](spec, batch, lanes)
     return Call(
         kernel.arguments,

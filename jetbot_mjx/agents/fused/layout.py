@@ -53,7 +53,7 @@ class VectorLayout(Layout):
         """Return a tree with `NetworkParams` in place of every vector of that length."""
         return jax.tree.map(lambda x: self._params(x) if x.shape == (self._size,) else x, tree)
 
-    def _vector(self, params: NetworkParams) -> Float[Array, " size"]:
+    def _vector(self, params: NetworkParams) -> Float[Array | np.ndarray, " size"]:
         """Return the vector that holds the parameters."""
         is_on_host = isinstance(jax.tree.leaves(params)[0], np.ndarray)
         concatenate = np.concatenate if is_on_host else jnp.concatenate

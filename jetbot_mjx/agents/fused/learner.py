@@ -56,24 +56,16 @@ def shape_of(
       observation_size: the length of the observation, or the shapes of its parts.
       action_size: the length of the action.
     """
-    # The kernels know one width, and one depth.
     network = config.network
     hidden = network.policy_hidden_layer_sizes
-    widths = {*hidden, *network.value_hidden_layer_sizes}
-    shape = UpdateShape(
-        observation_size if isinstance(observation_size, int) else 0,
-        max(widths),
-        len(hidden),
-        action_size,
-        network.distribution_type,
-        network.activation,
-        config.normalize_advantage,
-    )
+    # The kernels know one width, and one depth.
     if not isinstance(observation_size, int):
         return "it takes observations without images"
-    if hidden != network.value_hidden_layer_sizes or len(widths) > 1:
+    if hidden != network.value_hidden_layer_sizes or len(set(hidden)) > 1:
         return "it takes two networks of the same hidden layers of one width"
-    return shape
+    sizes = observation_size, hidden[0], len(hidden), action_size
+    kinds = network.distribution_type, network.activation
+    return UpdateShape(*sizes, *kinds, config.normalize_advantage)
 
 
 def make_fused_learner(
@@ -261,7 +253,7 @@ class FusedLearner(Learner):
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, " size"], PyTree, Float[Array, " totals"]]:
-        """Update the networks in several passes over the collected data, as in `Learner`."""
+        """Update the networks by one kernel, or by three for each minibatch, as in `Learner`."""
         collected = self.collected(data, normalizer)
         terms = self.adam_terms(optimizer_state)
         # Shuffle for all passes, and draw all noise, with all keys at once, unlike Brax's.

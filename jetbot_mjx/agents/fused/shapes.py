@@ -49,11 +49,10 @@ class UpdateShape(NamedTuple):
     @property
     def hidden_layers(self) -> list[tuple[int, int, int]]:
         """Return number, inputs and first parameter of each hidden layer of a network."""
-        ends = itertools.accumulate(self.width * (inputs + 1) for inputs in self.inputs[:-1])
-        return [
-            (layer, inputs, end - self.width * (inputs + 1))
-            for layer, (inputs, end) in enumerate(zip(self.inputs, ends, strict=False))
-        ]
+        # Weights, of shape (inputs, width), and biases of a layer precede those of the next one.
+        sizes = (self.width * (inputs + 1) for inputs in self.inputs[:-1])
+        starts = itertools.accumulate(sizes, initial=0)
+        return list(zip(range(self.layers), self.inputs, starts, strict=False))
 
     @property
     def deviations(self) -> int:
@@ -78,22 +77,17 @@ class UpdateShape(NamedTuple):
     @property
     def ranges(self) -> list[tuple[int, int]]:
         """Return the ranges of the vector that hold parameters; metrics are behind each."""
+        # The policy's weights, biases and deviations, its metrics; the values', and theirs.
         policy = self.policy_size
         return [(0, policy - len(POLICY_METRICS)), (policy, self.size - len(VALUE_METRICS))]
 
     @property
     def columns(self) -> dict[str, int]:
         """Return where the parts of a row of the collected data begin, and its `size`."""
-        sizes = {
-            "observation": self.observations,
-            "raw_action": self.actions,
-            "log_prob": 1,
-            "distribution": 2 * self.actions,
-            "reward": 1,
-            "discount": 1,
-            "truncation": 1,
-        }
-        return places(sizes)
+        # What the policy saw and did, and what came of it.
+        sizes = {"observation": self.observations, "raw_action": self.actions}
+        sizes |= {"log_prob": 1, "distribution": 2 * self.actions}
+        return places(sizes | dict.fromkeys(("reward", "discount", "truncation"), 1))
 
 
 class Minibatch(NamedTuple):
@@ -166,5 +160,6 @@ def places(sizes: Mapping[str, int], multiple: int = 1) -> dict[str, int]:
       sizes: the size of each part.
       multiple: what each size is rounded up to a multiple of.
     """
+    # A part begins where the ones before it end.
     padded = (-(-size // multiple) * multiple for size in sizes.values())
     return dict(zip((*sizes, "size"), itertools.accumulate(padded, initial=0), strict=True))

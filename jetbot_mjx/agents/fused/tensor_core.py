@@ -131,6 +131,7 @@ class GpuWriter(LlvmWriter):
 
     def synchronize_group(self, group: Value, threads: int) -> None:
         """Wait for as many threads as belong to a group, by its number from 0."""
+        # A warp has a barrier of its own; the hardware's barrier 0 is that of the whole block.
         if threads == LANES:
             self.do('call void asm sideeffect "bar.warp.sync -1;", "~{memory}"() #0')
         else:
@@ -166,6 +167,7 @@ class GpuWriter(LlvmWriter):
 
     def unpack(self, pair: Value) -> tuple[Value, Value]:
         """Return a pair of float16 as floats."""
+        # The two halves of 32 bits.
         halves = pair.bits_as(_PAIR)
         low, high = (self.let(f"extractelement {halves.typed}, i32 {i}", "half") for i in (0, 1))
         return low.to("float"), high.to("float")
