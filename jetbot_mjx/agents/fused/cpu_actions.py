@@ -5,12 +5,11 @@ states stay in the cache, the weights are arranged once, and no thread waits for
 call for each step would wake all threads twice.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import ACTIONS, UNROLL, Actions
 from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
-from jetbot_mjx.agents.fused.cpu_product import rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Stages, sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
 from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
@@ -95,19 +94,6 @@ class ActionStage(NetworkStage):
             there = w.minimum(count - start, w.lanes)
             self._draw(first + start, start, there, arrays)
 
-    def groups(self, count: Value) -> Iterator[Value]:
-        """Repeat what is appended for as many environments at once as a vector has lanes.
-
-        Args:
-          count: the number of environments.
-
-        Yields:
-          The first one of the group.
-        """
-        lanes = self.w.lanes
-        with self.w.loop(rounded_up(count, lanes)) as group:
-            yield group * lanes
-
     def _draw(self, first: Value, start: Value, there: Value, arrays: Mapping[str, Value]) -> None:
         """Draw the actions of a group of environments.
 
@@ -118,8 +104,7 @@ class ActionStage(NetworkStage):
           arrays: those of `act`.
         """
         w, shape, places = self.w, self.shape, self.places
-        lanes, actions = w.lanes, shape.actions
-        deviations = self.params + (shape.hidden + (shape.width + 1) * self.outputs)
+        lanes, actions, deviations = w.lanes, shape.actions, self.deviations
         # Collect what the samples read, environment by environment.
         with w.loop(lanes) as lane:
             # Lanes beyond the last environment repeat it.
@@ -128,13 +113,10 @@ class ActionStage(NetworkStage):
             noise = (first + within) * actions
             sources = [
                 (outputs, self.outputs),
-                (deviations if shape.deviations else outputs, actions),
+                (outputs if deviations is None else deviations, actions),
                 (arrays["action_noise"] + noise, actions),
             ]
-            target = places["sample"] + lane
-            numbers = [(source, i) for source, count in sources for i in range(count)]
-            for place, (source, i) in enumerate(numbers):
-                target[place * lanes] = source[i]
+            self.gather("sample", lane, sources)
         w.call("draw", places["sample"], places["drawn"])
         # Store what they draw, the numbers of each array behind those of the one before.
         with w.loop(there) as lane:

@@ -16,7 +16,6 @@ from jetbot_mjx.agents.fused.cpu_product import (
     add_to,
     fill,
     multiply,
-    rounded_up,
     transposed,
     vectors_of,
 )
@@ -318,9 +317,8 @@ class _PolicyStage(_GradientStage):
         w, time, places = self.w, self.batch.time, self.places
         lanes = w.lanes
         rows, results = count * time, places["results"]
-        with w.loop(rounded_up(rows, lanes)) as group:
+        for start in self.groups(rows):
             # Collect what the loss reads, sample by sample.
-            start = group * lanes
             there = w.minimum(rows - start, lanes)
             with w.loop(lanes) as lane:
                 # Lanes beyond the last sample repeat it, with a weight of zero.
@@ -344,10 +342,9 @@ class _PolicyStage(_GradientStage):
     ) -> None:
         """Copy what the loss of a sample reads to a lane, in the order of `PolicySample`."""
         w, shape, batch = self.w, self.shape, self.batch
-        columns, actions = shape.columns, shape.actions
+        columns, actions, deviations = shape.columns, shape.actions, self.deviations
         outputs = self.places["outputs"] + row * HEAD
         collected = self.row_of(unroll, step)
-        deviations = self.params + (shape.hidden + (shape.width + 1) * self.outputs)
         noise = self.arrays["noise"] + (step * batch.unrolls + unroll) * actions
         advantage = self.arrays["advantages"][unroll * batch.time + step]
         if shape.normalizes:
@@ -355,13 +352,10 @@ class _PolicyStage(_GradientStage):
         first = columns["raw_action"]
         sources = [
             (outputs, self.outputs),
-            (deviations if shape.deviations else outputs, actions),
+            (outputs if deviations is None else deviations, actions),
             (collected + first, columns["reward"] - first),
             (noise, actions),
         ]
         # The fields of `PolicySample`, one behind the other, and the coefficients.
-        values = [source[i] for source, count in sources for i in range(count)]
-        values += [advantage, w.select(is_there, w.constant(1.0), 0.0), *self.load_terms()]
-        target = self.places["loss"] + lane
-        for i, value in enumerate(values):
-            target[i * w.lanes] = value
+        weight = w.select(is_there, w.constant(1.0), 0.0)
+        self.gather("loss", lane, sources, advantage, weight, *self.load_terms())

@@ -8,7 +8,7 @@ a layer with its biases.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from jaxtyping import Array
 
@@ -172,6 +172,41 @@ class NetworkStage(Stage):
 
     def end_part(self) -> None:
         """Write what is known after the last tile."""
+
+    def groups(self, count: Value) -> Iterator[Value]:
+        """Repeat what is appended for as many rows at once as a vector has lanes.
+
+        Args:
+          count: the number of rows.
+
+        Yields:
+          The first row of the group.
+        """
+        lanes = self.lanes
+        with self.w.loop(rounded_up(count, lanes)) as group:
+            yield group * lanes
+
+    @property
+    def deviations(self) -> Value | None:
+        """Return the address of the standard deviations that are parameters; None: none are."""
+        if not self.shape.deviations:
+            return None
+        return self.params + (self.shape.hidden + (self.shape.width + 1) * self.outputs)
+
+    def gather(
+        self, name: str, lane: Value, sources: Sequence[tuple[Value, int]], *others: Value
+    ) -> None:
+        """Copy what a function of single samples reads to a lane, a number to each row.
+
+        Args:
+          name: the array of scratch memory that it reads, of shape (numbers, lanes).
+          lane: the lane.
+          sources: addresses, and how many numbers there.
+          *others: the numbers behind these.
+        """
+        numbers = [source[i] for source, count in sources for i in range(count)]
+        for i, number in enumerate([*numbers, *others]):
+            (self.places[name] + lane)[i * self.lanes] = number
 
     def stored_rows(self, rows: Value) -> Value:
         """Return a number of rows, rounded up to whole tiles of a product."""

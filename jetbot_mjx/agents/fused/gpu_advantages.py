@@ -101,17 +101,17 @@ class AdvantageKernel(NetworkKernel):
         self._store_values()
         ir.synchronize()
         # The differences, for all steps at once.
-        given = [self._read("values", own), reward, discount, truncation]
-        delta, factor = self._error([*given, self._read("values", own, 1)])
-        self._write(delta, "deltas", own)
-        self._write(factor, "factors", own)
+        given = [self.read("values", own), reward, discount, truncation]
+        delta, factor = self._error([*given, self.read("values", own, 1)])
+        self.write("deltas", own, delta)
+        self.write("factors", own, factor)
         ir.synchronize()
         # From the last step to the first, a thread for each unroll.
         with ir.when(self.thread < self.per_tile):
             self._accumulate()
         ir.synchronize()
         # The advantage is the difference by the next target.
-        advantage, _ = self._error([*given, self._read("targets", own, 1)])
+        advantage, _ = self._error([*given, self.read("targets", own, 1)])
         # Rows beyond the unrolls, and those of the last observations, have none.
         beyond = ir.constant(self.batch.unrolls, "u32")
         unroll = ir.select(own < self.per_tile * (time + 1), unroll, beyond)
@@ -120,7 +120,7 @@ class AdvantageKernel(NetworkKernel):
         with ir.when(there):
             place = unroll * time + step
             self.arrays["advantages"][place] = advantage
-            self.arrays["targets"][place] = self._read("targets", own)
+            self.arrays["targets"][place] = self.read("targets", own)
         return ir.select(there, advantage, 0.0)
 
     def _error(self, step: list[Value]) -> list[Value]:
@@ -142,35 +142,29 @@ class AdvantageKernel(NetworkKernel):
         ir, time = self.ir, self.batch.time
         first = self.thread * (time + 1)
         total, gae_step = ir.constant(0.0), sample_loss.gae_program()
-        self._write(self._read("values", first, time), "targets", first, time)
+        self.write("targets", first, self.read("values", first, time), time)
         for step in reversed(range(time)):
-            delta, factor = (self._read(name, first, step) for name in ("deltas", "factors"))
+            delta, factor = (self.read(name, first, step) for name in ("deltas", "factors"))
             (total,) = ir.run(gae_step, [delta, factor, total])
-            self._write(total + self._read("values", first, step), "targets", first, step)
-
-    def _read(self, name: str, row: Value, offset: int = 0) -> Value:
-        return self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset).load()
-
-    def _write(self, value: Value, name: str, row: Value, offset: int = 0) -> None:
-        self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset).store(value)
+            self.write("targets", first, total + self.read("values", first, step), step)
 
     def _store_statistics(self, *sums: Value) -> None:
         """Add up the threads' sums in a fixed order, and store those of the block."""
         ir, threads = self.ir, self.tiling.threads
         for i, value in enumerate(sums):
-            self._write(value, "statistics", self.thread, threads * i)
+            self.write("statistics", self.thread, value, threads * i)
         # The first warp adds up the sums of all threads, those of each lane.
         ir.synchronize()
         lanes = 2 * threads
         with ir.when(self.thread < LANES):
             for i in range(2):
                 rows = range(threads * i, threads * (i + 1), LANES)
-                total = ir.total(self._read("statistics", self.thread, row) for row in rows)
-                self._write(total, "statistics", self.thread, lanes + LANES * i)
+                total = ir.total(self.read("statistics", self.thread, row) for row in rows)
+                self.write("statistics", self.thread, total, lanes + LANES * i)
         # Then two threads add up those of the lanes.
         ir.synchronize()
         with ir.when(self.thread < 2):
             places = range(lanes, lanes + LANES)
             self.statistics[self.thread] = ir.total(
-                self._read("statistics", self.thread * LANES, place) for place in places
+                self.read("statistics", self.thread * LANES, place) for place in places
             )

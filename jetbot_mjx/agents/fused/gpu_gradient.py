@@ -124,7 +124,7 @@ class GradientKernel(NetworkKernel):
                     part = self.thread + j
                     value = self.arrays["statistics"][ir.minimum(part, self.parts - 1) * 2 + i]
                     total += ir.select(part < self.parts, value, 0.0)
-                ir.shared(self.thread * 4, place + 4 * LANES * i).store(total)
+                self.write("statistics", self.thread, total, LANES * i)
         ir.synchronize()
         with ir.when(self.thread < 1):
             totals = []

@@ -51,6 +51,14 @@ class NetworkKernel(GpuKernel):
         """Return the byte of shared memory where an array begins."""
         return self.tiling.layout[name]
 
+    def read(self, name: str, place: Value, offset: int = 0) -> Value:
+        """Return a number of an array of float32 in shared memory."""
+        return self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).load()
+
+    def write(self, name: str, place: Value, value: Value, offset: int = 0) -> None:
+        """Write a number of an array of float32 in shared memory."""
+        self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).store(value)
+
     def layer(self, number: int) -> str:
         """Return the name of a layer's activations; 0: the observations."""
         return f"layer{number if self.tiling.is_gradient else min(number, 1)}"
@@ -138,7 +146,7 @@ class NetworkKernel(GpuKernel):
           params: the address of the network's parameters.
           outputs: the number of its outputs.
         """
-        ir, shape, width = self.ir, self.shape, self.shape.width
+        shape, width = self.shape, self.shape.width
         self.params = params
         # The hidden layers, eight pairs of weights of a thread at a time.
         for layer, inputs, start in shape.hidden_layers:
@@ -146,8 +154,7 @@ class NetworkKernel(GpuKernel):
             for first in range(0, len(pairs), 8):
                 self._load_weights(params, start, layer, pairs[first : first + 8])
             for i in self.each(width):
-                bias = params[i + (start + inputs * width)]
-                ir.shared(i * 4, self.bytes_of(f"biases{layer}")).store(bias)
+                self.write(f"biases{layer}", i, params[i + (start + inputs * width)])
         # The last layer; its columns beyond the outputs are zero.
         for i in self.each(width * TILE // 2):
             row, column = i // (TILE // 2), i % (TILE // 2) * 2
@@ -158,12 +165,10 @@ class NetworkKernel(GpuKernel):
             self._store_pair("head", row, column, pair)
         head_biases = outputs * width + shape.hidden
         for i in self.each(MOST_OUTPUTS):
-            bias = self._within(params, head_biases, i, outputs)
-            ir.shared(i * 4, self.bytes_of("head_biases")).store(bias)
+            self.write("head_biases", i, self._within(params, head_biases, i, outputs))
         for name in ("mean", "scale"):
             for i in self.each(self.first):
-                value = self._within(self.arrays[name], None, i, shape.observations)
-                ir.shared(i * 4, self.bytes_of(name)).store(value)
+                self.write(name, i, self._within(self.arrays[name], None, i, shape.observations))
 
     def _load_weights(self, params: Value, offset: int, layer: int, places: list[Value]) -> None:
         """Copy the thread's pairs of a hidden layer's weights, with zeros beyond its inputs."""
@@ -203,10 +208,7 @@ class NetworkKernel(GpuKernel):
             fetched.append((row, column, pair))
         # (observation - mean) / std, with 1 / std as `scale`.
         for row, column, pair in fetched:
-            mean, scale = (
-                [ir.shared(column * 4, self.bytes_of(name) + 4 * j).load() for j in (0, 1)]
-                for name in ("mean", "scale")
-            )
+            mean, scale = ([self.read(x, column, j) for j in (0, 1)] for x in ("mean", "scale"))
             normalized = [(pair[j] - mean[j]) * scale[j] for j in (0, 1)]
             self._store_pair("layer0", row, column, normalized)
 
