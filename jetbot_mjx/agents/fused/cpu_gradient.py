@@ -31,6 +31,9 @@ from jetbot_mjx.agents.fused.shapes import (
 from onekernel import scalarize
 from onekernel.build import LlvmWriter, ScalarProgram, Value
 
+_READ = ("params", "mean", "scale", "rows")
+"""Arrays that both networks read first."""
+
 _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""
 
@@ -217,10 +220,7 @@ class _ValueStage(_GradientStage):
 
     name = "values"
     is_policy = False
-    arrays_of = (
-        *("params", "mean", "scale", "rows", "last", "unrolls", "terms"),
-        *("values_vectors", "advantages"),
-    )
+    arrays_of = (*_READ, "last", "unrolls", "terms", "values_vectors", "advantages")
 
     def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         self.slots, self.size = len(VALUE_METRICS), shape.size - shape.policy_size
@@ -273,10 +273,7 @@ class _PolicyStage(_GradientStage):
     """The gradient of the policy network."""
 
     name = "policy"
-    arrays_of = (
-        *("params", "mean", "scale", "rows", "unrolls", "noise", "terms"),
-        *("policy_vectors", "advantages"),
-    )
+    arrays_of = (*_READ, "unrolls", "noise", "terms", "policy_vectors", "advantages")
 
     def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         self.slots, self.size = shape.deviations + len(POLICY_METRICS), shape.policy_size

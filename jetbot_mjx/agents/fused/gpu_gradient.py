@@ -33,6 +33,15 @@ class GradientKernel(NetworkKernel):
 
     The arguments are those of `arrays.AXES` and the results of the kernel of the advantages. The
     sum of the vectors is the gradient, with the sums of the metrics at their places.
+
+    In shared memory it also has, with a row for each sample of a tile where nothing else is said:
+
+        layer1, layer2, ...    float16 (rows, width); the backward pass puts derivatives there
+        slopes1, slopes2, ...  the same, of `swish` only, whose slopes its values do not tell
+        errors                 float16 (rows, 16), derivatives of the loss by the outputs
+        extras                 float32 (rows, numbers that the loss reads beside the outputs)
+        statistics             float32, sums of the lanes, then mean and 1 / std of the advantages
+        slots                  float32 (sums that single samples add to, rows + 1)
     """
 
     name = "ppo_gradient"

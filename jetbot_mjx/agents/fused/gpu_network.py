@@ -27,7 +27,8 @@ class NetworkKernel(GpuKernel):
         layer0                   (rows of a tile, observations in whole tiles of 16), normalised
         layer1, layer2, ...      (rows, width), activations; without a backward pass only layer1
 
-    and of float32 the biases of each layer, the observations' statistics and the outputs.
+    and of float32 the biases of each layer (width), the observations' mean and scale, and the
+    outputs (rows of a tile, MOST_OUTPUTS + 1).
     """
 
     def __init__(
@@ -112,18 +113,19 @@ class NetworkKernel(GpuKernel):
         Args:
           side: on which side of the product it stands.
           name: its name.
-          sums: the axis along which the product sums; of the left operand it is that of the
-            columns, or that of the rows if the operand is transposed.
-          row: the first row.
-          column: the first column.
+          sums: what the product sums over: the columns of a left matrix, the rows of a right one,
+            or else those of its transpose.
+          row: the first row in memory.
+          column: the first column in memory.
         """
         ir, stride, by_rows = self.ir, self.stride_of(name), sums == "rows"
-        # Where the lane points `ldmatrix` at.
+        # The row of 8 numbers at which the lane points `ldmatrix`, in bytes.
         first = self.row_first if (side == "left") != by_rows else self.column_first
         place = (first[0] + row) * (2 * stride) + (first[1] + column) * 2
         pointer = ir.shared(place, self.bytes_of(name))
 
-        # A step of the sum and a tile of the result are 16 rows or columns, 32 bytes a row.
+        # A step of the sum, like a tile of the result, is 16 rows of 2 * stride bytes, or 16
+        # columns of 2 bytes.
         def fragments(tile: int, step: int) -> list[Value]:
             down, right = (step, tile) if by_rows else (tile, step)
             return ir.matrices(pointer, 32 * (down * stride + right), transposed=by_rows)
