@@ -113,9 +113,7 @@ def make_vision_networks(
     encode_one = _ObservationEncoder(encoder, shapes, normalize)
     brax_heads = make_heads(encode_one.features, action_size)
 
-    def encode(
-        normalizer: Normalizer, params: PyTree, obs: Mapping[str, Array]
-    ) -> dict[str, Array]:
+    def encode(normalizer: Normalizer, params: PyTree, obs: Images) -> dict[str, Array]:
         for_policy = encode_one(normalizer, params.policy, obs)
         if config.shared_cnn:
             return {_POLICY: for_policy, _VALUE: for_policy}
