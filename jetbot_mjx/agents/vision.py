@@ -103,9 +103,6 @@ def make_vision_networks(
       action_size: the length of the action.
       make_heads: builds Brax's networks from (observation_size, action_size, ...).
       normalize: a function of (numbers, statistics) that normalises the numbers.
-
-    Returns:
-      The networks.
     """
     # An encoder, and Brax's networks behind it, which take features and numbers as one vector.
     layers = CNNS[config.cnn]

@@ -37,8 +37,7 @@ def runs_correctly() -> bool:
     gradient = reference.gradient(_SHAPE, _TERMS, *data)
     observations = rows[:, 0, : _SHAPE.observations]
     actions = reference.actions(_SHAPE, params, observations, noise[0])
-    # What they compute.
-    # A new function each time, for which JAX has traced nothing yet.
+    # What they compute, as a new function each time, for which JAX has traced nothing yet.
     arrays = [np.asarray(x, np.float32) for x in data]
     with jax.default_device(jax.local_devices(backend=backend.PLATFORM)[0]):
         try:
