@@ -5,7 +5,7 @@ needs it.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,7 @@ class _Layers(NamedTuple):
     @property
     def smallest(self) -> int:
         """Return the side of the smallest image [pixels], which leaves one row of outputs."""
+        # Back through the layers: a stride for each output but the first, which takes a kernel.
         size = 1
         for _, side, stride in reversed(self.convolutions):
             size = (size - 1) * stride + side
@@ -57,11 +58,13 @@ def activation_bytes(config: NetworkConfig, shapes: Shapes) -> int:
     images = [shape for name, shape in shapes.items() if is_image(name)]
     height, width, _ = images[0]
     channels = sum(shape[2] for shape in images)
+    # The features, and of each convolution its outputs and the patches that it multiplies.
     count = layers.features
     for c_out, side, stride in layers.convolutions:
         height, width = ((size - side) // stride + 1 for size in (height, width))
         count += height * width * (side * side * channels + c_out)
         channels = c_out
+    # Separate networks encode the image twice.
     encoders = 1 if config.shared_cnn else 2
     return encoders * count * jnp.dtype(compute_dtype(config.cnn_dtype)).itemsize
 
@@ -76,6 +79,7 @@ def check_size(cnn: str, shapes: Shapes) -> None:
     Raises:
       InvalidError: an image is too small.
     """
+    # Brax's networks see images by the prefix of their names.
     for height, width, _ in (shape for name, shape in shapes.items() if is_image(name)):
         if min(height, width) < CNNS[cnn].smallest:
             sizes = ", ".join(f"{name}: {layers.smallest}" for name, layers in CNNS.items())
@@ -85,7 +89,7 @@ def check_size(cnn: str, shapes: Shapes) -> None:
             )
 
 
-def compute_dtype(name: str) -> Any:
+def compute_dtype(name: str) -> jax.typing.DTypeLike:
     """Return the type of number that `ppo.network.cnn_dtype` names, on JAX's default device."""
     if name == "auto":
         return jnp.float32 if jax.default_backend() == "cpu" else jnp.bfloat16

@@ -5,12 +5,12 @@
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, runtime_checkable
 
 import jax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from jetbot_mjx.agents.brax_parts import Transition
+from jetbot_mjx.agents.brax_parts import Normalizer, Transition
 from jetbot_mjx.agents.train_state import TrainState
 from jetbot_mjx.packed import Packed
 
@@ -129,7 +129,7 @@ class Learner(Protocol):
         self,
         params: PyTree,
         optimizer_state: PyTree,
-        normalizer: Any,
+        normalizer: Normalizer,
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[PyTree, PyTree, Float[Array, " totals"]]:

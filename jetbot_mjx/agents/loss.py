@@ -10,9 +10,9 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from jetbot_mjx.agents.brax_parts import Transition
+from jetbot_mjx.agents.brax_parts import Normalizer, Transition
 from jetbot_mjx.agents.gae import compute_gae
 from jetbot_mjx.agents.networks import NetworkParams, Networks
 from jetbot_mjx.config import PPOConfig
@@ -20,7 +20,7 @@ from jetbot_mjx.config import PPOConfig
 
 def ppo_loss(
     params: NetworkParams,
-    normalizer: Any,
+    normalizer: Normalizer,
     batch: Transition,
     key: PRNGKeyArray,
     *,
@@ -43,7 +43,7 @@ def ppo_loss(
     # Put the time first.
     batch = jax.tree.map(lambda x: jnp.swapaxes(x, 0, 1), batch)
     last = jax.tree.map(lambda x: x[-1], batch.next_observation)
-    distribution: Any = networks.parametric_action_distribution
+    distribution = networks.parametric_action_distribution
     value_network = networks.value_network
     outputs = networks.policy_network.apply(normalizer, params.policy, batch.observation)
     values = value_network.apply(normalizer, params.value, batch.observation)
@@ -80,13 +80,13 @@ def ppo_loss(
     }
 
 
-def _surrogate(ratio: Array, advantages: Array, epsilon: Any) -> Array:
+def _surrogate(ratio: Array, advantages: Array, epsilon: float | Array) -> Array:
     """Return the smaller of the surrogate objective and of the one with a clipped ratio."""
     surrogate, clipped = ratio * advantages, jnp.clip(ratio, 1 - epsilon, 1 + epsilon) * advantages
     return jnp.minimum(surrogate, clipped)
 
 
-def _policy_metrics(distribution: Any, outputs: Any, collected: Any) -> dict[str, Array]:
+def _policy_metrics(distribution: Any, outputs: PyTree, collected: PyTree) -> dict[str, Array]:
     """Return the divergence of the policy from that of the collection, and its deviation.
 
     Args:

@@ -56,7 +56,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree, UInt32
 
-from jetbot_mjx.agents.brax_parts import Env, Transition, UInt64, running_statistics
+from jetbot_mjx.agents.brax_parts import Env, Normalizer, Transition, UInt64
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner
 from jetbot_mjx.agents.learners import choose_learner, xla_instead
 from jetbot_mjx.agents.networks import (
@@ -271,7 +271,9 @@ class PPO:
         make_steps = self.learner.unroll(self._env, state)
 
         # An unroll: the policy acts for `unroll_length` steps in every environment.
-        def unroll(carry: Any, _: None) -> Any:
+        def unroll(
+            carry: tuple[Packed, PRNGKeyArray], _: None
+        ) -> tuple[tuple[Packed, PRNGKeyArray], tuple[Transition, NanDump]]:
             start, key = carry
             key, next_key = jax.random.split(key)
             after, data = make_steps(start, key)
@@ -291,21 +293,15 @@ class PPO:
         self,
         params: PyTree,
         optimizer_state: PyTree,
-        normalizer: running_statistics.RunningStatisticsState,
+        normalizer: Normalizer,
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
-        """Update the networks in several passes over the collected data, in minibatches.
+        """Let the learner update the networks, and average its metrics.
 
         Each minibatch applies one step of Adam along the gradient of the loss L that the module
-        states, clipped to the global norm `max_grad_norm`.
-
-        Args:
-          params: the parameters of the networks, from `Learner.begin`.
-          optimizer_state: the state of the optimizer, likewise.
-          normalizer: the statistics that normalise the observations.
-          data: the unrolls, shape (unrolls, time, ...); `next_observation` may hold only the last.
-          key: the random key of the shuffles and of the samples that estimate the entropy.
+        states, clipped to the global norm `max_grad_norm`. The arguments are those of
+        `Learner.update`.
 
         Returns:
           The new parameters, the new optimizer state, and the mean metrics of `LOSSES` over the
@@ -325,9 +321,7 @@ class PPO:
 
     # The normaliser and the metrics.
 
-    def _with_floor(
-        self, normalizer: running_statistics.RunningStatisticsState
-    ) -> running_statistics.RunningStatisticsState:
+    def _with_floor(self, normalizer: Normalizer) -> Normalizer:
         """Bound each standard deviation from below by the observation's physical scale.
 
         The height and tilt of a robot on a flat floor vary by micrometres. Normalised by such a
@@ -336,7 +330,7 @@ class PPO:
         """
         if self._min_std is None:
             return normalizer
-        raised: Any = normalizer
+        raised: PyTree = normalizer
         return raised.replace(std=jax.tree.map(jnp.maximum, raised.std, self._min_std))
 
     def _mean_metrics(self, totals: Float[Array, " metrics"]) -> Float[Array, " metrics"]:
@@ -353,7 +347,7 @@ class PPO:
     def _episode_sums(self, data: Transition) -> Float[Array, " sums"]:
         """Sum the metrics of the episodes that ended during collection over all devices."""
         ended = data.extras["state_extras"]["episode_done"]
-        statistics: Any = data.extras["state_extras"]["episode_metrics"]
+        statistics: PyTree = data.extras["state_extras"]["episode_metrics"]
         terms = [ended]
         terms += [ended * statistics.get(name, jnp.zeros(())) for name in EPISODE_SUMS]
         return self._devices.sum(jnp.stack(terms).sum(axis=(1, 2)))

@@ -37,6 +37,7 @@ def by_kernel(key: UInt32[Array, "2"]) -> PRNGKeyArray:
     Args:
       key: a key as `jax.random.PRNGKey` returns it.
     """
+    # Only where there are kernels, and as long as JAX draws as they do.
     backend = default_backend()
     if jax.default_backend() != "cpu" or backend is None or backend.obstacle():
         return key
@@ -52,6 +53,7 @@ def raw_key(key: Array) -> UInt32[Array, "..."]:
 
 @functools.cache
 def _generator() -> Any:
+    """Return JAX's default generator with kernels in the place of what XLA would compile."""
     return define_prng_impl(
         key_shape=(2,),
         seed=lambda seed: jax.random.key_data(jax.random.key(seed, impl="threefry2x32")),
@@ -64,6 +66,7 @@ def _generator() -> Any:
 
 
 def _bits(key: UInt32[Array, "2"], bit_width: int, shape: tuple[int, ...]) -> Array:
+    """Return random bits, those of 32 by kernels."""
     if bit_width != 32:
         dtype = np.dtype(f"uint{bit_width}")
         return jax.random.bits(_threefry(key), shape, dtype)
@@ -74,6 +77,7 @@ def _hashes(
     key: UInt32[Array, "2"], shape: tuple[int, ...], *, is_split: bool
 ) -> UInt32[Array, "..."]:
     """Return the bits of a key, or the keys into which it is split."""
+    # Few numbers are drawn by one instance of a kernel, many by an instance for each of them.
     count = math.prod(shape)
     if 0 < count <= _MOST_AT_ONCE:
         return _few(count, is_split)(key).reshape(*shape, *([2] if is_split else []))
@@ -86,8 +90,7 @@ def _hashes(
 def _few(count: int, is_split: bool) -> Callable[[Array], Array]:
     """Return the kernel that draws that many numbers or keys."""
     draw = jax.random.split if is_split else jax.random.bits
-    shape: Any = count if is_split else (count,)
-    return _kernel(lambda key: draw(key, shape))
+    return _kernel(lambda key: draw(key, (count,)))
 
 
 @functools.cache
@@ -95,6 +98,7 @@ def _one(is_split: bool) -> Callable[[Array, Array], Array]:
     """Return the kernel of the number or key at one place of many."""
 
     def hash_of(key: Array, place: Array) -> Array:
+        # JAX hashes the place in 64 bits, of which the upper half is zero below 2^32 numbers.
         words = threefry2x32_p.bind(key[0], key[1], jnp.uint32(0), place)
         return jnp.stack(words) if is_split else words[0] ^ words[1]
 

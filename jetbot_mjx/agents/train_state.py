@@ -5,7 +5,7 @@ from typing import Any
 from flax import struct
 from jaxtyping import PyTree
 
-from jetbot_mjx.agents.brax_parts import UInt64, running_statistics
+from jetbot_mjx.agents.brax_parts import Normalizer, UInt64
 from jetbot_mjx.agents.networks import PolicyParams
 
 # The metrics of a training step, by name.
@@ -47,14 +47,14 @@ class TrainState(struct.PyTreeNode):
     """
 
     # What is learned.
-    params: Any
+    params: PyTree
     """Weights of the networks, in the fields `policy` and `value`."""
     optimizer_state: PyTree
     """Adam's moments, step count and step size."""
-    normalizer: running_statistics.RunningStatisticsState
+    normalizer: Normalizer
     """Running mean and standard deviation of the observation."""
     # Where the environments and the random numbers are.
-    env_state: Any
+    env_state: PyTree
     """Batched state of all environments; in a packed state a `Packed`."""
     key: Any
     """Random key of the next training step."""
@@ -81,7 +81,7 @@ class NanDump(struct.PyTreeNode):
 
     found: Any
     """Whether there is a non-finite state; otherwise the other fields have no meaning."""
-    env_state: Any
+    env_state: PyTree
     """The state of one environment at the start of the unroll; a `Packed` on devices."""
     actions: Any
     """The actions of the unroll, shape (time, action)."""

@@ -1,11 +1,10 @@
 """Collect unrolls: step the environments with a policy's actions, and keep what the loss reads."""
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray, PyTree
 
 from jetbot_mjx.agents.brax_parts import Transition
 from jetbot_mjx.agents.learner import PackedEnv, Unroll
@@ -16,18 +15,18 @@ from jetbot_mjx.packed import Packed, pack
 _EXTRA_FIELDS = ("truncation", "episode_metrics", "episode_done")
 """Fields of the state's `info` that are collected."""
 
-Policy = Callable[[Any, Array], tuple[Array, Any]]
+Policy = Callable[[PyTree, Array], tuple[Array, PyTree]]
 """From the observations of all environments, and what the noise is drawn from, to the actions and
 what Brax keeps of them."""
 
 
-def kept_of(state: Any) -> dict[str, Any]:
+def kept_of(state: PyTree) -> dict[str, PyTree]:
     """Return what a collection keeps of the state after a step."""
     info = {name: state.info[name] for name in _EXTRA_FIELDS}
     return {"obs": state.obs, "reward": state.reward, "done": state.done, "info": info}
 
 
-def transition(obs: Any, action: Array, extras: Any, kept: dict[str, Any]) -> Transition:
+def transition(obs: PyTree, action: Array, extras: PyTree, kept: dict[str, PyTree]) -> Transition:
     """Return the data of one step, or of several.
 
     Args:
@@ -38,8 +37,8 @@ def transition(obs: Any, action: Array, extras: Any, kept: dict[str, Any]) -> Tr
     """
     # The loss needs the next observation only at the end of an unroll, where it is in the state:
     # the others, possibly images, are not even stored.
-    nothing: Any = None
-    all_extras: Any = {"policy_extras": extras, "state_extras": kept["info"]}
+    nothing: PyTree = None
+    all_extras: PyTree = {"policy_extras": extras, "state_extras": kept["info"]}
     return Transition(
         observation=obs,
         action=action,
@@ -98,7 +97,7 @@ def find_nan_dump(start: Packed, data: Transition) -> NanDump:
       data: its data, of shape (time, environment, ...).
     """
     # The environment has replaced a non-finite state, ended the episode and counted it.
-    statistics: Any = data.extras["state_extras"]["episode_metrics"]
+    statistics: PyTree = data.extras["state_extras"]["episode_metrics"]
     ended = data.extras["state_extras"]["episode_done"]
     nonfinite = ended * statistics.get("nonfinite_envs", jnp.zeros(())) > 0
     # The flat index is ordered by time and then by environment.

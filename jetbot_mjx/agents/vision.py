@@ -23,15 +23,19 @@ from typing import Any, NamedTuple
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, UInt8
+from jaxtyping import Array, Float, PyTree, UInt8
 
-from jetbot_mjx.agents import brax_parts  # noqa: F401  # before the rest of Brax
+# Before the rest of Brax.
+from jetbot_mjx.agents.brax_parts import Normalizer
 from jetbot_mjx.agents.cnn_sizes import CNNS, Shapes, compute_dtype, is_image
 from jetbot_mjx.config import NetworkConfig
 
 # isort: split
 from brax.training import networks as brax_networks
 from brax.training.agents.ppo import networks as ppo_networks
+
+Images = Mapping[str, Array]
+"""An observation with images, by the names of its parts."""
 
 _POLICY, _VALUE = "policy", "value"
 
@@ -49,7 +53,7 @@ class VisionNetworks(NamedTuple):
     parametric_action_distribution: Any
     heads: ppo_networks.PPONetworks
     """The networks behind the encoder, which take encoded observations."""
-    encode: Callable[[Any, Any, Any], dict[str, Float[Array, "*batch features"]]]
+    encode: Callable[[Normalizer, PyTree, PyTree], dict[str, Float[Array, "*batch features"]]]
     """Encode observations: (normaliser, parameters of both networks, observation)."""
 
 
@@ -58,7 +62,7 @@ class _ObservationEncoder(NamedTuple):
 
     encoder: "Encoder"
     shapes: Shapes
-    normalize: Callable[[Any, Any], Any]
+    normalize: Callable[[PyTree, Normalizer], PyTree]
 
     @property
     def features(self) -> int:
@@ -66,13 +70,16 @@ class _ObservationEncoder(NamedTuple):
         numbers = (shape[0] for name, shape in self.shapes.items() if not is_image(name))
         return self.encoder.features + sum(numbers)
 
-    def init(self, key: Any) -> Any:
+    def init(self, key: Array) -> PyTree:
         """Return initial parameters of the encoder."""
         images = {name: (1, *shape) for name, shape in self.shapes.items() if is_image(name)}
         pixels = {name: jnp.zeros(shape, jnp.uint8) for name, shape in sorted(images.items())}
         return self.encoder.init(key, _joined(pixels))
 
-    def __call__(self, normalizer: Any, params: Any, obs: Any) -> Float[Array, "*batch features"]:
+    def __call__(
+        self, normalizer: Normalizer, params: PyTree, obs: Mapping[str, Array]
+    ) -> Float[Array, "*batch features"]:
+        # Encode all images at once, and join the features and the normalised numbers.
         images = {name: obs[name] for name in sorted(self.shapes) if is_image(name)}
         numbers = {name: obs[name] for name in sorted(self.shapes) if name not in images}
         values = self.normalize(numbers, normalizer)
@@ -86,7 +93,7 @@ def make_vision_networks(
     action_size: int,
     *,
     make_heads: Callable[..., ppo_networks.PPONetworks],
-    normalize: Callable[[Any, Any], Any],
+    normalize: Callable[[PyTree, Normalizer], PyTree],
 ) -> VisionNetworks:
     """Build the networks for an observation with images.
 
@@ -96,16 +103,14 @@ def make_vision_networks(
       action_size: the length of the action.
       make_heads: builds Brax's networks from (observation_size, action_size, ...).
       normalize: a function of (numbers, statistics) that normalises the numbers.
-
-    Returns:
-      The networks.
     """
+    # An encoder, and Brax's networks behind it, which take features and numbers as one vector.
     layers = CNNS[config.cnn]
     encoder = Encoder(layers.convolutions, layers.features, config.cnn_dtype)
     encode_one = _ObservationEncoder(encoder, shapes, normalize)
     brax_heads = make_heads(encode_one.features, action_size)
 
-    def encode(normalizer: Any, params: Any, obs: Any) -> dict[str, Any]:
+    def encode(normalizer: Normalizer, params: PyTree, obs: Images) -> dict[str, Array]:
         for_policy = encode_one(normalizer, params.policy, obs)
         if config.shared_cnn:
             return {_POLICY: for_policy, _VALUE: for_policy}
@@ -120,11 +125,12 @@ def make_vision_networks(
         brax_heads.parametric_action_distribution,
     )
 
-    def apply_policy(normalizer: Any, params: Any, obs: Any) -> Array:
+    # For inference: encode and apply one network.
+    def apply_policy(normalizer: Normalizer, params: PyTree, obs: Images) -> Array:
         encoded = {_POLICY: encode_one(normalizer, params, obs)}
         return heads.policy_network.apply(None, params, encoded)
 
-    def apply_value(normalizer: Any, params: Any, obs: Any) -> Array:
+    def apply_value(normalizer: Normalizer, params: PyTree, obs: Images) -> Array:
         encoded = {_VALUE: encode_one(normalizer, params, obs)}
         return heads.value_network.apply(None, params, encoded)
 
@@ -152,7 +158,7 @@ def _on_features(
       encoder: the encoder whose parameters are among the network's; None: another has them.
     """
 
-    def init(key: Any) -> Any:
+    def init(key: Array) -> PyTree:
         encoder_key, head_key = jax.random.split(key)
         own = {} if encoder is None else {ENCODER: encoder.init(encoder_key)}
         return {HEAD: head.init(head_key), **own}
@@ -191,6 +197,7 @@ class Encoder(nn.Module):
                 # Divide the few weights instead of the many pixels.
                 kernel = kernel / 255.0
             x = nn.relu(convolve(x, kernel.astype(dtype), stride) + bias.astype(dtype))
+        # All outputs of the last convolution to the features, in float32 for what follows.
         x = x.reshape(x.shape[0], -1)
         x = nn.relu(nn.Dense(self.features, dtype=dtype, name="dense")(x))
         return x.astype(jnp.float32).reshape(*batch, self.features)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
-from jetbot_mjx.agents.brax_parts import Transition
+from jetbot_mjx.agents.brax_parts import Normalizer, Transition
 from jetbot_mjx.agents.learner import TREES, DeviceAxis, Layout, Learner, PackedEnv, Unroll
 from jetbot_mjx.agents.networks import Networks
 from jetbot_mjx.agents.optimizer import adapt_step_size, make_optimizer, read_adam
@@ -48,7 +48,7 @@ class XlaLearner(Learner):
         self.layout = layout
         self._config, self._networks, self._devices = config, networks, devices
         self._fallback = fallback
-        self._optimizer: Any = make_optimizer(config)
+        self._optimizer = make_optimizer(config)
 
     def begin(self, tree: PyTree) -> PyTree:
         """Return the trees of parameters and optimizer state."""
@@ -71,7 +71,7 @@ class XlaLearner(Learner):
         self,
         params: PyTree,
         optimizer_state: PyTree,
-        normalizer: Any,
+        normalizer: Normalizer,
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[PyTree, PyTree, Float[Array, " totals"]]:
@@ -80,7 +80,7 @@ class XlaLearner(Learner):
             report(self._fallback)
 
         # A minibatch: its gradient step, and the sums of the metrics.
-        def step(carry: Condensed, batch: Any) -> tuple[Condensed, None]:
+        def step(carry: Condensed, batch: tuple[Transition, Array]) -> tuple[Condensed, None]:
             params, optimizer_state, totals = carry.restore()
             params, optimizer_state, metrics = self.minibatch_step(
                 params, optimizer_state, normalizer, *batch
@@ -123,7 +123,7 @@ class XlaLearner(Learner):
         self,
         params: PyTree,
         optimizer_state: PyTree,
-        normalizer: Any,
+        normalizer: Normalizer,
         batch: Transition,
         key: PRNGKeyArray,
     ) -> tuple[PyTree, PyTree, Float[Array, " metrics"]]:
@@ -151,7 +151,7 @@ class XlaLearner(Learner):
         return params, optimizer_state, row
 
     def gradient(
-        self, params: PyTree, normalizer: Any, batch: Transition, key: PRNGKeyArray
+        self, params: PyTree, normalizer: Normalizer, batch: Transition, key: PRNGKeyArray
     ) -> tuple[Mapping[str, Array], PyTree]:
         """Differentiate the loss of a minibatch.
 
@@ -167,7 +167,7 @@ class XlaLearner(Learner):
         return metrics, unravel(self._devices.mean(vector))
 
     def loss(
-        self, params: PyTree, normalizer: Any, batch: Transition, key: PRNGKeyArray
+        self, params: PyTree, normalizer: Normalizer, batch: Transition, key: PRNGKeyArray
     ) -> tuple[Array, Mapping[str, Array]]:
         """Compute the loss of a minibatch, of images by their features."""
         # Late: a training whose programs are found compiled needs no loss.
@@ -180,7 +180,9 @@ class XlaLearner(Learner):
         return ppo_loss(params, normalizer, batch, key, networks=networks, config=self._config)
 
 
-def _encoded(networks: Networks, normalizer: Any, params: PyTree, batch: Transition) -> Transition:
+def _encoded(
+    networks: Networks, normalizer: Normalizer, params: PyTree, batch: Transition
+) -> Transition:
     """Replace the observations of a minibatch, of shape (unrolls, time, ...), by their features."""
     # Encode the last next observations along with the others: one product is faster than two.
     joined = jax.tree.map(

@@ -12,16 +12,13 @@ from brax.training.agents.ppo.networks import PPONetworks
 
 from helpers import simt
 from helpers.kernel_ppo import ACTIONS, OBSERVATIONS, config, make_ppo, minibatch
-from jetbot_mjx.agents.fused import (
-    actions,
-    adam,
-    advantages,
-    gpu_adam,
-    gradient,
-    launch,
-    launch_gpu,
-    probe,
-)
+from jetbot_mjx.agents.fused import adam, launch, launch_gpu, probe
+from jetbot_mjx.agents.fused.arrays import ACTIONS as ACTION_ARRAYS
+from jetbot_mjx.agents.fused.arrays import ADAM
+from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
+from jetbot_mjx.agents.fused.gpu_adam import AdamKernel
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
 from jetbot_mjx.agents.fused.learner import FusedLearner, make_fused_learner, shape_of
 from jetbot_mjx.agents.fused.shapes import Minibatch
@@ -134,8 +131,8 @@ def arrays_of(rule, batch):
     vector, statistics = floats(shape.size), floats(shape.observations)
     rows = floats(batch.collected, batch.time, shape.columns["size"])
     last = floats(batch.collected, shape.observations)
-    unrolls = jnp.zeros((batch.count, batch.unrolls), jnp.int32)
-    noise = floats(batch.count, batch.time, batch.unrolls, shape.actions)
+    unrolls = jnp.zeros((batch.minibatches, batch.unrolls), jnp.int32)
+    noise = floats(batch.minibatches, batch.time, batch.unrolls, shape.actions)
     data, terms, index = (
         (statistics, statistics, rows, last, unrolls, noise),
         floats(6),
@@ -275,18 +272,17 @@ def modelled(shape, *arrays):
         given = [np.array(x) for x in arrays]
         params, mean, scale, rows, last, unrolls, noise, index, terms = given
         batch = Minibatch(len(rows), unrolls.shape[1], rows.shape[1], len(unrolls))
-        tiling = Tiling(shape, 64, 1, "advantages")
-        blocks = min(2, advantages.tile_count(tiling, batch))
+        kernel = AdvantageKernel(Tiling(shape, 64, 1, "advantages"), batch)
+        blocks = min(2, kernel.tiles)
         sizes = batch.samples, batch.samples, (blocks, 2)
         estimates = [np.full(size, np.nan, np.float32) for size in sizes]
-        text = advantages.advantages_text(tiling, batch)
         arrays = [params, mean, scale, rows, last, unrolls, index, terms, *estimates]
-        simt.run(text, arrays, (blocks, 1, 1), shared_memory=tiling.layout["size"])
-        tiling = Tiling(shape, 32, 1)
+        memory = kernel.shared_memory
+        simt.run(kernel.text(), arrays, (blocks, 1, 1), shared_memory=memory)
+        kernel = GradientKernel(Tiling(shape, 32, 1), batch, blocks)
         vector = np.full((1, shape.size), np.nan, np.float32)
-        text = gradient.gradient_text(tiling, batch, blocks)
         arrays = [params, mean, scale, rows, unrolls, noise, index, *estimates, terms, vector]
-        simt.run(text, arrays, (1, 2, 1), shared_memory=tiling.layout["size"])
+        simt.run(kernel.text(), arrays, (1, 2, 1), shared_memory=kernel.shared_memory)
         return vector[0]
 
     result = jax.ShapeDtypeStruct((shape.size,), np.float32)
@@ -296,14 +292,14 @@ def modelled(shape, *arrays):
 def modelled_actions(shape, *arrays):
     """`launch.actions` on the model of a GPU, for one policy."""
     count = arrays[3].shape[0]
-    results = [jax.ShapeDtypeStruct(size, np.float32) for size in shape.drawn_shapes(count)]
+    shapes = ACTION_ARRAYS.shapes(shape, Minibatch(environments=count))
+    results = [jax.ShapeDtypeStruct(shapes[x], np.float32) for x in launch.Actions._fields]
 
     def run(*arrays):
         drawn = [np.full(x.shape, np.nan, np.float32) for x in results]
-        tiling = Tiling(shape, 32, 1, "actions")
+        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), count)
         given = [*(np.array(x) for x in arrays), *drawn]
-        text = actions.actions_text(tiling, count)
-        simt.run(text, given, shared_memory=tiling.layout["size"])
+        simt.run(kernel.text(), given, shared_memory=kernel.shared_memory)
         return drawn
 
     return launch.Actions(*jax.pure_callback(run, results, *arrays))
@@ -425,7 +421,7 @@ def rounding(settings, networks):
 
 def drawn_for(fused, order, key):
     """Unrolls and noise of some minibatches, and the index of the one with the given ones."""
-    count, index = fused.batch.count, fused.batch.count - 1
+    count, index = fused.batch.minibatches, fused.batch.minibatches - 1
     keys = jnp.zeros((count, 2), jnp.uint32).at[index].set(key)
     unrolls = jnp.full((count, len(order)), -1, jnp.int32).at[index].set(order)
     return unrolls, fused.noise(keys), jnp.int32(index)
@@ -504,11 +500,12 @@ def modelled_adam(rule, *arrays):
     def run(*arrays):
         given = {name: np.array(x) for name, x in zip(adam.ARRAYS, arrays, strict=True)}
         results = [given[name] for name in adam.UPDATED]
-        text, memory = gpu_adam.adam_text(rule, 2), gpu_adam.SHARED_MEMORY
-        simt.run(text, [*given.values(), *results], (2, 1, 1), shared_memory=memory)
+        kernel = AdamKernel(rule, 2)
+        memory = kernel.shared_memory
+        simt.run(kernel.text(), [*given.values(), *results], (2, 1, 1), shared_memory=memory)
         return results
 
-    like = [jax.ShapeDtypeStruct(arrays[i].shape, np.float32) for i in adam.ALIASES]
+    like = [jax.ShapeDtypeStruct(arrays[i].shape, np.float32) for i in ADAM.aliases]
     return jax.pure_callback(run, like, *arrays)
 
 

@@ -1,6 +1,7 @@
 """PPO's kernels as `launch_gpu` launches them, with its tiles and grids, on a model of a GPU."""
 
 import functools
+import math
 
 import jax
 import numpy as np
@@ -20,7 +21,7 @@ from helpers.update_cases import (
 )
 from jetbot_mjx.agents.fused import arrays as signatures
 from jetbot_mjx.agents.fused import launch_cpu, launch_gpu
-from jetbot_mjx.agents.fused.adam import ALIASES, SIZES, AdamRule
+from jetbot_mjx.agents.fused.adam import SIZES, AdamRule
 from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
 
 pytest.importorskip("llvmlite")
@@ -48,7 +49,7 @@ CASES = [
 def launched_by(launcher, kernel, spec, arrays):
     """The results of a kernel that a launcher launches."""
     given = dict(zip(kernel.arguments, arrays, strict=True))
-    return launcher.LAUNCHES[kernel.name](spec, given)
+    return launcher.launch(kernel, spec, kernel.batch_of(spec, arrays), given)
 
 
 @pytest.fixture
@@ -109,7 +110,7 @@ def test_a_step_of_adam_is_that_of_a_cpu(name, schedule, model):
     for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
         # The policy in the middle keeps what it has.
-        (argument,) = (key for key, value in ALIASES.items() if value == i)
+        (argument,) = (key for key, value in signatures.ADAM.aliases.items() if value == i)
         if i < 3:
             np.testing.assert_array_equal(one[1], arrays[argument][1])
             assert (one[0] != arrays[argument][0]).mean() > 0.9
@@ -134,9 +135,11 @@ def small_actions():
 
 def small_adam():
     rule = AdamRule(SHAPES["elu"], 64, "NONE", 1)
-    arrays = [np.arange(size, dtype=np.float32)[None] + 1 for size in rule.sizes.values()]
+    shapes = signatures.ADAM.shapes(rule, Minibatch()).values()
+    arrays = [
+        np.arange(math.prod(x), dtype=np.float32).reshape(1, *x) + np.float32(1) for x in shapes
+    ]
     arrays[5] = np.zeros(1, np.int32)
-    arrays[4] = arrays[4].reshape(1, 2, -1)
     launched_by(launch_gpu, signatures.ADAM, rule, arrays)
 
 

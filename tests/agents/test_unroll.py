@@ -7,7 +7,8 @@ import pytest
 from brax.envs import Wrapper
 
 from jetbot_mjx.agents.fused import launch
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll
+from jetbot_mjx.agents.fused.arrays import UNROLL
+from jetbot_mjx.agents.fused.shapes import Unroll
 from jetbot_mjx.config import load_config
 from jetbot_mjx.packed import pack
 from jetbot_mjx.runs import Setup
@@ -30,7 +31,7 @@ def built(root, name="jetbot", *overrides, envs=40):
 
 def collected(ppo, monkeypatch, states, keys, *, at_once):
     """What PPO collects, for each of several policies."""
-    monkeypatch.setattr(launch, "unrolls_at_once", lambda: at_once)
+    monkeypatch.setattr(launch, "has", lambda kernel: at_once or kernel is not UNROLL)
     run = jax.jit(jax.vmap(ppo.collect))
     traced = run.trace(states, keys)
     assert ("ppo_unroll" in str(traced.jaxpr)) == at_once

@@ -21,8 +21,11 @@ from helpers.update_cases import (
     stacked,
     terms_of,
 )
-from jetbot_mjx.agents.fused import actions, advantages, gpu_tiling, launch, launch_cpu
-from jetbot_mjx.agents.fused import gradient as gradient_kernel
+from jetbot_mjx.agents.fused import arrays as signatures
+from jetbot_mjx.agents.fused import gpu_tiling, launch, launch_cpu
+from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
 from jetbot_mjx.agents.fused.launch_gpu import PTX_VERSION
 from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
@@ -31,19 +34,26 @@ from onekernel import cpu, gpu
 pytest.importorskip("llvmlite")
 
 
+def drawn(shape, environments):
+    """The shapes of `launch.Actions`."""
+    shapes = signatures.ACTIONS.shapes(shape, Minibatch(environments=environments))
+    return [shapes[name] for name in launch.Actions._fields]
+
+
 @pytest.mark.parametrize("name", CASES)
 def test_the_advantages_are_those_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
     tiling = Tiling(case.shape, case.rows, -(-case.rows // 128), "advantages")
-    blocks = min(case.blocks, advantages.tile_count(tiling, case.batch))
+    kernel = AdvantageKernel(tiling, case.batch._replace(minibatches=COUNT))
+    blocks = min(case.blocks, kernel.tiles)
     results = [
         np.full((case.seeds, *rest), np.nan, np.float32)
         for rest in (case.batch[1:3], case.batch[1:3], (blocks, 2))
     ]
-    text = advantages.advantages_text(tiling, case.batch._replace(count=COUNT))
     arrays = [*stacked(made, *NETWORK, "last", "unrolls", "index"), terms_of(case), *results]
-    simt.run(text, arrays, (blocks, 1, case.seeds), tiling.threads, tiling.layout["size"])
+    sizes = kernel.threads, kernel.shared_memory
+    simt.run(kernel.text(), arrays, (blocks, 1, case.seeds), *sizes)
     for data, advantage, target, parts in zip(made, *results, strict=True):
         np.testing.assert_allclose(advantage, data.advantages, atol=0.01)
         np.testing.assert_allclose(target, data.targets, atol=0.01)
@@ -56,7 +66,8 @@ def test_the_gradient_is_that_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
     tiling = Tiling(case.shape, *case.gradient)
-    blocks = min(case.blocks, gradient_kernel.tile_count(tiling, case.batch))
+    kernel = GradientKernel(tiling, case.batch._replace(minibatches=COUNT), 3)
+    blocks = min(case.blocks, kernel.tiles)
     estimated = [
         np.stack([x.astype(np.float32) for x in column])
         for column in zip(*((data.advantages, data.targets) for data in made), strict=True)
@@ -65,10 +76,10 @@ def test_the_gradient_is_that_of_float64(name):
     thirds = [np.array_split(data.advantages.ravel(), 3) for data in made]
     parts = np.array([[[x.sum(), (x**2).sum()] for x in third] for third in thirds], np.float32)
     result = np.full((case.seeds, blocks, case.shape.size), np.nan, np.float32)
-    text = gradient_kernel.gradient_text(tiling, case.batch._replace(count=COUNT), 3)
     arrays = [*stacked(made, *NETWORK, "unrolls", "noise", "index"), *estimated, parts]
     arrays += [terms_of(case), result]
-    simt.run(text, arrays, (blocks, 2, case.seeds), tiling.threads, tiling.layout["size"])
+    sizes = kernel.threads, kernel.shared_memory
+    simt.run(kernel.text(), arrays, (blocks, 2, case.seeds), *sizes)
     for data, vectors in zip(made, result, strict=True):
         assert_is_gradient(vectors.astype(np.float64).sum(0), data, 0.01)
 
@@ -139,13 +150,12 @@ def test_the_actions_are_those_of_float64(name, rows):
     made = [make_actions(shape, environments, seed) for seed in range(2)]
     tiling = Tiling(shape, rows, -(-rows // 128), "actions")
     given = [np.stack(x) for x in zip(*(arrays for arrays, _ in made), strict=True)]
-    sizes = shape.drawn_shapes(environments)
-    results = [np.full((2, *size), np.nan, np.float32) for size in sizes]
+    results = [np.full((2, *size), np.nan, np.float32) for size in drawn(shape, environments)]
+    kernel = ActionKernel(tiling, environments)
     # Of two blocks, the model runs the one with the second tile after that with the third.
     for blocks in (1, 2):
-        text = actions.actions_text(tiling, environments)
-        grid = blocks, 1, 2
-        simt.run(text, [*given, *results], grid, tiling.threads, tiling.layout["size"])
+        sizes = (blocks, 1, 2), kernel.threads, kernel.shared_memory
+        simt.run(kernel.text(), [*given, *results], *sizes)
     for i, (_, expected) in enumerate(made):
         assert_are_actions([x[i] for x in results], shape, expected, 0.02)
 
@@ -174,10 +184,10 @@ def test_the_actions_at_the_ends_of_their_ranges_are_those_of_float64(name, spre
     shape = CASES[name].shape
     arrays, expected = make_actions(shape, 40, 0, spread)
     on_a_cpu = jax.jit(functools.partial(launch.actions, shape))
-    on_a_gpu = [np.full(size, np.nan, np.float32) for size in shape.drawn_shapes(40)]
-    tiling = Tiling(shape, 32, 1, "actions")
-    text, size = actions.actions_text(tiling, 40), tiling.layout["size"]
-    simt.run(text, [*arrays, *on_a_gpu], (2, 1, 1), tiling.threads, size)
+    on_a_gpu = [np.full(size, np.nan, np.float32) for size in drawn(shape, 40)]
+    kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), 40)
+    sizes = (2, 1, 1), kernel.threads, kernel.shared_memory
+    simt.run(kernel.text(), [*arrays, *on_a_gpu], *sizes)
     for results in ([np.asarray(x) for x in on_a_cpu(*arrays)], on_a_gpu):
         for ours, wanted in zip(results, expected, strict=True):
             # Of the largest numbers, the distance from the mean is what rounding leaves of it.
@@ -200,13 +210,13 @@ def test_llvm_compiles_them(name, architecture):
     case = CASES[name]
     others = (Tiling(case.shape, 64, 1, purpose) for purpose in ("advantages", "actions"))
     tilings = Tiling(case.shape, *case.gradient), *others
-    texts = (
-        gradient_kernel.gradient_text(tilings[0], Minibatch(4096, 512, 16), 74),
-        advantages.advantages_text(tilings[1], Minibatch(4096, 512, 16)),
-        actions.actions_text(tilings[2], 4096),
+    kernels = (
+        GradientKernel(tilings[0], Minibatch(4096, 512, 16), 74),
+        AdvantageKernel(tilings[1], Minibatch(4096, 512, 16)),
+        ActionKernel(tilings[2], 4096),
     )
-    for tiling, text in zip(tilings, texts, strict=True):
-        ptx = gpu.assembled(text, architecture, PTX_VERSION)
+    for tiling, kernel in zip(tilings, kernels, strict=True):
+        ptx = gpu.assembled(kernel.text(), architecture, PTX_VERSION)
         assert f".target sm_{architecture}" in ptx
         assert f".maxntid {tiling.threads}" in ptx
         assert "mma.sync.aligned.m16n8k16.row.col.f32.f16.f16.f32" in ptx

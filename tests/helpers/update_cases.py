@@ -157,7 +157,7 @@ def loss(leaves, data, case):
 
 def random_data(rng, case):
     """A minibatch: `unrolls` of it are taken from the collected ones, which are random as well."""
-    shape, (collected, unrolls, time, _) = case.shape, case.batch
+    shape, (collected, unrolls, time, *_) = case.shape, case.batch
     steps = unrolls, time
     data = {
         "mean": rng.normal(size=shape.observations),

@@ -21,7 +21,7 @@ TOGETHER = {
     "agents/test_learners": "agents.learner",
     "agents/test_ppo": "agents.brax_parts agents.train_state agents.xla_learner"
     " training.brax_trainer",
-    "agents/test_unroll": "agents.fused.cpu_unroll",
+    "agents/test_unroll": "agents.fused.cpu_actions",
     "agents/test_update_kernels": "agents.fused",
     "agents/test_vision": "agents.cnn_sizes",
     "commands/test_evaluate": "evaluation.evaluate_runs",

@@ -1,6 +1,6 @@
 """Write and launch the kernels of PPO; docs/kernels.md explains them and defines their words.
 
-- `shapes`: the networks and the minibatch
+- `shapes`: the networks, the data, and the step of an unroll
 - `sample_loss`: the action of one sample, and its loss with derivatives, as JAX functions
 - `adam`: a step of Adam along the gradient, as JAX functions
 - `reference`: what the kernels should compute, in NumPy
@@ -13,11 +13,11 @@
 On GPUs:
 
 - `gpu_tiling`: the division of the work into tiles
-- `tensor_core`: the writer of kernels, with products on tensor cores
-- `network`: what all kernels share: loading a network, and its forward pass
-- `actions`: the kernel that draws the actions of all environments
-- `advantages`: the kernel that computes values, advantages and value targets
-- `gradient`: the kernel that computes the gradient of both networks
+- `tensor_core`: a kernel and its writer, with products on tensor cores
+- `gpu_network`: what all kernels share: loading a network, and its forward pass
+- `gpu_actions`: the kernel that draws the actions of all environments
+- `gpu_advantages`: the kernel that computes values, advantages and value targets
+- `gpu_gradient`: the kernel that computes the gradient of both networks
 - `gpu_adam`: the kernel of Adam
 - `launch_gpu`: their launch
 
@@ -26,10 +26,9 @@ On CPUs:
 - `cpu_product`: products of matrices, and loops over numbers in memory
 - `cpu_stages`: a call whose threads go through several stages together
 - `cpu_network`: a stage that takes rows through a network, and its forward pass
-- `cpu_actions`: the call that draws the actions of all environments
+- `cpu_actions`: the calls that draw the actions of all environments, for one step or for all
+  steps of an unroll
 - `cpu_gradient`: the stages of the gradient, one for each network and the sum
-- `cpu_adam`: the stages of Adam
-- `cpu_update`: all minibatches as one call
-- `cpu_unroll`: all steps of an unroll as one call
+- `cpu_adam`: the stages of Adam, and all minibatches as one call
 - `launch_cpu`: their launch
 """

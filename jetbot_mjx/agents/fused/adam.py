@@ -12,8 +12,8 @@ carried from step to step.
 """
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ _EPSILON = 1e-8
 
 METRICS = (*POLICY_METRICS, *VALUE_METRICS)
 
+Scalar = Array | float
+
 
 class AdamRule(NamedTuple):
     """An `AdamRule` says what the vectors hold, and how the step size changes."""
@@ -39,12 +41,6 @@ class AdamRule(NamedTuple):
     """One of `ppo.learning_rate_schedule`."""
     steps: int
     """Number of steps of a training step."""
-
-    @property
-    def sizes(self) -> dict[str, int]:
-        """Return the number of elements of each of the `ARRAYS` for one policy."""
-        sizes = dict.fromkeys(ARRAYS, self.shape.size) | SIZES
-        return {**sizes, "progress": (self.steps + 1) * SIZES["progress"], "index": 1}
 
     @property
     def places(self) -> list[int]:
@@ -59,45 +55,45 @@ class AdamTerms(NamedTuple):
     The kernels read them from an array, because they may differ between policies.
     """
 
-    max_grad_norm: Any
-    learning_rate: Any
+    max_grad_norm: Scalar
+    learning_rate: Scalar
     """Size of the first step of all, for the schedule `LINEAR`."""
-    begun: Any
-    """Part of all steps that were done before this training step."""
-    share: Any
-    """Part of all steps that one step is."""
-    desired_kl: Any
-    min_rate: Any
-    max_rate: Any
+    begun: Scalar
+    """Part of all steps of the training that were done before this training step."""
+    share: Scalar
+    """Part of all steps of the training that one step makes up."""
+    desired_kl: Scalar
+    min_rate: Scalar
+    max_rate: Scalar
 
 
 class Progress(NamedTuple):
     """A `Progress` holds what a step of Adam carries on beside the vectors."""
 
-    rate: Any
+    rate: Scalar
     """Step size."""
-    power_1: Any
+    power_1: Scalar
     """Power of β₁ whose exponent is the number of steps."""
-    power_2: Any
-    sums: Any
-    """Sums of `METRICS` over the steps, whose samples they sum themselves."""
-    rates: Any
+    power_2: Scalar
+    sums: Sequence[Scalar]
+    """Sums of each of the `METRICS` over all samples of all steps so far."""
+    rates: Scalar
     """Sum of the step sizes."""
-    applied: Any
+    applied: Scalar
     """Number of steps of this training step."""
 
 
 class Factors(NamedTuple):
     """A `Factors` holds what all elements of the vectors have in common."""
 
-    is_applied: Any
+    is_applied: Array
     """1, or 0 if the gradient is not finite."""
-    clipping: Any
+    clipping: Array
     """What the gradient is multiplied by."""
-    rate: Any
-    inverse_1: Any
+    rate: Array
+    inverse_1: Array
     """1 / (1 - β₁ⁿ)."""
-    inverse_2: Any
+    inverse_2: Array
 
 
 SIZES = {"adam_terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
@@ -109,9 +105,6 @@ ARRAYS = ("gradient", "params", "mu", "nu", "progress", "index", "adam_terms")
 UPDATED = ("params", "mu", "nu", "progress")
 """Those which they change in place, and return."""
 
-ALIASES = {ARRAYS.index(name): i for i, name in enumerate(UPDATED)}
-"""The arguments whose memory the results take."""
-
 
 @functools.cache
 def programs(rule: AdamRule) -> tuple[ScalarProgram, ScalarProgram]:
@@ -122,14 +115,14 @@ def programs(rule: AdamRule) -> tuple[ScalarProgram, ScalarProgram]:
     """
     scalar, metrics = vector_of(), vector_of(len(METRICS))
     arrays = vector_of(SIZES["progress"]), vector_of(SIZES["adam_terms"])
-    common = _lowered(functools.partial(factors, rule=rule), scalar, metrics, *arrays)
-    return common, _lowered(element, *[scalar] * (4 + len(Factors._fields)))
-
-
-def _lowered(function: Callable[..., Any], *arguments: jax.ShapeDtypeStruct) -> ScalarProgram:
-    """Lower a function whose numbers may not be finite."""
-    closed = jax.make_jaxpr(function)(*arguments)
-    return scalarize_part(closed, closed.jaxpr.invars, closed.jaxpr.outvars, finite=False)
+    common = jax.make_jaxpr(functools.partial(factors, rule=rule))(scalar, metrics, *arrays)
+    of_all = Factors(*[scalar] * len(Factors._fields))
+    of_one = jax.make_jaxpr(element)(scalar, scalar, scalar, scalar, of_all)
+    # Their numbers may not be finite, so that x - x, for one, is not simplified to 0.
+    first, second = (
+        scalarize_part(x, x.jaxpr.invars, x.jaxpr.outvars, finite=False) for x in (common, of_one)
+    )
+    return first, second
 
 
 def factors(
@@ -151,9 +144,11 @@ def factors(
     given = AdamTerms(*(terms[i] for i in range(SIZES["adam_terms"])))
     rate, power_1, power_2, *rest = (progress[i] for i in range(SIZES["progress"]))
     old = Progress(rate, power_1, power_2, rest[: len(METRICS)], *rest[len(METRICS) :])
+    # Clip the gradient to its norm, and leave the step out if that is not finite.
     norm = jnp.sqrt(square)
     is_applied = jnp.isfinite(norm)
     clipping = jnp.where(norm < given.max_grad_norm, 1.0, given.max_grad_norm / norm)
+    # The step size by its schedule.
     if rule.schedule == "LINEAR":
         done = given.begun + old.applied * given.share
         rate = given.learning_rate * (1.0 - jnp.minimum(done, 1.0))
@@ -164,37 +159,20 @@ def factors(
         faster = jnp.minimum(given.max_rate, rate * 1.5)
         is_small = (divergence < 0.5 * given.desired_kl) & (divergence > 0.0)
         rate = jnp.where(is_small, faster, rate)
+    # The corrections of the means, which begin at zero.
     power_1, power_2 = power_1 * BETA_1, power_2 * BETA_2
-    common = Factors(
-        jnp.where(is_applied, 1.0, 0.0),
-        clipping,
-        rate,
-        1.0 / (1.0 - power_1),
-        1.0 / (1.0 - power_2),
-    )
-    new = Progress(
-        rate,
-        power_1,
-        power_2,
-        [total + metrics[i] for i, total in enumerate(old.sums)],
-        old.rates + rate,
-        old.applied + 1.0,
-    )
-    # Metrics of a step that is left out may not be finite.
+    is_one = jnp.where(is_applied, 1.0, 0.0)
+    inverses = 1.0 / (1.0 - power_1), 1.0 / (1.0 - power_2)
+    common = Factors(is_one, clipping, rate, *inverses)
+    # Count the step, unless it is left out: then its metrics may not be finite either.
+    sums = [total + metrics[i] for i, total in enumerate(old.sums)]
+    new = Progress(rate, power_1, power_2, sums, old.rates + rate, old.applied + 1.0)
     kept = [jnp.where(is_applied, *x) for x in zip(jax.tree.leaves(new), progress, strict=True)]
     return common, jnp.stack(kept)
 
 
 def element(
-    param: Array,
-    mu: Array,
-    nu: Array,
-    gradient: Array,
-    is_applied: Array,
-    clipping: Array,
-    rate: Array,
-    inverse_1: Array,
-    inverse_2: Array,
+    param: Array, mu: Array, nu: Array, gradient: Array, common: Factors
 ) -> tuple[Array, Array, Array]:
     """Return the next parameter and means of one element, or of many.
 
@@ -203,16 +181,17 @@ def element(
       mu: mean of its gradients.
       nu: mean of their squares.
       gradient: the gradient.
-      is_applied: the first of the `Factors`, which the others are, too.
-      clipping: what the gradient is multiplied by.
-      rate: the step size.
-      inverse_1: 1 / (1 - β₁ⁿ).
-      inverse_2: 1 / (1 - β₂ⁿ).
+      common: what the elements have in common.
     """
-    clipped = gradient * clipping
+    # The equation of the module, with the clipped gradient as g.
+    clipped = gradient * common.clipping
     new_mu = BETA_1 * mu + (1.0 - BETA_1) * clipped
     new_nu = BETA_2 * nu + (1.0 - BETA_2) * (clipped * clipped)
-    change = rate * (new_mu * inverse_1) / (jnp.sqrt(new_nu * inverse_2) + _EPSILON)
+    change = common.rate * (new_mu * common.inverse_1)
+    change = change / (jnp.sqrt(new_nu * common.inverse_2) + _EPSILON)
+    # Or what it was, if the step is left out.
     new, old = (param - change, new_mu, new_nu), (param, mu, nu)
-    first, second, third = (jnp.where(is_applied > 0.0, *x) for x in zip(new, old, strict=True))
+    first, second, third = (
+        jnp.where(common.is_applied > 0.0, *x) for x in zip(new, old, strict=True)
+    )
     return first, second, third

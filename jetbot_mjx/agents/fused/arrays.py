@@ -1,5 +1,7 @@
 """Name the arrays that the kernels of PPO take and return, and check their shapes."""
 
+import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
@@ -7,13 +9,8 @@ import numpy as np
 from jax.core import ShapedArray
 from jaxtyping import Array, Float
 
-from jetbot_mjx.agents.fused import adam
-from jetbot_mjx.agents.fused.adam import SIZES, UPDATED, AdamRule
-from jetbot_mjx.agents.fused.cpu_actions import PARAMETERS
-from jetbot_mjx.agents.fused.cpu_gradient import GRADIENT_ARGUMENTS
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll
-from jetbot_mjx.agents.fused.cpu_update import ARGUMENTS as UPDATE_ARGUMENTS
-from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.adam import ARRAYS, SIZES, UPDATED, AdamRule
+from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, Unroll, UpdateShape
 
 Arrays = Mapping[str, Array]
 """The arguments of a kernel by name, in its order."""
@@ -68,19 +65,25 @@ class Actions(NamedTuple):
     """Parameters of the distribution; of a `normal` one, means and standard deviations."""
 
 
-class Signature(NamedTuple):
+@dataclasses.dataclass(frozen=True, eq=False)
+class Signature:
     """A `Signature` says which arrays a kernel takes and returns."""
 
     name: str
     arguments: tuple[str, ...]
     """Names among `AXES`, in the order of the arguments."""
-    returns: tuple[str, ...]
-    """The axes of each result."""
-    updated: tuple[str, ...] = ()
-    """Names of the arguments that it changes in place, and returns."""
+    returns: Mapping[str, str]
+    """The axes of each result; those with the name of an argument take its place in memory."""
 
-    def results(self, spec: Spec, arrays: Sequence[Array | ShapedArray]) -> list[tuple[int, ...]]:
-        """Return the shapes of the results, and refuse what a kernel would read beyond its end.
+    @property
+    def aliases(self) -> dict[int, int]:
+        """Return the places of the arguments that the kernel changes, with those of the results."""
+        returned = list(self.returns)
+        places = enumerate(self.arguments)
+        return {i: returned.index(name) for i, name in places if name in returned}
+
+    def batch_of(self, spec: Spec, arrays: Sequence[Array | ShapedArray]) -> Minibatch:
+        """Return how much data there is, and refuse what a kernel would read beyond its end.
 
         Args:
           spec: the description for which the kernel is written.
@@ -89,53 +92,68 @@ class Signature(NamedTuple):
         Raises:
           TypeError: an argument has another dtype or shape.
         """
-        sizes, batch = _sizes(spec), arrays[0].shape[:-1]
+        lengths, batch = _lengths(spec), arrays[0].shape[:-1]
         for name, x in zip(self.arguments, arrays, strict=True):
             dtype = np.dtype(np.int32 if name in ("unrolls", "index") else np.float32)
             axes, shape = AXES[name].split(), x.shape[len(batch) :]
             # The first array with an axis of the data says how long it is.
-            wanted = tuple(sizes.setdefault(*axis) for axis in zip(axes, shape, strict=False))
+            wanted = tuple(lengths.setdefault(*axis) for axis in zip(axes, shape, strict=False))
             if len(axes) != len(shape) or x.shape != (*batch, *wanted) or x.dtype != dtype:
-                said = f"{name} is {x}, not {dtype} of {batch} and {axes}: {sizes}"
+                said = f"{name} is {x}, not {dtype} of {batch} and {axes}: {lengths}"
                 raise TypeError(f"{self.name}: {said}")
-        samples = sizes.get("unrolls", 0) * sizes.get("time", 0)
+        samples = lengths.get("unrolls", 0) * lengths.get("time", 0)
         if isinstance(spec, AdamRule) and samples not in (0, spec.samples):
             raise TypeError(f"{self.name}: a minibatch of {samples} samples does not fit {spec}")
-        return [(*batch, *(sizes[axis] for axis in axes.split())) for axes in self.returns]
+        return self.relevant(Minibatch(*(lengths.get(x, 0) for x in Minibatch._fields)))
+
+    def relevant(self, batch: Minibatch) -> Minibatch:
+        """Return what of the data the kernel's arguments tell, and zeros for the rest."""
+        axes = {axis for name in self.arguments for axis in AXES[name].split()}
+        return Minibatch(**{x: n if x in axes else 0 for x, n in batch._asdict().items()})
+
+    def shapes(self, spec: Spec, batch: Minibatch) -> dict[str, tuple[int, ...]]:
+        """Return the shapes of all arguments and results for one policy, by name."""
+        lengths = batch._asdict() | _lengths(spec)
+        axes = {name: AXES[name] for name in self.arguments} | dict(self.returns)
+        return {name: tuple(lengths[x] for x in axes[name].split()) for name in axes}
+
+    def counts(self, spec: Spec, batch: Minibatch) -> dict[str, int]:
+        """Return the numbers of one policy in each argument and result, by name."""
+        return {name: math.prod(shape) for name, shape in self.shapes(spec, batch).items()}
 
 
-def minibatch_of(arrays: Arrays) -> Minibatch:
-    """Return the minibatch of a kernel's arguments, which have one axis of policies in front."""
-    _, collected, time, _ = arrays["rows"].shape
-    _, count, unrolls = arrays["unrolls"].shape
-    return Minibatch(collected, unrolls, time, count)
-
-
-def _sizes(spec: Spec) -> dict[str, int]:
+def _lengths(spec: Spec) -> dict[str, int]:
     """Return how long the axes are that do not depend on the data."""
     shape = spec if isinstance(spec, UpdateShape) else spec.shape
-    sizes = {"size": shape.size, "obs": shape.observations, "columns": shape.columns["size"]}
-    sizes |= {"action": shape.actions, "2*action": 2 * shape.actions}
-    sizes |= {"terms": len(LossTerms._fields), **SIZES}
+    lengths = {"size": shape.size, "obs": shape.observations, "columns": shape.columns["size"]}
+    lengths |= {"action": shape.actions, "2*action": 2 * shape.actions}
+    lengths |= {"terms": len(LossTerms._fields), **SIZES}
     if isinstance(spec, AdamRule):
-        sizes |= {"minibatches": spec.steps, "steps+1": spec.steps + 1}
+        lengths |= {"minibatches": spec.steps, "steps+1": spec.steps + 1}
     if isinstance(spec, Unroll):
-        sizes |= {"state": spec.state, "kept": len(spec.kept)}
+        lengths |= {"state": spec.state, "kept": len(spec.kept)}
         # The kernel writes the next state in the place of the one before.
         if [x.shape for x in spec.kernel.results()] != [(spec.state,)]:
             raise TypeError(f"unroll: a step does not return {spec.state} numbers")
-    return sizes
+    return lengths
 
 
-_EACH = "environments action", "environments action", "environments", "environments 2*action"
-_LEARNED = tuple(AXES[name] for name in UPDATED)
+# The kernels. Their first arguments are those of a network.
 
-ACTIONS = Signature("actions", (*PARAMETERS, "observations", "action_noise"), _EACH)
+_NETWORK = ("params", "mean", "scale")
+_DATA = ("rows", "last", "unrolls", "noise")
+_EACH = dict.fromkeys(Actions._fields, "environments action")
+_EACH |= {"log_prob": "environments", "distribution_params": "environments 2*action"}
+_STEPS = {name: f"time {axes}" for name, axes in _EACH.items()}
+_LEARNED = {name: AXES[name] for name in UPDATED}
+
+ACTIONS = Signature("actions", (*_NETWORK, "observations", "action_noise"), _EACH)
 UNROLL = Signature(
     "unroll",
-    (*PARAMETERS, "start", "unroll_noise"),
-    ("environments state", "time environments kept", *(f"time {x}" for x in _EACH)),
+    (*_NETWORK, "start", "unroll_noise"),
+    {"end": "environments state", "kept": "time environments kept", **_STEPS},
 )
-GRADIENT = Signature("gradient", GRADIENT_ARGUMENTS, ("size",))
-ADAM = Signature("adam", adam.ARRAYS, _LEARNED, UPDATED)
-UPDATE = Signature("update", UPDATE_ARGUMENTS, _LEARNED, UPDATED)
+GRADIENT = Signature("gradient", (*_NETWORK, *_DATA, "index", "terms"), {"gradient": "size"})
+ADAM = Signature("adam", ARRAYS, _LEARNED)
+# The index of the minibatch is no argument: all minibatches are computed by one call.
+UPDATE = Signature("update", (*_NETWORK[1:], *_DATA, "terms", "adam_terms", *UPDATED), _LEARNED)

@@ -1,90 +1,63 @@
-"""Write the kernel that draws the actions of all environments on CPUs."""
+"""Write the kernels of a collection on CPUs: the actions of all environments, or whole unrolls.
 
-import dataclasses
-from collections.abc import Iterator, Mapping
+In an unroll, few environments at a time go through all steps, actions and physics in turns. Their
+states stay in the cache, the weights are arranged once, and no thread waits for another, while a
+call for each step would wake all threads twice.
+"""
+
+from collections.abc import Mapping
 
 from jetbot_mjx.agents.fused import sample_loss
-from jetbot_mjx.agents.fused.cpu_network import (
-    HEAD,
-    MOST_PARTS,
-    TILE_ROWS,
-    Division,
-    NetworkStage,
-)
-from jetbot_mjx.agents.fused.cpu_product import rounded_up
-from jetbot_mjx.agents.fused.cpu_stages import Call, sample_function
+from jetbot_mjx.agents.fused.arrays import ACTIONS, UNROLL, Actions
+from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
+from jetbot_mjx.agents.fused.cpu_stages import Stages, sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
-from jetbot_mjx.agents.fused.shapes import UpdateShape
-from onekernel.build import LlvmWriter, Value, scalarize
+from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
+from onekernel.build import LlvmWriter, Value, cpu, scalarize
 
 _PART_ROWS = 2 * TILE_ROWS
 """Environments of a part if there are no more than `MOST_PARTS` times as many; each part copies the
 weights."""
 
 
-@dataclasses.dataclass(frozen=True)
-class ActionDivision(Division):
-    """An `ActionDivision` divides the environments."""
-
-    shape: UpdateShape
-    environments: int
-    lanes: int
-    is_policy: bool = True
-
-    @property
-    def items(self) -> int:
-        """Return the number of environments."""
-        return self.environments
-
-    @property
-    def part_items(self) -> int:
-        """Return the number of environments of a part."""
-        return max(_PART_ROWS, -(-self.environments // MOST_PARTS))
-
-    @property
-    def steps(self) -> int:
-        """Return 1: an environment has one row."""
-        return 1
-
-    @property
-    def reads(self) -> int:
-        """Return how many numbers an action depends on."""
-        return self.outputs + 2 * self.shape.actions
-
-    def extra_sizes(self) -> dict[str, int]:
-        """Return the floats of what the sample reads and writes."""
-        lanes = self.lanes
-        return {"sample": self.reads * lanes, "drawn": sum(self.shape.drawn) * lanes}
-
-
-PARAMETERS = ("params", "mean", "scale")
-"""The arrays of `launch.actions` that all environments share."""
-
-DRAWN = ("action", "raw_action", "log_prob", "distribution_params")
-"""The arrays of `launch.Actions`."""
-
-_ARGUMENTS = (*PARAMETERS, "observations", "noise")
-
-
-def action_call(division: ActionDivision) -> Call:
-    """Return the call, which takes and returns the arrays of `launch.actions`.
+def action_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stage of `arrays.ACTIONS`.
 
     Args:
-      division: the division of the environments.
+      shape: the networks.
+      batch: the data, of which the number of environments is used.
+      lanes: the number of float32 values in a vector register.
     """
-    shape = division.shape
-    sizes = {"observations": shape.observations, "noise": shape.actions}
-    sizes |= zip(DRAWN, shape.drawn, strict=True)
-    sizes = {name: division.environments * size for name, size in sizes.items()}
-    sizes |= {"params": shape.size, "mean": shape.observations, "scale": shape.observations}
-    return Call(_ARGUMENTS, DRAWN, sizes, [ActionStage(division)])
+    return Stages([ActionStage(shape, batch.environments, lanes, _PART_ROWS)])
 
 
 class ActionStage(NetworkStage):
     """An `ActionStage` runs the policy network and draws an action from each distribution."""
 
     name = "actions"
-    arrays_of = (*_ARGUMENTS, *DRAWN)
+    arrays_of = (*ACTIONS.arguments, *ACTIONS.returns)
+
+    def __init__(self, shape: UpdateShape, environments: int, lanes: int, part_rows: int) -> None:
+        """Divide the environments.
+
+        Args:
+          shape: the networks.
+          environments: the number of environments.
+          lanes: the number of float32 values in a vector register.
+          part_rows: the environments of a part, unless there would be too many parts.
+        """
+        self.environments = environments
+        numbers = ACTIONS.counts(shape, Minibatch(environments=1))
+        self.drawn = {name: numbers[name] for name in Actions._fields}
+        """The numbers of an environment in each array of `Actions`."""
+        part_items = max(part_rows, -(-environments // MOST_PARTS))
+        super().__init__(shape, lanes, environments, part_items)
+
+    def scratch_sizes(self) -> dict[str, int]:
+        """Add what the samples read and write, a row of lanes for each number."""
+        reads = self.outputs + 2 * self.shape.actions
+        sizes = {"sample": reads * self.lanes, "drawn": sum(self.drawn.values()) * self.lanes}
+        return super().scratch_sizes() | sizes
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation and the sample."""
@@ -93,7 +66,7 @@ class ActionStage(NetworkStage):
         drawn = sample_loss.action_program(self.shape)
         return [
             self.on_layers("activate", activated, (0,), (0,)),
-            sample_function("draw", drawn, self.division.lanes),
+            sample_function("draw", drawn, self.lanes),
         ]
 
     def tile(self, first: Value, count: Value) -> None:
@@ -109,27 +82,16 @@ class ActionStage(NetworkStage):
           arrays: the addresses of the observations, the noise and the results of all environments.
           stride: numbers from one observation to the next.
         """
+        # Take the observations through the network, a row for each environment,
         w = self.w
         with w.loop(count) as row:
             place = (first + row) * stride
             self.load_observation(arrays["observations"] + place, row)
         self.forward(self.stored_rows(count))
+        # and draw the actions, a lane for each environment.
         for start in self.groups(count):
             there = w.minimum(count - start, w.lanes)
             self._draw(first + start, start, there, arrays)
-
-    def groups(self, count: Value) -> Iterator[Value]:
-        """Repeat what is appended for as many environments at once as a vector has lanes.
-
-        Args:
-          count: the number of environments.
-
-        Yields:
-          The first one of the group.
-        """
-        lanes = self.w.lanes
-        with self.w.loop(rounded_up(count, lanes)) as group:
-            yield group * lanes
 
     def _draw(self, first: Value, start: Value, there: Value, arrays: Mapping[str, Value]) -> None:
         """Draw the actions of a group of environments.
@@ -141,8 +103,7 @@ class ActionStage(NetworkStage):
           arrays: those of `act`.
         """
         w, shape, places = self.w, self.shape, self.places
-        lanes, actions = w.lanes, shape.actions
-        deviations = self.params + (shape.hidden + (shape.width + 1) * self.division.outputs)
+        lanes, actions, deviations = w.lanes, shape.actions, self.deviations
         # Collect what the samples read, environment by environment.
         with w.loop(lanes) as lane:
             # Lanes beyond the last environment repeat it.
@@ -150,20 +111,74 @@ class ActionStage(NetworkStage):
             outputs = places["outputs"] + (start + within) * HEAD
             noise = (first + within) * actions
             sources = [
-                (outputs, self.division.outputs),
-                (deviations if shape.deviations else outputs, actions),
-                (arrays["noise"] + noise, actions),
+                (outputs, self.outputs),
+                (outputs if deviations is None else deviations, actions),
+                (arrays["action_noise"] + noise, actions),
             ]
-            target = places["sample"] + lane
-            numbers = [(source, i) for source, count in sources for i in range(count)]
-            for place, (source, i) in enumerate(numbers):
-                target[place * lanes] = source[i]
+            self.gather("sample", lane, sources)
         w.call("draw", places["sample"], places["drawn"])
-        # Store what they draw.
+        # Store what they draw, the numbers of each array behind those of the one before.
         with w.loop(there) as lane:
             place = 0
-            for name, size in zip(DRAWN, shape.drawn, strict=True):
+            for name, size in self.drawn.items():
                 row = arrays[name] + (first + lane) * size
                 for i in range(size):
                     row[i] = (places["drawn"] + place * lanes)[lane]
                     place += 1
+
+
+def unroll_stages(unroll: Unroll, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stage of `arrays.UNROLL`.
+
+    Args:
+      unroll: the networks and the environment.
+      batch: the data, of which the number of environments and the time are used.
+      lanes: the number of float32 values in a vector register.
+    """
+    return Stages([_UnrollStage(unroll, batch, lanes)])
+
+
+class _UnrollStage(ActionStage):
+    """Takes environments through all steps of an unroll."""
+
+    name = "unroll"
+    arrays_of = (*UNROLL.arguments, *UNROLL.returns)
+
+    def __init__(self, unroll: Unroll, batch: Minibatch, lanes: int) -> None:
+        # The parts are smaller than those of one step: each arranges the weights for all steps.
+        super().__init__(unroll.shape, batch.environments, lanes, TILE_ROWS)
+        self._unroll, self._time = unroll, batch.time
+        numbers = {"kept": len(unroll.kept), "unroll_noise": self.shape.actions, **self.drawn}
+        self._step_sizes = {name: batch.environments * size for name, size in numbers.items()}
+        """The numbers of a step in each array that holds all steps."""
+
+    def own_functions(self) -> list[LlvmWriter]:
+        """Write the activation, the sample and the step of the environments."""
+        return [
+            *super().own_functions(),
+            *cpu.step_functions(self._unroll.kernel, self.lanes),
+        ]
+
+    def tile(self, first: Value, count: Value) -> None:
+        """Take some environments through all steps."""
+        w, unroll, end = self.w, self._unroll, self.arrays["end"]
+        limit = first + count
+        with w.loop(self._time) as step:
+            # Find the step's part of each array, and the states before it.
+            sizes = self._step_sizes.items()
+            here = {name: self.arrays[name] + step * size for name, size in sizes}
+            before = w.select(step.equals(0), self.arrays["start"], end)
+            here["observations"] = before + unroll.observation
+            here["action_noise"] = here["unroll_noise"]
+            # Draw the actions, and step the environments.
+            self.act(first, count, here, unroll.state)
+            for start in self.groups(count):
+                w.call("instances", before, here["action"], end, first + start, limit)
+            # Copy what is kept of the states.
+            with w.loop(count) as row:
+                environment = first + row
+                source = end + environment * unroll.state
+                target = here["kept"] + environment * len(unroll.kept)
+                for place, begin, last in unroll.ranges:
+                    with w.loop(last + 1 - begin) as i:
+                        (target + place)[i] = (source + begin)[i]

@@ -1,40 +1,53 @@
-"""Write a step of Adam on CPUs: first the squares of the gradient, and then all elements."""
+"""Write a step of Adam on CPUs: first the squares of the gradient, and then all elements.
+
+The call of all minibatches makes the stages of the gradient and then these for each of them. The
+first of these is joined with the sum of the gradients: it squares what that has just written.
+"""
 
 from jetbot_mjx.agents.fused import adam
-from jetbot_mjx.agents.fused.adam import ARRAYS, METRICS, SIZES, UPDATED, AdamRule, Factors
+from jetbot_mjx.agents.fused.adam import METRICS, SIZES, UPDATED, AdamRule, Factors
+from jetbot_mjx.agents.fused.cpu_gradient import gradient_stages
 from jetbot_mjx.agents.fused.cpu_product import add_all
 from jetbot_mjx.agents.fused.cpu_stages import (
     SQUARES,
     Call,
+    JoinedStage,
     SquareStage,
-    Stage,
+    Stages,
     VectorStage,
     sample_function,
 )
+from jetbot_mjx.agents.fused.shapes import Minibatch
 from onekernel.build import LlvmWriter, ScalarProgram, run_program
 
 _VECTORS = (*UPDATED[:3], "gradient")
 
 
-def adam_call(rule: AdamRule, lanes: int) -> Call:
-    """Return the call of a step, which takes `adam.ARRAYS` and changes `adam.UPDATED`.
+def adam_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stages of `arrays.ADAM`.
 
     Args:
       rule: what the vectors hold.
+      batch: the data, which a step does not read.
       lanes: the number of float32 values in a vector register.
     """
-    sizes = {**rule.sizes, "squares": SQUARES}
-    return Call(ARRAYS, (*UPDATED, "squares"), sizes, adam_stages(rule, lanes), minibatches=None)
+    del batch
+    stages = [SquareStage(lanes, rule.shape.ranges), _AdamStage(rule, lanes)]
+    return Stages(stages, {"squares": SQUARES})
 
 
-def adam_stages(rule: AdamRule, lanes: int) -> list[Stage]:
-    """Return the stages that change `adam.UPDATED` by the array `gradient`.
+def update_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stages of `arrays.UPDATE`, through which the call goes for each minibatch.
 
     Args:
       rule: what the vectors hold.
+      batch: the minibatch.
       lanes: the number of float32 values in a vector register.
     """
-    return [SquareStage(lanes, rule.shape.ranges), _AdamStage(rule, lanes)]
+    (*parts, total), between = gradient_stages(rule.shape, batch, lanes)
+    (squares, step), own = adam_stages(rule, batch, lanes)
+    stages = [*parts, JoinedStage(total, squares), step]
+    return Stages(stages, {"gradient": rule.shape.size, **own, **between})
 
 
 class _AdamStage(VectorStage):
@@ -50,6 +63,7 @@ class _AdamStage(VectorStage):
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function, and those that it calls."""
+        # Elements are updated a vector at a time, and those at the end one by one.
         factors, element = adam.programs(self.rule)
         elements = [_elements_function(element, n) for n in (self.lanes, 1)]
         return [sample_function("factors", factors, 1), *elements, self._step(call)]
@@ -80,10 +94,7 @@ class _AdamStage(VectorStage):
             first, count = self.chunk(part, start, stop)
             whole = count // lanes
             done = whole * lanes
-            for width, begin, length in (
-                (lanes, first, whole),
-                (1, first + done, count - done),
-            ):
+            for width, begin, length in ((lanes, first, whole), (1, first + done, count - done)):
                 w.call(f"elements.{width}", *(x + begin for x in vectors), writes, length)
         return w
 
@@ -93,6 +104,7 @@ def _elements_function(program: ScalarProgram, lanes: int) -> LlvmWriter:
     names = (f"ptr noalias {name}" for name in (*_VECTORS, "factors"))
     w = LlvmWriter(f"elements.{lanes}", *names, "u64 count", lanes=lanes)
     *vectors, factors, count = w.parameters
+    # All lanes have the same factors.
     common = [factors[i].splat(lanes) for i in range(len(Factors._fields))]
     with w.loop(count) as i:
         places = [vector + i * lanes for vector in vectors]

@@ -6,20 +6,20 @@ it adds to the part's gradient. Since a column of ones stands beside the activat
 adds to the gradient of weights and biases.
 """
 
-import dataclasses
+import abc
 
 from jetbot_mjx.agents.fused import sample_loss
-from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, Division, NetworkStage
+from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, NetworkStage
 from jetbot_mjx.agents.fused.cpu_product import (
     Matrix,
     add_all,
     add_to,
     fill,
     multiply,
-    rounded_up,
     transposed,
+    vectors_of,
 )
-from jetbot_mjx.agents.fused.cpu_stages import Call, Stage, SumStage, integer_at, sample_function
+from jetbot_mjx.agents.fused.cpu_stages import Stages, SumStage, integer_at, sample_function
 from jetbot_mjx.agents.fused.sample_loss import ValueStep, vector_of
 from jetbot_mjx.agents.fused.shapes import (
     POLICY_METRICS,
@@ -28,140 +28,79 @@ from jetbot_mjx.agents.fused.shapes import (
     Minibatch,
     UpdateShape,
 )
-from onekernel.build import LlvmWriter, Value, scalarize
+from onekernel.build import LlvmWriter, ScalarProgram, Value, scalarize
+
+_READ = ("params", "mean", "scale", "rows")
+"""Arrays that both networks read first."""
 
 _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""
 
 
-@dataclasses.dataclass(frozen=True)
-class GradientDivision(Division):
-    """A `GradientDivision` divides the unrolls of a minibatch."""
-
-    shape: UpdateShape
-    batch: Minibatch
-    is_policy: bool
-    lanes: int
-
-    @property
-    def items(self) -> int:
-        """Return the number of unrolls."""
-        return self.batch.unrolls
-
-    @property
-    def part_items(self) -> int:
-        """Return the number of unrolls of a part."""
-        wanted = max(1, round(_PART_SAMPLES / self.batch.time))
-        return max(wanted, -(-self.batch.unrolls // MOST_PARTS))
-
-    @property
-    def steps(self) -> int:
-        """Return the rows of an unroll: its steps and, of the values, its last observation."""
-        return self.batch.time + (not self.is_policy)
-
-    @property
-    def slots(self) -> int:
-        """Return the number of sums behind the head's parameters."""
-        if self.is_policy:
-            return self.shape.deviations + len(POLICY_METRICS)
-        return len(VALUE_METRICS)
-
-    @property
-    def size(self) -> int:
-        """Return the length of the network's part of the vector of parameters."""
-        policy = self.shape.policy_size
-        return policy if self.is_policy else self.shape.size - policy
-
-    @property
-    def reads(self) -> int:
-        """Return how many numbers the loss of a sample reads."""
-        return 6 * self.shape.actions + self.outputs + 3 + len(LossTerms._fields)
-
-    def extra_sizes(self) -> dict[str, int]:
-        """Return the floats of what the backward pass and the loss need."""
-        shape, stride, lanes = self.shape, self.stride, self.lanes
-        sizes = {f"turned{i}": shape.width * stride for i in range(1, shape.layers)}
-        sizes["turned_head"] = self.outputs * stride
-        sizes |= {f"slopes{i}": self.rows * stride for i in range(1, shape.layers + 1)}
-        sizes |= dict.fromkeys(("deltas0", "deltas1"), self.rows * stride)
-        sizes |= {"errors": self.rows * HEAD, "head_sums": (shape.width + 1) * HEAD}
-        sizes |= {"sums": self.slots * lanes, "statistics": lanes, "loss": self.reads * lanes}
-        return sizes | {"results": (HEAD + self.slots) * lanes}
-
-
-GRADIENT_ARGUMENTS = (
-    *("params", "mean", "scale", "rows", "last"),
-    *("unrolls", "noise", "index", "terms"),
-)
-"""The arrays of `launch.gradient`."""
-
-BETWEEN = ("values_vectors", "policy_vectors", "advantages")
-"""The arrays that the stages of a gradient hand on."""
-
-
-def divisions(
-    shape: UpdateShape, batch: Minibatch, lanes: int
-) -> tuple[GradientDivision, GradientDivision]:
-    """Return how the values' stage and the policy's stage divide a minibatch."""
-    return GradientDivision(shape, batch, False, lanes), GradientDivision(shape, batch, True, lanes)
-
-
-def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> list[Stage]:
-    """Return the stages that compute the array `gradient`, from values to the sum of all parts.
+def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
+    """Return the stages of `arrays.GRADIENT`, from values to the sum of all parts.
 
     Args:
       shape: the networks.
       batch: the minibatch.
       lanes: the number of float32 values in a vector register.
     """
-    values, policy = divisions(shape, batch, lanes)
+    values, policy = _ValueStage(shape, batch, lanes), _PolicyStage(shape, batch, lanes)
     (begin, end), (values_begin, values_end) = shape.ranges
     ranges = {
         "policy_vectors": (policy.parts, (begin, end, values_begin)),
         "values_vectors": (values.parts, (values_begin, values_end, shape.size)),
     }
-    return [_ValueStage(values), _PolicyStage(policy), SumStage(lanes, ranges)]
-
-
-def gradient_sizes(shape: UpdateShape, batch: Minibatch, lanes: int) -> dict[str, int]:
-    """Return the numbers of one policy in each array of these stages."""
-    values, policy = divisions(shape, batch, lanes)
-    return {
-        "params": shape.size,
-        "mean": shape.observations,
-        "scale": shape.observations,
-        "rows": batch.collected * batch.time * shape.columns["size"],
-        "last": batch.collected * shape.observations,
-        "unrolls": batch.count * batch.unrolls,
-        "noise": batch.count * batch.samples * shape.actions,
-        "index": 1,
-        "terms": len(LossTerms._fields),
+    between = {
+        # A gradient of each part, of its network only.
         "values_vectors": values.parts * values.size,
         "policy_vectors": policy.parts * policy.size,
         "advantages": batch.samples,
-        "gradient": shape.size,
     }
-
-
-def gradient_call(shape: UpdateShape, batch: Minibatch, lanes: int) -> Call:
-    """Return the call of a minibatch's gradient, which takes the arrays of `launch.gradient`.
-
-    Args:
-      shape: the networks.
-      batch: the minibatch.
-      lanes: the number of float32 values in a vector register.
-    """
-    sizes, results = gradient_sizes(shape, batch, lanes), ("gradient", *BETWEEN)
-    stages = gradient_stages(shape, batch, lanes)
-    return Call(GRADIENT_ARGUMENTS, results, sizes, stages, minibatches=None)
+    return Stages([values, policy, SumStage(lanes, ranges)], between)
 
 
 class _GradientStage(NetworkStage):
-    """A `_GradientStage` writes what both networks share."""
+    """A `_GradientStage` goes through the unrolls of a minibatch, for one of the networks.
 
-    def __init__(self, division: GradientDivision) -> None:
-        super().__init__(division)
-        self.batch = division.batch
+    Its scratch memory also has these matrices of float32:
+
+        turned1, turned2, ...  (width, width), weights transposed
+        turned_head            (outputs, width)
+        slopes1, slopes2, ...  (rows of a tile, width), derivatives of the activations
+        deltas0, deltas1       (rows, width), derivatives of the loss before an activation
+        errors                 (rows, HEAD), derivatives of the loss by the outputs
+        head_sums              (width + 1, HEAD), the gradient of the last layer
+        sums                   (slots, lanes), those of the deviations and the metrics
+        loss, results          (numbers of a sample, lanes), what its loss reads and writes
+    """
+
+    slots: int
+    """Number of sums behind the head's parameters."""
+    size: int
+    """Length of the network's part of the vector of parameters."""
+    loss_program: ScalarProgram
+    """The loss of a sample with its derivatives."""
+    loss_lanes: int
+    """Number of samples whose losses are computed at once."""
+
+    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
+        # A tile has whole unrolls, of the values each followed by its last observation.
+        self.batch = batch
+        unrolls = max(1, round(_PART_SAMPLES / batch.time), -(-batch.unrolls // MOST_PARTS))
+        super().__init__(shape, lanes, batch.unrolls, unrolls, batch.time + (not self.is_policy))
+
+    def scratch_sizes(self) -> dict[str, int]:
+        shape, stride, lanes, rows = self.shape, self.stride, self.lanes, self.rows
+        reads = 6 * shape.actions + self.outputs + 3 + len(LossTerms._fields)
+        sizes = {f"turned{i}": shape.width * stride for i in range(1, shape.layers)}
+        sizes["turned_head"] = self.outputs * stride
+        sizes |= {f"slopes{i}": rows * stride for i in range(1, shape.layers + 1)}
+        sizes |= dict.fromkeys(("deltas0", "deltas1"), rows * stride)
+        sizes |= {"errors": rows * HEAD, "head_sums": (shape.width + 1) * HEAD}
+        sizes |= {"sums": self.slots * lanes, "statistics": lanes, "loss": reads * lanes}
+        sizes |= {"results": (HEAD + self.slots) * lanes}
+        return super().scratch_sizes() | sizes
 
     def own_functions(self) -> list[LlvmWriter]:
         scalar = vector_of()
@@ -170,14 +109,12 @@ class _GradientStage(NetworkStage):
         return [
             self.on_layers("activate", activated, (0,), both),
             self.on_layers("multiply", scaled, both, (0,)),
-            self.loss_function(f"{self.name}_loss"),
+            sample_function(f"{self.name}_loss", self.loss_program, self.loss_lanes),
         ]
 
-    def loss_function(self, name: str) -> LlvmWriter:
-        raise NotImplementedError
-
+    @abc.abstractmethod
     def add_losses(self, first: Value, count: Value) -> None:
-        raise NotImplementedError
+        """Write the errors of a tile, and add to the sums."""
 
     def load_terms(self) -> list[Value]:
         """Return the coefficients of the loss."""
@@ -195,8 +132,8 @@ class _GradientStage(NetworkStage):
 
     def begin_part(self) -> None:
         super().begin_part()
-        w, shape, division, places = self.w, self.shape, self.division, self.places
-        self.vector = self.arrays[f"{self.name}_vectors"] + self.part.number * division.size
+        w, shape, places = self.w, self.shape, self.places
+        self.vector = self.arrays[f"{self.name}_vectors"] + self.part.number * self.size
         # Find the unrolls and the noise of the minibatch.
         for name, size in (
             ("unrolls", self.batch.unrolls),
@@ -205,23 +142,23 @@ class _GradientStage(NetworkStage):
             if name in self.arrays:
                 self.arrays[name] += self.part.minibatch * size
         # Transpose the weights for the backward pass, and set all sums to zero.
-        for i, inputs, start in self.hidden():
+        for i, inputs, start in shape.hidden_layers:
             source = self.params + start
             fill(self.vector + start, (inputs + 1) * shape.width)
             if i:
                 self._transpose(source, places[f"turned{i}"], inputs, shape.width)
         source = self.params + shape.hidden
-        self._transpose(source, places["turned_head"], shape.width, division.outputs)
+        self._transpose(source, places["turned_head"], shape.width, self.outputs)
         for name, count in (
-            ("errors", division.rows * HEAD),
+            ("errors", self.rows * HEAD),
             ("head_sums", (shape.width + 1) * HEAD),
-            ("sums", division.slots * w.lanes),
+            ("sums", self.slots * w.lanes),
         ):
             fill(places[name], count)
 
     def _transpose(self, source: Value, target: Value, rows: int, columns: int) -> None:
         """Copy a matrix of weights transposed."""
-        w, stride, lanes = self.w, self.division.stride, self.w.lanes
+        w, stride, lanes = self.w, self.stride, self.w.lanes
         # Whole squares in registers, and single numbers if there is none.
         side = lanes if rows % lanes == columns % lanes == 0 else 1
         with w.loop(rows // side) as i, w.loop(columns // side) as j:
@@ -235,24 +172,24 @@ class _GradientStage(NetworkStage):
 
     def tile(self, first: Value, count: Value) -> None:
         """Add the gradient of some unrolls, from the given one on."""
-        w, shape, division, places = self.w, self.shape, self.division, self.places
-        rows = count * division.steps
+        w, shape, places = self.w, self.shape, self.places
+        rows = count * self.steps
         stored = self.stored_rows(rows)
         # Forward.
         with w.loop(count) as i:
             unroll = first + i
-            with w.loop(division.steps) as step:
-                row = i * division.steps + step
+            with w.loop(self.steps) as step:
+                row = i * self.steps + step
                 self.load_observation(self.observation(unroll, step), row)
         self.forward(stored)
         # The loss, and its derivatives by the outputs.
         self.add_losses(first, count)
         # Backward: first the weights of a layer, and then the derivatives before it.
-        width, stride, layers = shape.width, division.stride, self.layers
+        width, stride, layers = shape.width, self.stride, self.layers
         errors, sums = Matrix(places["errors"], HEAD), Matrix(places["head_sums"], HEAD)
         multiply(layers[-1].transposed, errors, sums, (width + 1, HEAD, rows), adds=True)
-        turned, length = places["turned_head"], division.outputs
-        for i, inputs, start in reversed(self.hidden()):
+        turned, length = places["turned_head"], self.outputs
+        for i, inputs, start in reversed(shape.hidden_layers):
             deltas = Matrix(places[f"deltas{i % 2}"], stride)
             multiply(errors, Matrix(turned, stride), deltas, (stored, width, length))
             w.call("multiply", deltas.start, places[f"slopes{i + 1}"], stored)
@@ -267,12 +204,11 @@ class _GradientStage(NetworkStage):
 
     def end_part(self) -> None:
         # Copy the sums of the head and of the samples to the part's vector.
-        w, shape, division = self.w, self.shape, self.division
-        outputs = division.outputs
+        w, shape, outputs = self.w, self.shape, self.outputs
         with w.loop(shape.width + 1) as row, w.loop(outputs) as j:
             value = (self.places["head_sums"] + row * HEAD)[j]
             (self.vector + shape.hidden + row * outputs)[j] = value
-        with w.loop(division.slots) as slot:
+        with w.loop(self.slots) as slot:
             target = self.vector + (shape.hidden + (shape.width + 1) * outputs) + slot
             target.store(0.0)
             add_all(self.places["sums"] + slot * w.lanes, w.lanes, target)
@@ -282,13 +218,13 @@ class _ValueStage(_GradientStage):
     """Values, advantages, and the gradient of the value network."""
 
     name = "values"
-    arrays_of = (
-        *("params", "mean", "scale", "rows", "last", "unrolls", "terms"),
-        *("values_vectors", "advantages"),
-    )
+    is_policy = False
+    arrays_of = (*_READ, "last", "unrolls", "terms", "values_vectors", "advantages")
 
-    def loss_function(self, name: str) -> LlvmWriter:
-        return sample_function(name, sample_loss.value_step_program(self.batch.samples), 1)
+    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
+        self.slots, self.size = len(VALUE_METRICS), shape.size - shape.policy_size
+        self.loss_program, self.loss_lanes = sample_loss.value_step_program(batch.samples), 1
+        super().__init__(shape, batch, lanes)
 
     def observation(self, unroll: Value, step: Value) -> Value:
         # The row behind the steps has the observation after them. An address beyond the array is
@@ -336,14 +272,13 @@ class _PolicyStage(_GradientStage):
     """The gradient of the policy network."""
 
     name = "policy"
-    arrays_of = (
-        *("params", "mean", "scale", "rows", "unrolls", "noise", "terms"),
-        *("policy_vectors", "advantages"),
-    )
+    arrays_of = (*_READ, "unrolls", "noise", "terms", "policy_vectors", "advantages")
 
-    def loss_function(self, name: str) -> LlvmWriter:
-        program = sample_loss.policy_program(self.shape, self.batch.samples)
-        return sample_function(name, program, self.division.lanes)
+    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
+        self.slots, self.size = shape.deviations + len(POLICY_METRICS), shape.policy_size
+        self.loss_program = sample_loss.policy_program(shape, batch.samples)
+        self.loss_lanes = lanes
+        super().__init__(shape, batch, lanes)
 
     def begin_part(self) -> None:
         super().begin_part()
@@ -359,35 +294,27 @@ class _PolicyStage(_GradientStage):
 
     def _mean_advantage(self, centre: Value | None) -> Value:
         """Return the mean of the advantages, or of their squared distances from a centre."""
-        w, samples, lanes = self.w, self.batch.samples, self.w.lanes
+        w, samples, lanes = self.w, self.batch.samples, self.lanes
         total = self.places["statistics"]
+        # A sum for each lane, and then one of all lanes.
         fill(total, lanes)
-
-        def add(place: Value, kind: str) -> None:
+        first, count = (w.constant(x, "u64") for x in (0, samples))
+        for place, kind in vectors_of(first, count):
             value = (self.arrays["advantages"] + place).load(kind)
             if centre is not None:
                 distance = value - (centre if kind == "float" else centre.splat(lanes))
                 value = distance * distance
             add_to(total, value)
-
-        # A sum for each lane, and then one of all lanes.
-        whole = samples // lanes
-        with w.loop(whole) as i:
-            add(i * lanes, w.vector)
-        with w.loop(samples % lanes) as i:
-            add(i + whole * lanes, "float")
-        with w.loop(lanes - 1) as i:
-            add_to(total, total[i + 1])
+        add_all(total + 1, lanes - 1, total)
         return total[0] * (1 / samples)
 
     def add_losses(self, first: Value, count: Value) -> None:
         """Compute the losses of as many samples at once as a vector has lanes."""
         w, time, places = self.w, self.batch.time, self.places
-        division, lanes = self.division, self.w.lanes
+        lanes = w.lanes
         rows, results = count * time, places["results"]
-        with w.loop(rounded_up(rows, lanes)) as group:
+        for start in self.groups(rows):
             # Collect what the loss reads, sample by sample.
-            start = group * lanes
             there = w.minimum(rows - start, lanes)
             with w.loop(lanes) as lane:
                 # Lanes beyond the last sample repeat it, with a weight of zero.
@@ -398,12 +325,12 @@ class _PolicyStage(_GradientStage):
                 self._load_sample(first + within, step, row, is_there, lane)
             w.call("policy_loss", places["loss"], results)
             # Store the derivatives by the outputs, and add up the sums behind them.
-            with w.loop(there) as lane, w.loop(division.outputs) as j:
+            with w.loop(there) as lane, w.loop(self.outputs) as j:
                 source = results + j * lanes + lane
                 places["errors"][(start + lane) * HEAD + j] = source.load()
-            with w.loop(division.slots) as slot:
+            with w.loop(self.slots) as slot:
                 place = slot * lanes
-                value = (results + division.outputs * lanes + place).load(w.vector)
+                value = (results + self.outputs * lanes + place).load(w.vector)
                 add_to(places["sums"] + place, value)
 
     def _load_sample(
@@ -411,24 +338,20 @@ class _PolicyStage(_GradientStage):
     ) -> None:
         """Copy what the loss of a sample reads to a lane, in the order of `PolicySample`."""
         w, shape, batch = self.w, self.shape, self.batch
-        columns, actions = shape.columns, shape.actions
+        columns, actions, deviations = shape.columns, shape.actions, self.deviations
         outputs = self.places["outputs"] + row * HEAD
         collected = self.row_of(unroll, step)
-        deviations = self.params + (shape.hidden + (shape.width + 1) * self.division.outputs)
         noise = self.arrays["noise"] + (step * batch.unrolls + unroll) * actions
         advantage = self.arrays["advantages"][unroll * batch.time + step]
         if shape.normalizes:
             advantage = (advantage - self.mean) * self.scale
         first = columns["raw_action"]
         sources = [
-            (outputs, self.division.outputs),
-            (deviations if shape.deviations else outputs, actions),
+            (outputs, self.outputs),
+            (outputs if deviations is None else deviations, actions),
             (collected + first, columns["reward"] - first),
             (noise, actions),
         ]
         # The fields of `PolicySample`, one behind the other, and the coefficients.
-        values = [source[i] for source, count in sources for i in range(count)]
-        values += [advantage, w.select(is_there, w.constant(1.0), 0.0), *self.load_terms()]
-        target = self.places["loss"] + lane
-        for i, value in enumerate(values):
-            target[i * w.lanes] = value
+        weight = w.select(is_there, w.constant(1.0), 0.0)
+        self.gather("loss", lane, sources, advantage, weight, *self.load_terms())

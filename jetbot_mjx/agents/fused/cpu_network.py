@@ -7,16 +7,15 @@ A column of ones beside the activations has the biases as its weights, so that o
 a layer with its biases.
 """
 
-import abc
 import functools
-import itertools
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Sequence
+
+from jaxtyping import Array
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.cpu_product import ROWS, Matrix, fill, multiply, rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Call, Stage
-from jetbot_mjx.agents.fused.shapes import UpdateShape
+from jetbot_mjx.agents.fused.shapes import UpdateShape, places
 from onekernel.build import LlvmWriter, ScalarProgram, Value, run_program
 
 HEAD = 16
@@ -26,96 +25,61 @@ TILE_ROWS = 64
 """Rows of a tile, about, if there are as many."""
 
 MOST_PARTS = 32
+"""Parts of a stage at most: each has a gradient of its own, and arranges the weights."""
 
 _PAD = 16
 """Numbers between the rows of a matrix, so that they do not share few places of the cache."""
 
 
-class Division(abc.ABC):
-    """A `Division` divides the rows of a kernel into parts and tiles of whole items."""
-
-    shape: UpdateShape
-    lanes: int
-    """Number of float32 values in a vector register."""
-    is_policy: bool
-    """Whether the network is the policy's."""
-
-    @property
-    @abc.abstractmethod
-    def items(self) -> int:
-        """Return the number of items, for example unrolls."""
-
-    @property
-    @abc.abstractmethod
-    def part_items(self) -> int:
-        """Return the number of items of a part; the last parts may have fewer."""
-
-    @property
-    @abc.abstractmethod
-    def steps(self) -> int:
-        """Return the rows of an item."""
-
-    @abc.abstractmethod
-    def extra_sizes(self) -> dict[str, int]:
-        """Return the floats of each array of the scratch memory beside those of `Kernel`."""
-
-    @property
-    def parts(self) -> int:
-        """Return the number of parts."""
-        return -(-self.items // self.part_items)
-
-    @property
-    def tile_items(self) -> int:
-        """Return the number of items of a tile."""
-        return min(self.part_items, -(-TILE_ROWS // self.steps))
-
-    @property
-    def rows(self) -> int:
-        """Return the number of rows of a tile that are stored."""
-        return rounded(self.tile_items * self.steps, ROWS)
-
-    @property
-    def outputs(self) -> int:
-        """Return the number of outputs of the network."""
-        return self.shape.outputs[not self.is_policy]
-
-    @property
-    def stride(self) -> int:
-        """Return the stride of the rows of a layer."""
-        return self.shape.width + _PAD
-
-    @property
-    def first_stride(self) -> int:
-        """Return the stride of the rows of the observations."""
-        return rounded(self.shape.observations + 1, _PAD)
-
-    @functools.cached_property
-    def layout(self) -> dict[str, int]:
-        """Return where each array begins in a part's scratch memory, and its `size`, in floats."""
-        shape, stride = self.shape, self.stride
-        sizes = {f"weights{i}": (n + 1) * stride for i, n in enumerate(shape.inputs[:-1])}
-        sizes |= {"head": (shape.width + 1) * HEAD, "layer0": self.rows * self.first_stride}
-        sizes |= {f"layer{i}": self.rows * stride for i in range(1, shape.layers + 1)}
-        sizes |= {"outputs": self.rows * HEAD, **self.extra_sizes()}
-        padded = [rounded(size, _PAD) for size in sizes.values()]
-        starts = list(itertools.accumulate(padded, initial=0))
-        return {**dict(zip(sizes, starts, strict=False)), "size": starts[-1]}
-
-
 class NetworkStage(Stage):
-    """A `NetworkStage` takes tiles of rows through one of the networks."""
+    """A `NetworkStage` takes rows through one of the networks.
+
+    It divides its items, environments or unrolls, into parts, which XLA's threads compute, and the
+    items of a part into tiles. A thread's scratch memory has these matrices of float32:
+
+        weights0, weights1, ...  (inputs + 1, width) of each hidden layer; the last row are biases
+        head                     (width + 1, HEAD), zero beyond the outputs
+        layer0                   (rows of a tile, observations + 1), the last column ones
+        layer1, layer2, ...      (rows, width + 1), likewise
+        outputs                  (rows, HEAD)
+    """
 
     arrays_of: tuple[str, ...]
     """Names of the arrays that it reads or writes."""
+    is_policy = True
+    """Whether the network is the policy's."""
 
-    def __init__(self, division: Any) -> None:
-        """Prepare.
+    def __init__(
+        self, shape: UpdateShape, lanes: int, items: int, part_items: int, steps: int = 1
+    ) -> None:
+        """Divide the rows.
 
         Args:
-          division: the `Division` of its rows.
+          shape: the networks.
+          lanes: the number of float32 values in a vector register.
+          items: the number of items.
+          part_items: the number of items of a part; the last parts may have fewer.
+          steps: the rows of an item.
         """
-        self.division, self.shape = division, division.shape
-        self.parts, self.scratch = division.parts, division.layout["size"]
+        self.shape, self.lanes = shape, lanes
+        self.items, self.part_items, self.steps = items, part_items, steps
+        self.outputs = shape.outputs[not self.is_policy]
+        self.parts = -(-items // part_items)
+        self.tile_items = min(part_items, -(-TILE_ROWS // steps))
+        # The rows of a tile that are stored, and the strides of those of a layer.
+        self.rows = rounded(self.tile_items * steps, ROWS)
+        self.stride, self.first_stride = shape.width + _PAD, rounded(shape.observations + 1, _PAD)
+        self.layout = places(self.scratch_sizes(), _PAD)
+        """Where each array begins in a part's scratch memory, and its `size`, in floats."""
+        self.scratch = self.layout["size"]
+
+    def scratch_sizes(self) -> dict[str, int]:
+        """Return the floats of each array of the scratch memory."""
+        shape, rows = self.shape, self.rows
+        sizes = {f"weights{i}": (n + 1) * self.stride for i, n, _ in shape.hidden_layers}
+        sizes |= {"head": (shape.width + 1) * HEAD, "layer0": rows * self.first_stride}
+        sizes |= {f"layer{i}": rows * self.stride for i in range(1, shape.layers + 1)}
+        return sizes | {"outputs": rows * HEAD}
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the functions that a part calls; `activate` is one of them."""
@@ -141,12 +105,12 @@ class NetworkStage(Stage):
           reads: the layers that it reads, 0 or 1.
           writes: those that it writes.
         """
-        lanes = self.division.lanes
+        lanes = self.lanes
         names = "ptr noalias one", "ptr noalias other", "u64 rows"
         w = LlvmWriter(name, *names, lanes=lanes)
         *layers, rows = w.parameters
         with w.loop(rows) as row:
-            start = row * self.division.stride
+            start = row * self.stride
             # Vectors of a row; the columns beside them stay as they are.
             with w.loop(self.shape.width // lanes) as i:
                 place = start + i * lanes
@@ -156,26 +120,26 @@ class NetworkStage(Stage):
                     at[x].store(result)
         return w
 
-    def activation(self) -> Callable[..., Any]:
+    def activation(self) -> Callable[[Array], tuple[Array, Array]]:
         """Return the activation with its derivative, as a function of a scalar."""
         return functools.partial(sample_loss.activation, self.shape.activation)
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function that computes one part, and those that it calls."""
-        functions, division = self.own_functions(), self.division
-        self.w, self.part = w, part = self.begin(division.lanes)
+        functions = self.own_functions()
+        self.w, self.part = w, part = self.begin(self.lanes)
         # Find the arrays of the policy, the network's parameters and the scratch memory.
         self.arrays = {name: call.array(part.job, part.policy, name) for name in self.arrays_of}
-        start = 0 if division.is_policy else self.shape.policy_size
+        start = 0 if self.is_policy else self.shape.policy_size
         self.params = self.arrays["params"] + start
         self.places = {
-            name: part.scratch + place for name, place in division.layout.items() if name != "size"
+            name: part.scratch + place for name, place in self.layout.items() if name != "size"
         }
         self.begin_part()
         # Go through the items of the part in tiles.
-        first = part.number * division.part_items
-        there = w.minimum(division.items - first, division.part_items)
-        per_tile = division.tile_items
+        first = part.number * self.part_items
+        there = w.minimum(self.items - first, self.part_items)
+        per_tile = self.tile_items
         with w.loop(rounded_up(there, per_tile)) as tile:
             done = tile * per_tile
             count = w.minimum(there - done, per_tile)
@@ -183,40 +147,66 @@ class NetworkStage(Stage):
         self.end_part()
         return [*functions, w]
 
-    def hidden(self) -> list[tuple[int, int, int]]:
-        """Return number, inputs and first parameter of each hidden layer."""
-        sizes = [(n + 1) * self.shape.width for n in self.shape.inputs[:-1]]
-        starts = itertools.accumulate(sizes, initial=0)
-        return [
-            (i, n, start)
-            for i, (n, start) in enumerate(zip(self.shape.inputs[:-1], starts, strict=False))
-        ]
-
     def begin_part(self) -> None:
         """Arrange the weights, and set the numbers of the layers that no row changes."""
-        w, shape, division, places = self.w, self.shape, self.division, self.places
-        width, stride, lanes = shape.width, division.stride, w.lanes
+        w, shape, places = self.w, self.shape, self.places
+        width, stride, lanes = shape.width, self.stride, w.lanes
         # The hidden layers' weights and biases, with room between their rows.
-        for i, inputs, start in self.hidden():
+        for i, inputs, start in shape.hidden_layers:
             source = self.params + start
             with w.loop(inputs + 1) as row, w.loop(width // lanes) as j:
                 place, target = row * width + j * lanes, row * stride + j * lanes
                 (places[f"weights{i}"] + target).store((source + place).load(w.vector))
         # Those of the last layer, with zeros beyond its outputs.
         fill(places["head"], (width + 1) * HEAD)
-        fill(places["layer0"], division.rows * division.first_stride)
-        source, outputs = self.params + shape.hidden, division.outputs
+        fill(places["layer0"], self.rows * self.first_stride)
+        source, outputs = self.params + shape.hidden, self.outputs
         with w.loop(width + 1) as row, w.loop(outputs) as j:
             place, target = row * outputs + j, row * HEAD + j
             places["head"][target] = source[place]
         # The column of ones beside the activations.
-        with w.loop(division.rows) as row:
-            (places["layer0"] + row * division.first_stride)[shape.observations] = 1.0
+        with w.loop(self.rows) as row:
+            (places["layer0"] + row * self.first_stride)[shape.observations] = 1.0
             for i in range(1, shape.layers + 1):
                 (places[f"layer{i}"] + row * stride)[width] = 1.0
 
     def end_part(self) -> None:
         """Write what is known after the last tile."""
+
+    def groups(self, count: Value) -> Iterator[Value]:
+        """Repeat what is appended for as many rows at once as a vector has lanes.
+
+        Args:
+          count: the number of rows.
+
+        Yields:
+          The first row of the group.
+        """
+        lanes = self.lanes
+        with self.w.loop(rounded_up(count, lanes)) as group:
+            yield group * lanes
+
+    @property
+    def deviations(self) -> Value | None:
+        """Return the address of the standard deviations that are parameters; None: none are."""
+        if not self.shape.deviations:
+            return None
+        return self.params + (self.shape.hidden + (self.shape.width + 1) * self.outputs)
+
+    def gather(
+        self, name: str, lane: Value, sources: Sequence[tuple[Value, int]], *others: Value
+    ) -> None:
+        """Copy what a function of single samples reads to a lane, a number to each row.
+
+        Args:
+          name: the array of scratch memory that it reads, of shape (numbers, lanes).
+          lane: the lane.
+          sources: addresses, and how many numbers there.
+          *others: the numbers behind these.
+        """
+        numbers = [source[i] for source, count in sources for i in range(count)]
+        for i, number in enumerate([*numbers, *others]):
+            (self.places[name] + lane)[i * self.lanes] = number
 
     def stored_rows(self, rows: Value) -> Value:
         """Return a number of rows, rounded up to whole register tiles of a product."""
@@ -225,7 +215,7 @@ class NetworkStage(Stage):
     def load_observation(self, source: Value, row: Value) -> None:
         """Copy a normalised observation to a row of the tile."""
         # (observation - mean) / std, with 1 / std as `scale`.
-        target = self.places["layer0"] + row * self.division.first_stride
+        target = self.places["layer0"] + row * self.first_stride
         with self.w.loop(self.shape.observations) as i:
             value, mean, scale = source[i], self.arrays["mean"][i], self.arrays["scale"][i]
             target[i] = (value - mean) * scale
@@ -233,7 +223,7 @@ class NetworkStage(Stage):
     @property
     def layers(self) -> list[Matrix]:
         """Return the observations and the activations of each hidden layer."""
-        strides = [self.division.first_stride, *[self.division.stride] * self.shape.layers]
+        strides = [self.first_stride, *[self.stride] * self.shape.layers]
         return [Matrix(self.places[f"layer{i}"], stride) for i, stride in enumerate(strides)]
 
     def forward(self, stored: Value) -> None:
@@ -244,9 +234,9 @@ class NetworkStage(Stage):
         """
         w, shape, places, layers = self.w, self.shape, self.places, self.layers
         none = Value(w, "null", "ptr")
-        for i, inputs, _ in self.hidden():
+        for i, inputs, _ in shape.hidden_layers:
             # The weighted sums with the biases, and then in their place the activations.
-            weights, after = Matrix(places[f"weights{i}"], self.division.stride), layers[i + 1]
+            weights, after = Matrix(places[f"weights{i}"], self.stride), layers[i + 1]
             multiply(layers[i], weights, after, (stored, shape.width, inputs + 1))
             w.call("activate", after.start, places.get(f"slopes{i + 1}", none), stored)
         # The last layer has no activation.

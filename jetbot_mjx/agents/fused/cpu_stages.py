@@ -53,8 +53,8 @@ class Call:
     sizes: Mapping[str, int]
     """Numbers of one policy in each array."""
     stages: Sequence["Stage"]
-    minibatches: int | None = 1
-    """How often to go through the stages; None: once, for the minibatch of the array `index`."""
+    minibatches: int
+    """How often to go through the stages. With an array `index`, that is the only minibatch."""
 
     def text(self, *, lanes: int, registers: int, machine: str) -> str:
         """Return the LLVM module.
@@ -69,7 +69,7 @@ class Call:
         functions += [*product_functions(lanes, registers), self._needed(), self._block()]
         return cpu.call_text(
             functions,
-            blocks_per_instance=self._parts * (self.minibatches or 1),
+            blocks_per_instance=self._parts * self.minibatches,
             blocks_per_thread=1,
             scratch=max(64 * -(-stage.scratch // 16) for stage in self.stages),
             machine=machine,
@@ -77,6 +77,7 @@ class Call:
 
     def array(self, job: Value, policy: Value, name: str) -> Value:
         """Return the address of the array of a policy."""
+        # XLA passes the arguments and then the results, each with the policies as its first axis.
         place = (*self.arguments, *self.results).index(name)
         return cpu.array_of(job, place) + policy * self.sizes[name]
 
@@ -117,11 +118,19 @@ class Call:
             with w.when(place < policies * (start + stage.parts)):
                 within = place - policies * start
                 policy, part = within // stage.parts, within % stage.parts
-                if self.minibatches is None:
+                if "index" in self.arguments:
                     minibatch = integer_at(self.array(job, policy, "index"))
                 w.call(stage.name, *Part(job, policy, part, minibatch, scratch))
                 w.ret()
         return w
+
+
+class Stages(NamedTuple):
+    """A `Stages` holds the stages of a call, in their order."""
+
+    stages: Sequence["Stage"]
+    between: Mapping[str, int] = {}
+    """Numbers of one policy in each array that the stages hand on to each other."""
 
 
 def integer_at(address: Value) -> Value:
@@ -199,6 +208,7 @@ class SumStage(VectorStage):
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function."""
         w, (job, policy, part, *_) = self.begin(self._lanes)
+        # The array of each network has a vector for each part of its stage.
         gradient = call.array(job, policy, "gradient")
         for name, (count, places) in self._ranges.items():
             vectors, begin, size = call.array(job, policy, name), places[0], places[-1] - places[0]

@@ -5,17 +5,16 @@ then updates its own elements: so no block waits for another one.
 """
 
 from jetbot_mjx.agents.fused import adam
-from jetbot_mjx.agents.fused.adam import ARRAYS, SIZES, UPDATED, AdamRule, Factors
-from jetbot_mjx.agents.fused.tensor_core import LANES, GpuWriter, Value
+from jetbot_mjx.agents.fused.adam import SIZES, UPDATED, AdamRule, Factors
+from jetbot_mjx.agents.fused.arrays import ADAM
+from jetbot_mjx.agents.fused.shapes import Minibatch
+from jetbot_mjx.agents.fused.tensor_core import LANES, GpuKernel, Value
 
-NAME = "ppo_adam"
-"""Name of the kernel."""
-
-THREADS = 1024
+_THREADS = 1024
 """Threads of a block."""
 
-SHARED_MEMORY = 4 * (THREADS + LANES)
-"""Bytes of shared memory: a sum of squares for each thread, and then one for each lane."""
+BLOCK_ELEMENTS = 2 * _THREADS
+"""Elements of the vectors that a block updates, if the GPU has enough multiprocessors."""
 
 _EARLY = 4
 """Elements that a thread fetches before the threads wait for each other."""
@@ -24,79 +23,70 @@ _SUMS = 4
 """Sums of squares of a thread, so that no addition waits for the one before."""
 
 
-def adam_text(rule: AdamRule, blocks: int) -> str:
-    """Write the kernel.
+class AdamKernel(GpuKernel):
+    """An `AdamKernel` takes `adam.ARRAYS` of each policy, and changes `adam.UPDATED`."""
 
-    It takes `adam.ARRAYS` with the policies as their first axis, and changes `adam.UPDATED`.
+    name = "ppo_adam"
 
-    Args:
-      rule: what the vectors hold.
-      blocks: the number of blocks of a policy.
-
-    Returns:
-      The text of an LLVM module; its launch needs `SHARED_MEMORY` bytes of shared memory.
-    """
-    return _AdamKernel(rule, blocks).write()
-
-
-class _AdamKernel:
     def __init__(self, rule: AdamRule, blocks: int) -> None:
-        self.rule, self.blocks = rule, blocks
-        self.ir = GpuWriter(NAME, len(ARRAYS) + len(UPDATED))
+        """Prepare to write.
 
-    def write(self) -> str:
+        Args:
+          rule: what the vectors hold.
+          blocks: the number of blocks of a policy.
+        """
+        # In shared memory, floats: a sum of squares of each thread, and then one of each lane.
+        shared_memory = 4 * (_THREADS + LANES)
+        super().__init__(ADAM.counts(rule, Minibatch()), len(UPDATED), _THREADS, shared_memory)
+        self.rule, self.blocks = rule, blocks
+
+    def text(self) -> str:
         """Return the module."""
         ir, rule = self.ir, self.rule
-        # The arrays of the policy, which the third axis of the grid says.
         self.thread, self.block = ir.register("tid.x"), ir.register("ctaid.x")
-        policy = ir.register("ctaid.z")
-        arrays = {
-            name: ir.row(array, policy, rule.sizes[name])
-            for name, array in zip(ARRAYS, ir.parameters, strict=False)
-        }
-        gradient, index = arrays["gradient"], arrays["index"].load("u32")
-        before = ir.row(arrays["progress"], index, SIZES["progress"])
+        self.find_arrays(ir.register("ctaid.z"))
+        gradient, index = self.arrays["gradient"], self.arrays["index"].load("u32")
+        before = ir.row(self.arrays["progress"], index, SIZES["progress"])
         # Begin to load everything before the threads wait for each other.
         given = [gradient[place] for place in rule.places]
-        for name, array in (("progress", before), ("adam_terms", arrays["adam_terms"])):
-            given += self._all(array, SIZES[name])
+        for name, array in (("progress", before), ("adam_terms", self.arrays["adam_terms"])):
+            given += [array[i] for i in range(SIZES[name])]
         places = self._places()
-        early = [self._fetch(arrays, place) for place in places[:_EARLY]]
+        early = [self._fetch(place) for place in places[:_EARLY]]
         # The norm of the gradient, and what follows from it for all elements.
         square = self._sum(self._squares(gradient))
         factors, element = adam.programs(rule)
         results = ir.run(factors, [square, *given])
         common, progress = results[: len(Factors._fields)], results[len(Factors._fields) :]
-        # The elements of the thread.
+        # Update the elements of the thread.
         for i, place in enumerate(places):
-            values = early[i] if i < _EARLY else self._fetch(arrays, place)
+            values = early[i] if i < _EARLY else self._fetch(place)
             updated = ir.run(element, [*values, *common])
             with ir.when(self._is_parameter(place)):
                 for name, value in zip(UPDATED, updated, strict=False):
-                    arrays[name][place] = value
+                    self.arrays[name][place] = value
+        # One thread of all writes the row behind that which the other blocks may still read.
         after = before + SIZES["progress"]
-        with ir.when((self.block * THREADS + self.thread).equals(0)):
+        with ir.when((self.block * _THREADS + self.thread).equals(0)):
             for i, value in enumerate(progress):
                 after[i] = value
-        return ir.module(THREADS)
-
-    def _all(self, array: Value, count: int) -> list[Value]:
-        return [array[i] for i in range(count)]
+        return ir.module(_THREADS)
 
     def _places(self) -> list[Value]:
         """Return where the thread's elements are; the last one may be beyond the end."""
-        first, stride = self.block * THREADS + self.thread, self.blocks * THREADS
+        first, stride = self.block * _THREADS + self.thread, self.blocks * _THREADS
         return [first + start for start in range(0, self.rule.shape.size, stride)]
 
-    def _fetch(self, arrays: dict[str, Value], place: Value) -> list[Value]:
+    def _fetch(self, place: Value) -> list[Value]:
         """Fetch what `element` takes of the vectors."""
         kept = self.ir.minimum(place, self.rule.shape.size - 1)
-        return [arrays[name][kept] for name in (*UPDATED[:3], "gradient")]
+        return [self.arrays[name][kept] for name in (*UPDATED[:3], "gradient")]
 
     def _is_parameter(self, place: Value) -> Value:
         """Return whether an element is a parameter: metrics are behind those of each network."""
         ir, ((start, stop), (first, end)) = self.ir, self.rule.shape.ranges
         assert start == 0
+        # Move those between the networks to the second one's start, and its metrics to the end.
         middle = ir.select(place < stop, first, place)
         return ir.select(middle < first, end, middle) < end
 
@@ -104,9 +94,10 @@ class _AdamKernel:
         """Return the thread's sums of squares over the whole gradient."""
         ir, size = self.ir, self.rule.shape.size
         sums = [ir.constant(0.0)] * _SUMS
-        for i, start in enumerate(range(0, size, THREADS)):
-            place, stop = self.thread + start, start + THREADS
+        for i, start in enumerate(range(0, size, _THREADS)):
+            place, stop = self.thread + start, start + _THREADS
             value = gradient[ir.minimum(place, size - 1) if stop > size else place]
+            # Metrics are no part of the norm; most rows of threads have none.
             if not any(first <= start and stop <= last for first, last in self.rule.shape.ranges):
                 value = ir.select(self._is_parameter(place), value, 0.0)
             sums[i % _SUMS] += value * value
@@ -117,14 +108,11 @@ class _AdamKernel:
         ir = self.ir
         total = sum(sums[1:], sums[0])
         ir.shared(self.thread * 4).store(total)
+        # The first warp reads the sums of all threads, and then all threads those of its lanes.
         ir.synchronize()
         with ir.when(self.thread < LANES):
-            total = ir.constant(0.0)
-            for i in range(THREADS // LANES):
-                total += ir.shared(self.thread * 4, 4 * LANES * i).load()
-            ir.shared(self.thread * 4, 4 * THREADS).store(total)
+            rows = range(0, 4 * _THREADS, 4 * LANES)
+            total = ir.total(ir.shared(self.thread * 4, row).load() for row in rows)
+            ir.shared(self.thread * 4, 4 * _THREADS).store(total)
         ir.synchronize()
-        total = ir.constant(0.0)
-        for i in range(LANES):
-            total += ir.shared(4 * (THREADS + i)).load()
-        return total
+        return ir.total(ir.shared(4 * (_THREADS + i)).load() for i in range(LANES))

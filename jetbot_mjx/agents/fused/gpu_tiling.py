@@ -5,7 +5,7 @@ import functools
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, starts
+from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, places
 from jetbot_mjx.agents.fused.tensor_core import LANES, TILE
 
 MOST_OUTPUTS = 8
@@ -41,6 +41,7 @@ class Shares(NamedTuple):
     @classmethod
     def of(cls, rows: int, pairs: int) -> "Shares":
         """Return the shares with the fewest sums and, of these, with the fewest loads."""
+        # Groups of warps share the rows, and the warps of a group the columns.
         options = []
         for row_tiles in range(1, rows + 1):
             groups = -(-rows // row_tiles)
@@ -106,6 +107,7 @@ class Tiling:
     @functools.cached_property
     def layout(self) -> dict[str, int]:
         """Return the byte of shared memory where each array begins, and their `size`."""
+        # Every kernel: the network, float16 but for biases and statistics, and the observations.
         shape, rows = self.shape, self.rows
         stride = shape.width + PAD
         first, outputs = padded(shape.observations), 4 * rows * (MOST_OUTPUTS + 1)
@@ -115,6 +117,8 @@ class Tiling:
         sizes |= {"head_biases": 4 * MOST_OUTPUTS, "mean": 4 * first, "scale": 4 * first}
         sizes["layer0"] = 2 * rows * (first + PAD)
         if self.is_gradient:
+            # All layers for the backward pass, the loss's operands and results for each row, the
+            # statistics of the advantages, and a sum for each row and slot.
             sizes |= {f"layer{i + 1}": 2 * rows * stride for i in range(shape.layers)}
             if shape.activation == "swish":
                 sizes |= {f"slopes{i + 1}": 2 * rows * stride for i in range(shape.layers)}
@@ -124,13 +128,15 @@ class Tiling:
             sizes["statistics"] = 4 * (2 * LANES + 2)
             sizes["slots"] = 4 * shape.slots * (rows + 1)
         elif self.purpose == "actions":
+            # One layer, in which each replaces the one before.
             sizes |= {"layer1": 2 * rows * stride, "outputs": outputs}
         else:
+            # Likewise, a number of each kind for each row and one behind it, and a pair of sums for
+            # each thread and each lane.
             sizes["layer1"] = 2 * rows * stride
             sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
             sizes["statistics"] = 4 * 2 * (self.threads + LANES)
-        begins = starts({name: -(-size // 16) * 16 for name, size in sizes.items()})
-        return {**dict(zip(sizes, begins, strict=False)), "size": begins[-1]}
+        return places(sizes, 16)
 
 
 def gradient_tiling(shape: UpdateShape, shared_memory: int) -> Tiling | None:
@@ -143,6 +149,7 @@ def gradient_tiling(shape: UpdateShape, shared_memory: int) -> Tiling | None:
     Returns:
       The tiling; None: not even the smallest tile fits.
     """
+    # The larger the tile, the fewer barriers for each sample.
     tilings = [Tiling(shape, 128, 2), Tiling(shape, 64, 1), Tiling(shape, 32, 1)]
     return next((x for x in tilings if x.layout["size"] <= shared_memory), None)
 
@@ -192,6 +199,7 @@ def _fastest(
     tilings: Iterable[Tiling], tiles: Callable[[int], int], blocks: int, shared_memory: int
 ) -> Tiling | None:
     """Return the tiling that fits and is likely fastest, from the number of tiles by their rows."""
+    # Larger tiles need fewer barriers, and smaller ones leave no multiprocessor without work.
     fitting = [x for x in tilings if x.layout["size"] <= shared_memory]
 
     def cost(tiling: Tiling) -> int:

@@ -4,8 +4,8 @@ Their arguments are arrays of `arrays`, in the order of each kernel's signature 
 """
 
 import math
-from collections.abc import Callable, Mapping
-from typing import Any, Protocol
+from collections.abc import Collection, Sequence
+from typing import Protocol
 
 import jax
 import numpy as np
@@ -16,9 +16,8 @@ from jaxtyping import Array, Float
 
 from jetbot_mjx.agents.fused import arrays, launch_cpu, launch_gpu
 from jetbot_mjx.agents.fused.adam import AdamRule
-from jetbot_mjx.agents.fused.arrays import Actions, Arrays, Signature
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.arrays import Actions, Arrays, Signature, Spec
+from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel.build import Backend, make_primitive
 
 
@@ -27,27 +26,35 @@ class Launcher(Protocol):
 
     BACKEND: Backend
     """The back end that compiles the kernels."""
-    LAUNCHES: Mapping[str, Callable[[Any, Arrays], list[Array]]]
-    """The kernels by the name of their signature: functions that JAX calls while it lowers a
-    program, from what describes the kernel and its arguments, with one axis of policies in front,
-    to arrays that begin with the numbers of the results, whatever their shape."""
+
+    NAMES: Collection[str]
+    """Names of the signatures of its kernels."""
 
     def refusal(self, shape: UpdateShape, batch: Minibatch) -> str | None:
         """Return why this process cannot run the kernels, or None."""
 
-    def prepare(
-        self, rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
-    ) -> None:
-        """Begin to compile the kernels, as `launch.prepare`."""
+    def prepare(self, kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> None:
+        """Begin to compile a kernel, as `launch.prepare`, by the relevant part of the data."""
+
+    def launch(
+        self, kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays
+    ) -> list[Array]:
+        """Launch a kernel, while JAX lowers a program.
+
+        Args:
+          kernel: the kernel.
+          spec: what it is written for.
+          batch: the data, from `Signature.batch_of`.
+          arrays: the arguments, with one axis of policies in front.
+
+        Returns:
+          Arrays that begin with the numbers of the results, whatever their shape, and then others.
+        """
+        ...
 
 
 _LAUNCHERS: dict[str, Launcher] = {"gpu": launch_gpu, "cpu": launch_cpu}
 """The modules that launch the kernels, by the kind of JAX's default device."""
-
-
-def _has(kernel: Signature) -> bool:
-    launcher = _LAUNCHERS.get(jax.default_backend())
-    return launcher is not None and kernel.name in launcher.LAUNCHES
 
 
 def backend() -> Backend:
@@ -69,41 +76,23 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return launcher.refusal(shape, batch)
 
 
-def computes_at_once() -> bool:
-    """Return whether one kernel computes all minibatches on JAX's default device: `update`."""
-    return _has(arrays.UPDATE)
+def has(kernel: Signature) -> bool:
+    """Return whether JAX's default device has a kernel."""
+    launcher = _LAUNCHERS.get(jax.default_backend())
+    return launcher is not None and kernel.name in launcher.NAMES
 
 
-def unrolls_at_once() -> bool:
-    """Return whether one kernel computes an unroll on JAX's default device: `unroll`."""
-    return _has(arrays.UNROLL)
-
-
-def prepare(
-    rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
-) -> None:
-    """Begin to compile the kernels, before a program is traced that launches them.
+def prepare(kernel: Signature, spec: Spec, batch: Minibatch, policies: int = 1) -> None:
+    """Begin to compile a kernel, before a program is traced that launches it.
 
     Args:
-      rule: the networks, and how the step size changes.
-      batch: the minibatch.
-      environments: the number of environments of a policy.
+      kernel: the kernel.
+      spec: the description for which it is written.
+      batch: how much data a policy has.
       policies: the number of policies that are trained at once.
-      at_once: whether `update` is what it launches, and not `gradient` and `adam`.
     """
     launcher = _LAUNCHERS[jax.default_backend()]
-    launcher.prepare(rule, batch, environments, policies, at_once=at_once)
-
-
-def prepare_unroll(spec: Unroll, environments: int, time: int) -> None:
-    """Begin to compile the kernel of `unroll`, which only CPUs have.
-
-    Args:
-      spec: the networks and the environment.
-      environments: the number of environments.
-      time: the number of steps.
-    """
-    launch_cpu.prepare_unroll(spec, environments, time)
+    launcher.prepare(kernel, spec, kernel.relevant(batch), policies)
 
 
 def actions(shape: UpdateShape, *given: Array) -> Actions:
@@ -113,7 +102,7 @@ def actions(shape: UpdateShape, *given: Array) -> Actions:
       shape: the networks.
       *given: the arguments of `arrays.ACTIONS`.
     """
-    return Actions(*_actions_p.bind(*given, spec=shape))
+    return Actions(*_PRIMITIVES["actions"].bind(*given, spec=shape))
 
 
 def unroll(
@@ -129,7 +118,7 @@ def unroll(
       The states after the last step; what is kept of the states after each step; and the actions
       of all steps.
     """
-    end, kept, *drawn = _unroll_p.bind(*given, spec=spec)
+    end, kept, *drawn = _PRIMITIVES["unroll"].bind(*given, spec=spec)
     return end, kept, Actions(*drawn)
 
 
@@ -143,7 +132,7 @@ def gradient(shape: UpdateShape, *given: Array) -> Float[Array, " size"]:
     Returns:
       The gradient, with the sums of the metrics at their places.
     """
-    return _gradient_p.bind(*given, spec=shape)[0]
+    return _PRIMITIVES["gradient"].bind(*given, spec=shape)[0]
 
 
 def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
@@ -156,7 +145,7 @@ def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The next parameters, means and progress.
     """
-    params, mu, nu, progress = _adam_p.bind(*given, spec=rule)
+    params, mu, nu, progress = _PRIMITIVES["adam"].bind(*given, spec=rule)
     return params, mu, nu, progress
 
 
@@ -170,7 +159,7 @@ def update(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The parameters, means and progress after the last minibatch.
     """
-    params, mu, nu, progress = _update_p.bind(*given, spec=rule)
+    params, mu, nu, progress = _PRIMITIVES["update"].bind(*given, spec=rule)
     return params, mu, nu, progress
 
 
@@ -178,39 +167,42 @@ def _primitive(kernel: Signature) -> Primitive:
     """Return the primitive of a kernel, which the launchers lower."""
     primitive = make_primitive(f"ppo_{kernel.name}", "spec")
 
+    def result_shapes(given: Sequence[Array | ShapedArray], spec: Spec) -> list[tuple[int, ...]]:
+        shapes, batch = kernel.shapes(spec, kernel.batch_of(spec, given)), given[0].shape[:-1]
+        return [(*batch, *shapes[name]) for name in kernel.returns]
+
     # The shapes, for any number of policies.
     @primitive.def_abstract_eval
-    def abstract(*given: Any, spec: Any) -> list[ShapedArray]:
-        return [ShapedArray(shape, np.float32) for shape in kernel.results(spec, given)]
+    def abstract(*given: ShapedArray, spec: Spec) -> list[ShapedArray]:
+        return [ShapedArray(shape, np.float32) for shape in result_shapes(given, spec)]
 
-    def lowered_by(launch: Callable[[Any, Arrays], list[Array]]) -> Callable[..., list[Array]]:
-        def lowered(*given: Array, spec: Any) -> list[Array]:
+    def lower_by(launcher: Launcher) -> None:
+        def lowered(*given: Array, spec: Spec) -> list[Array]:
             # One axis of policies. XLA would copy what is changed in place if it had another shape.
             batch = given[0].shape[:-1]
             flat = {
                 name: x
-                if name in kernel.updated
+                if name in kernel.returns
                 else x.reshape(math.prod(batch), *x.shape[len(batch) :])
                 for name, x in zip(kernel.arguments, given, strict=True)
             }
+            made = launcher.launch(kernel, spec, kernel.batch_of(spec, given), flat)
             # Behind the results there may be scratch memory.
-            shapes = kernel.results(spec, given)
-            made = zip(launch(spec, flat), shapes, strict=False)
-            return [x.reshape(shape) for x, shape in made]
+            shapes = result_shapes(given, spec)
+            return [x.reshape(shape) for x, shape in zip(made, shapes, strict=False)]
 
-        return lowered
+        lowering = mlir.lower_fun(lowered)
+        mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
 
     # For every platform that has the kernel, whatever the default device is.
     for launcher in _LAUNCHERS.values():
-        if launch := launcher.LAUNCHES.get(kernel.name):
-            lowering = mlir.lower_fun(lowered_by(launch))
-            mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
+        if kernel.name in launcher.NAMES:
+            lower_by(launcher)
     return primitive
 
 
-# The kernels as JAX sees them.
-_actions_p = _primitive(arrays.ACTIONS)
-_unroll_p = _primitive(arrays.UNROLL)
-_gradient_p = _primitive(arrays.GRADIENT)
-_adam_p = _primitive(arrays.ADAM)
-_update_p = _primitive(arrays.UPDATE)
+_PRIMITIVES = {
+    kernel.name: _primitive(kernel)
+    for kernel in (arrays.ACTIONS, arrays.UNROLL, arrays.GRADIENT, arrays.ADAM, arrays.UPDATE)
+}
+"""The kernels as JAX sees them."""

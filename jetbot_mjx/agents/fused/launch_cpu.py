@@ -1,24 +1,19 @@
 """Launch the kernels of PPO on CPUs, of which one computes a whole update."""
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Mapping
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
-from jetbot_mjx.agents.fused import adam
-from jetbot_mjx.agents.fused.adam import AdamRule
-from jetbot_mjx.agents.fused.arrays import Arrays, minibatch_of
-from jetbot_mjx.agents.fused.cpu_actions import ActionDivision, action_call
-from jetbot_mjx.agents.fused.cpu_adam import adam_call
-from jetbot_mjx.agents.fused.cpu_gradient import divisions, gradient_call
+from jetbot_mjx.agents.fused.arrays import UPDATE, Arrays, Signature, Spec
+from jetbot_mjx.agents.fused.cpu_actions import action_stages, unroll_stages
+from jetbot_mjx.agents.fused.cpu_adam import adam_stages, update_stages
+from jetbot_mjx.agents.fused.cpu_gradient import gradient_stages
 from jetbot_mjx.agents.fused.cpu_network import HEAD
-from jetbot_mjx.agents.fused.cpu_stages import Call
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll, unroll_call
-from jetbot_mjx.agents.fused.cpu_update import update_call
-from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.cpu_stages import Call, Stages
+from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel.build import Backend, cpu, in_background
 
 BACKEND: Backend = cpu
@@ -45,117 +40,70 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     if shape.width % _WIDTH_STEP:
         return f"it takes layers of 16, 32, 48, ... units, not {shape.width}"
     lanes = cpu.host_processor().lanes
-    if max(4 * x.layout["size"] for x in divisions(shape, batch, lanes)) > _MOST_MEMORY:
+    if max(4 * x.scratch for x in gradient_stages(shape, batch, lanes).stages) > _MOST_MEMORY:
         return f"unrolls of {batch.time} steps do not fit in {_MOST_MEMORY >> 20} MiB"
     return None
 
 
-def _write(host: cpu.Host, write: Callable[..., Call], *given: Any) -> str:
-    """Write the LLVM module of a call.
+_STAGES: Mapping[str, Callable[..., Stages]] = {
+    "actions": action_stages,
+    "unroll": unroll_stages,
+    "gradient": gradient_stages,
+    "adam": adam_stages,
+    "update": update_stages,
+}
+"""Functions that return the stages of a kernel, by its name, from what it is written for, the data,
+and the number of float32 values in a vector register."""
 
-    Args:
-      host: the processor.
-      write: a function that returns the call.
-      *given: its arguments before the number of lanes.
-    """
-    return write(*given, host.lanes).text(
-        lanes=host.lanes, registers=host.registers, machine=host.machine
+NAMES: Collection[str] = frozenset(_STAGES)
+"""Names of the kernels, as in `launch.Launcher`."""
+
+
+def _call(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
+    """Return the call of a kernel."""
+    # Behind the results come the arrays between the stages, for which XLA finds memory.
+    stages = _STAGES[kernel.name](spec, batch, lanes)
+    return Call(
+        kernel.arguments,
+        (*kernel.returns, *(name for name in stages.between if name not in kernel.returns)),
+        {**kernel.counts(spec, batch), **stages.between},
+        stages.stages,
+        minibatches=batch.minibatches if kernel is UPDATE else 1,
     )
 
 
-_text = functools.cache(_write)
+def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
+    """Write the LLVM module of a kernel."""
+    call = _call(kernel, spec, batch, host.lanes)
+    return call.text(lanes=host.lanes, registers=host.registers, machine=host.machine)
 
 
-def _unroll_text(host: cpu.Host, write: Callable[..., Call], *given: Any) -> str:
-    """Return the LLVM module of an unroll, which is kept with the kernel of its environment."""
-    # The name needs no kernel, for it is the kernel that keeps the text.
-    unroll, *sizes = given
-    name = repr((*unroll._replace(kernel=None), *sizes, host))
-    return unroll.kernel.text(name, lambda: _write(host, write, *given))
+_written_once = functools.cache(_written)
 
 
-def _action_call(shape: UpdateShape, environments: int, lanes: int) -> Call:
-    return action_call(ActionDivision(shape, environments, lanes))
+def _text(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
+    """Return the LLVM module of a kernel, which is written once."""
+    if not isinstance(spec, Unroll):
+        return _written_once(host, kernel, spec, batch)
+    # That of an unroll is kept with the kernel of its environment, whom its name need not tell.
+    name = repr((spec.shape, spec.observation, spec.kept, batch, host))
+    return spec.kernel.text(name, lambda: _written(host, kernel, spec, batch))
 
 
-def prepare(
-    rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
-) -> None:
-    """Begin to compile all kernels, which serve any number of policies, as `launch.prepare`."""
-    # One call for all minibatches, or two for each.
-    calls: list[tuple[Any, ...]] = [(gradient_call, rule.shape, batch), (adam_call, rule)]
-    if at_once:
-        calls = [(update_call, rule, batch)]
+def prepare(kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> None:
+    """Begin to compile a kernel, which serves any number of policies, as `launch.prepare`."""
+    del policies
     host = cpu.host_processor()
-    for call in calls:
-        in_background(lambda call=call: cpu.registered(_text(host, *call)))
+    in_background(lambda: cpu.registered(_text(host, kernel, spec, batch)))
 
 
-def prepare_unroll(unroll: Unroll, environments: int, time: int) -> None:
-    """Begin to compile an unroll, as `launch.prepare_unroll`."""
-    host, given = cpu.host_processor(), (unroll, environments, time)
-    in_background(lambda: cpu.registered(_unroll_text(host, unroll_call, *given)))
-
-
-def _launch(
-    arrays: Arrays,
-    write: Callable[..., Call],
-    *given: Any,
-    updated: Sequence[str] = (),
-    text: Callable[..., str] = _text,
-) -> list[Array]:
-    """Call a function, while JAX lowers a program for CPUs.
-
-    Args:
-      arrays: its arguments, of which the first one has the policies as its first axis.
-      write: a function that returns the call.
-      *given: its arguments before the number of lanes.
-      updated: the names of the arguments that it changes, and returns before other results.
-      text: a function of the processor, `write` and what it is given that returns the LLVM module.
-
-    Returns:
-      Its results and its scratch memory, of shape (policies, numbers) unless they are arguments.
-    """
-    host, (first, *_) = cpu.host_processor(), arrays.values()
+def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> list[Array]:
+    """Call a kernel while JAX lowers a program for CPUs, as `launch.Launcher` specifies."""
+    host, policies = cpu.host_processor(), len(next(iter(arrays.values())))
     # Results are as long as the call says, but for those that take the place of arguments.
-    call = write(*given, host.lanes)
-    shapes: list[tuple[int, ...]] = [(first.shape[0], call.sizes[name]) for name in call.results]
-    shapes[: len(updated)] = [arrays[name].shape for name in updated]
-    like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
-    # XLA is told by number which arguments these are.
-    aliases = {list(arrays).index(name): i for i, name in enumerate(updated)}
-    return cpu.launch_text(text(host, write, *given), list(arrays.values()), like, aliases)
-
-
-# The kernels by name. What describes a kernel comes first, then its arguments.
-
-
-def _launch_actions(shape: UpdateShape, arrays: Arrays) -> list[Array]:
-    return _launch(arrays, _action_call, shape, arrays["observations"].shape[1])
-
-
-def _launch_unroll(unroll: Unroll, arrays: Arrays) -> list[Array]:
-    _, time, environments, _ = arrays["unroll_noise"].shape
-    return _launch(arrays, unroll_call, unroll, environments, time, text=_unroll_text)
-
-
-def _launch_gradient(shape: UpdateShape, arrays: Arrays) -> list[Array]:
-    return _launch(arrays, gradient_call, shape, minibatch_of(arrays))
-
-
-def _launch_adam(rule: AdamRule, arrays: Arrays) -> list[Array]:
-    return _launch(arrays, adam_call, rule, updated=adam.UPDATED)
-
-
-def _launch_update(rule: AdamRule, arrays: Arrays) -> list[Array]:
-    return _launch(arrays, update_call, rule, minibatch_of(arrays), updated=adam.UPDATED)
-
-
-LAUNCHES: Mapping[str, Callable[[Any, Arrays], list[Array]]] = {
-    "actions": _launch_actions,
-    "unroll": _launch_unroll,
-    "gradient": _launch_gradient,
-    "adam": _launch_adam,
-    "update": _launch_update,
-}
-"""The kernels, as in `launch.Launcher`."""
+    call = _call(kernel, spec, batch, host.lanes)
+    shapes = {name: (policies, call.sizes[name]) for name in call.results}
+    shapes |= {name: arrays[name].shape for name in kernel.returns if name in arrays}
+    like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes.values()]
+    text = _text(host, kernel, spec, batch)
+    return cpu.launch_text(text, list(arrays.values()), like, kernel.aliases)

@@ -6,26 +6,23 @@ each, which XLA adds up in a fixed order.
 """
 
 import functools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from jetbot_mjx.agents.fused import actions, adam, advantages, gpu_adam, gpu_tiling
-from jetbot_mjx.agents.fused import gradient as gradient_kernel
+from jetbot_mjx.agents.fused import gpu_advantages, gpu_gradient, gpu_tiling
 from jetbot_mjx.agents.fused.adam import AdamRule
-from jetbot_mjx.agents.fused.arrays import Arrays, minibatch_of
-from jetbot_mjx.agents.fused.gpu_tiling import (
-    MOST_OBSERVATIONS,
-    MOST_OUTPUTS,
-    MOST_SUMS,
-    MOST_WIDTH,
-    Tiling,
-)
+from jetbot_mjx.agents.fused.arrays import ACTIONS, ADAM, Arrays, Signature, Spec
+from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
+from jetbot_mjx.agents.fused.gpu_adam import BLOCK_ELEMENTS, AdamKernel
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel
+from jetbot_mjx.agents.fused.gpu_gradient import GradientKernel
 from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.tensor_core import GpuKernel
 from onekernel.build import Backend, gpu, in_background
 
 BACKEND: Backend = gpu
@@ -37,19 +34,9 @@ _LEAST_CAPABILITY = 80
 PTX_VERSION = 81
 """Ten times the first version of PTX whose conversions to float16 saturate."""
 
-_ELEMENTS = 2
-"""Elements of the vectors that a thread updates, if the GPU has enough multiprocessors."""
-
-_SHARED_MEMORY = {
-    80: 166_912,
-    86: 101_376,
-    87: 166_912,
-    89: 101_376,
-    90: 232_448,
-    110: 232_448,
-    120: 101_376,
-}
-"""Bytes of shared memory that a block may have, by the least compute capability."""
+_SHARED_MEMORY = {80: 163, 86: 99, 87: 163, 89: 99, 90: 227, 110: 227, 120: 99}
+"""Shared memory that a block may have [KiB], by the least compute capability. It is that of a
+multiprocessor but for 1 KiB, by NVIDIA's programming guide."""
 
 
 def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
@@ -61,13 +48,13 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     """
     # Sizes that no GPU takes.
     outputs = max(shape.outputs)
-    if shape.observations > MOST_OBSERVATIONS:
-        return f"it takes at most {MOST_OBSERVATIONS} numbers, not {shape.observations}"
-    if outputs > MOST_OUTPUTS:
-        return f"it takes at most {MOST_OUTPUTS} outputs, not {outputs}"
-    if shape.width % 16 or shape.width > MOST_WIDTH:
-        return f"it takes layers of 16, 32, ... {MOST_WIDTH} units, not {shape.width}"
-    if gpu_tiling.sums_of(shape) > MOST_SUMS:
+    if shape.observations > gpu_tiling.MOST_OBSERVATIONS:
+        return f"it takes at most {gpu_tiling.MOST_OBSERVATIONS} numbers, not {shape.observations}"
+    if outputs > gpu_tiling.MOST_OUTPUTS:
+        return f"it takes at most {gpu_tiling.MOST_OUTPUTS} outputs, not {outputs}"
+    if shape.width % 16 or shape.width > gpu_tiling.MOST_WIDTH:
+        return f"it takes layers of 16, 32, ... {gpu_tiling.MOST_WIDTH} units, not {shape.width}"
+    if gpu_tiling.sums_of(shape) > gpu_tiling.MOST_SUMS:
         return "the gradient of these networks does not fit in the registers of a block"
     # What this GPU takes.
     try:
@@ -85,18 +72,16 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return None
 
 
-class _Kernel(NamedTuple):
-    """A `_Kernel` is a kernel, ready to launch."""
+class _Launch(NamedTuple):
+    """A `_Launch` is a kernel that is being compiled, with its grid."""
 
-    name: str
-    text: Future[str]
-    """Its PTX."""
+    kernel: GpuKernel
+    ptx: Future[str]
+    blocks: int
+    """Blocks of a policy, or of one of its networks."""
     grid: tuple[int, int, int]
-    threads: int
-    shared_memory: int
-    """Dynamic shared memory of a block [bytes]."""
 
-    def launch(
+    def __call__(
         self,
         arguments: Sequence[Array],
         *results: tuple[int, ...],
@@ -104,41 +89,99 @@ class _Kernel(NamedTuple):
     ) -> list[Float[Array, "..."]]:
         """Run the kernel, and return float32 arrays of the given shapes."""
         like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in results]
-        return gpu.launch_ptx(
-            self.name,
-            self.text.result(),
-            arguments,
-            like,
-            self.grid,
-            self.threads,
-            self.shared_memory,
-            aliases,
-        )
+        kernel, ptx = self.kernel, self.ptx.result()
+        sizes = self.grid, kernel.threads, kernel.shared_memory
+        return gpu.launch_ptx(kernel.name, ptx, arguments, like, *sizes, aliases)
 
 
-def _kernel(
-    name: str,
-    write: Callable[[], str],
-    grid: tuple[int, int, int],
-    threads: int,
-    shared_memory: int,
-) -> _Kernel:
-    """Begin to compile a kernel to PTX."""
+def _begin(kernel: GpuKernel, blocks: int, policies: int, networks: int = 1) -> _Launch:
+    """Begin to compile a kernel to PTX, and that to machine code."""
     architecture = gpu.target_architecture()
 
     def compiled() -> str:
-        text = gpu.assembled(write(), architecture, PTX_VERSION)
-        gpu.assemble_ahead(text)
-        return text
+        ptx = gpu.assembled(kernel.text(), architecture, PTX_VERSION)
+        gpu.assemble_ahead(ptx)
+        return ptx
 
-    return _Kernel(name, in_background(compiled), grid, threads, shared_memory)
+    return _Launch(kernel, in_background(compiled), blocks, (blocks, networks, policies))
 
 
-def _tiled(
-    name: str, write: Callable[[], str], tiling: Tiling, grid: tuple[int, int, int]
-) -> _Kernel:
-    """Begin to compile a kernel whose blocks loop over tiles."""
-    return _kernel(name, write, grid, tiling.threads, tiling.layout["size"])
+# The kernels by name. What describes a kernel comes first, then its data and how many policies
+# share the GPU's multiprocessors.
+
+
+@functools.cache
+def _action_kernel(shape: UpdateShape, batch: Minibatch, policies: int) -> _Launch:
+    # The larger the tile, the fewer the blocks: choose both by the multiprocessors of a policy.
+    most, environments = _most_blocks(policies), batch.environments
+    tiling = gpu_tiling.action_tiling(shape, environments, most, _shared_memory())
+    assert tiling is not None
+    kernel = ActionKernel(tiling, environments)
+    return _begin(kernel, min(most, kernel.tiles), policies)
+
+
+@functools.cache
+def _gradient_kernels(
+    shape: UpdateShape, batch: Minibatch, policies: int
+) -> tuple[_Launch, _Launch]:
+    # Advantages: a tile holds whole unrolls.
+    most = _most_blocks(policies)
+    tiling = gpu_tiling.advantage_tiling(shape, batch, most, _shared_memory())
+    assert tiling is not None
+    first = AdvantageKernel(tiling, batch)
+    parts = min(most, first.tiles)
+    # Gradient: half of the blocks compute the policy's gradient, and half the values'.
+    tiling = gpu_tiling.gradient_tiling(shape, _shared_memory())
+    assert tiling is not None
+    second = GradientKernel(tiling, batch, parts)
+    blocks = max(1, min(most // 2, second.tiles))
+    return _begin(first, parts, policies), _begin(second, blocks, policies, networks=2)
+
+
+@functools.cache
+def _adam_kernel(rule: AdamRule, batch: Minibatch, policies: int) -> _Launch:
+    blocks = min(_most_blocks(policies), -(-rule.shape.size // BLOCK_ELEMENTS))
+    return _begin(AdamKernel(rule, blocks), blocks, policies)
+
+
+_KERNELS: Mapping[str, Callable[..., object]] = {
+    "actions": _action_kernel,
+    "gradient": _gradient_kernels,
+    "adam": _adam_kernel,
+}
+
+NAMES: Collection[str] = frozenset(_KERNELS)
+"""Names of the kernels, as in `launch.Launcher`."""
+
+
+def prepare(kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> None:
+    """Divide the work among the blocks, and begin to compile, as `launch.prepare`."""
+    _KERNELS[kernel.name](spec, batch, policies)
+
+
+def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> list[Array]:
+    """Launch a kernel while JAX lowers a program for GPUs, as `launch.Launcher` specifies."""
+    policies, given = len(next(iter(arrays.values()))), list(arrays.values())
+    if isinstance(spec, AdamRule):
+        results = [arrays[name].shape for name in kernel.returns]
+        return _adam_kernel(spec, batch, policies)(given, *results, aliases=ADAM.aliases)
+    assert isinstance(spec, UpdateShape)
+    if kernel is ACTIONS:
+        shapes = ACTIONS.shapes(spec, batch)
+        results = [(policies, *shapes[name]) for name in ACTIONS.returns]
+        return _action_kernel(spec, batch, policies)(given, *results)
+    # The kernel of the advantages, which also returns the sums of each block, and that of the
+    # gradient. Its blocks write a gradient each; they are added up in a fixed order.
+    first, second = _gradient_kernels(spec, batch, policies)
+    samples = policies, batch.samples
+    estimates = first(
+        [arrays[name] for name in gpu_advantages.ARGUMENTS],
+        *(samples, samples, (policies, first.blocks, 2)),
+    )
+    all_arrays = {**arrays, **dict(zip(gpu_advantages.RESULTS, estimates, strict=True))}
+    given = [all_arrays[name] for name in gpu_gradient.ARGUMENTS]
+    (vectors,) = second(given, (policies, second.blocks, spec.size))
+    return [vectors.sum(1)]
 
 
 def _most_blocks(policies: int) -> int:
@@ -146,103 +189,6 @@ def _most_blocks(policies: int) -> int:
     return max(1, gpu.processor_count() // policies)
 
 
-@functools.cache
-def _action_kernel(shape: UpdateShape, environments: int, policies: int) -> _Kernel:
-    """Return the kernel of the actions."""
-    # The larger the tile, the fewer the blocks: choose both by the multiprocessors of a policy.
-    most = _most_blocks(policies)
-    tiling = gpu_tiling.action_tiling(shape, environments, most, _shared_memory())
-    assert tiling is not None
-    blocks = min(most, actions.tile_count(tiling, environments))
-    write = functools.partial(actions.actions_text, tiling, environments)
-    return _tiled(actions.NAME, write, tiling, (blocks, 1, policies))
-
-
-@functools.cache
-def _gradient_kernels(
-    shape: UpdateShape, size: Minibatch, policies: int
-) -> tuple[_Kernel, _Kernel]:
-    """Return the kernels of the advantages and of the gradient."""
-    # Advantages: a tile holds whole unrolls.
-    most = _most_blocks(policies)
-    tiling = gpu_tiling.advantage_tiling(shape, size, most, _shared_memory())
-    assert tiling is not None
-    parts = min(most, advantages.tile_count(tiling, size))
-    write = functools.partial(advantages.advantages_text, tiling, size)
-    first = _tiled(advantages.NAME, write, tiling, (parts, 1, policies))
-    # Gradient: half of the blocks compute the policy's gradient, and half the values'.
-    tiling = gpu_tiling.gradient_tiling(shape, _shared_memory())
-    assert tiling is not None
-    blocks = max(1, min(most // 2, gradient_kernel.tile_count(tiling, size)))
-    write = functools.partial(gradient_kernel.gradient_text, tiling, size, parts)
-    return first, _tiled(gradient_kernel.NAME, write, tiling, (blocks, 2, policies))
-
-
-@functools.cache
-def _adam_kernel(rule: AdamRule, policies: int) -> _Kernel:
-    """Return the kernel of Adam."""
-    # As many blocks as there are elements for their threads, and no more than multiprocessors.
-    wanted = -(-rule.shape.size // (_ELEMENTS * gpu_adam.THREADS))
-    blocks = min(_most_blocks(policies), wanted)
-    write = functools.partial(gpu_adam.adam_text, rule, blocks)
-    grid = blocks, 1, policies
-    return _kernel(gpu_adam.NAME, write, grid, gpu_adam.THREADS, gpu_adam.SHARED_MEMORY)
-
-
-def prepare(
-    rule: AdamRule, batch: Minibatch, environments: int, policies: int, *, at_once: bool
-) -> None:
-    """Divide the work among the blocks, and begin to compile all kernels, as `launch.prepare`."""
-    assert not at_once
-    _action_kernel(rule.shape, environments, policies)
-    _gradient_kernels(rule.shape, batch, policies)
-    _adam_kernel(rule, policies)
-
-
-# The kernels by name. What describes a kernel comes first, then its arguments.
-
-
-def _launch_actions(shape: UpdateShape, arrays: Arrays) -> list[Array]:
-    policies, environments, _ = arrays["observations"].shape
-    kernel = _action_kernel(shape, environments, policies)
-    results = [(policies, *sizes) for sizes in shape.drawn_shapes(environments)]
-    return kernel.launch(list(arrays.values()), *results)
-
-
-def _launch_gradient(shape: UpdateShape, arrays: Arrays) -> list[Array]:
-    """Launch the kernel of the advantages, and that of the gradient, whose blocks XLA adds up."""
-    params, mean, scale, rows, last, unrolls, noise, index, terms = arrays.values()
-    policies, size = len(rows), minibatch_of(arrays)
-    first, second = _gradient_kernels(shape, size, policies)
-    parts, blocks = first.grid[0], second.grid[0]
-    samples = policies, size.samples
-    # Advantages, value targets, and the sums of each block.
-    estimates = first.launch(
-        [params, mean, scale, rows, last, unrolls, index, terms],
-        *(samples, samples, (policies, parts, 2)),
-    )
-    # A gradient of each block; they are added up in a fixed order.
-    (vectors,) = second.launch(
-        [params, mean, scale, rows, unrolls, noise, index, *estimates, terms],
-        (policies, blocks, shape.size),
-    )
-    return [vectors.sum(1)]
-
-
-def _launch_adam(rule: AdamRule, arrays: Arrays) -> list[Array]:
-    kernel = _adam_kernel(rule, len(arrays["gradient"]))
-    results = [arrays[name].shape for name in adam.UPDATED]
-    return kernel.launch(list(arrays.values()), *results, aliases=adam.ALIASES)
-
-
-LAUNCHES: Mapping[str, Callable[[Any, Arrays], list[Array]]] = {
-    "actions": _launch_actions,
-    "gradient": _launch_gradient,
-    "adam": _launch_adam,
-}
-"""The kernels, as in `launch.Launcher`."""
-
-
 def _shared_memory() -> int:
     capability = gpu.compute_capability()
-    return _SHARED_MEMORY[max(x for x in _SHARED_MEMORY if x <= capability)]
+    return _SHARED_MEMORY[max(x for x in _SHARED_MEMORY if x <= capability)] << 10

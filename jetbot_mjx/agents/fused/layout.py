@@ -1,7 +1,7 @@
 """Lay the parameters of both networks out as one vector, in which Adam's moments lie likewise."""
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -53,9 +53,10 @@ class VectorLayout(Layout):
         """Return a tree with `NetworkParams` in place of every vector of that length."""
         return jax.tree.map(lambda x: self._params(x) if x.shape == (self._size,) else x, tree)
 
-    def _vector(self, params: NetworkParams) -> Float[Array, " size"]:
+    def _vector(self, params: NetworkParams) -> Float[Array | np.ndarray, " size"]:
         """Return the vector that holds the parameters."""
-        library: Any = np if isinstance(jax.tree.leaves(params)[0], np.ndarray) else jnp
+        is_on_host = isinstance(jax.tree.leaves(params)[0], np.ndarray)
+        concatenate = np.concatenate if is_on_host else jnp.concatenate
         parts, end = [], 0
         for place in self._places:
             leaf = getattr(params, place.network)
@@ -64,12 +65,12 @@ class VectorLayout(Layout):
             # The room for metrics before it, if any, and the parameter.
             parts += [np.zeros(place.start - end, np.float32), leaf.reshape(-1)]
             end = place.stop
-        return library.concatenate([*parts, np.zeros(self._size - end, np.float32)])
+        return concatenate([*parts, np.zeros(self._size - end, np.float32)])
 
     def _params(self, vector: Float[Array, " size"]) -> NetworkParams:
         """Return the parameters that a vector holds."""
         # Make the dictionaries on the way to each parameter, and put it there.
-        networks: dict[str, Any] = {"policy": {}, "value": {}}
+        networks: dict[str, PyTree] = {"policy": {}, "value": {}}
         for place in self._places:
             inner = networks[place.network]
             for key in place.path[:-1]:

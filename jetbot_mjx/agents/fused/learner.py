@@ -9,18 +9,18 @@ On GPUs, products round their operands to float16; everything else is float32.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray, PyTree
 
-from jetbot_mjx.agents.brax_parts import Transition
-from jetbot_mjx.agents.fused import adam, launch, probe
+from jetbot_mjx.agents.brax_parts import Normalizer, Transition
+from jetbot_mjx.agents.fused import adam, arrays, launch, probe
 from jetbot_mjx.agents.fused.adam import AdamRule, AdamTerms, Progress
-from jetbot_mjx.agents.fused.cpu_unroll import Unroll as UnrollSpec
 from jetbot_mjx.agents.fused.layout import VectorLayout
 from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, UpdateShape
+from jetbot_mjx.agents.fused.shapes import Unroll as UnrollSpec
 from jetbot_mjx.agents.learner import ONE_DEVICE, DeviceAxis, Learner, PackedEnv, Unroll
 from jetbot_mjx.agents.optimizer import read_adam, write_adam
 from jetbot_mjx.agents.random_keys import Keys
@@ -28,6 +28,9 @@ from jetbot_mjx.agents.train_state import LOSSES, TrainState
 from jetbot_mjx.agents.unrolls import kept_of, step_by_step, transition
 from jetbot_mjx.config import PPOConfig
 from jetbot_mjx.packed import Packed, PackedStep, pack
+
+Extras = dict[str, Array | tuple[Array, ...]]
+"""What Brax keeps of actions, by name."""
 
 
 class Collected(NamedTuple):
@@ -44,7 +47,7 @@ class Collected(NamedTuple):
 
 
 def shape_of(
-    config: PPOConfig, observation_size: int | Mapping[str, Any], action_size: int
+    config: PPOConfig, observation_size: int | Mapping[str, object], action_size: int
 ) -> UpdateShape | str:
     """Return the networks as the kernels know them, or why the kernels cannot compute them.
 
@@ -53,29 +56,21 @@ def shape_of(
       observation_size: the length of the observation, or the shapes of its parts.
       action_size: the length of the action.
     """
-    # The kernels know one width, and one depth.
     network = config.network
     hidden = network.policy_hidden_layer_sizes
-    widths = {*hidden, *network.value_hidden_layer_sizes}
-    shape = UpdateShape(
-        observation_size if isinstance(observation_size, int) else 0,
-        max(widths),
-        len(hidden),
-        action_size,
-        network.distribution_type,
-        network.activation,
-        config.normalize_advantage,
-    )
+    # The kernels know one width, and one depth.
     if not isinstance(observation_size, int):
         return "it takes observations without images"
-    if hidden != network.value_hidden_layer_sizes or len(widths) > 1:
+    if hidden != network.value_hidden_layer_sizes or len(set(hidden)) > 1:
         return "it takes two networks of the same hidden layers of one width"
-    return shape
+    sizes = observation_size, hidden[0], len(hidden), action_size
+    kinds = network.distribution_type, network.activation
+    return UpdateShape(*sizes, *kinds, config.normalize_advantage)
 
 
 def make_fused_learner(
     config: PPOConfig,
-    observation_size: int | Mapping[str, Any],
+    observation_size: int | Mapping[str, object],
     action_size: int,
     devices: DeviceAxis = ONE_DEVICE,
 ) -> "FusedLearner | str":
@@ -120,17 +115,20 @@ class FusedLearner(Learner):
         """The networks."""
         self._config, self._devices = config, devices
         # Each device has its share of the environments and of every minibatch.
-        self._environments = config.num_envs // devices.size
         unrolls, steps = config.batch_size // devices.size, config.num_minibatches
         self.batch = Minibatch(
-            unrolls * steps, unrolls, config.unroll_length, steps * config.num_updates_per_batch
+            collected=unrolls * steps,
+            unrolls=unrolls,
+            time=config.unroll_length,
+            minibatches=steps * config.num_updates_per_batch,
+            environments=config.num_envs // devices.size,
         )
         """A minibatch on one device."""
         schedule = config.learning_rate_schedule
-        self.rule = AdamRule(shape, self.batch.samples, schedule, self.batch.count)
+        self.rule = AdamRule(shape, self.batch.samples, schedule, self.batch.minibatches)
         """What the vectors hold, and how the step size changes."""
         # Several devices average each gradient before Adam's step.
-        self.at_once = devices.size == 1 and launch.computes_at_once()
+        self.at_once = devices.size == 1 and launch.has(arrays.UPDATE)
         """Whether one kernel computes all minibatches."""
 
     # Whether the kernels can be used.
@@ -148,7 +146,14 @@ class FusedLearner(Learner):
 
     def prepare(self, policies: int) -> None:
         """Begin to compile the kernels for a number of policies that train at once."""
-        launch.prepare(self.rule, self.batch, self._environments, policies, at_once=self.at_once)
+        # An unroll is prepared as soon as its environment is known.
+        if not launch.has(arrays.UNROLL):
+            launch.prepare(arrays.ACTIONS, self.shape, self.batch, policies)
+        if self.at_once:
+            launch.prepare(arrays.UPDATE, self.rule, self.batch, policies)
+        else:
+            launch.prepare(arrays.GRADIENT, self.shape, self.batch, policies)
+            launch.prepare(arrays.ADAM, self.rule, self.batch, policies)
 
     # The collection.
 
@@ -159,7 +164,7 @@ class FusedLearner(Learner):
         if spec is None:
             return step_by_step(env, self.policy(state.params, state.normalizer), self.action_noise)
         # All steps by one kernel, which writes what is kept of each state as a row of numbers.
-        launch.prepare_unroll(spec, self._environments, self.batch.time)
+        launch.prepare(arrays.UNROLL, spec, self.batch)
         statistics = self._statistics(state.normalizer)
         kept_like = jax.eval_shape(
             lambda x: pack(kept_of(x.unpack()), batch_axes=1), state.env_state
@@ -184,7 +189,7 @@ class FusedLearner(Learner):
           start: its states.
         """
         step = env.step_packed
-        if not launch.unrolls_at_once() or not isinstance(step, PackedStep):
+        if not launch.has(arrays.UNROLL) or not isinstance(step, PackedStep):
             return None
         kernel = step.kernel(start)
         if kernel is None or jax.eval_shape(lambda x: x.unpack().obs, start).dtype != jnp.float32:
@@ -195,8 +200,8 @@ class FusedLearner(Learner):
         return UnrollSpec(self.shape, kernel, int(places.obs[0]), tuple(map(int, kept)))
 
     def policy(
-        self, params: Float[Array, " size"], normalizer: Any
-    ) -> Callable[[Array, Array], tuple[Array, dict[str, Any]]]:
+        self, params: Float[Array, " size"], normalizer: Normalizer
+    ) -> Callable[[Array, Array], tuple[Array, Extras]]:
         """Return the policy of a collection.
 
         Args:
@@ -210,7 +215,7 @@ class FusedLearner(Learner):
         """
         statistics = self._statistics(normalizer)
 
-        def act(observations: Array, noise: Array) -> tuple[Array, dict[str, Any]]:
+        def act(observations: Array, noise: Array) -> tuple[Array, Extras]:
             drawn = launch.actions(self.shape, params, *statistics, observations, noise)
             return drawn.action, self._extras(drawn)
 
@@ -218,9 +223,11 @@ class FusedLearner(Learner):
 
     def action_noise(self, key: PRNGKeyArray) -> Float[Array, "time environments actions"]:
         """Draw the noise of all actions of an unroll."""
-        return jax.random.normal(key, (self.batch.time, self._environments, self.shape.actions))
+        return jax.random.normal(
+            key, (self.batch.time, self.batch.environments, self.shape.actions)
+        )
 
-    def _extras(self, drawn: launch.Actions) -> dict[str, Any]:
+    def _extras(self, drawn: launch.Actions) -> Extras:
         """Return what Brax keeps of actions."""
         extras = drawn._asdict()
         del extras["action"]
@@ -228,10 +235,11 @@ class FusedLearner(Learner):
             extras["distribution_params"] = tuple(jnp.split(drawn.distribution_params, 2, -1))
         return extras
 
-    def _statistics(self, normalizer: Any) -> tuple[Array, Array]:
+    def _statistics(self, normalizer: Normalizer) -> tuple[Array, Array]:
         """Return the mean of the observations, and the inverse of their standard deviations."""
         if self._config.normalize_observations:
-            return normalizer.mean, 1.0 / normalizer.std
+            statistics: PyTree = normalizer
+            return statistics.mean, 1.0 / statistics.std
         size = self.shape.observations
         return jnp.zeros(size), jnp.ones(size)
 
@@ -241,19 +249,19 @@ class FusedLearner(Learner):
         self,
         params: Float[Array, " size"],
         optimizer_state: PyTree,
-        normalizer: Any,
+        normalizer: Normalizer,
         data: Transition,
         key: PRNGKeyArray,
     ) -> tuple[Float[Array, " size"], PyTree, Float[Array, " totals"]]:
-        """Update the networks in several passes over the collected data, as in `Learner`."""
+        """Update the networks by one kernel, or by three for each minibatch, as in `Learner`."""
         collected = self.collected(data, normalizer)
         terms = self.adam_terms(optimizer_state)
         # Shuffle for all passes, and draw all noise, with all keys at once, unlike Brax's.
         shuffle_key, noise_key = jax.random.split(key)
         shuffle_keys = jax.random.split(shuffle_key, self._config.num_updates_per_batch)
         orders = jax.vmap(lambda key: jax.random.permutation(key, self.batch.collected))
-        unrolls = orders(shuffle_keys).reshape(self.batch.count, -1)
-        noise = self.noise(jax.random.split(noise_key, self.batch.count))
+        unrolls = orders(shuffle_keys).reshape(self.batch.minibatches, -1)
+        noise = self.noise(jax.random.split(noise_key, self.batch.minibatches))
         state = self.first_vectors(params, optimizer_state)
         # All minibatches by one kernel.
         if self.at_once:
@@ -269,10 +277,10 @@ class FusedLearner(Learner):
 
         # `scan` would carry a counter of its own beside `index`, which would be another launch.
         begun = jnp.zeros((), jnp.int32), *state
-        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.count, step, begun)
+        ended = jax.lax.while_loop(lambda state: state[0] < self.batch.minibatches, step, begun)
         return self.results(ended[1:], optimizer_state)
 
-    def collected(self, data: Transition, normalizer: Any) -> Collected:
+    def collected(self, data: Transition, normalizer: Normalizer) -> Collected:
         """Return the collected data as the kernels read it.
 
         Args:
@@ -280,7 +288,7 @@ class FusedLearner(Learner):
           normalizer: the statistics of the observations.
         """
         # A row for each step: what the policy saw and did, and what came of it.
-        extras: Any = data.extras
+        extras: PyTree = data.extras
         distribution = extras["policy_extras"]["distribution_params"]
         if self.shape.distribution == "normal":
             distribution = jnp.concatenate(distribution, axis=-1)
@@ -409,5 +417,5 @@ class FusedLearner(Learner):
         }
 
 
-def _array(numbers: Iterable[Any]) -> Float[Array, " numbers"]:
+def _array(numbers: Iterable[Array | float]) -> Float[Array, " numbers"]:
     return jnp.stack([jnp.asarray(x, jnp.float32) for x in numbers])

@@ -4,15 +4,15 @@ The check is a few actions, a small gradient and a step of Adam, compared with t
 """
 
 import functools
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, PyTree
 
 from jetbot_mjx.agents.fused import adam, launch, reference
 from jetbot_mjx.agents.fused.adam import AdamRule
+from jetbot_mjx.agents.fused.arrays import Actions
 from jetbot_mjx.agents.fused.shapes import LossTerms, UpdateShape
 
 _SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh", normalizes=False)
@@ -37,7 +37,7 @@ def runs_correctly() -> bool:
     gradient = reference.gradient(_SHAPE, _TERMS, *data)
     observations = rows[:, 0, : _SHAPE.observations]
     actions = reference.actions(_SHAPE, params, observations, noise[0])
-    # What they compute.
+    # What they compute, as a new function each time, for which JAX has traced nothing yet.
     arrays = [np.asarray(x, np.float32) for x in data]
     with jax.default_device(jax.local_devices(backend=backend.PLATFORM)[0]):
         try:
@@ -71,7 +71,7 @@ def _data() -> tuple[np.ndarray, ...]:
     return params, rows, last, noise[0]
 
 
-def _adam_arrays(params: Any, gradient: Any) -> dict[str, Any]:
+def _adam_arrays(params: Array | np.ndarray, gradient: Array | np.ndarray) -> dict[str, PyTree]:
     """Return what a step of Adam takes; any vectors serve as the means."""
     progress = np.zeros((2, adam.SIZES["progress"]), np.float32)
     progress[0, :3] = _RATE, 1, 1
@@ -81,7 +81,9 @@ def _adam_arrays(params: Any, gradient: Any) -> dict[str, Any]:
     return dict(zip(adam.ARRAYS, arrays, strict=True))
 
 
-def _run(params: Array, rows: Array, last: Array, noise: Array) -> Any:
+def _run(
+    params: Array, rows: Array, last: Array, noise: Array
+) -> tuple[Array, Actions, tuple[Array, ...]]:
     """Return a gradient, the actions of the first steps, and a step of Adam, by the kernels."""
     # The observations stay as they are.
     statistics = jnp.zeros(_SHAPE.observations), jnp.ones(_SHAPE.observations)

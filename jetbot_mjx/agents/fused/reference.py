@@ -34,7 +34,8 @@ def actions(
     # The program of the kernels, for all samples at once.
     outputs = network(shape, params, observations)
     drawn = np.stack(evaluate(program, _columns(outputs, np.zeros(noise.shape), noise)), -1)
-    action, raw, log_prob, parameters = np.split(drawn, np.cumsum(shape.drawn)[:-1], axis=-1)
+    ends = np.cumsum([shape.actions, shape.actions, 1])
+    action, raw, log_prob, parameters = np.split(drawn, ends, axis=-1)
     return [action, raw, log_prob[..., 0], parameters]
 
 

@@ -294,7 +294,7 @@ def value_step(
 
 
 def vector_of(*sizes: int) -> Any:
-    """Return the shape of an argument of a function of one sample."""
+    """Return a shape that stands for an array among the arguments of a function of one sample."""
     return jax.ShapeDtypeStruct(sizes, jnp.float32)
 
 
@@ -313,13 +313,12 @@ def action_program(shape: UpdateShape, *, for_gpu: bool = False) -> ScalarProgra
 @functools.cache
 def policy_program(shape: UpdateShape, samples: int, *, for_gpu: bool = False) -> ScalarProgram:
     """Lower `policy_sample`."""
-    # All arguments but the numbers are vectors of as many numbers as there are actions.
-    fields: dict[str, Any] = dict.fromkeys(PolicySample._fields, vector_of(shape.actions))
-    fields |= dict.fromkeys(("log_prob", "advantage", "weight"), vector_of())
-    fields |= {"outputs": vector_of(shape.outputs[0]), "old": vector_of(2 * shape.actions)}
+    each, number = vector_of(shape.actions), vector_of()
+    outputs, old = vector_of(shape.outputs[0]), vector_of(2 * shape.actions)
+    sample = PolicySample(outputs, each, each, number, old, each, number, number)
     tanh = shape.distribution == "tanh_normal"
     loss = functools.partial(policy_sample, samples=samples, tanh=tanh)
-    return scalarize(loss, PolicySample(**fields), _TERMS, approximate=for_gpu)
+    return scalarize(loss, sample, _TERMS, approximate=for_gpu)
 
 
 def value_step_program(samples: int) -> ScalarProgram:

@@ -1,8 +1,12 @@
-"""Describe networks and minibatches to the kernels of PPO's update."""
+"""Describe networks, data and unrolls to the writers of PPO's kernels."""
 
 import itertools
-import math
-from typing import Any, NamedTuple
+from collections.abc import Mapping
+from typing import Generic, NamedTuple, TypeVar
+
+from onekernel import Kernel
+
+Number = TypeVar("Number")
 
 POLICY_METRICS = ("policy_loss", "entropy", "kl", "std")
 VALUE_METRICS = ("value_loss",)
@@ -43,6 +47,14 @@ class UpdateShape(NamedTuple):
         return sum(self.width * (inputs + 1) for inputs in self.inputs[:-1])
 
     @property
+    def hidden_layers(self) -> list[tuple[int, int, int]]:
+        """Return number, inputs and first parameter of each hidden layer of a network."""
+        # Weights, of shape (inputs, width), and biases of a layer precede those of the next one.
+        sizes = (self.width * (inputs + 1) for inputs in self.inputs[:-1])
+        starts = itertools.accumulate(sizes, initial=0)
+        return list(zip(range(self.layers), self.inputs, starts, strict=False))
+
+    @property
     def deviations(self) -> int:
         """Return the number of standard deviations that are parameters."""
         return self.actions if self.distribution == "normal" else 0
@@ -65,45 +77,30 @@ class UpdateShape(NamedTuple):
     @property
     def ranges(self) -> list[tuple[int, int]]:
         """Return the ranges of the vector that hold parameters; metrics are behind each."""
+        # The policy's weights, biases and deviations, its metrics; the values', and theirs.
         policy = self.policy_size
         return [(0, policy - len(POLICY_METRICS)), (policy, self.size - len(VALUE_METRICS))]
 
     @property
-    def drawn(self) -> list[int]:
-        """Return how many numbers of each array of `launch.Actions` an environment has."""
-        return [math.prod(shape) for shape in self.drawn_shapes(1)]
-
-    def drawn_shapes(self, environments: int) -> list[tuple[int, ...]]:
-        """Return the shapes of the arrays of `launch.Actions`."""
-        each = environments, self.actions
-        return [each, each, (environments,), (environments, 2 * self.actions)]
-
-    @property
     def columns(self) -> dict[str, int]:
         """Return where the parts of a row of the collected data begin, and its `size`."""
-        sizes = {
-            "observation": self.observations,
-            "raw_action": self.actions,
-            "log_prob": 1,
-            "distribution": 2 * self.actions,
-            "reward": 1,
-            "discount": 1,
-            "truncation": 1,
-        }
-        begins = starts(sizes)
-        return {**dict(zip(sizes, begins, strict=False)), "size": begins[-1]}
+        # What the policy saw and did, and what came of it.
+        sizes = {"observation": self.observations, "raw_action": self.actions}
+        sizes |= {"log_prob": 1, "distribution": 2 * self.actions}
+        return places(sizes | dict.fromkeys(("reward", "discount", "truncation"), 1))
 
 
 class Minibatch(NamedTuple):
-    """A `Minibatch` says how many unrolls there are."""
+    """A `Minibatch` says how much data of one policy there is, on one device."""
 
-    collected: int
+    collected: int = 0
     """Unrolls among which the minibatch's are."""
-    unrolls: int
-    time: int
+    unrolls: int = 0
+    time: int = 0
     """Steps of an unroll."""
-    count: int = 1
+    minibatches: int = 1
     """Number of minibatches of a training step, in all passes."""
+    environments: int = 0
 
     @property
     def samples(self) -> int:
@@ -111,20 +108,58 @@ class Minibatch(NamedTuple):
         return self.unrolls * self.time
 
 
-class LossTerms(NamedTuple):
+class Unroll(NamedTuple):
+    """An `Unroll` describes a step of an unroll."""
+
+    shape: UpdateShape
+    kernel: Kernel
+    """The step of an environment, from the numbers of its state and an action to the next state."""
+    observation: int
+    """Where the observation begins among the numbers of a state."""
+    kept: tuple[int, ...]
+    """Places of the numbers that are kept of each state."""
+
+    @property
+    def state(self) -> int:
+        """Return how many numbers a state has."""
+        return self.kernel.argument_shapes[0][0]
+
+    @property
+    def ranges(self) -> list[tuple[int, int, int]]:
+        """Return the ranges of adjacent numbers that are kept of a state.
+
+        Of each range: its place among the kept numbers, and its first and last number.
+        """
+        ranges: list[tuple[int, int, int]] = []
+        for place, number in enumerate(self.kept):
+            if ranges and ranges[-1][2] == number - 1:
+                ranges[-1] = (*ranges[-1][:2], number)
+            else:
+                ranges.append((place, number, number))
+        return ranges
+
+
+class LossTerms(NamedTuple, Generic[Number]):
     """A `LossTerms` holds the coefficients of the loss, under the names of the configuration.
 
     The kernels read them from an array, because they may differ between policies.
     """
 
-    clipping_epsilon: Any
-    entropy_cost: Any
-    vf_loss_coefficient: Any
-    discounting: Any
-    gae_lambda: Any
-    reward_scaling: Any
+    clipping_epsilon: Number
+    entropy_cost: Number
+    vf_loss_coefficient: Number
+    discounting: Number
+    gae_lambda: Number
+    reward_scaling: Number
 
 
-def starts(sizes: dict[str, int]) -> list[int]:
-    """Return where parts of the given sizes begin, one after the other, and the end."""
-    return list(itertools.accumulate(sizes.values(), initial=0))
+def places(sizes: Mapping[str, int], multiple: int = 1) -> dict[str, int]:
+    """Return where parts begin that lie one behind the other, and their `size` together.
+
+    Args:
+      sizes: the size of each part.
+      multiple: what each size is rounded up to a multiple of.
+    """
+    # A part begins where the ones before it end.
+    padded = (-(-size // multiple) * multiple for size in sizes.values())
+    return dict(zip((*sizes, "size"), itertools.accumulate(padded, initial=0), strict=True))

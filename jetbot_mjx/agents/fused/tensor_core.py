@@ -10,7 +10,8 @@ The operands come from shared memory by `ldmatrix`, four matrices of 8 x 8 numbe
 row at an address that one lane gives. With `.trans` each matrix is transposed on its way.
 """
 
-from collections.abc import Callable, Iterable, Sequence
+import abc
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from onekernel.build import LlvmWriter, ScalarProgram, Value, gpu, run_program
 
@@ -31,6 +32,39 @@ Sums = list[list[list[Value]]]
 
 Operand = Callable[[int, int], list[Value]]
 """Return the fragments of an operand by its tile of 16 rows or columns and the step of the sum."""
+
+
+class GpuKernel(abc.ABC):
+    """A `GpuKernel` writes one kernel, of which each thread of each block runs the same text.
+
+    The third axis of the grid is the policy, and each policy has a row of every array.
+    """
+
+    name: str
+    """Name of the kernel."""
+
+    def __init__(
+        self, sizes: Mapping[str, int], others: int, threads: int, shared_memory: int
+    ) -> None:
+        """Prepare to write.
+
+        Args:
+          sizes: the numbers of a policy's row of each array, by name, in the kernel's order.
+          others: the number of arrays behind these.
+          threads: the threads of a block.
+          shared_memory: the shared memory that a launch gives to each block [bytes].
+        """
+        self.sizes, self.threads, self.shared_memory = sizes, threads, shared_memory
+        self.ir = GpuWriter(self.name, len(sizes) + others)
+
+    @abc.abstractmethod
+    def text(self) -> str:
+        """Return the kernel as a module of LLVM IR."""
+
+    def find_arrays(self, policy: Value) -> None:
+        """Set `arrays` to the addresses of a policy's rows."""
+        rows = zip(self.sizes.items(), self.ir.parameters, strict=False)
+        self.arrays = {name: self.ir.row(array, policy, size) for (name, size), array in rows}
 
 
 class GpuWriter(LlvmWriter):
@@ -81,11 +115,15 @@ class GpuWriter(LlvmWriter):
         """Return the hyperbolic tangent."""
         return self.assembly("tanh.approx.f32", x)
 
+    def total(self, numbers: Iterable[Value]) -> Value:
+        """Return the sum of some numbers, added one by one in their order."""
+        return sum(numbers, self.constant(0.0))
+
     def run(self, program: ScalarProgram, values: Iterable[Value]) -> list[Value]:
         """Append a program, and return its results."""
         return run_program(self, program, values, for_gpu=True)
 
-    # Barriers.
+    # Barriers. Without the one between a thread's store and another one's load, these would race.
 
     def synchronize(self) -> None:
         """Wait for all threads of the block."""
@@ -93,6 +131,7 @@ class GpuWriter(LlvmWriter):
 
     def synchronize_group(self, group: Value, threads: int) -> None:
         """Wait for as many threads as belong to a group, by its number from 0."""
+        # A warp has a barrier of its own; the hardware's barrier 0 is that of the whole block.
         if threads == LANES:
             self.do('call void asm sideeffect "bar.warp.sync -1;", "~{memory}"() #0')
         else:
@@ -128,6 +167,7 @@ class GpuWriter(LlvmWriter):
 
     def unpack(self, pair: Value) -> tuple[Value, Value]:
         """Return a pair of float16 as floats."""
+        # The two halves of 32 bits.
         halves = pair.bits_as(_PAIR)
         low, high = (self.let(f"extractelement {halves.typed}, i32 {i}", "half") for i in (0, 1))
         return low.to("float"), high.to("float")

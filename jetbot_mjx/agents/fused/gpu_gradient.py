@@ -9,15 +9,16 @@ import itertools
 from collections.abc import Iterator
 
 from jetbot_mjx.agents.fused import sample_loss
+from jetbot_mjx.agents.fused.arrays import GRADIENT
+from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import PAD, Tiling, padded, shares_of
-from jetbot_mjx.agents.fused.network import NetworkKernel
-from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, LossTerms, Minibatch
+from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, Minibatch
 from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Sums, Value
 
-NAME = "ppo_gradient"
-"""Name of the kernel."""
-
-_ARRAYS = 12
+ARGUMENTS = (
+    *("params", "mean", "scale", "rows", "unrolls", "noise", "index"),
+    *("advantages", "targets", "statistics", "terms"),
+)
 
 _ONES = 0x3C003C00
 """Two ones in float16."""
@@ -27,83 +28,91 @@ _MEAN_SCALE = 1 / 16
 over many, they would be too small for float16."""
 
 
-def tile_count(tiling: Tiling, batch: Minibatch) -> int:
-    """Return the number of tiles of a minibatch."""
-    return -(-batch.samples // tiling.rows)
+class GradientKernel(NetworkKernel):
+    """A `GradientKernel` takes `ARGUMENTS`, and returns a vector for each block.
 
+    The arguments are those of `arrays.AXES` and the results of the kernel of the advantages. The
+    sum of the vectors is the gradient, with the sums of the metrics at their places.
 
-def gradient_text(tiling: Tiling, batch: Minibatch, parts: int) -> str:
-    """Write the kernel.
+    In shared memory it also has, with a row for each sample of a tile where nothing else is said:
 
-    Its arguments are the parameters, mean and 1 / std of the observations, the collected rows, the
-    unrolls of all minibatches and their noise, of shape (time, unrolls, action) each, which of them
-    to compute, the results of the kernel of the advantages, and the `LossTerms`; its result is a
-    vector for each block, whose sum is the gradient.
-
-    Args:
-      tiling: the division of the work.
-      batch: the minibatch.
-      parts: the number of blocks of the kernel of the advantages.
-
-    Returns:
-      The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
+        layer1, layer2, ...    float16 (rows, width); the backward pass puts derivatives there
+        slopes1, slopes2, ...  the same, of `swish` only, whose slopes its values do not tell
+        errors                 float16 (rows, 16), derivatives of the loss by the outputs
+        extras                 float32 (rows, numbers that the loss reads beside the outputs)
+        statistics             float32, sums of the lanes, then mean and 1 / std of the advantages
+        slots                  float32 (sums that single samples add to, rows + 1)
     """
-    return _GradientKernel(tiling, batch, parts).write()
 
+    name = "ppo_gradient"
 
-class _GradientKernel(NetworkKernel):
     def __init__(self, tiling: Tiling, batch: Minibatch, parts: int) -> None:
-        super().__init__(NAME, _ARRAYS, tiling, batch, tile_count(tiling, batch))
+        """Prepare to write.
+
+        Args:
+          tiling: the division of the work.
+          batch: the minibatch.
+          parts: the number of blocks of the kernel of the advantages.
+        """
+        sizes = GRADIENT.counts(tiling.shape, batch) | {"statistics": 2 * parts}
+        sizes |= {"advantages": batch.samples, "targets": batch.samples}
+        sizes = {name: sizes[name] for name in ARGUMENTS}
+        super().__init__(sizes, 1, tiling, batch, -(-batch.samples // tiling.rows))
         self.parts = parts
         self.width, self.shares = self.shape.width, shares_of(self.shape)
         self.error_scale = batch.samples * _MEAN_SCALE
 
-    def write(self) -> str:
-        ir, shape, batch = self.ir, self.shape, self.batch
+    def text(self) -> str:
+        """Return the module."""
+        ir, shape = self.ir, self.shape
         self.prepare()
-        # The arrays of the policy, which the third axis of the grid says.
-        self.network, seed = ir.register("ctaid.y"), ir.register("ctaid.z")
-        self.is_policy = self.network.equals(0)
-        sizes = [shape.size, shape.observations, shape.observations]
-        drawn, noise = batch.unrolls, batch.samples * shape.actions
-        sizes += [batch.collected * batch.time * shape.columns["size"]]
-        sizes += [batch.count * drawn, batch.count * noise, 1]
-        sizes += [batch.samples, batch.samples, 2 * self.parts, len(LossTerms._fields)]
-        self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
-        # Those of the minibatch.
-        minibatch = self.minibatch(self.arrays[6])
-        self.unrolls = ir.row(self.arrays[4], minibatch, drawn)
-        self.noise = ir.row(self.arrays[5], minibatch, noise)
-        # Each block writes a gradient of its own, of one of the networks.
-        part = seed * self.blocks + self.block
-        start = self.network * shape.policy_size
-        parts = ir.row(ir.parameters[-1], part, shape.size)
-        self.part = parts + start
-        self.params = self.arrays[0] + start
-        self.terms = self.load_terms(self.arrays[10])
-        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
         # Load what all tiles need into shared memory.
-        self.load_network(self.params, self.outputs, self.arrays[1], self.arrays[2])
+        self.load_network(self._find_data(), self.outputs)
         self._clear()
-        if self.shape.normalizes:
+        if shape.normalizes:
             self._load_statistics()
         ir.synchronize()
+        # Go through the tiles; the sums of the gradient are carried from one to the next.
         self._take_sums(itertools.repeat(ir.constant(0.0)))
         with ir.repeat(self.block, *self._all_sums()) as loop:
             tile, *sums = loop.carried
             self._take_sums(iter(sums))
             self._load_tile(tile)
+            # Warps read rows that others have loaded,
             ir.synchronize()
             self.store_outputs(self.forward())
+            # the loss all outputs of a row,
             ir.synchronize()
             with ir.when(self.thread < self.tiling.rows):
                 self._loss(tile)
+            # and the backward pass the errors of all rows.
             ir.synchronize()
             self._backward()
+            # The next tile overwrites what the backward pass reads.
             ir.synchronize()
             self.next_tile(loop, tile, *self._all_sums())
         self._store_gradient()
-        return self.module()
+        return ir.module(self.threads)
+
+    def _find_data(self) -> Value:
+        """Find the data of the minibatch, and return the parameters of the block's network."""
+        ir, shape, batch = self.ir, self.shape, self.batch
+        # The second axis of the grid is the network, the third one the policy.
+        self.network, policy = ir.register("ctaid.y"), ir.register("ctaid.z")
+        self.is_policy = self.network.equals(0)
+        self.find_arrays(policy)
+        index, noise = self.arrays["index"].load("u32"), batch.samples * shape.actions
+        self.unrolls = ir.row(self.arrays["unrolls"], index, batch.unrolls)
+        self.noise = ir.row(self.arrays["noise"], index, noise)
+        # Each block writes a gradient of its own, of one of the networks.
+        part = policy * self.blocks + self.block
+        start = self.network * shape.policy_size
+        parts = ir.row(ir.parameters[-1], part, shape.size)
+        self.part = parts + start
+        params = self.arrays["params"] + start
+        self.load_terms()
+        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
+        return params
 
     def _clear(self) -> None:
         ir = self.ir
@@ -122,16 +131,15 @@ class _GradientKernel(NetworkKernel):
                 total = ir.constant(0.0)
                 for j in range(0, self.parts, LANES):
                     part = self.thread + j
-                    value = self.arrays[9][ir.minimum(part, self.parts - 1) * 2 + i]
+                    value = self.arrays["statistics"][ir.minimum(part, self.parts - 1) * 2 + i]
                     total += ir.select(part < self.parts, value, 0.0)
-                ir.shared(self.thread * 4, place + 4 * LANES * i).store(total)
+                self.write("statistics", self.thread, total, LANES * i)
         ir.synchronize()
         with ir.when(self.thread < 1):
             totals = []
             for i in range(2):
-                total = ir.constant(0.0)
-                for j in range(LANES):
-                    total += ir.shared(place + 4 * (LANES * i + j)).load()
+                lanes = range(LANES * i, LANES * (i + 1))
+                total = ir.total(ir.shared(place + 4 * lane).load() for lane in lanes)
                 totals.append(total * (1 / self.batch.samples))
             mean, square = totals
             variance = square - mean * mean
@@ -148,7 +156,7 @@ class _GradientKernel(NetworkKernel):
             sample = ir.minimum(tile * self.tiling.rows + row, self.batch.samples - 1)
             unroll, step = sample // time, sample % time
             collected = (self.unrolls + unroll).load("u32")
-            start = ir.row(self.arrays[3], collected * time + step, columns["size"])
+            start = ir.row(self.arrays["rows"], collected * time + step, columns["size"])
             return sample, unroll, step, start
 
         # Fetch everything before anything is stored.
@@ -158,8 +166,8 @@ class _GradientKernel(NetworkKernel):
         extras = [start[i] for i in range(first, last)]
         noise = (step * self.batch.unrolls + unroll) * self.shape.actions
         extras += [self.noise[noise + i] for i in range(self.shape.actions)]
-        extras += [self.arrays[i][sample] for i in (7, 8)]
-        self.load_observations(lambda row: place(row)[3])()
+        extras += [self.arrays[name][sample] for name in ("advantages", "targets")]
+        self.load_observations(lambda row: place(row)[3])
         # Store it in a row for each sample.
         pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
         for i, value in enumerate(extras):
@@ -204,7 +212,7 @@ class _GradientKernel(NetworkKernel):
         # A `PolicySample` and the coefficients.
         extras = [self._extra(i) for i in range(self.tiling.extras - 2)]
         outputs = self.outputs_of(self.thread, shape.outputs[0])
-        sample = [*outputs, *self.deviations(self.params), *extras]
+        sample = [*outputs, *self.deviations(), *extras]
         sample += [self._advantage(), ir.constant(1.0), *self.terms]
         program = sample_loss.policy_program(shape, self.batch.samples, for_gpu=True)
         results = ir.run(program, sample)
@@ -243,37 +251,24 @@ class _GradientKernel(NetworkKernel):
         samples, tiles = tiling.rows // TILE, self.width // TILE
         # The head's weights: the activations, transposed, times the errors.
         column = ir.minimum(self.warp, tiles - 1) * TILE
-        left = self.lanes(f"layer{shape.layers}", self.stride, self.column_first, 0, column)
-        right = self.lanes("errors", TILE + PAD, self.row_first)
-        self.head_sums = ir.product(
-            self.head_sums,
-            samples,
-            lambda _, k: ir.matrices(left, 32 * k * self.stride, transposed=True),
-            lambda _, k: ir.matrices(right, 32 * k * (TILE + PAD), transposed=True),
-        )
+        left = self.operand("left", f"layer{shape.layers}", "rows", 0, column)
+        right = self.operand("right", "errors", "rows")
+        self.head_sums = ir.product(self.head_sums, samples, left, right)
         # Back through the layers; the weights of one need the errors behind it.
-        self._propagate(shape.layers, "errors", TILE + PAD, "head", TILE + PAD, 1)
+        self._propagate(shape.layers, "errors", "head", 1)
         for layer in reversed(range(shape.layers)):
             self._add_weights(layer)
             if layer:
-                name = f"layer{layer + 1}"
-                self._propagate(layer, name, self.stride, f"weights{layer}", self.stride, tiles)
+                self._propagate(layer, f"layer{layer + 1}", f"weights{layer}", tiles)
 
-    def _propagate(
-        self, layer: int, errors: str, stride: int, weights: str, by: int, steps: int
-    ) -> None:
+    def _propagate(self, layer: int, errors: str, weights: str, steps: int) -> None:
         """Replace a layer's activations by the derivatives before its activation function."""
-        ir, tiling = self.ir, self.tiling
+        ir = self.ir
         # The errors times the weights, transposed.
-        left = self.lanes(errors, stride, self.row_first, self.row)
-        right = self.lanes(weights, by, self.column_first, self.column)
-        zero = ir.constant(0.0)
-        sums = ir.product(
-            [[[zero] * 4 for _ in range(2 * self.pairs)] for _ in range(tiling.row_tiles)],
-            steps,
-            lambda row, k: ir.matrices(left, 32 * row * stride + 32 * k, transposed=False),
-            lambda pair, k: ir.matrices(right, 32 * pair * by + 32 * k, transposed=False),
-        )
+        left = self.operand("left", errors, "columns", self.row)
+        right = self.operand("right", weights, "columns", self.column)
+        zeros = [[[ir.constant(0.0)] * 4] * (2 * self.pairs)] * self.tiling.row_tiles
+        sums = ir.product(zeros, steps, left, right)
         # Times the slopes of the activations, which stand where the results go.
         kind = self.shape.activation
         name = f"slopes{layer}" if kind == "swish" else f"layer{layer}"
@@ -293,30 +288,17 @@ class _GradientKernel(NetworkKernel):
     def _add_weights(self, layer: int) -> None:
         """Add a tile's gradient of a layer's weights and biases, transposed: (outputs, inputs)."""
         ir = self.ir
-        samples = self.tiling.rows // TILE
-        name, stride = self.source(layer)
-        errors = f"layer{layer + 1}"
+        samples, errors = self.tiling.rows // TILE, f"layer{layer + 1}"
         # The weights: the errors, transposed, times the inputs of the layer.
         row, column = self._share_of_warp(layer)
-        left = self.lanes(errors, self.stride, self.column_first, 0, row)
-        right = self.lanes(name, stride, self.row_first, 0, column)
-        self.weight_sums[layer] = ir.product(
-            self.weight_sums[layer],
-            samples,
-            lambda m, k: ir.matrices(left, 32 * k * self.stride + 32 * m, transposed=True),
-            lambda pair, k: ir.matrices(right, 32 * k * stride + 32 * pair, transposed=True),
-        )
+        left = self.operand("left", errors, "rows", 0, row)
+        right = self.operand("right", self.layer(layer), "rows", 0, column)
+        self.weight_sums[layer] = ir.product(self.weight_sums[layer], samples, left, right)
         # The biases: the same with ones in place of the layer's inputs.
-        tiles = self.width // TILE
-        place = ir.minimum(self.warp, tiles - 1) * TILE
-        own = self.lanes(errors, self.stride, self.column_first, 0, place)
-        one = ir.constant(_ONES, "u32")
-        self.bias_sums[layer] = ir.product(
-            self.bias_sums[layer],
-            samples,
-            lambda _, k: ir.matrices(own, 32 * k * self.stride, transposed=True),
-            lambda *_: [one] * 4,
-        )
+        place = ir.minimum(self.warp, self.width // TILE - 1) * TILE
+        left = self.operand("left", errors, "rows", 0, place)
+        ones = [ir.constant(_ONES, "u32")] * 4
+        self.bias_sums[layer] = ir.product(self.bias_sums[layer], samples, left, lambda *_: ones)
 
     def _share_of_warp(self, layer: int) -> tuple[Value, Value]:
         """Return the first row (output) and column (input) of the warp's share of a gradient."""
@@ -334,29 +316,29 @@ class _GradientKernel(NetworkKernel):
 
     def _store_gradient(self) -> None:
         """Store the block's sums."""
-        ir, shape, offset = self.ir, self.shape, 0
+        ir, shape = self.ir, self.shape
         # A lane has four sums of each product; `tensor_core` says which.
-        for layer, inputs in enumerate(shape.inputs[:-1]):
+        for layer, inputs, start in shape.hidden_layers:
             row, column = self._share_of_warp(layer)
             output, first = row + self.sum_row, column + self.sum_column
             for m, sums in enumerate(self.weight_sums[layer]):
                 for n, four in enumerate(sums):
                     for i, value in enumerate(four):
                         at = first + (8 * n + i % 2)
-                        place = at * self.width + output + (offset + TILE * m + 8 * (i // 2))
+                        place = at * self.width + output + (start + TILE * m + 8 * (i // 2))
                         if inputs % TILE:
                             with ir.when(at < inputs):
                                 self._put_sum(value, place)
                         else:
                             self._put_sum(value, place)
-            offset += inputs * self.width
+            # The bias of an output is in all columns of its sums.
             ((four,),) = self.bias_sums[layer]
-            place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row + offset
+            place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
+            place += start + inputs * self.width
             with ir.when(self.sum_column.equals(0)):
                 self._put_sum(four[0], place)
                 self._put_sum(four[2], place + 8)
-            offset += self.width
-        self._store_head(offset)
+        self._store_head(shape.hidden)
 
     def _store_head(self, offset: int) -> None:
         """Store the sums of the last layer, and of what the slots hold."""
@@ -368,16 +350,12 @@ class _GradientKernel(NetworkKernel):
             place = (row + 8 * (i // 2)) * self.outputs + column + offset
             with ir.when(column < self.outputs):
                 self._put_sum(value, place)
-        count = ir.select(
-            self.is_policy,
-            ir.constant(shape.slots, "u32"),
-            1 + len(VALUE_METRICS),
-        )
+        # A thread adds up a slot over the rows of a tile: biases, deviations and metrics.
+        slots = ir.constant(shape.slots, "u32")
+        count = ir.select(self.is_policy, slots, 1 + len(VALUE_METRICS))
         with ir.when(self.thread < count):
             first = ir.shared(self.thread * (4 * (self.tiling.rows + 1)), self.bytes_of("slots"))
-            total = ir.constant(0.0)
-            for i in range(self.tiling.rows):
-                total += ir.moved(first, 4 * i).load()
+            total = ir.total(ir.moved(first, 4 * i).load() for i in range(self.tiling.rows))
             self.part[self.outputs * self.width + self.thread + offset] = total
 
 

@@ -7,62 +7,52 @@ all that their normalisation needs.
 """
 
 from jetbot_mjx.agents.fused import sample_loss
+from jetbot_mjx.agents.fused.arrays import GRADIENT
+from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
-from jetbot_mjx.agents.fused.network import NetworkKernel
-from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch
+from jetbot_mjx.agents.fused.shapes import Minibatch
 from jetbot_mjx.agents.fused.tensor_core import LANES, Value
 
-NAME = "ppo_advantages"
-"""Name of the kernel."""
-
-_ARRAYS = 11
+ARGUMENTS = ("params", "mean", "scale", "rows", "last", "unrolls", "index", "terms")
+RESULTS = ("advantages", "targets", "statistics")
 
 
-def tile_count(tiling: Tiling, batch: Minibatch) -> int:
-    """Return the number of tiles of a minibatch."""
-    return -(-batch.unrolls // (tiling.rows // (batch.time + 1)))
+class AdvantageKernel(NetworkKernel):
+    """An `AdvantageKernel` takes `ARGUMENTS`, as `arrays.AXES` lists them.
 
-
-def advantages_text(tiling: Tiling, batch: Minibatch) -> str:
-    """Write the kernel.
-
-    Its arguments are the parameters, mean and 1 / std of the observations, the collected rows,
-    the last observations, the unrolls of all minibatches, which of them to compute, and the
-    `LossTerms`; its results the advantages, the targets, and for each block the sums of the
-    advantages and of their squares.
-
-    Args:
-      tiling: the division of the work.
-      batch: the minibatch.
-
-    Returns:
-      The text of an LLVM module; its launch needs `tiling.layout["size"]` bytes of shared memory.
+    It returns the advantages and the value targets, each of shape (unrolls, time), and the sums of
+    the advantages and of their squares, of shape (blocks, 2).
     """
-    return _AdvantageKernel(tiling, batch).write()
 
+    name = "ppo_advantages"
 
-class _AdvantageKernel(NetworkKernel):
     def __init__(self, tiling: Tiling, batch: Minibatch) -> None:
-        super().__init__(NAME, _ARRAYS, tiling, batch, tile_count(tiling, batch))
-        self.per_tile = tiling.rows // (batch.time + 1)
+        """Prepare to write.
 
-    def write(self) -> str:
-        ir, shape, batch = self.ir, self.shape, self.batch
-        # The arrays of the policy, which the third axis of the grid says.
+        Args:
+          tiling: the division of the work.
+          batch: the minibatch.
+        """
+        sizes = GRADIENT.counts(tiling.shape, batch)
+        sizes = {name: sizes[name] for name in ARGUMENTS}
+        sizes |= {"advantages": batch.samples, "targets": batch.samples}
+        self.per_tile = tiling.rows // (batch.time + 1)
+        super().__init__(sizes, 1, tiling, batch, -(-batch.unrolls // self.per_tile))
+
+    def text(self) -> str:
+        """Return the module."""
+        ir, shape = self.ir, self.shape
         self.prepare()
-        seed = ir.register("ctaid.z")
-        sizes = [shape.size, shape.observations, shape.observations]
-        sizes += [batch.collected * batch.time * shape.columns["size"]]
-        sizes += [batch.collected * shape.observations, batch.count * batch.unrolls, 1]
-        sizes += [len(LossTerms._fields), batch.samples, batch.samples]
-        self.arrays = [self.argument(i, seed, size) for i, size in enumerate(sizes)]
+        policy = ir.register("ctaid.z")
+        self.find_arrays(policy)
         # Each block has sums of its own.
-        part = seed * self.blocks + self.block
+        part = policy * self.blocks + self.block
         self.statistics = ir.row(ir.parameters[-1], part, 2)
-        self.unrolls = ir.row(self.arrays[5], self.minibatch(self.arrays[6]), batch.unrolls)
-        self.terms = self.load_terms(self.arrays[7])
-        params = self.arrays[0] + shape.policy_size
-        self.load_network(params, ir.constant(1, "u32"), self.arrays[1], self.arrays[2])
+        index = self.arrays["index"].load("u32")
+        self.unrolls = ir.row(self.arrays["unrolls"], index, self.batch.unrolls)
+        self.load_terms()
+        # Load the value network once, and then take the tiles through it.
+        self.load_network(self.arrays["params"] + shape.policy_size, ir.constant(1, "u32"))
         ir.synchronize()
         zero = ir.constant(0.0)
         with ir.repeat(self.block, zero, zero) as loop:
@@ -72,7 +62,7 @@ class _AdvantageKernel(NetworkKernel):
             total, squares = total + advantage, squares + advantage * advantage
             self.next_tile(loop, tile, total, squares)
         self._store_statistics(total, squares)
-        return self.module()
+        return ir.module(self.threads)
 
     def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
         """Return the unroll of a row of a tile, which may not exist, and the step in it."""
@@ -85,7 +75,7 @@ class _AdvantageKernel(NetworkKernel):
         kept = ir.minimum(unroll, self.batch.unrolls - 1)
         collected = (self.unrolls + kept).load("u32")
         sample = collected * time + ir.minimum(step, time - 1)
-        return collected, ir.row(self.arrays[3], sample, self.shape.columns["size"])
+        return collected, ir.row(self.arrays["rows"], sample, self.shape.columns["size"])
 
     def _tile(self, tile: Value) -> Value:
         """Compute a tile; return the thread's advantage, or 0 if it has none."""
@@ -102,27 +92,26 @@ class _AdvantageKernel(NetworkKernel):
         def observation(row: Value) -> Value:
             unroll, step = self._unroll(tile, row)
             collected, start = self._row(unroll, step)
-            last = ir.row(self.arrays[4], collected, shape.observations)
+            last = ir.row(self.arrays["last"], collected, shape.observations)
             return ir.select(step < time, start, last)
 
         # The values of all rows.
-        self.load_observations(observation)()
+        self.load_observations(observation)
         ir.synchronize()
         self._store_values()
         ir.synchronize()
         # The differences, for all steps at once.
-        given = [self._read("values", own), reward, discount, truncation]
-        delta, factor = self._error([*given, self._read("values", own, 1)])
-        self._write(delta, "deltas", own)
-        self._write(factor, "factors", own)
+        given = [self.read("values", own), reward, discount, truncation]
+        delta, factor = self._error([*given, self.read("values", own, 1)])
+        self.write("deltas", own, delta)
+        self.write("factors", own, factor)
         ir.synchronize()
         # From the last step to the first, a thread for each unroll.
         with ir.when(self.thread < self.per_tile):
             self._accumulate()
         ir.synchronize()
         # The advantage is the difference by the next target.
-        # The advantage is the difference by the next target.
-        advantage, _ = self._error([*given, self._read("targets", own, 1)])
+        advantage, _ = self._error([*given, self.read("targets", own, 1)])
         # Rows beyond the unrolls, and those of the last observations, have none.
         beyond = ir.constant(self.batch.unrolls, "u32")
         unroll = ir.select(own < self.per_tile * (time + 1), unroll, beyond)
@@ -130,8 +119,8 @@ class _AdvantageKernel(NetworkKernel):
         there = ir.select(self.thread < rows, unroll, beyond) < beyond
         with ir.when(there):
             place = unroll * time + step
-            self.arrays[8][place] = advantage
-            self.arrays[9][place] = self._read("targets", own)
+            self.arrays["advantages"][place] = advantage
+            self.arrays["targets"][place] = self.read("targets", own)
         return ir.select(there, advantage, 0.0)
 
     def _error(self, step: list[Value]) -> list[Value]:
@@ -153,34 +142,29 @@ class _AdvantageKernel(NetworkKernel):
         ir, time = self.ir, self.batch.time
         first = self.thread * (time + 1)
         total, gae_step = ir.constant(0.0), sample_loss.gae_program()
-        self._write(self._read("values", first, time), "targets", first, time)
+        self.write("targets", first, self.read("values", first, time), time)
         for step in reversed(range(time)):
-            delta, factor = (self._read(name, first, step) for name in ("deltas", "factors"))
+            delta, factor = (self.read(name, first, step) for name in ("deltas", "factors"))
             (total,) = ir.run(gae_step, [delta, factor, total])
-            self._write(total + self._read("values", first, step), "targets", first, step)
-
-    def _read(self, name: str, row: Value, offset: int = 0) -> Value:
-        return self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset).load()
-
-    def _write(self, value: Value, name: str, row: Value, offset: int = 0) -> None:
-        self.ir.shared(row * 4, self.bytes_of(name) + 4 * offset).store(value)
+            self.write("targets", first, total + self.read("values", first, step), step)
 
     def _store_statistics(self, *sums: Value) -> None:
         """Add up the threads' sums in a fixed order, and store those of the block."""
         ir, threads = self.ir, self.tiling.threads
         for i, value in enumerate(sums):
-            self._write(value, "statistics", self.thread, threads * i)
+            self.write("statistics", self.thread, value, threads * i)
+        # The first warp adds up the sums of all threads, those of each lane.
         ir.synchronize()
         lanes = 2 * threads
         with ir.when(self.thread < LANES):
             for i in range(2):
-                total = ir.constant(0.0)
-                for j in range(threads // LANES):
-                    total += self._read("statistics", self.thread, threads * i + LANES * j)
-                self._write(total, "statistics", self.thread, lanes + LANES * i)
+                rows = range(threads * i, threads * (i + 1), LANES)
+                total = ir.total(self.read("statistics", self.thread, row) for row in rows)
+                self.write("statistics", self.thread, total, lanes + LANES * i)
+        # Then two threads add up those of the lanes.
         ir.synchronize()
         with ir.when(self.thread < 2):
-            total = ir.constant(0.0)
-            for j in range(LANES):
-                total += self._read("statistics", self.thread * LANES, lanes + j)
-            self.statistics[self.thread] = total
+            places = range(lanes, lanes + LANES)
+            self.statistics[self.thread] = ir.total(
+                self.read("statistics", self.thread * LANES, place) for place in places
+            )

@@ -1,65 +1,77 @@
 """Load a network into shared memory, and write its forward pass."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Literal
 
 from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_BYTES, PAD, Tiling, padded
 from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, LossTerms, Minibatch
 from jetbot_mjx.agents.fused.tensor_core import (
     LANES,
     TILE,
+    GpuKernel,
     GpuWriter,
+    Operand,
     Sums,
     Value,
 )
 from onekernel.build import Repeat
 
 
-class NetworkKernel:
-    """A `NetworkKernel` writes what the kernels share: a loop over tiles, and a forward pass."""
+class NetworkKernel(GpuKernel):
+    """A `NetworkKernel` writes what the kernels share: a loop over tiles, and a forward pass.
+
+    Shared memory has these matrices of float16, whose rows have `stride_of` numbers:
+
+        weights0, weights1, ...  (inputs, width) of each hidden layer; inputs in whole tiles of 16
+        head                     (width, 16), zero beyond the outputs
+        layer0                   (rows of a tile, observations in whole tiles of 16), normalised
+        layer1, layer2, ...      (rows, width), activations; without a backward pass only layer1
+
+    and of float32 the biases of each layer (width), the observations' mean and scale, and the
+    outputs (rows of a tile, MOST_OUTPUTS + 1).
+    """
 
     def __init__(
-        self, name: str, arrays: int, tiling: Tiling, batch: Minibatch, tiles: int
+        self, sizes: Mapping[str, int], others: int, tiling: Tiling, batch: Minibatch, tiles: int
     ) -> None:
         """Prepare to write.
 
         Args:
-          name: the name of the kernel.
-          arrays: the number of its arrays.
+          sizes: the numbers of a policy's row of each array.
+          others: the number of arrays behind these.
           tiling: the division of the work.
           batch: the minibatch.
-          tiles: the number of tiles of the minibatch.
+          tiles: the number of tiles of all data.
         """
+        super().__init__(sizes, others, tiling.threads, tiling.layout["size"])
         self.tiling, self.shape, self.batch, self.tiles = tiling, tiling.shape, batch, tiles
         self.stride = self.shape.width + PAD
         self.first = padded(self.shape.observations)
-        self.ir = GpuWriter(name, arrays)
-
-    def write(self) -> str:
-        """Return the kernel as a module of LLVM IR."""
-        raise NotImplementedError
 
     def bytes_of(self, name: str) -> int:
         """Return the byte of shared memory where an array begins."""
         return self.tiling.layout[name]
 
-    def source(self, layer: int) -> tuple[str, int]:
-        """Return the name and the row stride of a layer's activations; 0: the observations."""
-        if layer == 0:
-            return "layer0", self.first + PAD
-        return f"layer{layer if self.tiling.is_gradient else 1}", self.stride
+    def read(self, name: str, place: Value, offset: int = 0) -> Value:
+        """Return a number of an array of float32 in shared memory."""
+        return self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).load()
 
-    def argument(self, index: int, seed: Value, size: int) -> Value:
-        """Return the array of a seed."""
-        return self.ir.row(self.ir.parameters[index], seed, size)
+    def write(self, name: str, place: Value, value: Value, offset: int = 0) -> None:
+        """Write a number of an array of float32 in shared memory."""
+        self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).store(value)
 
-    def minibatch(self, array: Value) -> Value:
-        """Return which minibatch to compute."""
-        return array.load("u32")
+    def layer(self, number: int) -> str:
+        """Return the name of a layer's activations; 0: the observations."""
+        return f"layer{number if self.tiling.is_gradient else min(number, 1)}"
 
-    def load_terms(self, array: Value) -> LossTerms:
-        """Return the coefficients of the loss."""
-        count = len(LossTerms._fields)
-        return LossTerms(*(array[i] for i in range(count)))
+    def stride_of(self, name: str) -> int:
+        """Return the float16 numbers from row to row of a matrix."""
+        special = {"layer0": self.first + PAD, "head": TILE + PAD, "errors": TILE + PAD}
+        return special.get(name, self.stride)
+
+    def load_terms(self) -> None:
+        """Load the coefficients of the loss."""
+        self.terms = LossTerms(*(self.arrays["terms"][i] for i in range(len(LossTerms._fields))))
 
     def share(self, total: int, groups: int, group: Value) -> Value:
         """Return the first of a group's tiles; the last group's may overlap the one before."""
@@ -88,17 +100,37 @@ class NetworkKernel:
             self.column + self.sum_column
         ) * 2
 
-    def lanes(
+    def operand(
         self,
+        side: Literal["left", "right"],
         name: str,
-        stride: int,
-        pattern: tuple[Value, Value],
+        sums: Literal["rows", "columns"],
         row: Value | int = 0,
         column: Value | int = 0,
-    ) -> Value:
-        """Return the lane's pointer into a matrix of float16, from a row and a column on."""
-        place = (pattern[0] + row) * (2 * stride) + (pattern[1] + column) * 2
-        return self.ir.shared(place, self.bytes_of(name))
+    ) -> Operand:
+        """Return a matrix in shared memory as an operand of a product.
+
+        Args:
+          side: on which side of the product it stands.
+          name: its name.
+          sums: what the product sums over: the columns of a left matrix, the rows of a right one,
+            or else those of its transpose.
+          row: the first row in memory.
+          column: the first column in memory.
+        """
+        ir, stride, by_rows = self.ir, self.stride_of(name), sums == "rows"
+        # The row of 8 numbers at which the lane points `ldmatrix`, in bytes.
+        first = self.row_first if (side == "left") != by_rows else self.column_first
+        place = (first[0] + row) * (2 * stride) + (first[1] + column) * 2
+        pointer = ir.shared(place, self.bytes_of(name))
+
+        # A step of the sum, like a tile of the result, is 16 rows of 2 * stride bytes, or 16
+        # columns of 2 bytes.
+        def fragments(tile: int, step: int) -> list[Value]:
+            down, right = (step, tile) if by_rows else (tile, step)
+            return ir.matrices(pointer, 32 * (down * stride + right), transposed=by_rows)
+
+        return fragments
 
     def each(self, count: int) -> list[Value]:
         """Return the thread's share of the numbers below a count; surplus ones repeat the last."""
@@ -109,39 +141,41 @@ class NetworkKernel:
             numbers.append(self.ir.minimum(self.thread + threads * full, count - 1))
         return numbers
 
-    def load_network(self, params: Value, outputs: Value, mean: Value, scale: Value) -> None:
-        """Copy a network and the observations' statistics to shared memory."""
-        ir, shape, width = self.ir, self.shape, self.shape.width
-        offset = 0
-        for layer, inputs in enumerate(shape.inputs[:-1]):
-            places = self.each(padded(inputs) * width // 2)
-            for start in range(0, len(places), 8):
-                self._load_weights(params, offset, layer, places[start : start + 8])
-            offset += inputs * width
+    def load_network(self, params: Value, outputs: Value) -> None:
+        """Copy a network and the observations' statistics to shared memory.
+
+        Args:
+          params: the address of the network's parameters.
+          outputs: the number of its outputs.
+        """
+        shape, width = self.shape, self.shape.width
+        self.params = params
+        # The hidden layers, eight pairs of weights of a thread at a time.
+        for layer, inputs, start in shape.hidden_layers:
+            pairs = self.each(padded(inputs) * width // 2)
+            for first in range(0, len(pairs), 8):
+                self._load_weights(params, start, layer, pairs[first : first + 8])
             for i in self.each(width):
-                bias = params[i + offset]
-                ir.shared(i * 4, self.bytes_of(f"biases{layer}")).store(bias)
-            offset += width
-        # The columns beyond the outputs are zero.
+                self.write(f"biases{layer}", i, params[i + (start + inputs * width)])
+        # The last layer; its columns beyond the outputs are zero.
         for i in self.each(width * TILE // 2):
             row, column = i // (TILE // 2), i % (TILE // 2) * 2
             pair = [
-                self._within(params, row * outputs + offset, column + j, outputs) for j in (0, 1)
+                self._within(params, row * outputs + shape.hidden, column + j, outputs)
+                for j in (0, 1)
             ]
-            place = row * (2 * (TILE + PAD)) + column * 2
-            packed = ir.pack(*pair)
-            ir.shared(place, self.bytes_of("head")).store(packed)
-        head_biases = outputs * width + offset
+            self._store_pair("head", row, column, pair)
+        head_biases = outputs * width + shape.hidden
         for i in self.each(MOST_OUTPUTS):
-            bias = self._within(params, head_biases, i, outputs)
-            ir.shared(i * 4, self.bytes_of("head_biases")).store(bias)
-        for name, array in (("mean", mean), ("scale", scale)):
+            self.write("head_biases", i, self._within(params, head_biases, i, outputs))
+        for name in ("mean", "scale"):
             for i in self.each(self.first):
-                value = self._within(array, None, i, shape.observations)
-                ir.shared(i * 4, self.bytes_of(name)).store(value)
+                self.write(name, i, self._within(self.arrays[name], None, i, shape.observations))
 
     def _load_weights(self, params: Value, offset: int, layer: int, places: list[Value]) -> None:
+        """Copy the thread's pairs of a hidden layer's weights, with zeros beyond its inputs."""
         ir, width, inputs = self.ir, self.shape.width, self.shape.inputs[layer]
+        # Fetch all pairs before the first one is stored, so that the thread waits only once.
         pairs = []
         for i in places:
             row, column = i // (width // 2), i % (width // 2) * 2
@@ -160,71 +194,61 @@ class NetworkKernel:
         value = array[kept if start is None else start + kept]
         return self.ir.select(index < count, value, 0.0)
 
-    def load_observations(self, starts: Callable[[Value], Value]) -> Callable[[], None]:
-        """Fetch a tile's observations, and return a function that normalises them into layer 0.
+    def load_observations(self, starts: Callable[[Value], Value]) -> None:
+        """Fetch a tile's observations, and normalise them into layer 0.
 
         Args:
           starts: a function from a row of the tile to the pointer to its observation.
         """
         ir, count = self.ir, self.shape.observations
+        # Fetch all pairs of the thread before the first one is stored.
         fetched = []
         for i in self.each(self.tiling.rows * self.first // 2):
             row, column = i // (self.first // 2), i % (self.first // 2) * 2
             start = starts(row)
             pair = [start[ir.minimum(column + j, count - 1)] for j in (0, 1)]
             fetched.append((row, column, pair))
+        # (observation - mean) / std, with 1 / std as `scale`.
+        for row, column, pair in fetched:
+            mean, scale = ([self.read(x, column, j) for j in (0, 1)] for x in ("mean", "scale"))
+            normalized = [(pair[j] - mean[j]) * scale[j] for j in (0, 1)]
+            self._store_pair("layer0", row, column, normalized)
 
-        def store() -> None:
-            for row, column, pair in fetched:
-                mean, scale = (
-                    [ir.shared(column * 4, self.bytes_of(name) + 4 * j).load() for j in (0, 1)]
-                    for name in ("mean", "scale")
-                )
-                normalized = [(pair[j] - mean[j]) * scale[j] for j in (0, 1)]
-                place = row * (2 * (self.first + PAD)) + column * 2
-                packed = ir.pack(*normalized)
-                ir.shared(place, self.bytes_of("layer0")).store(packed)
-
-        return store
+    def _store_pair(self, name: str, row: Value, column: Value, pair: list[Value]) -> None:
+        """Store two neighbouring numbers of a matrix of float16."""
+        place = row * (2 * self.stride_of(name)) + column * 2
+        packed = self.ir.pack(*pair)
+        self.ir.shared(place, self.bytes_of(name)).store(packed)
 
     def synchronize_rows(self) -> None:
         """Wait for the warps that compute the same rows."""
         self.ir.synchronize_group(self.row_group, LANES * self.tiling.column_groups)
 
     def forward(self) -> Sums:
-        """Write the forward pass of a tile, and return the outputs' sums."""
-        ir, tiling, steps = self.ir, self.tiling, self.first // TILE
-        for layer in range(self.shape.layers):
-            name, stride = self.source(layer)
-            left = self.lanes(name, stride, self.row_first, self.row)
-            right = self.lanes(f"weights{layer}", self.stride, self.row_first, 0, self.column)
-            biases = ir.shared((self.column + self.sum_column) * 4, self.bytes_of(f"biases{layer}"))
-            sums = ir.product(
-                self._biases(biases, tiling.row_tiles, 2 * self.pairs),
-                steps,
-                lambda row, k, at=left, by=stride: ir.matrices(
-                    at, 32 * row * by + 32 * k, transposed=False
-                ),
-                lambda pair, k, at=right: ir.matrices(
-                    at, 32 * k * self.stride + 32 * pair, transposed=True
-                ),
-            )
-            if layer and not self.tiling.is_gradient:
-                # The activations replace those of the layer before.
+        """Write the forward pass of a tile, and return the outputs' sums.
+
+        Each warp computes `row_tiles` x `pairs` tiles of 16 x 16 of every layer.
+        """
+        ir, shape, tiling, steps = self.ir, self.shape, self.tiling, self.first // TILE
+        for layer in range(shape.layers):
+            # The activations before the layer times its weights, added to its biases.
+            left = self.operand("left", self.layer(layer), "columns", self.row)
+            right = self.operand("right", f"weights{layer}", "rows", 0, self.column)
+            column = (self.column + self.sum_column) * 4
+            biases = self._biases(column, f"biases{layer}", 2 * self.pairs)
+            sums = ir.product(biases, steps, left, right)
+            if layer and not tiling.is_gradient:
+                # The activations replace those of the layer before, which the other warps of these
+                # rows have read by then.
                 self.synchronize_rows()
             self._activate(sums, layer + 1)
+            # The next layer reads the columns of the other warps of these rows.
             self.synchronize_rows()
-            steps = self.shape.width // TILE
-        name, stride = self.source(self.shape.layers)
-        left = self.lanes(name, stride, self.row_first, self.row)
-        right = self.lanes("head", TILE + PAD, self.row_first)
-        biases = ir.shared(self.sum_column * 4, self.bytes_of("head_biases"))
-        return ir.product(
-            self._biases(biases, tiling.row_tiles, 1),
-            steps,
-            lambda row, k: ir.matrices(left, 32 * row * self.stride + 32 * k, transposed=False),
-            lambda _, k: ir.matrices(right, 32 * k * (TILE + PAD), transposed=True),
-        )
+            steps = shape.width // TILE
+        left = self.operand("left", self.layer(shape.layers), "columns", self.row)
+        right = self.operand("right", "head", "rows")
+        biases = self._biases(self.sum_column * 4, "head_biases", 1)
+        return ir.product(biases, steps, left, right)
 
     def store_outputs(self, sums: Sums) -> None:
         """Store the outputs of the network in shared memory, a row for each sample."""
@@ -241,23 +265,25 @@ class NetworkKernel:
         place = self.ir.shared(row * OUTPUT_BYTES, self.bytes_of("outputs"))
         return [self.ir.moved(place, 4 * i).load() for i in range(count)]
 
-    def deviations(self, params: Value) -> list[Value]:
+    def deviations(self) -> list[Value]:
         """Return the standard deviations that are parameters of the policy, or any numbers."""
         count = self.shape.actions
         if not self.shape.deviations:
             return [self.ir.constant(0.0)] * count
         place = self.shape.policy_size - len(POLICY_METRICS) - count
-        return [params[place + i] for i in range(count)]
+        return [self.params[place + i] for i in range(count)]
 
-    def _biases(self, pointer: Value, row_tiles: int, columns: int) -> Sums:
-        ir = self.ir
+    def _biases(self, place: Value, name: str, columns: int) -> Sums:
+        """Return the sums with which a layer's product begins: a bias for each column."""
+        ir, pointer = self.ir, self.ir.shared(place, self.bytes_of(name))
         pairs = [[ir.moved(pointer, 32 * n + 4 * j).load() for j in (0, 1)] for n in range(columns)]
-        return [[[*pair, *pair] for pair in pairs] for _ in range(row_tiles)]
+        # A lane's four sums are in two rows of the same two columns.
+        return [[[*pair, *pair] for pair in pairs] for _ in range(self.tiling.row_tiles)]
 
     def _activate(self, sums: Sums, layer: int) -> None:
         """Store the activations of a layer and, if they do not tell it, the slopes."""
         ir = self.ir
-        pointer = ir.shared(self.place, self.bytes_of(self.source(layer)[0]))
+        pointer = ir.shared(self.place, self.bytes_of(self.layer(layer)))
         for offset, low, high in self.halves(sums):
             pair = [_activated(ir, self.shape.activation, z) for z in (low, high)]
             values = ir.pack(pair[0][0], pair[1][0])
@@ -275,10 +301,6 @@ class NetworkKernel:
             for n, four in enumerate(row)
             for half in (0, 1)
         ]
-
-    def module(self) -> str:
-        """Return the module of the kernel."""
-        return self.ir.module(self.tiling.threads)
 
     def next_tile(self, loop: Repeat, tile: Value, *carried: Value) -> None:
         """End an iteration of the loop over a block's tiles, which carries some values."""

@@ -1,0 +1,80 @@
+"""Write the kernel that draws the actions of all environments on GPUs.
+
+A block loops over tiles of environments: it runs the policy network as the kernels of the update
+do, and then each thread draws the action of one environment.
+"""
+
+from jetbot_mjx.agents.fused import sample_loss
+from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
+from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
+from jetbot_mjx.agents.fused.gpu_tiling import Tiling
+from jetbot_mjx.agents.fused.shapes import Minibatch
+from jetbot_mjx.agents.fused.tensor_core import Value
+
+
+class ActionKernel(NetworkKernel):
+    """An `ActionKernel` takes and returns the arrays of `arrays.ACTIONS`."""
+
+    name = "ppo_actions"
+
+    def __init__(self, tiling: Tiling, environments: int) -> None:
+        """Prepare to write.
+
+        Args:
+          tiling: the division of the work.
+          environments: the number of environments of a policy.
+        """
+        batch = Minibatch(environments=environments)
+        sizes = ACTIONS.counts(tiling.shape, batch)
+        super().__init__(sizes, 0, tiling, batch, -(-environments // tiling.rows))
+
+    def text(self) -> str:
+        """Return the module."""
+        ir, shape = self.ir, self.shape
+        self.prepare()
+        self.find_arrays(ir.register("ctaid.z"))
+        # Load the network once, and then take the tiles through it.
+        self.load_network(self.arrays["params"], ir.constant(shape.outputs[0], "u32"))
+        ir.synchronize()
+        with ir.repeat(self.block) as loop:
+            (tile,) = loop.carried
+            self._tile(tile)
+            self.next_tile(loop, tile)
+        return ir.module(self.threads)
+
+    def _environment(self, tile: Value, row: Value) -> Value:
+        """Return the environment of a row of a tile, or the last one if there is none."""
+        return self.ir.minimum(tile * self.tiling.rows + row, self.batch.environments - 1)
+
+    def _tile(self, tile: Value) -> None:
+        ir, shape, rows = self.ir, self.shape, self.tiling.rows
+        # Fetch the noise before the threads wait for each other.
+        own = ir.minimum(self.thread, rows - 1)
+        drawn = ir.row(self.arrays["action_noise"], self._environment(tile, own), shape.actions)
+        noise = [drawn[i] for i in range(shape.actions)]
+        observations, size = self.arrays["observations"], shape.observations
+        self.load_observations(lambda row: ir.row(observations, self._environment(tile, row), size))
+        # All observations are there before a warp reads rows that others have loaded, and all
+        # outputs before a thread reads a row that several warps have computed.
+        ir.synchronize()
+        self.store_outputs(self.forward())
+        ir.synchronize()
+        # The next tile writes outputs only after all threads have reached its first barrier.
+        beyond = ir.constant(self.batch.environments, "u32")
+        environment = tile * rows + self.thread
+        with ir.when(ir.select(self.thread < rows, environment, beyond) < beyond):
+            self._draw(environment, noise)
+
+    def _draw(self, environment: Value, noise: list[Value]) -> None:
+        """Draw the action of the thread's environment, and store it."""
+        ir, shape = self.ir, self.shape
+        # Run the program of a sample.
+        outputs = self.outputs_of(self.thread, shape.outputs[0])
+        sample = [*outputs, *self.deviations(), *noise]
+        results = iter(ir.run(sample_loss.action_program(shape, for_gpu=True), sample))
+        # Store its results, which follow each other in the order of the arrays.
+        for name in Actions._fields:
+            size = self.sizes[name] // self.batch.environments
+            row = ir.row(self.arrays[name], environment, size)
+            for i in range(size):
+                row[i] = next(results)
