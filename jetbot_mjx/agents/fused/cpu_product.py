@@ -77,10 +77,10 @@ _PARAMETERS = (
 
 
 def _product_function(columns: int, lanes: int) -> LlvmWriter:
-    """Write the function that divides a product into tiles.
+    """Write the function that divides a product into register tiles.
 
     Args:
-      columns: the number of vectors in a row of a tile.
+      columns: the number of vectors in a row of a register tile.
       lanes: the number of float32 values in a vector.
     """
     sizes = "u64 rows", "u64 columns", "u64 length", "i1 adds"
@@ -92,7 +92,7 @@ def _product_function(columns: int, lanes: int) -> LlvmWriter:
         places = left, a_row, a_column, b + column, b_row, result, c_row
         w.call(_tile_name(height, vectors), *places, length, adds)
 
-    # Go down through all rows, first by whole tiles and then one by one.
+    # Go down through all rows, first by whole register tiles and then one by one.
     def down(vectors: int, column: Value) -> None:
         # The columns of the right matrix stay in the cache while all rows pass.
         blocks = rows // ROWS
@@ -102,7 +102,7 @@ def _product_function(columns: int, lanes: int) -> LlvmWriter:
         with w.loop(rows - first) as i:
             tile(1, vectors, first + i, column)
 
-    # Take tiles of full width, and then tiles of one vector.
+    # Take register tiles of full width, and then those of one vector.
     wide = columns * lanes
     blocks = width // wide
     with w.loop(blocks) as i:
@@ -118,7 +118,7 @@ def _tile_name(rows: int, columns: int) -> str:
 
 
 def _tile_function(rows: int, columns: int, lanes: int) -> LlvmWriter:
-    """Write the function that computes a tile of some rows and some vectors in each of them."""
+    """Write the function that computes a register tile: rows of some vectors each."""
     name = _tile_name(rows, columns)
     w = LlvmWriter(name, *_PARAMETERS, "u64 length", "i1 adds", lanes=lanes)
     a, a_row, a_column, b, b_row, c, c_row, length, adds = w.parameters
@@ -138,7 +138,7 @@ def _tile_function(rows: int, columns: int, lanes: int) -> LlvmWriter:
             sums += [w.intrinsic("fmuladd", factor, x, next(before)) for x in right]
         following = step + 1, column + a_column, row + b_row
         loop.again(following[0] < length, *following, *sums)
-    # Store the tile, whose sums have stayed in registers.
+    # Store the register tile.
     for place, total in zip(places, sums, strict=True):
         place.store(total)
     return w

@@ -46,8 +46,8 @@ class AdvantageKernel(NetworkKernel):
         policy = ir.register("ctaid.z")
         self.find_arrays(policy)
         # Each block has sums of its own.
-        part = policy * self.blocks + self.block
-        self.statistics = ir.row(ir.parameters[-1], part, 2)
+        place = policy * self.blocks + self.block
+        self.statistics = ir.row(ir.parameters[-1], place, 2)
         index = self.arrays["index"].load("u32")
         self.unrolls = ir.row(self.arrays["unrolls"], index, self.batch.unrolls)
         self.load_terms()

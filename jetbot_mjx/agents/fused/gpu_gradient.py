@@ -46,19 +46,19 @@ class GradientKernel(NetworkKernel):
 
     name = "ppo_gradient"
 
-    def __init__(self, tiling: Tiling, batch: Minibatch, parts: int) -> None:
+    def __init__(self, tiling: Tiling, batch: Minibatch, advantage_blocks: int) -> None:
         """Prepare to write.
 
         Args:
           tiling: the division of the work.
           batch: the minibatch.
-          parts: the number of blocks of the kernel of the advantages.
+          advantage_blocks: the number of blocks of the kernel of the advantages.
         """
-        sizes = GRADIENT.counts(tiling.shape, batch) | {"statistics": 2 * parts}
+        sizes = GRADIENT.counts(tiling.shape, batch) | {"statistics": 2 * advantage_blocks}
         sizes |= {"advantages": batch.samples, "targets": batch.samples}
         sizes = {name: sizes[name] for name in ARGUMENTS}
         super().__init__(sizes, 1, tiling, batch, -(-batch.samples // tiling.rows))
-        self.parts = parts
+        self.advantage_blocks = advantage_blocks
         self.width, self.shares = self.shape.width, shares_of(self.shape)
         self.error_scale = batch.samples * _MEAN_SCALE
 
@@ -105,10 +105,9 @@ class GradientKernel(NetworkKernel):
         self.unrolls = ir.row(self.arrays["unrolls"], index, batch.unrolls)
         self.noise = ir.row(self.arrays["noise"], index, noise)
         # Each block writes a gradient of its own, of one of the networks.
-        part = policy * self.blocks + self.block
+        place = policy * self.blocks + self.block
         start = self.network * shape.policy_size
-        parts = ir.row(ir.parameters[-1], part, shape.size)
-        self.part = parts + start
+        self.vector = ir.row(ir.parameters[-1], place, shape.size) + start
         params = self.arrays["params"] + start
         self.load_terms()
         self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
@@ -129,10 +128,11 @@ class GradientKernel(NetworkKernel):
         with ir.when(self.thread < LANES):
             for i in range(2):
                 total = ir.constant(0.0)
-                for j in range(0, self.parts, LANES):
-                    part = self.thread + j
-                    value = self.arrays["statistics"][ir.minimum(part, self.parts - 1) * 2 + i]
-                    total += ir.select(part < self.parts, value, 0.0)
+                for j in range(0, self.advantage_blocks, LANES):
+                    block = self.thread + j
+                    kept = ir.minimum(block, self.advantage_blocks - 1)
+                    value = self.arrays["statistics"][kept * 2 + i]
+                    total += ir.select(block < self.advantage_blocks, value, 0.0)
                 self.write("statistics", self.thread, total, LANES * i)
         ir.synchronize()
         with ir.when(self.thread < 1):
@@ -312,7 +312,7 @@ class GradientKernel(NetworkKernel):
 
     def _put_sum(self, value: Value, place: Value) -> None:
         """Store a sum of products with errors."""
-        self.part[place] = value * (1 / self.error_scale)
+        self.vector[place] = value * (1 / self.error_scale)
 
     def _store_gradient(self) -> None:
         """Store the block's sums."""
@@ -356,7 +356,7 @@ class GradientKernel(NetworkKernel):
         with ir.when(self.thread < count):
             first = ir.shared(self.thread * (4 * (self.tiling.rows + 1)), self.bytes_of("slots"))
             total = ir.total(ir.moved(first, 4 * i).load() for i in range(self.tiling.rows))
-            self.part[self.outputs * self.width + self.thread + offset] = total
+            self.vector[self.outputs * self.width + self.thread + offset] = total
 
 
 def _slope(ir: GpuWriter, activation: str, value: Value, factor: Value) -> Value:

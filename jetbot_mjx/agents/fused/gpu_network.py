@@ -88,7 +88,7 @@ class NetworkKernel(GpuKernel):
         self.row_first = (lane % 16, lane // 16 * 8)
         self.column_first = (lane // 16 * 8 + lane % 8, lane // 8 % 2 * 8)
         self.sum_row, self.sum_column = lane // 4, lane % 4 * 2
-        # The part of a layer's product that this warp computes.
+        # The share of a layer's product that this warp computes.
         self.row_group = self.warp // tiling.column_groups
         self.row = self.row_group * (TILE * tiling.row_tiles)
         pairs = self.shape.width // TILE

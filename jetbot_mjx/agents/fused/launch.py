@@ -1,4 +1,4 @@
-"""Run the kernels of PPO as JAX functions, which `jax.vmap` batches over seeds.
+"""Run the kernels of PPO as JAX functions, which `jax.vmap` batches over policies.
 
 Their arguments are arrays of `arrays`, in the order of each kernel's signature there.
 """

@@ -129,13 +129,14 @@ def _gradient_kernels(
     tiling = gpu_tiling.advantage_tiling(shape, batch, most, _shared_memory())
     assert tiling is not None
     first = AdvantageKernel(tiling, batch)
-    parts = min(most, first.tiles)
+    advantage_blocks = min(most, first.tiles)
     # Gradient: half of the blocks compute the policy's gradient, and half the values'.
     tiling = gpu_tiling.gradient_tiling(shape, _shared_memory())
     assert tiling is not None
-    second = GradientKernel(tiling, batch, parts)
+    second = GradientKernel(tiling, batch, advantage_blocks)
     blocks = max(1, min(most // 2, second.tiles))
-    return _begin(first, parts, policies), _begin(second, blocks, policies, networks=2)
+    first_launch = _begin(first, advantage_blocks, policies)
+    return first_launch, _begin(second, blocks, policies, networks=2)
 
 
 @functools.cache
