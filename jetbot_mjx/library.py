@@ -9,7 +9,7 @@ import contextlib
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Unpack, overload
 
 from jetbot_mjx import evaluation, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
@@ -78,27 +78,14 @@ def train(
 
 @overload
 def evaluate(
-    runs: str | Path,
-    *,
-    which: "Which" = ...,
-    episodes: int = ...,
-    output: str | Path | None = ...,
-    robustness: bool = ...,
-    ranges: str | Path | None = ...,
-    simulator: "evaluation.Simulator | None" = ...,
-    verbose: bool = ...,
+    runs: str | Path, *, verbose: bool = ..., **options: "Unpack[evaluation.ReportOptions]"
 ) -> "evaluation.Report": ...
 @overload
 def evaluate(
     runs: Sequence[str | Path],
     *,
-    which: "Which" = ...,
-    episodes: int = ...,
-    output: str | Path | None = ...,
-    robustness: bool = ...,
-    ranges: str | Path | None = ...,
-    simulator: "evaluation.Simulator | None" = ...,
     verbose: bool = ...,
+    **options: "Unpack[evaluation.ReportOptions]",
 ) -> "evaluation.Comparison": ...
 def evaluate(
     runs: str | Path | Sequence[str | Path],
@@ -134,7 +121,7 @@ def evaluate(
       UserError: a run or argument is wrong, the runs cannot be compared, or a folder cannot be
         written.
     """
-    options: dict[str, Any] = {
+    options: evaluation.ReportOptions = {
         "which": which,
         "episodes": episodes,
         "output": output,
@@ -214,7 +201,7 @@ def tune(
     config: str | Path | Config,
     overrides: Overrides = (),
     *,
-    space: str | Path | Mapping[str, Any],
+    space: str | Path | Mapping[str, object],
     trials: int = 64,
     round_size: int = 16,
     confirm: int = 3,

@@ -1,12 +1,11 @@
 """The batched MJX environment with NumPy arrays in and out, for trainers written in Python."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions
 from jetbot_mjx.adapters.renderer import Pose
@@ -20,7 +19,19 @@ Observations = Float[np.ndarray, "n obs"] | UInt8[np.ndarray, "n h w c"] | dict[
 Rewards = Float[np.ndarray, " n"]
 Flags = Bool[np.ndarray, " n"]
 
+_Part = TypeVar("_Part")
+
 _MOST_ENVS = 2**24
+
+
+class _Results(NamedTuple):
+    """The results of a step on the device, in few arrays."""
+
+    obs: PyTree
+    reward: Float[Array, " n"]
+    flags: Bool[Array, "4 n"]
+    """Where an episode was terminated, truncated, successful, or not finite."""
+    final_obs: PyTree
 
 
 class Steps(NamedTuple):
@@ -42,9 +53,9 @@ class Steps(NamedTuple):
         return self.terminated | self.truncated
 
 
-def unwrap_single(parts: Any) -> Any:
+def unwrap_single(parts: _Part | dict[str, _Part]) -> _Part | dict[str, _Part]:
     """Return the only part of an observation, or the observation if it is none of several parts."""
-    if isinstance(parts, Mapping) and len(parts) == 1:
+    if isinstance(parts, dict) and len(parts) == 1:
         return next(iter(parts.values()))
     return parts
 
@@ -76,21 +87,21 @@ class BatchedEnv:
         self._reset_keys = ResetKeys(seed, self.num_envs)
         self.env = make_env(config)
         length = config.task.episode_length
-        wrapped: Any = wrap_for_training(self.env, length, final_images=True)
+        wrapped = wrap_for_training(self.env, length, final_images=True)
         options = compiler_options(config.deterministic)
 
-        def step(state: State, actions: jax.Array) -> tuple[State, tuple[Any, ...]]:
+        def step(state: State, actions: jax.Array) -> tuple[State, _Results]:
             state = wrapped.step(state, actions)
             info, metrics = state.info, state.metrics
             flags = (info["terminated"], info["truncation"], metrics["success"])
             flags = jnp.stack([*flags, metrics["nonfinite_envs"]]) > 0
             obs, final_obs = unwrap_single(state.obs), unwrap_single(info["final_obs"])
-            return state, (obs, state.reward, flags, final_obs)
+            return state, _Results(obs, state.reward, flags, final_obs)
 
         self._reset = jax.jit(wrapped.reset, compiler_options=options)
         self._step = jax.jit(step, compiler_options=options)
         self._state: State | None = None
-        self._results: tuple[Any, ...] | None = None
+        self._results: _Results | None = None
 
     def reset(self, seed: Seed = None) -> Observations:
         """Begin an episode in every environment.

@@ -11,8 +11,8 @@ import os
 import subprocess
 import sys
 import weakref
-from collections.abc import Iterable
-from typing import Any
+from collections.abc import Callable, Iterable
+from typing import Protocol
 
 import mujoco
 import numpy as np
@@ -38,6 +38,14 @@ _REMEDY_LINUX = (
     " libosmesa6 (Debian and Ubuntu: apt-get install libegl1 libegl-mesa0)"
 )
 _REMEDY_ELSEWHERE = "run it in a session with a display, where GLFW can open a window"
+
+
+class _GLContext(Protocol):
+    """An OpenGL context of one of MuJoCo's back ends."""
+
+    def make_current(self) -> None: ...
+
+    def free(self) -> None: ...
 
 
 class SceneRenderer:
@@ -138,7 +146,7 @@ def _end_at_exit() -> None:
     atexit.register(lambda: [renderer.end() for renderer in list(_open)])
 
 
-def context_class() -> Any:
+def context_class() -> Callable[[int, int], _GLContext]:
     """Return the class of OpenGL contexts of the back end that works.
 
     Raises:

@@ -38,7 +38,7 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import jax
 import numpy as np
@@ -79,7 +79,7 @@ class _Typed(Protocol):
     def shape(self) -> Sequence[int]: ...
 
     @property
-    def dtype(self) -> Any: ...
+    def dtype(self) -> object: ...
 
 
 class CheckpointError(UserError):
@@ -364,7 +364,7 @@ def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
 
 
-def flatten(tree: PyTree) -> dict[str, Any]:
+def flatten(tree: PyTree) -> dict[str, PyTree]:
     """Return the leaves of a tree by their path, such as `params.policy.hidden_0.bias`."""
     return {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
@@ -505,5 +505,5 @@ def _reason(error: Exception) -> str:
 def _describe(array: _Typed | None) -> str:
     if array is None:
         return "missing"
-    dtype = getattr(array.dtype, "numpy_dtype", array.dtype)
-    return f"{np.dtype(dtype)}{list(array.shape)}"
+    dtype = getattr(array.dtype, "numpy_dtype", None)
+    return f"{dtype or array.dtype}{list(array.shape)}"
