@@ -6,6 +6,7 @@ settings as they are. They work in a notebook and in any thread.
 """
 
 import contextlib
+import functools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -251,17 +252,8 @@ def tune(
             round_size=round_size,
             confirm=confirm,
             storage=storage,
-            say=_print_at_once if verbose else _print_nothing,
+            say=functools.partial(print, flush=True) if verbose else lambda text: None,
         )
-
-
-def _print_at_once(text: str) -> None:
-    """Print a line on standard output without waiting for more."""
-    print(text, file=sys.stdout, flush=True)
-
-
-def _print_nothing(text: str) -> None:
-    """Print nothing."""
 
 
 def _name(config: str | Path | Config) -> Path:

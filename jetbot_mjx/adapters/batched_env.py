@@ -1,11 +1,12 @@
 """The batched MJX environment with NumPy arrays in and out, for trainers written in Python."""
 
+import operator
 from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree, UInt8
+from jaxtyping import Bool, Float, PyTree, UInt8
 
 from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions
 from jetbot_mjx.adapters.renderer import Pose
@@ -24,16 +25,6 @@ _Part = TypeVar("_Part")
 _MOST_ENVS = 2**24
 
 
-class _Results(NamedTuple):
-    """The results of a step on the device, in few arrays."""
-
-    obs: PyTree
-    reward: Float[Array, " n"]
-    flags: Bool[Array, "4 n"]
-    """Where an episode was terminated, truncated, successful, or not finite."""
-    final_obs: PyTree
-
-
 class Steps(NamedTuple):
     """One step of every environment. Where an episode ended, `obs` is the next one's first."""
 
@@ -47,6 +38,10 @@ class Steps(NamedTuple):
     final_obs: Observations
     """The observation after the step, before any reset; without a reset it equals `obs`."""
 
+    def final_obs_of(self, index: np.intp) -> PyTree:
+        """Return the observation of one robot after the step, before any reset."""
+        return jax.tree.map(operator.itemgetter(index), self.final_obs)
+
     @property
     def done(self) -> Flags:
         """Return where an episode ended."""
@@ -58,13 +53,6 @@ def unwrap_single(parts: _Part | dict[str, _Part]) -> _Part | dict[str, _Part]:
     if isinstance(parts, dict) and len(parts) == 1:
         return next(iter(parts.values()))
     return parts
-
-
-def observation_at(obs: Observations, index: int | np.intp) -> np.ndarray | dict[str, np.ndarray]:
-    """Return the observation of one robot."""
-    if isinstance(obs, dict):
-        return {name: part[index] for name, part in obs.items()}
-    return obs[index]
 
 
 class BatchedEnv:
@@ -90,18 +78,18 @@ class BatchedEnv:
         wrapped = wrap_for_training(self.env, length, final_images=True)
         options = compiler_options(config.deterministic)
 
-        def step(state: State, actions: jax.Array) -> tuple[State, _Results]:
+        def step(state: State, actions: jax.Array) -> tuple[State, tuple[PyTree, ...]]:
             state = wrapped.step(state, actions)
             info, metrics = state.info, state.metrics
             flags = (info["terminated"], info["truncation"], metrics["success"])
             flags = jnp.stack([*flags, metrics["nonfinite_envs"]]) > 0
             obs, final_obs = unwrap_single(state.obs), unwrap_single(info["final_obs"])
-            return state, _Results(obs, state.reward, flags, final_obs)
+            return state, (obs, state.reward, flags, final_obs)
 
         self._reset = jax.jit(wrapped.reset, compiler_options=options)
         self._step = jax.jit(step, compiler_options=options)
         self._state: State | None = None
-        self._results: _Results | None = None
+        self._results: tuple[PyTree, ...] | None = None
 
     def reset(self, seed: Seed = None) -> Observations:
         """Begin an episode in every environment.

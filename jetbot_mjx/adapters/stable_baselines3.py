@@ -1,4 +1,4 @@
-"""Several robots as a `VecEnv` of Stable-Baselines3, over the batched MJX environment."""
+"""Any number of robots as a `VecEnv` of Stable-Baselines3, over the batched MJX environment."""
 
 from collections.abc import Iterable, Sequence
 
@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.base import BatchAdapter, ObservationSpace, spaces
-from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards, observation_at
+from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards
 from jetbot_mjx.envs import JetBotEnv
 from jetbot_mjx.errors import UserError, requires_extra
 
@@ -68,7 +68,7 @@ class JetBotVecEnv(BatchAdapter, VecEnv):
         infos: list[dict[str, object]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(done):
             infos[index] = {
-                "terminal_observation": observation_at(steps.final_obs, index),
+                "terminal_observation": steps.final_obs_of(index),
                 "TimeLimit.truncated": bool(steps.truncated[index]),
                 "is_success": bool(steps.success[index]),
             }

@@ -1,11 +1,11 @@
-"""Several robots as a `gymnasium.vector.VectorEnv`, over the batched MJX environment."""
+"""Any number of robots as a `gymnasium.vector.VectorEnv`, over the batched MJX environment."""
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Seed
 from jetbot_mjx.adapters.base import BatchAdapter, ObservationSpace
-from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards, observation_at
+from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.errors import requires_extra
 
@@ -78,7 +78,7 @@ class JetBotVectorEnv(BatchAdapter, VectorEnv):
         if done.any():
             final_obs = np.full(self.num_envs, None, object)
             for index in np.flatnonzero(done):
-                final_obs[index] = observation_at(steps.final_obs, index)
+                final_obs[index] = steps.final_obs_of(index)
             final_info = {"is_success": steps.success & done, "_is_success": done.copy()}
             if steps.nonfinite.any():
                 final_info |= {"nonfinite_world": steps.nonfinite}

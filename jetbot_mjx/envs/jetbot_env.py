@@ -236,7 +236,7 @@ class JetBotEnv(Env):
           The next state, with the same tree structure, shapes and dtypes.
         """
         mocap_pos = self.mocap_positions(state.goal)
-        physics = self.step_physics(state.pipeline_state, ctrl, mocap_pos)
+        physics = self.physics.step(state.pipeline_state, ctrl, mocap_pos)
         before, after = robot_state(state.pipeline_state), robot_state(physics)
         task = self.task_step(before, after, state.goal, action)
         rewards = {f"reward/{name}": term for name, term in task.terms.items()}
@@ -321,25 +321,6 @@ class JetBotEnv(Env):
             wheel_radius=CONTROLLER_WHEEL_RADIUS,
             wheel_separation=CONTROLLER_WHEEL_SEPARATION,
         )
-
-    def step_physics(
-        self,
-        physics: PhysicsState,
-        ctrl: Float[Array, "2"],
-        mocap_pos: Float[Array, "nmocap 3"] | None = None,
-    ) -> PhysicsState:
-        """Integrate the physics of one environment step.
-
-        Args:
-          physics: the physics state before the step.
-          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
-          mocap_pos: positions of the task's solid mocap bodies [m], world frame; None: their
-            positions in the model.
-
-        Returns:
-          The physics state one `ctrl_dt` later.
-        """
-        return self.physics.step(physics, ctrl, mocap_pos)
 
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:

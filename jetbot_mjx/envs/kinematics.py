@@ -74,25 +74,6 @@ def wheel_speeds(
     return jnp.stack([v - turn, v + turn]) / wheel_radius
 
 
-def body_twist(
-    wheel_speeds: Float[Array, "2"], *, wheel_radius: float, wheel_separation: float
-) -> Float[Array, "2"]:
-    """Return the body twist of a differential drive that rolls without slip.
-
-        v = r (ω_L + ω_R) / 2        ω = r (ω_R - ω_L) / b
-
-    Args:
-      wheel_speeds: (ω_L, ω_R) [rad/s].
-      wheel_radius: r [m].
-      wheel_separation: b, distance between the two wheels' contact points [m].
-
-    Returns:
-      (v, ω), forward speed [m/s] and yaw rate [rad/s].
-    """
-    left, right = wheel_speeds
-    return wheel_radius * jnp.stack([0.5 * (left + right), (right - left) / wheel_separation])
-
-
 def rotate(quat: Float[Array, "4"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """Rotate a vector by a unit quaternion: body frame to world frame.
 

@@ -11,8 +11,7 @@ import os
 import subprocess
 import sys
 import weakref
-from collections.abc import Callable, Iterable
-from typing import Protocol
+from collections.abc import Iterable
 
 import mujoco
 import numpy as np
@@ -38,14 +37,6 @@ _REMEDY_LINUX = (
     " libosmesa6 (Debian and Ubuntu: apt-get install libegl1 libegl-mesa0)"
 )
 _REMEDY_ELSEWHERE = "run it in a session with a display, where GLFW can open a window"
-
-
-class _GLContext(Protocol):
-    """An OpenGL context of one of MuJoCo's back ends."""
-
-    def make_current(self) -> None: ...
-
-    def free(self) -> None: ...
 
 
 class SceneRenderer:
@@ -74,7 +65,8 @@ class SceneRenderer:
         self.scene = mujoco.MjvScene(mj_model, max_geoms)
         """What `render` renders."""
         self._rect = mujoco.MjrRect(0, 0, self.width, self.height)
-        self._gl = context_class()(self.width, self.height)
+        back_end = importlib.import_module(f"mujoco.{find_backend()}")
+        self._gl = back_end.GLContext(self.width, self.height)
         _open.add(self)
         _end_at_exit()
         self._gl.make_current()
@@ -144,15 +136,6 @@ _open: "weakref.WeakSet[SceneRenderer]" = weakref.WeakSet()
 def _end_at_exit() -> None:
     """End all contexts before EGL ends, whose own handler the first context has registered."""
     atexit.register(lambda: [renderer.end() for renderer in list(_open)])
-
-
-def context_class() -> Callable[[int, int], _GLContext]:
-    """Return the class of OpenGL contexts of the back end that works.
-
-    Raises:
-      UserError: as `find_backend`.
-    """
-    return importlib.import_module(f"mujoco.{find_backend()}").GLContext
 
 
 @functools.cache

@@ -166,16 +166,6 @@ class CheckpointStore:
             if not start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
 
-    def wait(self) -> None:
-        """Wait until all checkpoints are on disk.
-
-        Raises:
-          CheckpointError: a checkpoint could not be written.
-        """
-        if self._manager is not None:
-            with self._writing():
-                self._manager.wait_until_finished()
-
     def __enter__(self) -> Self:
         """Return the store itself."""
         return self

@@ -76,13 +76,11 @@ def train(setup: Setup, recorder: TrainerCallback) -> None:
         nonlocal latest
         latest = PolicyParams(*params)
         if env_steps == 0:
-            report(0, {}, 0.0)
+            report(0, {})
 
-    def on_metrics(env_steps: int, metrics: Mapping[str, jax.Array]) -> None:
-        report(env_steps, metrics, time.perf_counter() - clock)
-
-    def report(env_steps: int, metrics: Mapping[str, jax.Array], seconds: float) -> None:
+    def report(env_steps: int, metrics: Mapping[str, jax.Array]) -> None:
         nonlocal clock
+        seconds = time.perf_counter() - clock if env_steps else 0.0
         params = jax.device_get(latest)
         named = rename_metrics(metrics, config.ppo.entropy_cost)
         if rate is not None and metrics:
@@ -107,7 +105,7 @@ def train(setup: Setup, recorder: TrainerCallback) -> None:
             run_evals=False,
             # Brax resets an evaluation batch of this size even without evaluations.
             num_eval_envs=1,
-            progress_fn=on_metrics,
+            progress_fn=report,
             policy_params_fn=on_params,
             **ppo,
         )

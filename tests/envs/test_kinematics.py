@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from helpers.rolling import body_twist
 from jetbot_mjx.envs import kinematics
 
 CONTROLLER = {"wheel_radius": 0.0325, "wheel_separation": 0.1125}
@@ -49,7 +50,7 @@ def test_the_fastest_wheel_turns_at_36_rad_per_second():
 def test_inverses():
     twist = jnp.array([0.3, -1.2])
     wheels = kinematics.wheel_speeds(twist, **CONTROLLER)
-    np.testing.assert_allclose(kinematics.body_twist(wheels, **CONTROLLER), twist, rtol=1e-5)
+    np.testing.assert_allclose(body_twist(wheels, **CONTROLLER), twist, rtol=1e-5)
     limits = {"max_speed": 1.0, "max_yaw_rate": math.pi}
     action = kinematics.action_from_twist(twist, **limits)
     np.testing.assert_allclose(kinematics.twist_from_action(action, **limits), twist, rtol=1e-5)
