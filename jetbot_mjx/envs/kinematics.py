@@ -137,19 +137,6 @@ def pitched(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4
     return jnp.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x])
 
 
-def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
-    """Return the angle between the z axes of a body and of the world.
-
-    Args:
-      quat: the attitude (w, x, y, z) of the body in the world frame.
-
-    Returns:
-      Tilt in [0, π] [rad]; π is upside down.
-    """
-    _, x, y, _ = quat
-    return 2.0 * jnp.arcsin(jnp.clip(jnp.hypot(x, y), 0.0, 1.0))
-
-
 def to_body(heading: Float[Array, ""], vector_w: Float[Array, "2"]) -> Float[Array, "2"]:
     """Rotate a horizontal vector from the world frame into the body frame.
 

@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from helpers.rolling import body_twist
+from helpers import motion
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -202,7 +202,7 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
         "wheel_separation": robot_model.WHEEL_SEPARATION,
     }
     wheels = jax.vmap(env.wheel_targets)(actions)
-    expected = jax.vmap(lambda w: body_twist(w, **geometry))(wheels)
+    expected = jax.vmap(lambda w: motion.body_twist(w, **geometry))(wheels)
     forward = np.asarray(physics.qpos[-1, 0, 0] - physics.qpos[120, 0, 0]) / (
         (STEPS - 121) * env.dt
     )
@@ -226,7 +226,7 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     physics = drive(mjx_model, actions)
     assert np.all(np.isfinite(physics.qpos))
     assert np.all(np.isfinite(physics.qvel))
-    tilt = np.degrees(jax.vmap(jax.vmap(kinematics.tilt))(physics.qpos[:, :, 3:7]).max())
+    tilt = np.degrees(jax.vmap(jax.vmap(motion.tilt))(physics.qpos[:, :, 3:7]).max())
     print(f"\n{env.config.robot.preset}, friction {friction}: worst tilt {tilt:.2f}°")
     assert tilt < WORST_TILT
 

@@ -12,7 +12,7 @@ from unittest import mock
 
 import jax.numpy as jnp
 
-from helpers.rolling import body_twist
+from helpers import motion
 from jetbot_mjx import cli
 from jetbot_mjx.envs import kinematics, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
@@ -33,7 +33,7 @@ LAG = 0.1  # [s] of the motors, so that there is something to learn
 class GlidingPhysics(Physics):
     def step(self, state, ctrl, mocap_pos=None):
         dt = self._config.ctrl_dt
-        wanted = body_twist(
+        wanted = motion.body_twist(
             ctrl,
             wheel_radius=CONTROLLER_WHEEL_RADIUS,
             wheel_separation=CONTROLLER_WHEEL_SEPARATION,

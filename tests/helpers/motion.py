@@ -1,4 +1,4 @@
-"""The inverse of `kinematics.wheel_speeds`: how a robot moves whose wheels roll."""
+"""What tests ask of a robot's motion: how it moves while its wheels roll, and how far it tilts."""
 
 import jax.numpy as jnp
 
@@ -18,3 +18,16 @@ def body_twist(wheel_speeds, *, wheel_radius, wheel_separation):
     """
     left, right = wheel_speeds
     return wheel_radius * jnp.stack([0.5 * (left + right), (right - left) / wheel_separation])
+
+
+def tilt(quat):
+    """Return the angle between the z axes of a body and of the world.
+
+    Args:
+      quat: the attitude (w, x, y, z) of the body in the world frame.
+
+    Returns:
+      Tilt in [0, π] [rad]; π is upside down.
+    """
+    _, x, y, _ = quat
+    return 2.0 * jnp.arcsin(jnp.clip(jnp.hypot(x, y), 0.0, 1.0))
