@@ -495,5 +495,4 @@ def _reason(error: Exception) -> str:
 def _describe(array: _Typed | None) -> str:
     if array is None:
         return "missing"
-    dtype = getattr(array.dtype, "numpy_dtype", None)
-    return f"{dtype or array.dtype}{list(array.shape)}"
+    return f"{getattr(array.dtype, 'numpy_dtype', array.dtype)}{list(array.shape)}"
