@@ -38,7 +38,7 @@ def numbers_of(obs: Obs) -> Obs:
 
 
 class _Seen(Protocol):
-    """What a `CameraWrapper` needs of the environment inside it, which observes numbers only."""
+    """The interface that a `CameraWrapper` requires of the environment inside it."""
 
     task: _Task
     observation_size: int
