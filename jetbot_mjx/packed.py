@@ -7,6 +7,7 @@ however small it is. The state of an environment is twenty arrays.
 import dataclasses
 import math
 from collections.abc import Callable, Hashable
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,7 @@ def _is_packed(shape: tuple[int, ...], dtype: object) -> bool:
 class Packed(struct.PyTreeNode):
     """A `Packed` holds a tree of arrays, with any batch axes in front, on host or device."""
 
-    words: Float[Array | np.ndarray, "*batch columns"]
+    words: Float[Array, "*batch columns"]
     """The bits of all arrays with numbers of 32 bits, one after the other."""
     others: list[Array]
     """The other arrays."""
@@ -100,7 +101,7 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     """
     leaves, structure = jax.tree.flatten(tree)
     shapes = tuple((x.shape[batch_axes:], x.dtype) for x in leaves)
-    library = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
+    library: ModuleType = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
     packed = [_is_packed(*one) for one in shapes]
     words = [
         library.asarray(x).view(np.float32).reshape(*x.shape[:batch_axes], math.prod(shape))
