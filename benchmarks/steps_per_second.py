@@ -1,7 +1,7 @@
 """Measure steps per second: `python benchmarks/steps_per_second.py --num-envs 256,1024`.
 
 Six rates for each number of environments, each of a program of its own:
-  physics   `JetBotEnv.step_physics` alone, under random actions
+  physics   `Physics.step` alone, under random actions
   switched  `physics` under commands of ±1 that each robot holds for 1 to 24 steps
   env       the training environment: observation, reward, episode statistics, resets to new goals
   rollout   `env` under the exploring policy, with the transitions that PPO stores

@@ -18,7 +18,7 @@ import shlex
 import sys
 from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NoReturn
+from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
 
 from jetbot_mjx import startup
 from jetbot_mjx.errors import (
@@ -258,9 +258,10 @@ def show_progress() -> contextlib.AbstractContextManager[None]:
 
 
 _LARGEST = 2**31 - 1
+_Number = TypeVar("_Number", int, float)
 
 
-def number(kind: type, least: float, most: float = _LARGEST) -> Callable[[str], Any]:
+def number(kind: type[_Number], least: float, most: float = _LARGEST) -> Callable[[str], _Number]:
     """Return an argument type for numbers within bounds.
 
     Args:
@@ -272,7 +273,7 @@ def number(kind: type, least: float, most: float = _LARGEST) -> Callable[[str], 
       A function to pass as `type` to an argument parser.
     """
 
-    def parse(text: str) -> Any:
+    def parse(text: str) -> _Number:
         try:
             value = kind(text)
         except ValueError:

@@ -13,7 +13,6 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import jax
 
@@ -21,7 +20,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.fallbacks import Fallback, report
 from onekernel import cache_folder, known_options
 
-Options = dict[str, Any]
+Options = dict[str, bool | int | str]
 
 _ON_CPU: Options = {
     "xla_backend_optimization_level": 1,
@@ -65,10 +64,10 @@ def use_compilation_cache() -> None:
     turns it off. A folder that other users may write to is not used, because JAX runs the programs
     that it finds there.
     """
-    settings: Any = jax.config
-    given = settings.jax_compilation_cache_dir
+    settings = jax.config.values
+    given = settings["jax_compilation_cache_dir"]
     # Leave remote folders such as gs:// to JAX.
-    if not settings.jax_enable_compilation_cache or "://" in (given or ""):
+    if not settings["jax_enable_compilation_cache"] or "://" in (given or ""):
         return
     folder = _cache_folder(given)
     jax.config.update("jax_compilation_cache_dir", folder and str(folder))
@@ -110,7 +109,7 @@ def require_device() -> None:
 
 
 @contextlib.contextmanager
-def default_device_cpu() -> Iterator[Any]:
+def default_device_cpu() -> Iterator[object]:
     """Run the computations inside on the host CPU, where small programs compile at once.
 
     Yields:
@@ -121,7 +120,7 @@ def default_device_cpu() -> Iterator[Any]:
         yield device
 
 
-def host_cpu() -> Any:
+def host_cpu() -> object:
     """Return JAX's device of the host CPU, or the default device if `JAX_PLATFORMS` excludes it."""
     try:
         return jax.local_devices(backend="cpu")[0]

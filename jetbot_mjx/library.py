@@ -6,10 +6,11 @@ settings as they are. They work in a notebook and in any thread.
 """
 
 import contextlib
+import functools
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Unpack, overload
 
 from jetbot_mjx import evaluation, training, tuning, viewers
 from jetbot_mjx.config import Config, Overrides, load_config
@@ -78,27 +79,14 @@ def train(
 
 @overload
 def evaluate(
-    runs: str | Path,
-    *,
-    which: "Which" = ...,
-    episodes: int = ...,
-    output: str | Path | None = ...,
-    robustness: bool = ...,
-    ranges: str | Path | None = ...,
-    simulator: "evaluation.Simulator | None" = ...,
-    verbose: bool = ...,
+    runs: str | Path, *, verbose: bool = ..., **options: "Unpack[evaluation.ReportOptions]"
 ) -> "evaluation.Report": ...
 @overload
 def evaluate(
     runs: Sequence[str | Path],
     *,
-    which: "Which" = ...,
-    episodes: int = ...,
-    output: str | Path | None = ...,
-    robustness: bool = ...,
-    ranges: str | Path | None = ...,
-    simulator: "evaluation.Simulator | None" = ...,
     verbose: bool = ...,
+    **options: "Unpack[evaluation.ReportOptions]",
 ) -> "evaluation.Comparison": ...
 def evaluate(
     runs: str | Path | Sequence[str | Path],
@@ -134,7 +122,7 @@ def evaluate(
       UserError: a run or argument is wrong, the runs cannot be compared, or a folder cannot be
         written.
     """
-    options: dict[str, Any] = {
+    options: evaluation.ReportOptions = {
         "which": which,
         "episodes": episodes,
         "output": output,
@@ -214,7 +202,7 @@ def tune(
     config: str | Path | Config,
     overrides: Overrides = (),
     *,
-    space: str | Path | Mapping[str, Any],
+    space: str | Path | Mapping[str, object],
     trials: int = 64,
     round_size: int = 16,
     confirm: int = 3,
@@ -264,17 +252,8 @@ def tune(
             round_size=round_size,
             confirm=confirm,
             storage=storage,
-            say=_print_at_once if verbose else _print_nothing,
+            say=functools.partial(print, flush=True) if verbose else lambda text: None,
         )
-
-
-def _print_at_once(text: str) -> None:
-    """Print a line on standard output without waiting for more."""
-    print(text, file=sys.stdout, flush=True)
-
-
-def _print_nothing(text: str) -> None:
-    """Print nothing."""
 
 
 def _name(config: str | Path | Config) -> Path:

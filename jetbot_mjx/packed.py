@@ -6,8 +6,8 @@ however small it is. The state of an environment is twenty arrays.
 
 import dataclasses
 import math
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Hashable
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PyTree
 
 from onekernel import Kernel
 
-_Shape = tuple[tuple[int, ...], Any]
+_Shape = tuple[tuple[int, ...], np.dtype]
 
 
 def _is_packed(shape: tuple[int, ...], dtype: object) -> bool:
@@ -36,7 +36,7 @@ class Packed(struct.PyTreeNode):
     """The bits of all arrays with numbers of 32 bits, one after the other."""
     others: list[Array]
     """The other arrays."""
-    structure: Any = struct.field(pytree_node=False)
+    structure: Hashable = struct.field(pytree_node=False)
     """Structure of the tree."""
     shapes: tuple[_Shape, ...] = struct.field(pytree_node=False)
     """Shape, without the batch axes, and dtype of each array."""
@@ -101,7 +101,7 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     """
     leaves, structure = jax.tree.flatten(tree)
     shapes = tuple((x.shape[batch_axes:], x.dtype) for x in leaves)
-    library: Any = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
+    library: ModuleType = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
     packed = [_is_packed(*one) for one in shapes]
     words = [
         library.asarray(x).view(np.float32).reshape(*x.shape[:batch_axes], math.prod(shape))
@@ -120,7 +120,7 @@ class Condensed(struct.PyTreeNode):
 
     large: list[Array]
     small: Packed
-    structure: Any = struct.field(pytree_node=False)
+    structure: Hashable = struct.field(pytree_node=False)
     """Structure of the tree."""
     is_large: tuple[bool, ...] = struct.field(pytree_node=False)
     """Whether each of its leaves is large."""

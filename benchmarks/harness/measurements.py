@@ -65,7 +65,7 @@ def prepare_physics(config: Config, num_envs: int, sizes: Sizes) -> TimedProgram
 
     def step(carry: Carry) -> Carry:
         key, actions = random_actions(carry.key, num_envs)
-        physics = jax.vmap(env.step_physics)(carry.state, jax.vmap(env.wheel_targets)(actions))
+        physics = jax.vmap(env.physics.step)(carry.state, jax.vmap(env.wheel_targets)(actions))
         checksum = carry.tally.checksum + sum_per_env(physics)
         return Carry(physics, key, carry.tally._replace(checksum=checksum))
 
@@ -94,7 +94,7 @@ def measure_switched(config: Config, num_envs: int, sizes: Sizes) -> Row:
 
     def step(carry: Carry) -> Carry:
         actions = jax.vmap(action)(robots, holds, carry.state.time)
-        physics = jax.vmap(env.step_physics)(carry.state, jax.vmap(env.wheel_targets)(actions))
+        physics = jax.vmap(env.physics.step)(carry.state, jax.vmap(env.wheel_targets)(actions))
         checksum = carry.tally.checksum + sum_per_env(physics)
         return Carry(physics, carry.key, carry.tally._replace(checksum=checksum))
 

@@ -69,6 +69,7 @@ from jetbot_mjx.config import Config, load_config, parse_config
 from jetbot_mjx.devices import compiler_options, require_device, use_compilation_cache
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
+from jetbot_mjx.envs.physics import Physics
 from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
@@ -109,27 +110,28 @@ PROBE = {
 }
 
 
-class Unicycle(JetBotEnv):
-    """An environment whose robot moves exactly as commanded, without slip or lag."""
+class Unicycle(Physics):
+    """The physics of a robot that moves exactly as commanded, without slip or lag."""
 
-    def step_physics(
+    def step(
         self,
-        physics: PhysicsState,
+        state: PhysicsState,
         ctrl: Float[Array, "2"],
         mocap_pos: Float[Array, "nmocap 3"] | None = None,
     ) -> PhysicsState:
         """Integrate the commanded wheel speeds over one environment step."""
+        dt = self._config.ctrl_dt
         left, right = CONTROLLER_WHEEL_RADIUS * ctrl
         speed, yaw_rate = 0.5 * (left + right), (right - left) / CONTROLLER_WHEEL_SEPARATION
-        heading = kinematics.yaw(physics.qpos[QPOS_QUAT]) + yaw_rate * self.dt
+        heading = kinematics.yaw(state.qpos[QPOS_QUAT]) + yaw_rate * dt
         zero = jnp.zeros(())
         velocity = speed * jnp.stack([jnp.cos(heading), jnp.sin(heading), zero])
         quat = jnp.stack([jnp.cos(heading / 2), zero, zero, jnp.sin(heading / 2)])
-        qvel = physics.qvel.at[QVEL_LINEAR_W].set(velocity)
-        return physics.replace(
-            qpos=physics.qpos.at[:3].add(velocity * self.dt).at[QPOS_QUAT].set(quat),
+        qvel = state.qvel.at[QVEL_LINEAR_W].set(velocity)
+        return state.replace(
+            qpos=state.qpos.at[:3].add(velocity * dt).at[QPOS_QUAT].set(quat),
             qvel=qvel.at[QVEL_ANGULAR_B].set(jnp.stack([zero, zero, yaw_rate])),
-            time=physics.time + self.dt,
+            time=state.time + dt,
         )
 
 
@@ -369,7 +371,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     values["ppo"] |= ADAPTIVE_KL if config.ppo.learning_rate_schedule == "LINEAR" else {}
     values["ppo"]["normalizer"] = "brax"
     config = parse_config(values)
-    tasks = {"probe": (probe, Unicycle(probe)), options.config.name: (config, make_env(config))}
+    probe_env = make_env(probe)
+    probe_env = probe_env.with_physics(Unicycle(probe_env.physics.mj_model, probe.physics))
+    tasks = {"probe": (probe, probe_env), options.config.name: (config, make_env(config))}
     for trainer in TRAINERS:
         _with_trainer(config, trainer, config.seed).check_devices(jax.device_count())
     # Train and compare on each task.

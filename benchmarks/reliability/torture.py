@@ -40,7 +40,7 @@ from jetbot_mjx.runs.checkpoint_store import (
     read_about,
     read_tree,
 )
-from jetbot_mjx.runs.resumption import tree_shapes
+from jetbot_mjx.runs.resumption import to_trees
 from jetbot_mjx.training.ppo_trainer import CompiledTrainer
 
 CONFIG = CONFIGS / "smoke.yaml"
@@ -219,7 +219,7 @@ def make_template(settings: Sequence[str]) -> TrainState:
 
 def check_checkpoint(run_dir: Path, env_steps: int, template: TrainState) -> None:
     """Read a whole checkpoint; raise CheckpointError if it is not as it was written."""
-    for name, tree in tree_shapes(template).items():
+    for name, tree in jax.eval_shape(to_trees, template).items():
         read_tree(checkpoint_path(run_dir, env_steps), name, tree)
 
 

@@ -1,6 +1,6 @@
 """Compare with other simulators and trainers: `python benchmarks/throughput/compare.py`.
 
-  physics     this project's `JetBotEnv.step_physics` under random actions
+  physics     this project's `Physics.step` under random actions
   mujoco      C MuJoCo's threaded `mujoco.rollout` with the same model, sub-steps and actions
   warp        MJX-Warp with the same model, on an NVIDIA GPU
   env         this project's training environment under random actions

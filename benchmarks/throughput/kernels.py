@@ -116,7 +116,7 @@ def compiled_text(config: Config, program: str) -> str:
     actions = jnp.zeros((config.ppo.num_envs, 2))
     if program == "physics":
         first = jax.eval_shape(jax.vmap(env.reset), keys).pipeline_state
-        lowered = jax.jit(jax.vmap(env.step_physics)).lower(first, actions)
+        lowered = jax.jit(jax.vmap(env.physics.step)).lower(first, actions)
     elif program == "env":
         step: Any = batch.step
         lowered = jax.jit(step).lower(jax.eval_shape(batch.reset, keys), actions)
@@ -124,7 +124,8 @@ def compiled_text(config: Config, program: str) -> str:
         ppo = PPO(config.ppo, batch, build_ppo(Setup(config, env=env)).networks)
         state = jax.eval_shape(lambda key: ppo.packed(ppo.init(key)), jax.random.PRNGKey(0))
         lowered = jax.jit(ppo.train_step).lower(state)
-    return str(lowered.compile(compiler_options=compiler_options(config.deterministic)).as_text())
+    options: dict[str, Any] = {**compiler_options(config.deterministic)}
+    return str(lowered.compile(compiler_options=options).as_text())
 
 
 def count_scalars(config: Config) -> dict[str, int]:
@@ -133,7 +134,7 @@ def count_scalars(config: Config) -> dict[str, int]:
     values["physics"] |= {"impl": "xla", "ctrl_dt": config.physics.sim_dt}
     env = make_env(parse_config(values))
     physics = jax.eval_shape(env.reset, jax.random.PRNGKey(0)).pipeline_state
-    program = scalarize(env.step_physics, physics, jnp.zeros(env.action_size))
+    program = scalarize(env.physics.step, physics, jnp.zeros(env.action_size))
     return dict(collections.Counter(x.op for x in program.block.values()).most_common())
 
 

@@ -4,6 +4,7 @@ import math
 import numbers
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, UInt32
@@ -17,18 +18,23 @@ Source = Config | Mapping[str, object] | str | Path | None
 """A configuration, nested settings, a YAML file, or None for the tutorial's configuration."""
 
 
-def resolve(
-    config: Source,
-    skip_frame: int,
-    physics_dt: float | None,
-    rendering_dt: float | None,
-    max_episode_length: int | None,
-    headless: bool,
-    render_mode: str | None,
-) -> tuple[Config, str | None, float]:
+class TutorialArguments(NamedTuple):
+    """The arguments of the tutorial's constructor, which `JetBotGymEnv` documents."""
+
+    skip_frame: int
+    physics_dt: float | None
+    rendering_dt: float | None
+    max_episode_length: int | None
+    headless: bool
+    render_mode: str | None
+
+
+def resolve(config: Source, given: TutorialArguments) -> tuple[Config, str | None, float]:
     """Apply the tutorial's arguments to a configuration.
 
-    `JetBotGymEnv` documents the arguments; None leaves a setting as it is in the configuration.
+    Args:
+      config: The configuration.
+      given: The arguments; None leaves a setting as it is in the configuration.
 
     Returns:
       The configuration to build the environment from, the render mode, and the simulated time
@@ -39,6 +45,7 @@ def resolve(
     """
     # Check each argument, with the configuration's value where none is given.
     base = _read(config)
+    skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode = given
     physics_dt = base.physics.ctrl_dt if physics_dt is None else physics_dt
     length = base.task.episode_length if max_episode_length is None else max_episode_length
     check_count("skip_frame", skip_frame)

@@ -1,13 +1,12 @@
 """The construction and the rendering that all adapters share."""
 
 from collections.abc import Mapping
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
 
-from jetbot_mjx.adapters.arguments import Seed, Source, resolve
-from jetbot_mjx.adapters.batched_env import BatchedEnv, unwrap_single
+from jetbot_mjx.adapters.arguments import Seed, Source, TutorialArguments, resolve
+from jetbot_mjx.adapters.batched_env import BatchedEnv
 from jetbot_mjx.adapters.renderer import RENDER_MODES, FrameRenderer, Pose, is_available
 from jetbot_mjx.agents import is_image
 from jetbot_mjx.config import Config
@@ -20,7 +19,10 @@ with requires_extra("gymnasium", "the adapter"):
     from gymnasium import spaces
 
 
-def observation_space(size: int | Mapping[str, tuple[int, ...]]) -> "spaces.Space[Any]":
+ObservationSpace = spaces.Box | spaces.Dict
+
+
+def observation_space(size: int | Mapping[str, tuple[int, ...]]) -> ObservationSpace:
     """Return the space of an observation: a `Box`, or a `Dict` if numbers stand beside an image.
 
     Images are uint8 of shape (height, width, channels), 0 to 255, as Stable-Baselines3 expects
@@ -31,13 +33,13 @@ def observation_space(size: int | Mapping[str, tuple[int, ...]]) -> "spaces.Spac
     """
     if isinstance(size, int):
         return spaces.Box(-np.inf, np.inf, (size,))
-    parts: dict[str, spaces.Space[Any]] = {
+    parts = {
         name: spaces.Box(0, 255, shape, np.uint8)
         if is_image(name)
         else spaces.Box(-np.inf, np.inf, shape)
         for name, shape in size.items()
     }
-    return unwrap_single(parts) if len(parts) == 1 else spaces.Dict(parts)
+    return next(iter(parts.values())) if len(parts) == 1 else spaces.Dict({**parts})
 
 
 class AdapterBase:
@@ -54,21 +56,21 @@ class AdapterBase:
     _is_begun = False
     """Whether there was a `reset`; the subclass sets it."""
 
-    def _configure(self, config: Source, *given: Any) -> None:
+    def _configure(self, config: Source, given: TutorialArguments) -> None:
         """Set `config` and `render_mode`.
 
         Args:
           config: The constructor's `config`.
-          given: The constructor's other arguments, in the order of `arguments.resolve`.
+          given: The constructor's arguments from the tutorial.
 
         Raises:
           UserError: An argument or setting is wrong.
         """
-        self.config, self.render_mode, self._rendering_dt = resolve(config, *given)
+        self.config, self.render_mode, self._rendering_dt = resolve(config, given)
         # A script that imports an adapter has no other reason to set up JAX's cache.
         use_compilation_cache()
 
-    def _prepare(self, env: JetBotEnv) -> tuple["spaces.Space[Any]", spaces.Box]:
+    def _prepare(self, env: JetBotEnv) -> tuple[ObservationSpace, spaces.Box]:
         """Build the renderer, and set `metadata`.
 
         Args:
@@ -157,11 +159,11 @@ class BatchAdapter(AdapterBase):
           UserError: An argument or setting is wrong, or there is no display for a window.
         """
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self._configure(config, *given)
+        self._configure(config, TutorialArguments(*given))
         self.batch = BatchedEnv(self.config, num_envs, seed)
         self._set_spaces(*self._prepare(self.batch.env))
 
-    def _set_spaces(self, observation: "spaces.Space[Any]", action: spaces.Box) -> None:
+    def _set_spaces(self, observation: ObservationSpace, action: spaces.Box) -> None:
         """Set the attributes of the environment's class from the spaces of one robot."""
         raise NotImplementedError
 

@@ -1,12 +1,12 @@
 """The batched MJX environment with NumPy arrays in and out, for trainers written in Python."""
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+import operator
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, UInt8
+from jaxtyping import Bool, Float, PyTree, UInt8
 
 from jetbot_mjx.adapters.arguments import ResetKeys, Seed, as_actions
 from jetbot_mjx.adapters.renderer import Pose
@@ -19,6 +19,8 @@ Observations = Float[np.ndarray, "n obs"] | UInt8[np.ndarray, "n h w c"] | dict[
 """Numbers, images, or both by name."""
 Rewards = Float[np.ndarray, " n"]
 Flags = Bool[np.ndarray, " n"]
+
+_Part = TypeVar("_Part")
 
 _MOST_ENVS = 2**24
 
@@ -36,24 +38,21 @@ class Steps(NamedTuple):
     final_obs: Observations
     """The observation after the step, before any reset; without a reset it equals `obs`."""
 
+    def final_obs_of(self, index: np.intp) -> PyTree:
+        """Return the observation of one robot after the step, before any reset."""
+        return jax.tree.map(operator.itemgetter(index), self.final_obs)
+
     @property
     def done(self) -> Flags:
         """Return where an episode ended."""
         return self.terminated | self.truncated
 
 
-def unwrap_single(parts: Any) -> Any:
+def unwrap_single(parts: _Part | dict[str, _Part]) -> _Part | dict[str, _Part]:
     """Return the only part of an observation, or the observation if it is none of several parts."""
-    if isinstance(parts, Mapping) and len(parts) == 1:
+    if isinstance(parts, dict) and len(parts) == 1:
         return next(iter(parts.values()))
     return parts
-
-
-def observation_at(obs: Observations, index: int | np.intp) -> np.ndarray | dict[str, np.ndarray]:
-    """Return the observation of one robot."""
-    if isinstance(obs, dict):
-        return {name: part[index] for name, part in obs.items()}
-    return obs[index]
 
 
 class BatchedEnv:
@@ -76,10 +75,10 @@ class BatchedEnv:
         self._reset_keys = ResetKeys(seed, self.num_envs)
         self.env = make_env(config)
         length = config.task.episode_length
-        wrapped: Any = wrap_for_training(self.env, length, final_images=True)
+        wrapped = wrap_for_training(self.env, length, final_images=True)
         options = compiler_options(config.deterministic)
 
-        def step(state: State, actions: jax.Array) -> tuple[State, tuple[Any, ...]]:
+        def step(state: State, actions: jax.Array) -> tuple[State, tuple[PyTree, ...]]:
             state = wrapped.step(state, actions)
             info, metrics = state.info, state.metrics
             flags = (info["terminated"], info["truncation"], metrics["success"])
@@ -90,7 +89,7 @@ class BatchedEnv:
         self._reset = jax.jit(wrapped.reset, compiler_options=options)
         self._step = jax.jit(step, compiler_options=options)
         self._state: State | None = None
-        self._results: tuple[Any, ...] | None = None
+        self._results: tuple[PyTree, ...] | None = None
 
     def reset(self, seed: Seed = None) -> Observations:
         """Begin an episode in every environment.

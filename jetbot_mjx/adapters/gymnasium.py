@@ -1,11 +1,9 @@
 """One robot as a `gymnasium.Env`, registered as `JetBot-v0`."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.arguments import ResetKeys, Source, as_actions
+from jetbot_mjx.adapters.arguments import ResetKeys, Source, TutorialArguments, as_actions
 from jetbot_mjx.adapters.base import AdapterBase
 from jetbot_mjx.adapters.batched_env import unwrap_single
 from jetbot_mjx.adapters.renderer import RENDER_MODES, Pose
@@ -63,7 +61,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
             there is no display for a window.
         """
         given = skip_frame, physics_dt, rendering_dt, max_episode_length, headless, render_mode
-        self._configure(config, *given)
+        self._configure(config, TutorialArguments(*given))
         if drawn := ", ".join(self.config.randomization.drawn):
             raise UserError(
                 f"randomization.{drawn}: this environment has the preset's robot only: use"
@@ -76,8 +74,8 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         self._steps = 0
 
     def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[Observation, dict[str, Any]]:
+        self, *, seed: int | None = None, options: dict[str, object] | None = None
+    ) -> tuple[Observation, dict[str, object]]:
         """Begin an episode: the robot at rest at the origin, a new goal.
 
         Args:
@@ -97,7 +95,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
 
     def step(
         self, action: Float[np.ndarray, "2"]
-    ) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
+    ) -> tuple[Observation, float, bool, bool, dict[str, object]]:
         """Apply an action for one environment step.
 
         Args:
@@ -114,7 +112,7 @@ class JetBotGymEnv(AdapterBase, gymnasium.Env):
         self._steps += 1
         out_of_time = self._steps >= self.config.task.episode_length
         truncated = not terminated and (out_of_time or not finite)
-        info = {"is_success": success}
+        info: dict[str, object] = {"is_success": success}
         if not finite:
             info["nonfinite_world"] = True
         self._show()

@@ -1,13 +1,13 @@
 """Any number of robots as a `VecEnv` of Stable-Baselines3, over the batched MJX environment."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float, UInt8
 
-from jetbot_mjx.adapters.base import BatchAdapter, spaces
-from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards, observation_at
+from jetbot_mjx.adapters.base import BatchAdapter, ObservationSpace, spaces
+from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards
+from jetbot_mjx.envs import JetBotEnv
 from jetbot_mjx.errors import UserError, requires_extra
 
 with requires_extra("sb3", "the adapter"):
@@ -24,7 +24,7 @@ class JetBotVecEnv(BatchAdapter, VecEnv):
     the next episode's. Without a seed `reset` continues the random streams of the environments.
     """
 
-    def _set_spaces(self, observation: "spaces.Space[Any]", action: "spaces.Box") -> None:
+    def _set_spaces(self, observation: ObservationSpace, action: spaces.Box) -> None:
         self._attributes: dict[str, list[object]] = {}
         metadata = self.metadata
         VecEnv.__init__(self, self.batch.num_envs, observation, action)
@@ -68,7 +68,7 @@ class JetBotVecEnv(BatchAdapter, VecEnv):
         infos: list[dict[str, object]] = [{} for _ in range(self.num_envs)]
         for index in np.flatnonzero(done):
             infos[index] = {
-                "terminal_observation": observation_at(steps.final_obs, index),
+                "terminal_observation": steps.final_obs_of(index),
                 "TimeLimit.truncated": bool(steps.truncated[index]),
                 "is_success": bool(steps.success[index]),
             }
@@ -106,7 +106,7 @@ class JetBotVecEnv(BatchAdapter, VecEnv):
         chosen = self._get_indices(indices)
         if attr_name in self._attributes:
             return [self._attributes[attr_name][index] for index in chosen]
-        value = self._shared(attr_name)
+        value = getattr(self._owner_of(attr_name), attr_name)
         return [value for _ in chosen]
 
     def set_attr(self, attr_name: str, value: object, indices: Indices = None) -> None:
@@ -130,8 +130,12 @@ class JetBotVecEnv(BatchAdapter, VecEnv):
             values[index] = value
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: Indices = None, **method_kwargs: Any
-    ) -> list[Any]:
+        self,
+        method_name: str,
+        *method_args: object,
+        indices: Indices = None,
+        **method_kwargs: object,
+    ) -> list[object]:
         """Call a method that the environments share, such as `wheel_targets`.
 
         Args:
@@ -146,17 +150,16 @@ class JetBotVecEnv(BatchAdapter, VecEnv):
         Raises:
           AttributeError: There is no such method.
         """
-        method = self._shared(method_name)
+        method = getattr(self._owner_of(method_name), method_name)
         return [method(*method_args, **method_kwargs) for _ in self._get_indices(indices)]
 
     def env_is_wrapped(self, wrapper_class: type, indices: Indices = None) -> list[bool]:
         """Return False for every environment: wrappers such as `VecMonitor` hold the batch."""
         return [False for _ in self._get_indices(indices)]
 
-    def _shared(self, name: str) -> Any:
-        if name in ("render_mode", "config"):
-            return getattr(self, name)
-        return getattr(self.batch.env, name)
+    def _owner_of(self, name: str) -> "JetBotVecEnv | JetBotEnv":
+        """Return what has an attribute that the environments share."""
+        return self if name in ("render_mode", "config") else self.batch.env
 
     def close(self) -> None:
         """Close the renderer; the base class of Stable-Baselines3 has nothing to close."""

@@ -1,13 +1,11 @@
 """Any number of robots as a `gymnasium.vector.VectorEnv`, over the batched MJX environment."""
 
-from typing import Any
-
 import numpy as np
 from jaxtyping import Float, UInt8
 
 from jetbot_mjx.adapters.arguments import Seed
-from jetbot_mjx.adapters.base import BatchAdapter
-from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards, observation_at
+from jetbot_mjx.adapters.base import BatchAdapter, ObservationSpace
+from jetbot_mjx.adapters.batched_env import Flags, Observations, Rewards
 from jetbot_mjx.adapters.renderer import RENDER_MODES
 from jetbot_mjx.errors import requires_extra
 
@@ -31,7 +29,7 @@ class JetBotVectorEnv(BatchAdapter, VectorEnv):
         "autoreset_mode": AutoresetMode.SAME_STEP,
     }
 
-    def _set_spaces(self, observation: "spaces.Space[Any]", action: "spaces.Box") -> None:
+    def _set_spaces(self, observation: ObservationSpace, action: spaces.Box) -> None:
         self.num_envs = self.batch.num_envs
         self.single_observation_space, self.single_action_space = observation, action
         self.observation_space = batch_space(observation, self.num_envs)
@@ -80,7 +78,7 @@ class JetBotVectorEnv(BatchAdapter, VectorEnv):
         if done.any():
             final_obs = np.full(self.num_envs, None, object)
             for index in np.flatnonzero(done):
-                final_obs[index] = observation_at(steps.final_obs, index)
+                final_obs[index] = steps.final_obs_of(index)
             final_info = {"is_success": steps.success & done, "_is_success": done.copy()}
             if steps.nonfinite.any():
                 final_info |= {"nonfinite_world": steps.nonfinite}

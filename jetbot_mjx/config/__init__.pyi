@@ -19,6 +19,7 @@ from .robot import RobotConfig as RobotConfig
 from .robot_quantities import RobotParams as RobotParams
 from .run import CHANGEABLE_ON_RESUME as CHANGEABLE_ON_RESUME
 from .run import Config as Config
+from .run import Setting as Setting
 from .task import TaskConfig as TaskConfig
 from .task_modules import find_task_here as find_task_here
 from .task_modules import import_root as import_root

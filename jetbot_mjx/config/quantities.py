@@ -21,10 +21,16 @@ Sources, by tag; BOM, EST and SIM are those of `envs/robot_model.py`:
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-Value = Any
-"""A number or a traced scalar, whose type is JAX's, which a configuration does not import."""
+if TYPE_CHECKING:
+    from jax import Array
+
+    Value = float | Array
+else:
+    # A configuration does not import JAX.
+    Value = object
+"""A number or a traced scalar."""
 
 
 ANGLE = math.pi + 1e-3

@@ -34,19 +34,18 @@ class RandomizationConfig(_Ranges, defer_build=False):
 
     @field_validator("*", mode="before")
     @classmethod
-    def _within_bounds(cls, value: Any, info: ValidationInfo) -> object:
+    def _within_bounds(cls, value: object, info: ValidationInfo) -> object:
         if value is None:
             return None
         low, high, _, whole = QUANTITIES[str(info.field_name)].bounds
         kinds = int if whole else (int, float)
-        fits = (
+        if not (
             isinstance(value, list | tuple)
             and len(value) == 2
             and all(isinstance(integral(end), kinds) for end in value)
             and not any(isinstance(end, bool) for end in value)
             and low <= value[0] <= value[1] <= high
-        )
-        if not fits:
+        ):
             raise PydanticCustomError(
                 "range",
                 "[low, high], {kind} from {low} to {high}, the smaller one first",

@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Literal, Self, TypeAlias
 
 from pydantic import BeforeValidator, Field, model_validator
 from ruamel.yaml import YAML
@@ -23,6 +23,12 @@ BRAX_DEFAULTS: Mapping[str, object] = {
     "ppo": {"normalizer": "brax", "network": {"shared_cnn": False}},
 }
 """Defaults of settings under `trainer: brax` that differ from the others."""
+
+
+Setting = bool | int | float | str | list["Setting"] | None
+"""Value of a setting, as JSON."""
+
+_Nested: TypeAlias = "Mapping[str, Setting | _Nested]"
 
 
 class Config(Section):
@@ -145,7 +151,7 @@ class Config(Section):
             for index in range(self.seeds)
         ]
 
-    def flat(self) -> dict[str, Any]:
+    def flat(self) -> dict[str, Setting]:
         """Return every setting by its full key, such as `ppo.num_envs`."""
         return _flat(self.model_dump(mode="json"))
 
@@ -223,17 +229,20 @@ CHANGEABLE_ON_RESUME = (
 """Settings that may change on resume: the length of the training, and what it writes."""
 
 
-def _with_defaults(values: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
+def _with_defaults(
+    values: Mapping[str, object], defaults: Mapping[str, object]
+) -> dict[str, object]:
     """Return nested settings with those that are missing taken from others."""
     merged = {**defaults, **values}
     for key, default in defaults.items():
-        if isinstance(default, Mapping) and isinstance(values.get(key), Mapping):
-            merged[key] = _with_defaults(values[key], default)
+        given = values.get(key)
+        if isinstance(default, Mapping) and isinstance(given, Mapping):
+            merged[key] = _with_defaults(given, default)
     return merged
 
 
-def _flat(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    flat: dict[str, object] = {}
+def _flat(values: _Nested, prefix: str = "") -> dict[str, Setting]:
+    flat: dict[str, Setting] = {}
     for key, value in values.items():
         if isinstance(value, Mapping):
             flat |= _flat(value, f"{prefix}{key}.")

@@ -2,11 +2,12 @@
 
 import json
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from matplotlib.figure import Figure
+from matplotlib.typing import HashableList
 
 from jetbot_mjx.deployment.drive_pictures import LoggedPicture, picture_strip, read_picture
 from jetbot_mjx.deployment.simulated_camera import camera_config
@@ -152,11 +153,11 @@ def _read_lines(path: Path) -> list[str]:
         raise UserError(f"{path} is not a log of deploy/drive.py: it is not text") from None
 
 
-def _parse_goal(header: Any) -> tuple[float, float] | None:
+def _parse_goal(header: JsonObject) -> tuple[float, float] | None:
     """Return the position of the goal; only a drive by camera may have none."""
     if header["goal"] is None and "image" in header:
         return None
-    x, y = map(float, header["goal"])
+    x, y = map(float, header["goal"] or ())
     if not np.isfinite([x, y]).all():
         raise ValueError(f"its goal is {header['goal']}")
     return x, y
@@ -244,7 +245,7 @@ def plot(replay: Replay) -> Figure:
       The figure.
     """
     log = replay.log
-    layout: list[Any] = [["plan", "place"], ["plan", "turn"]]
+    layout: list[HashableList[str]] = [["plan", "place"], ["plan", "turn"]]
     if log.pictures:
         layout.append(["seen", "seen"])
     figure = Figure(figsize=(10, 4.6 + 2.2 * bool(log.pictures)), layout="constrained")

@@ -12,7 +12,7 @@ import types
 from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import jax
 import numpy as np
@@ -108,11 +108,13 @@ class _OnnxGraph:
         self.constants.append(numpy_helper.from_array(np.asarray(value, np.float32), name))
         return name
 
-    def node(self, kind: str, *inputs: str, out: str, **attributes: Any) -> str:
+    def node(self, kind: str, *inputs: str, out: str, **attributes: int | list[int]) -> str:
         """Add a node and return the name of its output, `out`."""
         from onnx import helper
 
-        self.nodes.append(helper.make_node(kind, inputs, [out], name=out, **attributes))
+        node = helper.make_node(kind, inputs, [out], name=out)
+        node.attribute.extend(helper.make_attribute(*one) for one in sorted(attributes.items()))
+        self.nodes.append(node)
         return out
 
     def dense(self, layer: Layer, x: str, name: str) -> str:
@@ -192,9 +194,15 @@ def _read_onnx(path: Path) -> Act:
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
-    session: Any = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
     names = [one.name for one in session.get_inputs()]
-    return lambda *inputs: tuple(session.run(_OUTPUTS, dict(zip(names, inputs, strict=True))))
+
+    def act(*inputs: np.ndarray) -> Outputs:
+        outputs = session.run(_OUTPUTS, dict(zip(names, inputs, strict=True)))
+        action, wheel_speeds = map(np.asarray, outputs)
+        return action, wheel_speeds
+
+    return act
 
 
 FORMATS = {

@@ -9,13 +9,13 @@ import copy
 import functools
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.config import Config, Overrides, load_config
 from jetbot_mjx.envs import kinematics, mjx
@@ -28,13 +28,14 @@ from jetbot_mjx.envs.robot_model import (
     ROBOTS,
     make_mj_model,
 )
-from jetbot_mjx.envs.state import PhysicsState, State, robot_state
+from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
 from jetbot_mjx.envs.task import (
     AdvancesGoal,
     Goal,
     GoalTask,
     RobotState,
     Task,
+    TaskClass,
     layout_size,
     make_task,
     min_std,
@@ -49,7 +50,7 @@ class TaskStep(NamedTuple):
     It does not depend on which simulator moved the robot.
     """
 
-    obs: object
+    obs: Obs
     """Observation after the step, as of `JetBotEnv.observe`."""
     reward: Float[Array, ""]
     """Reward of the step."""
@@ -75,7 +76,7 @@ class JetBotEnv(Env):
     `done` means termination only; `EpisodeWrapper` adds the time limit.
     """
 
-    def __init__(self, config: Config, task_class: type[object] | None = None) -> None:
+    def __init__(self, config: Config, task_class: TaskClass | None = None) -> None:
         """Build the task and its models.
 
         Args:
@@ -235,7 +236,7 @@ class JetBotEnv(Env):
           The next state, with the same tree structure, shapes and dtypes.
         """
         mocap_pos = self.mocap_positions(state.goal)
-        physics = self.step_physics(state.pipeline_state, ctrl, mocap_pos)
+        physics = self.physics.step(state.pipeline_state, ctrl, mocap_pos)
         before, after = robot_state(state.pipeline_state), robot_state(physics)
         task = self.task_step(before, after, state.goal, action)
         rewards = {f"reward/{name}": term for name, term in task.terms.items()}
@@ -270,7 +271,7 @@ class JetBotEnv(Env):
         obs = self.observe(after, goal)
         return TaskStep(obs, reward, terms, terminated, success, goal)
 
-    def observe(self, robot: RobotState, goal: Goal) -> object:
+    def observe(self, robot: RobotState, goal: Goal) -> Obs:
         """Return the task's observation: a vector, or an empty dictionary if its layout is empty.
 
         Args:
@@ -321,25 +322,6 @@ class JetBotEnv(Env):
             wheel_separation=CONTROLLER_WHEEL_SEPARATION,
         )
 
-    def step_physics(
-        self,
-        physics: PhysicsState,
-        ctrl: Float[Array, "2"],
-        mocap_pos: Float[Array, "nmocap 3"] | None = None,
-    ) -> PhysicsState:
-        """Integrate the physics of one environment step.
-
-        Args:
-          physics: the physics state before the step.
-          ctrl: wheel speed targets (left, right) [rad/s], constant during the step.
-          mocap_pos: positions of the task's solid mocap bodies [m], world frame; None: their
-            positions in the model.
-
-        Returns:
-          The physics state one `ctrl_dt` later.
-        """
-        return self.physics.step(physics, ctrl, mocap_pos)
-
     @property
     def observation_size(self) -> int | dict[str, tuple[int, ...]]:
         """Length of the observation vector; with a camera, the shapes of the parts by name."""
@@ -349,7 +331,7 @@ class JetBotEnv(Env):
         return observation_shapes(self.camera, length)
 
     @property
-    def observation_min_std(self) -> Any:
+    def observation_min_std(self) -> PyTree[np.ndarray]:
         """Smallest standard deviation by which training normalises each number of the observation.
 
         Raises:
@@ -398,7 +380,7 @@ def make_env(
     config: str | Path | Config,
     overrides: Overrides = (),
     *,
-    task_class: type[object] | None = None,
+    task_class: TaskClass | None = None,
 ) -> JetBotEnv:
     """Build the environment that a configuration describes.
 

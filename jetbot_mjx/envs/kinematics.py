@@ -74,25 +74,6 @@ def wheel_speeds(
     return jnp.stack([v - turn, v + turn]) / wheel_radius
 
 
-def body_twist(
-    wheel_speeds: Float[Array, "2"], *, wheel_radius: float, wheel_separation: float
-) -> Float[Array, "2"]:
-    """Return the body twist of a differential drive that rolls without slip.
-
-        v = r (ω_L + ω_R) / 2        ω = r (ω_R - ω_L) / b
-
-    Args:
-      wheel_speeds: (ω_L, ω_R) [rad/s].
-      wheel_radius: r [m].
-      wheel_separation: b, distance between the two wheels' contact points [m].
-
-    Returns:
-      (v, ω), forward speed [m/s] and yaw rate [rad/s].
-    """
-    left, right = wheel_speeds
-    return wheel_radius * jnp.stack([0.5 * (left + right), (right - left) / wheel_separation])
-
-
 def rotate(quat: Float[Array, "4"], vector: Float[Array, "3"]) -> Float[Array, "3"]:
     """Rotate a vector by a unit quaternion: body frame to world frame.
 
@@ -154,19 +135,6 @@ def pitched(quat: Float[Array, "4"], angle: Float[Array, ""]) -> Float[Array, "4
     c, s = jnp.cos(0.5 * angle), jnp.sin(0.5 * angle)
     w, x, y, z = quat
     return jnp.stack([c * w - s * y, c * x - s * z, c * y + s * w, c * z + s * x])
-
-
-def tilt(quat: Float[Array, "4"]) -> Float[Array, ""]:
-    """Return the angle between the z axes of a body and of the world.
-
-    Args:
-      quat: the attitude (w, x, y, z) of the body in the world frame.
-
-    Returns:
-      Tilt in [0, π] [rad]; π is upside down.
-    """
-    _, x, y, _ = quat
-    return 2.0 * jnp.arcsin(jnp.clip(jnp.hypot(x, y), 0.0, 1.0))
 
 
 def to_body(heading: Float[Array, ""], vector_w: Float[Array, "2"]) -> Float[Array, "2"]:

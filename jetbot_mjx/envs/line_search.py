@@ -10,11 +10,10 @@ MuJoCo Warp does the same (google-deepmind/mujoco_warp#1374).
 import contextlib
 import threading
 from collections.abc import Iterator
-from typing import Any
 from unittest import mock
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, PyTree
 
 from jetbot_mjx.envs.mjx import ConeType, Data, Model, solver
 
@@ -52,7 +51,8 @@ def _line_search(m: Model, d: Data, ctx: solver.Context) -> solver.Context:
     Elliptic cones and dry friction in joints, whose costs are not quadratic, are passed to MJX.
     """
     search, _ = _library
-    rows: Any = d._impl
+    rows = d._impl
+    assert isinstance(rows, solver.DataJAX)
     if not _thread.in_context or m.opt.cone != ConeType.PYRAMIDAL or rows.nf:
         return search(m, d, ctx)
     # MJX takes the difference of a point's cost and `gauss` for the cost of the constraints.
@@ -61,7 +61,7 @@ def _line_search(m: Model, d: Data, ctx: solver.Context) -> solver.Context:
         return search(m, d, relative).replace(gauss=ctx.gauss)
 
 
-def _point(*arguments: Any) -> solver._LSPoint:
+def _point(*arguments: PyTree) -> solver._LSPoint:
     _, create = _library
     return _relative_point(*arguments) if _thread.is_relative else create(*arguments)
 
@@ -74,7 +74,7 @@ def _relative_point(
     jv: Float[Array, " rows"],
     quad: Float[Array, "rows 3"],
     quad_gauss: Float[Array, "3"],
-    *cone: Any,
+    *cone: Array,
 ) -> solver._LSPoint:
     """Return a point of the line search, with its cost relative to that at `alpha` = 0.
 
@@ -96,7 +96,8 @@ def _relative_point(
     point = create(
         m, d, ctx, alpha, jv, quad * without_constant, quad_gauss * without_constant, *cone
     )
-    rows: Any = d._impl
+    rows = d._impl
+    assert isinstance(rows, solver.DataJAX)
     contacts = slice(rows.ne, None)  # after the equality constraints, which are always active
     before = ctx.Jaref[contacts] < 0
     after = ctx.Jaref[contacts] + alpha * jv[contacts] < 0

@@ -4,7 +4,7 @@ MJX puts models on the first of all devices, which only one of several processes
 small programs there for many arrays. Here a model's arrays are constants of programs instead.
 """
 
-from typing import Any
+from typing import TypeVar
 
 import jax
 import mujoco
@@ -29,6 +29,9 @@ __all__ = [
 ]
 
 
+_Tree = TypeVar("_Tree", Model, Data)
+
+
 def put_model(model: mujoco.MjModel) -> Model:
     """Return the MJX model of a C model, as uncommitted arrays."""
     # The caller may be tracing a program.
@@ -42,7 +45,7 @@ def make_data(model: mujoco.MjModel) -> Data:
         return _uncommitted(mjx.make_data(model, device=device))
 
 
-def _uncommitted(tree: Any) -> Any:
+def _uncommitted(tree: _Tree) -> _Tree:
     """Return arrays that JAX may move to any device."""
     # `jnp.asarray` would compile a program for every shape.
     return jax.device_put(jax.tree.map(np.asarray, tree))

@@ -7,21 +7,21 @@ observation, images, reward, termination) is the code of `JetBotEnv`, compiled b
 import copy
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jaxtyping import Array, Float, UInt8, UInt32
+from jaxtyping import Array, Float, PyTree, UInt8, UInt32
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.devices import default_device_cpu
 from jetbot_mjx.envs.camera.wrapper import NUMBERS, PIXELS, see
 from jetbot_mjx.envs.jetbot_env import JetBotEnv, make_env
 from jetbot_mjx.envs.robot_model import CONTROLLER_WHEEL_RADIUS, CONTROLLER_WHEEL_SEPARATION
-from jetbot_mjx.envs.state import PhysicsState, State, robot_state
-from jetbot_mjx.envs.task import AdvancesGoal, Goal, layout_size
+from jetbot_mjx.envs.state import Obs, PhysicsState, State, robot_state
+from jetbot_mjx.envs.task import AdvancesGoal, Goal, TaskClass, layout_size
 
 # MuJoCo prints each of these warnings once per episode and appends it to a file in the working
 # directory. They are suppressed, since `Step.finite` reports the same.
@@ -55,10 +55,10 @@ class _Programs(NamedTuple):
 
     env: JetBotEnv
     model: mujoco.MjModel
-    reset: Any
+    reset: jax.stages.Compiled
     """From a key to (first pose, goal, positions of solid bodies, numbers of the observation, its
     images, next key)."""
-    task_step: Any
+    task_step: jax.stages.Compiled
     """From (poses and action, goal, images before) to (numbers and scalars of the step, images,
     goal, positions of solid bodies); the last two are None if goals cannot change. Images are None
     without a camera."""
@@ -67,7 +67,7 @@ class _Programs(NamedTuple):
 class MujocoJetBot:
     """A `MujocoJetBot` simulates one robot and its goal."""
 
-    def __init__(self, config: Config, task_class: type[Any] | None = None) -> None:
+    def __init__(self, config: Config, task_class: TaskClass | None = None) -> None:
         """Build the model, and compile the programs of the task.
 
         Args:
@@ -176,7 +176,7 @@ class MujocoJetBot:
 
 
 @functools.lru_cache(maxsize=8)
-def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
+def _programs(settings: str, task_class: TaskClass | None) -> _Programs:
     """Build the environment, model and programs of a configuration.
 
     Args:
@@ -196,7 +196,7 @@ def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
             return None
         return see(env.camera, env.task, state, before, begins=before is None).obs[PIXELS]
 
-    def reset(key: UInt32[Array, "2"]) -> tuple[Any, ...]:
+    def reset(key: UInt32[Array, "2"]) -> tuple[PyTree, ...]:
         state = env.blind().reset(key)
         pose = jnp.concatenate([state.pipeline_state.qpos, state.pipeline_state.qvel])
         mocap_pos, numbers = env.mocap_positions(state.goal), _vector(state.obs)
@@ -230,6 +230,6 @@ def _programs(settings: str, task_class: type[Any] | None) -> _Programs:
     return _Programs(env, model, reset_program, task_program)
 
 
-def _vector(obs: Any) -> Float[Array, " obs"]:
+def _vector(obs: Obs) -> Float[Array, " obs"]:
     """Return the numbers of an observation without images, which may be an empty dictionary."""
     return jnp.zeros(0) if isinstance(obs, dict) else obs

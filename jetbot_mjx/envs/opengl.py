@@ -12,7 +12,6 @@ import subprocess
 import sys
 import weakref
 from collections.abc import Iterable
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -66,7 +65,8 @@ class SceneRenderer:
         self.scene = mujoco.MjvScene(mj_model, max_geoms)
         """What `render` renders."""
         self._rect = mujoco.MjrRect(0, 0, self.width, self.height)
-        self._gl = context_class()(self.width, self.height)
+        back_end = importlib.import_module(f"mujoco.{find_backend()}")
+        self._gl = back_end.GLContext(self.width, self.height)
         _open.add(self)
         _end_at_exit()
         self._gl.make_current()
@@ -136,15 +136,6 @@ _open: "weakref.WeakSet[SceneRenderer]" = weakref.WeakSet()
 def _end_at_exit() -> None:
     """End all contexts before EGL ends, whose own handler the first context has registered."""
     atexit.register(lambda: [renderer.end() for renderer in list(_open)])
-
-
-def context_class() -> Any:
-    """Return the class of OpenGL contexts of the back end that works.
-
-    Raises:
-      UserError: as `find_backend`.
-    """
-    return importlib.import_module(f"mujoco.{find_backend()}").GLContext
 
 
 @functools.cache

@@ -1,9 +1,7 @@
 """Define the state of an environment: Brax's state, as small as physics allows."""
 
-from typing import Any
-
 from flax import struct
-from jaxtyping import Array, Float, UInt32
+from jaxtyping import Array, Float, PyTree, UInt32
 
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.robot_model import QPOS_QUAT, QPOS_XYZ, QVEL_ANGULAR_B, QVEL_LINEAR_W
@@ -28,6 +26,11 @@ class PhysicsState(struct.PyTreeNode):
     """Simulated time since the episode began [s]."""
 
 
+Obs = Float[Array, " obs"] | dict[str, Array]
+"""Observation of the policy: a vector of numbers, or a dictionary with images, as of
+`CameraWrapper`."""
+
+
 class State(struct.PyTreeNode):
     """A `State` holds the state of an environment: Brax's fields and those of this package.
 
@@ -36,22 +39,20 @@ class State(struct.PyTreeNode):
 
     pipeline_state: PhysicsState
     """The physics state; the name is Brax's."""
-    obs: Any
-    """Observation of the policy: a vector of numbers, or a dictionary with images, as of
-    `CameraWrapper`."""
+    obs: Obs
     reward: Float[Array, ""]
     """Reward of the last step."""
     done: Float[Array, ""]
     """1 where the last step ended the episode, else 0."""
     metrics: dict[str, Float[Array, ""]]
     """Metrics of the last step; the names are the same at every step."""
-    info: dict[str, Any]
+    info: dict[str, PyTree]
     """Fields of wrappers and trainers; the names are the same at every step."""
     goal: Goal
     """The goal that the task drew for this episode, as it stands now."""
     key: UInt32[Array, "2"]
     """Random key from which the next episode is drawn."""
-    episode_params: Any = None
+    episode_params: PyTree = None
     """`EpisodeParams` of a `DomainRandomizationWrapper`: the robot parameters of this episode and
     the states of actuators, sensors and camera. None: the robot is its preset."""
 

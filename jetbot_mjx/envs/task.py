@@ -9,9 +9,9 @@ import difflib
 import importlib
 import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple, Protocol, TypedDict, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -89,12 +89,18 @@ def layout_size(layout: Layout) -> int:
     return sum(field.size for field in layout)
 
 
-def layout_data(layout: Layout) -> list[dict[str, Any]]:
+class FieldData(TypedDict):
+    """A field as JSON."""
+
+    name: str
+    size: int
+    unit: str
+    frame: str
+
+
+def layout_data(layout: Layout) -> list[FieldData]:
     """Return a layout as JSON for the users of a trained policy: all fields but `min_std`."""
-    return [
-        {name: value for name, value in field._asdict().items() if name != "min_std"}
-        for field in layout
-    ]
+    return [FieldData(name=x.name, size=x.size, unit=x.unit, frame=x.frame) for x in layout]
 
 
 def min_std(field: Field) -> float:
@@ -146,6 +152,10 @@ class Task(Protocol):
     """Description of the observation: name, size, unit and frame of each part; empty if the policy
     sees images only."""
 
+    def __init__(self, config: TaskConfig) -> None:
+        """Build the task."""
+        ...
+
     def sample(self, key: UInt32[Array, "2"]) -> Goal:
         """Draw the goal of one episode, arrays in any pytree."""
         ...
@@ -186,6 +196,10 @@ class Task(Protocol):
           spec: the scene with robot and floor; it is modified in place.
         """
         ...
+
+
+TaskClass = Callable[[TaskConfig], Task]
+"""The class of a task, which is built from the task section."""
 
 
 @runtime_checkable
@@ -319,7 +333,7 @@ class GoalTask:
         return jnp.linalg.norm(self.goal_position(goal) - robot.position_w)
 
 
-def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
+def make_task(config: TaskConfig, task_class: TaskClass | None = None) -> Task:
     """Import and build the task that a configuration names.
 
     Args:
@@ -329,7 +343,7 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     Raises:
       UserError: the name is malformed, cannot be imported, or does not name a task.
     """
-    found: Any = task_class or _import_class(config.name)
+    found = task_class or _import_class(config.name)
     _check_members(config.name, found, METHODS)
     if found is Task:
         raise InvalidError(
@@ -340,7 +354,7 @@ def make_task(config: TaskConfig, task_class: type[Any] | None = None) -> Task:
     return task
 
 
-def _import_class(name: str) -> object:
+def _import_class(name: str) -> TaskClass:
     """Import what a name `package.module:Class` refers to, which may not be a class."""
     module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:
@@ -372,7 +386,7 @@ def _import_class(name: str) -> object:
             f"task.name = {name!r}: {error.filename}, line {error.lineno}, is not valid Python:"
             f" {error.msg}"
         ) from None
-    task_class: object = getattr(module, class_name, None)
+    task_class = getattr(module, class_name, None)
     if task_class is None:
         close = difflib.get_close_matches(class_name, dir(module), n=1)
         hint = f": did you mean {close[0]!r}?" if close else ""

@@ -8,9 +8,8 @@
 All wrappers but the last one see a single robot without a batch axis.
 """
 
-import functools
 from collections.abc import Callable
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import jax.numpy as jnp
@@ -33,9 +32,17 @@ RandomizationFn = Callable[[mjx.Model], tuple[mjx.Model, PyTree]]
 class _Env(Protocol):
     """The interface that a wrapper requires of the environment inside it."""
 
+    unwrapped: JetBotEnv
+
     def reset(self, rng: UInt32[Array, "2"]) -> State: ...
 
     def step(self, state: State, action: Float[Array, "2"]) -> State: ...
+
+
+class _PackedEnv(_Env, Protocol):
+    """The interface that a batch requires of the environment inside it."""
+
+    def step_packed(self, packed: Packed, action: Float[Array, "2"]) -> Packed: ...
 
 
 def wrap_for_training(
@@ -45,7 +52,7 @@ def wrap_for_training(
     randomization_fn: RandomizationFn | None = None,
     *,
     final_images: bool = False,
-) -> Env:
+) -> "BatchWrapper":
     """Wrap an environment for a trainer: batched, with automatic resets and domain randomization.
 
     The signature is that of Brax's `wrap_env_fn`, so this function can be passed to `ppo.train`.
@@ -66,9 +73,9 @@ def wrap_for_training(
       (n, 2).
     """
 
-    def wrap_one(env: JetBotEnv) -> Any:
+    def wrap_one(env: JetBotEnv) -> NewEpisodeWrapper:
         varied = maybe_randomize(env)
-        one: Any = env.blind() if varied is env else varied
+        one = env.blind() if isinstance(varied, JetBotEnv) else varied
         if final_images:
             one = with_camera(one, env.camera)
         return NewEpisodeWrapper(EpisodeWrapper(one, episode_length, action_repeat))
@@ -263,14 +270,16 @@ class KernelWrapper(Wrapper):
     the next packed state.
     """
 
-    def __init__(self, env: Any) -> None:
+    env: _Env
+
+    def __init__(self, env: Env) -> None:
         """Wrap one environment, which observes numbers only.
 
         Args:
           env: the environment, in all wrappers of a single robot but that of the camera.
         """
         super().__init__(env)
-        physics = env.unwrapped.physics
+        physics = self.env.unwrapped.physics
 
         def report_unsupported(error: UnsupportedError) -> None:
             # If physics is not a kernel, it has reported the reason already.
@@ -278,8 +287,7 @@ class KernelWrapper(Wrapper):
                 reason = f"one kernel cannot do {error}: the page on own tasks says what to avoid"
                 report(Fallback("environment step", reason))
 
-        # Pyright would want the names of the methods' arguments.
-        def compiled(function: Callable[..., Any]) -> Any:
+        def compiled(function: Callable[..., PyTree]) -> Callable[..., PyTree]:
             return fuse(
                 function,
                 on_unsupported=report_unsupported,
@@ -288,20 +296,19 @@ class KernelWrapper(Wrapper):
                 on_fallback=physics.kernel_impl.report_fallback,
             )
 
-        self.reset = compiled(env.reset)
-        self.step = compiled(env.step)
+        def step_packed(packed: Packed, action: Float[Array, "2"]) -> Packed:
+            return pack(self.env.step(packed.unpack(), action))
+
+        self.reset = compiled(self.env.reset)
+        self.step = compiled(self.env.step)
         # A step of a packed state has one array in and one array out.
-        self.step_packed = compiled(functools.partial(_step_packed, env))
-
-
-def _step_packed(env: Any, packed: Packed, action: Float[Array, "2"]) -> Packed:
-    return pack(env.step(packed.unpack(), action))
+        self.step_packed = compiled(step_packed)
 
 
 class BatchWrapper(Wrapper):
     """A batch of environments, with the methods of one."""
 
-    env: Any
+    env: _PackedEnv
 
     def reset(self, rng: UInt32[Array, "n 2"]) -> State:
         """Begin an episode in every environment.
@@ -348,7 +355,7 @@ class RandomizedBatchWrapper(BatchWrapper):
     def __init__(
         self,
         env: JetBotEnv,
-        wrap_one: Callable[[JetBotEnv], Any],
+        wrap_one: Callable[[JetBotEnv], Env],
         randomization_fn: RandomizationFn,
     ) -> None:
         """Draw the models.

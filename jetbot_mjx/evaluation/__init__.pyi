@@ -1,5 +1,6 @@
 from .bootstrap_intervals import bootstrap as bootstrap
 from .comparison import Comparison as Comparison
+from .evaluate_runs import ReportOptions as ReportOptions
 from .evaluate_runs import Simulator as Simulator
 from .evaluate_runs import compare_runs as compare_runs
 from .evaluate_runs import evaluate_in_mujoco as evaluate_in_mujoco

@@ -5,7 +5,7 @@ separately. Its random seed is fixed, so the same values always give the same in
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy.stats
@@ -134,8 +134,8 @@ def median_estimate(values: Float[np.ndarray, " n"]) -> Estimate:
         return Estimate(None)
     value = float(np.median(values))
     # The type stub of this function accepts only integers.
-    test: Any = scipy.stats.quantile_test
-    interval = test(values, q=value, p=0.5).confidence_interval(0.95)
+    test = scipy.stats.quantile_test(values, q=value, p=0.5)  # pyright: ignore[reportArgumentType]
+    interval = test.confidence_interval(0.95)
     if not np.isfinite(interval).all():
         return Estimate(value)
     return Estimate(value, float(interval.low), float(interval.high))

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, TypedDict, get_args
 
 import jax
 
@@ -42,6 +42,17 @@ Simulator = Literal["mujoco"]
 """A simulator other than the one that policies are trained in."""
 
 _FOLDER = "evaluations"
+
+
+class ReportOptions(TypedDict, total=False):
+    """The keyword arguments of `evaluate_run` and `compare_runs`."""
+
+    episodes: int
+    which: Which
+    output: str | Path | None
+    robustness: bool
+    ranges: str | Path | None
+    simulator: Simulator | None
 
 
 def evaluate_run(

@@ -7,7 +7,7 @@ for the evaluations during training, by which the best checkpoint is chosen, and
 
 import math
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -122,13 +122,17 @@ def success_and_time(won: Bool[np.ndarray, " n"], seconds: Float[np.ndarray, " n
     }
 
 
-def json_values(value: Any) -> Any:
-    """Return named tuples as dictionaries and tuples as lists, at any depth."""
-    if hasattr(value, "_asdict"):
-        value = value._asdict()
+def json_values(values: Mapping[str, object]) -> JsonObject:
+    """Return values in which named tuples are dictionaries and tuples are lists, at any depth."""
+    return {name: _json_value(value) for name, value in values.items()}
+
+
+def _json_value(value: object) -> object:
+    if (as_dict := getattr(value, "_asdict", None)) is not None:
+        value = as_dict()
     if isinstance(value, Mapping):
-        return {name: json_values(one) for name, one in value.items()}
-    return [json_values(one) for one in value] if isinstance(value, tuple | list) else value
+        return json_values(value)
+    return [_json_value(one) for one in value] if isinstance(value, tuple | list) else value
 
 
 def path_efficiencies(episodes: Episodes) -> Float[np.ndarray, " n"]:

@@ -9,9 +9,9 @@ import json
 import os
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
 
 import jinja2
+from jaxtyping import PyTree
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
@@ -180,7 +180,7 @@ def _numbers(values: JsonObject, suffix: str) -> Callable[[str, str], str]:
     """Return a function that formats a JSON value by its path, such as `policy.success_rate`."""
 
     def number(place: str, form: str) -> str:
-        value: Any = values
+        value: PyTree = values
         for key in place.split("."):
             value = value[int(key)] if isinstance(value, list) else value[key]
         text = "-" if value is None else _FORMS[form].format(value)

@@ -3,8 +3,8 @@
 The episodes are run again from their keys, because a report records trajectories but no images.
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,11 @@ MOST_FAILURES = 8
 
 _SIDE = 1.15  # [inch] side of an image in the figure
 _LEAST_HEAT = 0.05  # change of the action below which no part of a map is bright
+
+
+_Seen = tuple[UInt8[Array, "n moments h w c"], Float[Array, "n moments h w"]]
+_Replay = Callable[[PolicyParams, UInt32[Array, "n 2"], Int[Array, "n moments"]], _Seen]
+"""From parameters, reset keys and times of the moments to images and occlusion maps."""
 
 
 class SeenEpisode(NamedTuple):
@@ -102,8 +107,8 @@ class MomentFinder:
         )
 
 
-def _replay_fn(env: JetBotEnv, networks: Networks) -> Any:
-    """Return a function of (parameters, reset keys, times of the moments) to images and maps."""
+def _replay_fn(env: JetBotEnv, networks: Networks) -> _Replay:
+    """Return the function that runs episodes again."""
     episode_env = with_camera(
         EpisodeWrapper(env.blind(), env.config.task.episode_length), env.camera
     )
@@ -114,7 +119,7 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> Any:
 
     def run(
         params: PolicyParams, keys: UInt32[Array, "n 2"], times: Int[Array, "n moments"]
-    ) -> tuple[UInt8[Array, "n moments h w c"], Float[Array, "n moments h w"]]:
+    ) -> _Seen:
         policy = make_policy(networks, params)
 
         def advance(carry: tuple[Array, State, PyTree]) -> tuple[Array, State, PyTree]:
@@ -168,7 +173,7 @@ def plot_moments(episodes: Sequence[SeenEpisode]) -> Figure:
     size = (2 * len(MOMENTS) * (side_x + 0.08) + 1.0, len(episodes) * (side_y + 0.24) + 0.3)
     figure = Figure(figsize=size)
     figure.set_layout_engine("constrained", w_pad=0.02, h_pad=0.02, wspace=0.01, hspace=0.01)
-    grid: Any = figure.subplots(len(episodes), 2 * len(MOMENTS), squeeze=False)
+    grid = figure.subplots(len(episodes), 2 * len(MOMENTS), squeeze=False)
     largest = largest_change(episodes)
     for row, episode in zip(grid, episodes, strict=True):
         outcome = "reached" if episode.success else "missed"

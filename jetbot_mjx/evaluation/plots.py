@@ -6,7 +6,7 @@ The colours come from the theme in which a figure is drawn: `with theme("dark"):
 import contextlib
 import io
 from collections.abc import Iterator, Sequence
-from typing import Any, Literal
+from typing import Literal
 
 import matplotlib
 import numpy as np
@@ -47,7 +47,7 @@ _MAX_FAILURES = 200
 def theme(name: Theme) -> Iterator[None]:
     """Set the colours of figures that are drawn inside the context to a light or dark theme."""
     paper, ink, faint, cycle = _COLOURS[name]
-    style: Any = {
+    style = {
         **dict.fromkeys((f"{part}.facecolor" for part in _FACES), paper),
         **dict.fromkeys(("legend.edgecolor", "axes.edgecolor", "grid.color", "hatch.color"), faint),
         **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), ink),
@@ -61,7 +61,8 @@ def theme(name: Theme) -> Iterator[None]:
         "axes.titlelocation": "left",
         "font.size": 10,
     }
-    with matplotlib.rc_context(style):
+    # The stub lists all names, and some of these are composed.
+    with matplotlib.rc_context(style):  # pyright: ignore[reportArgumentType]
         yield
 
 

@@ -7,7 +7,7 @@ does not see. The evaluation in C MuJoCo uses the same robot with numerics that 
 """
 
 from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,13 +79,10 @@ class Sweep(NamedTuple):
     @property
     def variants(self) -> list[Variant]:
         """Return robot and looks for each value."""
-        kind = 1 if self.is_look else 0
-        variants = []
-        for value in self.values:
-            parts: list[Any] = [RobotParams(), LookParams()]
-            parts[kind] = parts[kind]._replace(**{self.name: value})
-            variants.append((parts[0], parts[1]))
-        return variants
+        changes = [{self.name: value} for value in self.values]
+        if self.is_look:
+            return [(RobotParams(), LookParams()._replace(**change)) for change in changes]
+        return [(RobotParams()._replace(**change), LookParams()) for change in changes]
 
 
 SWEEPS = tuple(

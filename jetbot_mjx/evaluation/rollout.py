@@ -6,7 +6,7 @@ that a scripted controller can be evaluated like a policy. This module adds the 
 """
 
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -85,7 +85,7 @@ class _Carry(NamedTuple):
 class _OneEpisodeWrapper(Wrapper):
     """A wrapper that sums up the first episode in `info`, and then keeps its final state."""
 
-    env: Any
+    env: envs.EpisodeWrapper
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
         """Begin the episode with empty statistics."""

@@ -21,13 +21,13 @@ from jetbot_mjx.agents import (
 )
 from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.devices import require_float32
-from jetbot_mjx.envs import JetBotEnv, layout_data
+from jetbot_mjx.envs import FieldData, JetBotEnv, layout_data
 from jetbot_mjx.errors import InvalidError, UserError, os_errors, shown
 from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
 from jetbot_mjx.runs.run_dir import JsonObject
 from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
-from jetbot_mjx.runs.run_finder import ROOT, find_run, list_runs, suggest_run
+from jetbot_mjx.runs.run_finder import ROOT, find_run, scan_runs, suggest_run
 from jetbot_mjx.runs.setup import Setup
 from jetbot_mjx.runs.task_code import stored_task_class
 
@@ -40,7 +40,7 @@ POLICY = "policy"
 FORMAT = "jetbot_mjx/3"
 """Format of a checkpoint's content; checkpoints of other formats cannot be read."""
 
-LayoutData = Sequence[JsonObject]
+LayoutData = Sequence[FieldData]
 """The fields of an observation, as checkpoints store them."""
 
 _Size = Annotated[int, Field(ge=1, lt=2**24)]
@@ -306,7 +306,7 @@ def _find(path: Path, which: Which) -> Path:
         return path
     if seeds := sorted(path.glob("seed-*")):
         raise missing(f"it holds several seeds; name one, such as {seeds[0]}")
-    if not (path / FOLDER).is_dir() and (runs := list_runs(path)):
+    if not (path / FOLDER).is_dir() and (runs := scan_runs(path)[0]):
         names = ", ".join(run.path.name for run in runs[:8]) + (", ..." if runs[8:] else "")
         raise missing(f"it holds {len(runs)} runs; name one of {names}")
     if not (path / FOLDER).is_dir():

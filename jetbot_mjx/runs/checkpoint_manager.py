@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
 import jax
 import numpy as np
@@ -71,7 +70,10 @@ class _PreserveBestAndLatest(checkpoint_managers.PreservationPolicy):
         self._success = success
 
     def should_preserve(
-        self, checkpoints: Sequence[Any], *, context: checkpoint_managers.PreservationContext
+        self,
+        checkpoints: Sequence[checkpoint_managers.PolicyCheckpointInfo],
+        *,
+        context: checkpoint_managers.PreservationContext,
     ) -> Sequence[bool]:
         success = [self._success.get(one.step, -1.0) for one in checkpoints]
         best = max(range(len(success)), key=lambda index: (success[index], index), default=0)

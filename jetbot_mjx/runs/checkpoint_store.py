@@ -38,7 +38,7 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol, Self
+from typing import TYPE_CHECKING, Protocol, Self
 
 import jax
 import numpy as np
@@ -79,7 +79,7 @@ class _Typed(Protocol):
     def shape(self) -> Sequence[int]: ...
 
     @property
-    def dtype(self) -> Any: ...
+    def dtype(self) -> object: ...
 
 
 class CheckpointError(UserError):
@@ -165,16 +165,6 @@ class CheckpointStore:
                 )
             if not start_save(self._manager, env_steps, arrays, {_ABOUT: about}):
                 raise ValueError(f"there is one after {env_steps} steps or more")
-
-    def wait(self) -> None:
-        """Wait until all checkpoints are on disk.
-
-        Raises:
-          CheckpointError: a checkpoint could not be written.
-        """
-        if self._manager is not None:
-            with self._writing():
-                self._manager.wait_until_finished()
 
     def __enter__(self) -> Self:
         """Return the store itself."""
@@ -364,7 +354,7 @@ def read_tree(path: Path, name: str, template: PyTree) -> PyTree:
     return jax.tree.unflatten(jax.tree.structure(template), [flat[key] for key in wanted])
 
 
-def flatten(tree: PyTree) -> dict[str, Any]:
+def flatten(tree: PyTree) -> dict[str, PyTree]:
     """Return the leaves of a tree by their path, such as `params.policy.hidden_0.bias`."""
     return {
         jax.tree_util.keystr(path, simple=True, separator="."): leaf
@@ -505,5 +495,4 @@ def _reason(error: Exception) -> str:
 def _describe(array: _Typed | None) -> str:
     if array is None:
         return "missing"
-    dtype = getattr(array.dtype, "numpy_dtype", array.dtype)
-    return f"{np.dtype(dtype)}{list(array.shape)}"
+    return f"{getattr(array.dtype, 'numpy_dtype', array.dtype)}{list(array.shape)}"

@@ -35,7 +35,7 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
 
 import jax
 from tensorboardX import summary as tensorboard_summary
@@ -46,6 +46,9 @@ from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import read_bytes, write_text
 from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
+
+if TYPE_CHECKING:
+    from google.protobuf.message import Message
 
 METRICS = "metrics.jsonl"
 """Name of the file of metrics in a run folder."""
@@ -180,8 +183,8 @@ def _line(env_steps: int, timestamp: float, metrics: MetricValues) -> str:
 
 
 # Protocol buffers create their classes at import time, so pyright does not know them.
-_SUMMARY: Any = vars(summary_pb2)["Summary"]
-_EVENT: Any = vars(event_pb2)["Event"]
+_SUMMARY = vars(summary_pb2)["Summary"]
+_EVENT = vars(event_pb2)["Event"]
 
 _GIF_SIZE_AT = 6
 """Byte of a GIF at which its width and height begin, two bytes each."""
@@ -231,7 +234,7 @@ class TensorBoardSink:
             events.unlink()
         # tensorboardX's SummaryWriter writes from a thread, whose errors would not be reported.
         self._writer = EventsWriter(str(folder / "events"))
-        self._at_end: Any = None
+        self._at_end: Message | None = None
         if config is not None:
             self._describe(config)
         for entry in history:

@@ -40,19 +40,7 @@ class Resumption(NamedTuple):
 def to_trees(state: TrainState) -> dict[str, PyTree]:
     """Return a training state as the trees of a checkpoint, with its sums by name."""
     rest = {name: getattr(state, name) for name in _REST}
-    sums = {name: np.asarray(total) for name, total in state.sums.items()}
-    return {POLICY: state.policy_params, TRAINING: {**rest, "tally": sums}}
-
-
-def tree_shapes(template: TrainState) -> dict[str, PyTree]:
-    """Return the shapes and dtypes of the trees of `to_trees`.
-
-    Args:
-      template: the shapes and dtypes of a training state.
-    """
-    rest = {name: getattr(template, name) for name in _REST}
-    sums = dict.fromkeys(TALLIED, jax.ShapeDtypeStruct((), np.float32))
-    return {POLICY: template.policy_params, TRAINING: {**rest, "tally": sums}}
+    return {POLICY: state.policy_params, TRAINING: {**rest, "tally": state.sums}}
 
 
 def resume(
@@ -109,7 +97,7 @@ def _read(path: Path, config: Config, template: TrainState) -> tuple[TrainState,
         parse_config(about["config"], source="stored config").check_resume(config)
     except ConfigError as error:
         raise CheckpointError(f"checkpoint {path} belongs to another run: {error}") from None
-    shapes = tree_shapes(template)
+    shapes = jax.eval_shape(to_trees, template)
     policy: PolicyParams = checkpoint_store.read_tree(path, POLICY, shapes[POLICY])
     rest = checkpoint_store.read_tree(path, TRAINING, shapes[TRAINING])
     rest["tally"] = np.stack([rest["tally"][name] for name in TALLIED])

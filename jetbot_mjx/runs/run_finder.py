@@ -118,18 +118,6 @@ def find_run_config(run_dir: Path) -> Path:
     return run_dir / CONFIG
 
 
-def list_runs(root: Path = ROOT) -> list[RunInfo]:
-    """Return the runs in the subfolders of a folder, the latest first, without damaged ones.
-
-    Args:
-      root: the folder, which may be missing.
-
-    Raises:
-      UserError: the folder cannot be read.
-    """
-    return scan_runs(root)[0]
-
-
 def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRun]]:
     """Return the runs in the subfolders of a folder, the latest first, and the damaged ones.
 
@@ -244,7 +232,7 @@ def suggest_run(path: Path, what: str = "a run folder or a checkpoint in it") ->
       path: the path.
       what: what to give instead, if no name is similar.
     """
-    names = [_LATEST, *(run.path.name for run in list_runs())]
+    names = [_LATEST, *(run.path.name for run in scan_runs()[0])]
     names += [f"{_PREFIX}{one.name}" for one in PRETRAINED.iterdir()]
     if path.name == _PREFIX[:-1]:
         return f"write {_PREFIX}NAME, as in {names[-1]}"

@@ -1,10 +1,17 @@
 """Build what a configuration describes: environment, networks, programs."""
 
 import functools
+
 from jetbot_mjx.agents import Networks, make_networks
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import JetBotEnv, Task, make_env, open_program_cache, wrap_for_training
-from jetbot_mjx.mjx_import import Env
+from jetbot_mjx.envs import (
+    BatchWrapper,
+    JetBotEnv,
+    Task,
+    make_env,
+    open_program_cache,
+    wrap_for_training,
+)
 from onekernel import ProgramCache
 
 
@@ -45,7 +52,7 @@ class Setup:
         return self._env or make_env(self.config, task_class=self._task_class)
 
     @functools.cached_property
-    def training_env(self) -> Env:
+    def training_env(self) -> BatchWrapper:
         """Return the environment in the wrappers of a training, batched."""
         return wrap_for_training(self.env, self.config.task.episode_length)
 

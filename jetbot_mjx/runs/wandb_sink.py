@@ -9,15 +9,16 @@ import contextlib
 import importlib.util
 import json
 import uuid
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Protocol
 
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import MissingPackageError
 from jetbot_mjx.runs.metrics import VIDEO_TAG, History, MetricValues
 from jetbot_mjx.runs.run_dir import JsonObject, read_text, write_json
 from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
+
 _FILE = "wandb.json"
 _INIT_SECONDS = 30.0
 _FINISH_SHARE_OF_NOTICE = 0.3
@@ -39,6 +40,14 @@ def check_tracking(config: Config) -> None:
             f"wandb = {config.wandb!r} needs a package that is not installed:"
             " pip install 'jetbot_mjx[wandb]'"
         )
+
+
+class _Run(Protocol):
+    """A run of Weights & Biases."""
+
+    def log(self, data: Mapping[str, object], *, step: int) -> None: ...
+
+    def finish(self) -> None: ...
 
 
 class WandbSink:
@@ -69,7 +78,7 @@ class WandbSink:
         self._say = say
         self._path = run_dir / _FILE
         self._progress = _read(self._path, config.wandb)
-        self._run: Any = None
+        self._run: _Run | None = None
         self._last_written: int | None = None
         with self._disable_on_error():
             self._run = self._begin(config, run_dir, seeds)
@@ -77,8 +86,8 @@ class WandbSink:
         for entry in history:
             self.write(entry.env_steps, entry.metrics)
 
-    def _begin(self, config: Config, run_dir: Path, seeds: int) -> Any:
-        wandb: Any = importlib.import_module("wandb")
+    def _begin(self, config: Config, run_dir: Path, seeds: int) -> _Run:
+        wandb = importlib.import_module("wandb")
         group = run_dir.parent.name if seeds > 1 else None
         task = config.task.name.rpartition(":")[2]
         tags = (task, config.task.observation, config.robot.preset, config.trainer)

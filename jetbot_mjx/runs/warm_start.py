@@ -16,7 +16,7 @@ and the part that gives the width of its noise is that of a new policy. The opti
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -24,19 +24,16 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jetbot_mjx.agents import PolicyParams, TrainState, UInt64, last_layer, make_policy
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs import JetBotEnv, layout_data
+from jetbot_mjx.envs import JetBotEnv, State, layout_data
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.checkpoint import Checkpoint, LayoutData
 from jetbot_mjx.runs.run_dir import JsonObject
 from jetbot_mjx.runs.setup import Setup
 
-# Pyright does not follow flax's dataclasses.
-_UInt64: Any = UInt64
-
 MEAN_SCALE = 0.25
 """Factor on the means of the actions, before they are limited to -1 .. 1."""
 
-_Driving = tuple[Any, Array]
+_Driving = tuple[State, Array]
 """The states of the environments, and the key of the next actions."""
 
 _MEASURED_ENVS = 256
@@ -215,7 +212,7 @@ def _measure(params: PolicyParams, setup: Setup, rows: Int[np.ndarray, " new"]) 
     config, batched = setup.config, setup.training_env
     policy = make_policy(setup.networks, params)
 
-    def step(carry: _Driving, _: None) -> tuple[_Driving, Float[Array, "n obs"]]:
+    def step(carry: _Driving, _: None) -> tuple[_Driving, PyTree]:
         state, key = carry
         key, action_key = jax.random.split(key)
         return (batched.step(state, policy(state.obs, action_key)), key), state.obs
@@ -233,7 +230,8 @@ def _measure(params: PolicyParams, setup: Setup, rows: Int[np.ndarray, " new"]) 
     floor = setup.env.observation_min_std if config.ppo.normalizer == "physical" else 1e-6
     std = np.where(known, old.std, np.maximum(measured_std, floor)).astype(np.float32)
     return old.replace(
-        count=_UInt64(hi=np.uint32(0), lo=np.uint32(count)),
+        # Pyright does not follow flax's dataclasses.
+        count=UInt64(hi=np.uint32(0), lo=np.uint32(count)),  # pyright: ignore[reportCallIssue]
         mean=np.where(known, old.mean, measured_mean).astype(np.float32),
         std=std,
         summed_variance=(np.square(std) * count).astype(np.float32),

@@ -16,7 +16,6 @@ import importlib.machinery
 import sys
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any
 
 from jetbot_mjx.startup.switch import is_plain
 
@@ -26,7 +25,7 @@ _Around = Callable[[], contextlib.AbstractContextManager[None]]
 class LazyModule(types.ModuleType):
     """A stand-in for a module, which imports the module at the first access to an attribute."""
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         if sys.modules.get(self.__name__) is self:
             del sys.modules[self.__name__]
         return getattr(importlib.import_module(self.__name__), name)
@@ -36,7 +35,7 @@ class _Trimesh(LazyModule):
     """A lazy trimesh with its class `Trimesh`, which MJX's annotations use at import time."""
 
     @staticmethod
-    def Trimesh(*arguments: Any, **options: Any) -> Any:
+    def Trimesh(*arguments: object, **options: object) -> object:
         return importlib.import_module("trimesh").Trimesh(*arguments, **options)
 
 

@@ -11,7 +11,10 @@ import io
 import os
 import select
 import sys
-from typing import Any
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from _typeshed import ReadableBuffer
 
 
 class _Output(io.FileIO):
@@ -19,7 +22,7 @@ class _Output(io.FileIO):
 
     error: OSError | None = None
 
-    def write(self, data: Any, /) -> int:
+    def write(self, data: "ReadableBuffer", /) -> int:
         """Write bytes, and return how many were written or dropped."""
         try:
             # None: the file descriptor does not block, and its reader is slower than this process.
@@ -28,7 +31,7 @@ class _Output(io.FileIO):
             return count
         except OSError as error:
             self.error = error
-            return len(data)
+            return memoryview(data).nbytes
 
 
 def protect_output() -> None:

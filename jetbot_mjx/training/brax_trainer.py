@@ -8,7 +8,7 @@ resumed, because Brax keeps its state in local variables.
 import contextlib
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import Self
 
 import jax
 import jax.numpy as jnp
@@ -52,8 +52,7 @@ class _LinearRate(float):
 
     def at(self, env_steps: int) -> float:
         """Return the step size after a number of environment steps."""
-        rate: Any = self._schedule(env_steps * self._gradient_steps_per_step)
-        return float(rate)
+        return float(np.asarray(self._schedule(env_steps * self._gradient_steps_per_step)))
 
 
 def train(setup: Setup, recorder: TrainerCallback) -> None:
@@ -70,8 +69,6 @@ def train(setup: Setup, recorder: TrainerCallback) -> None:
         rate = ppo["learning_rate"] = _LinearRate(config.ppo.learning_rate, config.ppo)
         ppo["learning_rate_schedule"] = "NONE"
     latest: PolicyParams | None = None
-    # Brax annotates it as a function of the environment alone, but passes four arguments.
-    wrap_env_fn: Any = wrap_for_training
     clock = time.perf_counter()
 
     # Brax calls back twice in an epoch: first with the parameters, then with the metrics.
@@ -79,13 +76,11 @@ def train(setup: Setup, recorder: TrainerCallback) -> None:
         nonlocal latest
         latest = PolicyParams(*params)
         if env_steps == 0:
-            report(0, {}, 0.0)
+            report(0, {})
 
-    def on_metrics(env_steps: int, metrics: Mapping[str, Any]) -> None:
-        report(env_steps, metrics, time.perf_counter() - clock)
-
-    def report(env_steps: int, metrics: Mapping[str, float], seconds: float) -> None:
+    def report(env_steps: int, metrics: Mapping[str, jax.Array]) -> None:
         nonlocal clock
+        seconds = time.perf_counter() - clock if env_steps else 0.0
         params = jax.device_get(latest)
         named = rename_metrics(metrics, config.ppo.entropy_cost)
         if rate is not None and metrics:
@@ -94,9 +89,6 @@ def train(setup: Setup, recorder: TrainerCallback) -> None:
             raise _StopTraining
         clock = time.perf_counter()
 
-    def network_factory(*_: Any, **__: Any) -> Any:
-        return setup.networks
-
     from brax.training.agents.ppo import train as brax_train
 
     # Run Brax's trainer without its own evaluations.
@@ -104,27 +96,28 @@ def train(setup: Setup, recorder: TrainerCallback) -> None:
         brax_train.train(
             environment=setup.env,
             episode_length=config.task.episode_length,
-            wrap_env_fn=wrap_env_fn,
-            network_factory=network_factory,
+            # Brax annotates it as a function of the environment alone, but passes four arguments.
+            wrap_env_fn=wrap_for_training,  # pyright: ignore[reportArgumentType]
+            network_factory=lambda *_, **__: setup.networks,  # pyright: ignore[reportArgumentType]
             seed=config.seed,
             # Report at the beginning and after every interval; the recorder evaluates.
             num_evals=1 + max(1, round(config.ppo.num_timesteps / config.checkpoint_interval)),
             run_evals=False,
             # Brax resets an evaluation batch of this size even without evaluations.
             num_eval_envs=1,
-            progress_fn=on_metrics,
+            progress_fn=report,
             policy_params_fn=on_params,
             **ppo,
         )
 
 
-def rename_metrics(metrics: Mapping[str, float], entropy_cost: float) -> dict[str, float]:
+def rename_metrics(metrics: Mapping[str, jax.Array], entropy_cost: float) -> dict[str, float]:
     """Return Brax's metrics under this project's names."""
     brax = {name.removeprefix("training/"): float(value) for name, value in metrics.items()}
-    metrics = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
+    found = {ours: brax[theirs] for theirs, ours in LOSSES.items() if theirs in brax}
     if "entropy_loss" in brax and entropy_cost > 0:
-        metrics["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
-    return metrics
+        found["policy/entropy"] = -brax["entropy_loss"] / entropy_cost
+    return found
 
 
 @contextlib.contextmanager

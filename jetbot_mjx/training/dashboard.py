@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TextIO
+from typing import TextIO
 
 import jax
 from rich.columns import Columns
@@ -381,7 +381,7 @@ class _LineQueue(io.TextIOBase):
     def fileno(self) -> int:
         return self._stream.fileno()
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name: str) -> object:
         return getattr(self._stream, name)
 
 

@@ -8,7 +8,6 @@ make the same collective calls in the same order, and none waits for a process t
 import os
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -152,8 +151,8 @@ def broadcast_from_primary(trees: Sequence[PyTree], template: PyTree, count: int
         leaves = jax.tree.leaves(list(trees))
         local = np.concatenate([np.ascontiguousarray(x).reshape(-1).view(np.uint8) for x in leaves])
     # Broadcast bytes: JAX broadcasts by a sum, in which a float loses the sign of a zero.
-    content: Any = multihost_utils.broadcast_one_to_all(local)
-    parts = np.split(np.asarray(content), np.cumsum(sizes)[:-1])
+    content = np.asarray(multihost_utils.broadcast_one_to_all(local))
+    parts = np.split(content, np.cumsum(sizes)[:-1])
     arrays = [
         part.view(np.dtype(x.dtype)).reshape(x.shape) for part, x in zip(parts, shapes, strict=True)
     ]

@@ -22,7 +22,7 @@ import contextlib
 import functools
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, Self
+from typing import Self
 
 import jax
 import numpy as np
@@ -183,7 +183,9 @@ class CompiledTrainer:
         # CPUs multiply the matrices of a batch faster.
         alone = len(self._seeds) == 1 and jax.default_backend() == "gpu"
 
-        def advance(state: TrainState, steps: jax.Array, restart: jax.Array) -> Any:
+        def advance(
+            state: TrainState, steps: jax.Array, restart: jax.Array
+        ) -> tuple[TrainState, NanDump]:
             if alone:
                 # A batch of one would be traced a second time, as a batch.
                 one = jax.tree.map(lambda x: x[0], state)
@@ -371,9 +373,9 @@ def env_steps(state: TrainState) -> int:
     return int(state.env_steps.to_numpy())
 
 
-def _metrics(sums: Mapping[str, Any], entropy_cost: float) -> dict[str, float]:
+def _metrics(totals: Mapping[str, Array], entropy_cost: float) -> dict[str, float]:
     """Return means and counts from the sums of a state; empty before the first step."""
-    sums = {name: float(value) for name, value in sums.items()}
+    sums = {name: float(value) for name, value in totals.items()}
     steps, episodes = sums["training_steps"], sums["rollout/episodes"]
     if steps == 0:
         return {}

@@ -22,7 +22,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from jetbot_mjx.config import Config, ConfigError
+from jetbot_mjx.config import Config, ConfigError, Setting
 from jetbot_mjx.errors import UserError, ran_out, requires_extra
 from jetbot_mjx.evaluation import REPORT_GOALS, report_keys
 from jetbot_mjx.runs import load_checkpoint, make_folder
@@ -491,5 +491,5 @@ def _check_config(config: Config) -> None:
         load_checkpoint(config.init_from)
 
 
-def _frozen(value: Value | list[Value]) -> Value:
-    return tuple(value) if isinstance(value, list) else value
+def _frozen(value: Setting) -> Value:
+    return tuple(map(_frozen, value)) if isinstance(value, list) else value

@@ -8,7 +8,7 @@ world. A player is not thread-safe.
 import operator
 import time
 from pathlib import Path
-from typing import Any
+from typing import TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +24,8 @@ from jetbot_mjx.viewers.step_fns import AGENTS, Inputs, Snapshot, make_viewer_fn
 
 SPEEDS = (0.1, 4.0)
 """Slowest and fastest pace, as a multiple of real time."""
+
+_Tree = TypeVar("_Tree")
 
 _NUDGES = 8  # key presses from standstill to the largest command
 _HOLD_SECONDS = 0.4  # pause after the end of an episode, so that the user sees it
@@ -284,7 +286,7 @@ class Player:
         self.crowd: Snapshot = jax.device_get(result[1])
         """The same of all robots."""
 
-    def _put(self, tree: Any) -> Any:
+    def _put(self, tree: _Tree) -> _Tree:
         return jax.device_put(tree, self._device)
 
     def _restart_clock(self) -> None:

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -163,7 +163,7 @@ def _move_goal(env: envs.JetBotEnv, state: envs.State, position_w: Float[Array, 
 def _snapshot(env: envs.JetBotEnv, states: envs.State) -> Snapshot:
     """Return the snapshot of all robots."""
 
-    def terms(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    def terms(metrics: Mapping[str, Array]) -> dict[str, Array]:
         names = (name for name in metrics if name.startswith(_REWARD))
         return {name.removeprefix(_REWARD): metrics[name] for name in names}
 

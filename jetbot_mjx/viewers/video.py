@@ -10,7 +10,7 @@ import io
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import imageio.v3 as iio
 import jax
@@ -290,7 +290,7 @@ class VideoRenderer(contextlib.ExitStack):
 
 
 @functools.cache
-def _font(size: float) -> Any:
+def _font(size: float) -> ImageFont.FreeTypeFont | ImageFont.ImageFont:
     return ImageFont.load_default(size)
 
 
@@ -364,8 +364,7 @@ def write_mp4(path: Path, frames: Iterable[Frame], fps: float = FPS) -> None:
     """
     # Encode in memory, so that a full disk leaves no partial file.
     file = io.BytesIO()
-    with iio.imopen(file, "w", plugin="pyav", extension=".mp4") as opened:
-        video: Any = opened
+    with iio.imopen(file, "w", plugin="pyav", extension=".mp4") as video:
         video.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
         for frame in frames:
             video.write_frame(frame)

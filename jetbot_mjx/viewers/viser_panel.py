@@ -3,7 +3,7 @@
 import html
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Literal
 
 import viser
 
@@ -151,7 +151,9 @@ class ControlPanel:
             self._add_key("H", "stop", press, player.drive, 0, 0),
         ]
 
-    def _add_key(self, key: Any, label: str, *press: Any) -> viser.CommandHandle:
+    def _add_key(
+        self, key: Literal["I", "J", "K", "L", "H"], label: str, *press: Callable[..., None] | int
+    ) -> viser.CommandHandle:
         command = self._server.gui.add_command(f"Drive: {label}", hotkey=key)
         command.on_trigger(lambda _: self._ask(*press))
         return command

@@ -8,7 +8,6 @@ import itertools
 import math
 import time
 from collections.abc import Callable
-from typing import Any
 
 import mujoco
 import numpy as np
@@ -20,6 +19,7 @@ from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
 from jetbot_mjx.envs import QPOS_QUAT, QPOS_XYZ
+from jetbot_mjx.runs import JsonObject
 from jetbot_mjx.viewers.meshes import Geom, visible_geoms
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.pose import set_pose
@@ -240,13 +240,13 @@ class Scene:
         scene.add_light_hemisphere("/sky", ground_color=(170, 170, 170), intensity=2.0)
         self._sun = scene.add_light_directional("/sun", position=(-1.0, -2.0, 4.0), intensity=2.0)
 
-    def _add_bodies(self) -> list[tuple[int, Any, Any]]:
+    def _add_bodies(self) -> list[tuple[int, UInt8[np.ndarray, "3"], viser.BatchedMeshHandle]]:
         """Add the meshes; return the body, the colour and the node of each.
 
         Parts of one body and one colour are one mesh.
         """
 
-        def look(geom: Geom) -> tuple[Any, ...]:
+        def look(geom: Geom) -> tuple[int, bool, tuple[float, ...]]:
             return geom.body, geom.smooth, geom.rgba
 
         sections = _SECTIONS if self._few else _COARSE_SECTIONS
@@ -254,7 +254,8 @@ class Scene:
         positions, quats = self._poses()
         parts = []
         for number, ((body, smooth, rgba), same) in enumerate(itertools.groupby(geoms, look)):
-            mesh: Any = trimesh.util.concatenate([geom.mesh for geom in same])
+            mesh = trimesh.util.concatenate([geom.mesh for geom in same])
+            assert isinstance(mesh, trimesh.Trimesh)
             name = self._model.body(body).name or f"body {body}"
             rgb = _page_rgb(255 * np.array(rgba[:3]))
             node = self._server.scene.add_batched_meshes_simple(
@@ -276,7 +277,7 @@ class Scene:
     def _on_click(self, event: viser.SceneClickEvent) -> None:
         self.point(event.ray_origin, event.ray_direction)
 
-    async def _on_drag(self, event: viser.SceneNodeDragEvent[Any]) -> None:
+    async def _on_drag(self, event: viser.SceneNodeDragEvent[viser.BatchedMeshHandle]) -> None:
         robot = event.instance_index or 0
         self._dragging = event.phase != "end"
         if event.phase == "start":
@@ -336,7 +337,7 @@ def _lines(edge: float, scale: float) -> bytes:
     return gltf.export_glb(scene, include_normals=False, tree_postprocessor=_unlit)
 
 
-def _unlit(tree: dict[str, Any]) -> None:
+def _unlit(tree: JsonObject) -> None:
     """Mark all materials as unlit: lighting the lines would cost more than the robot does."""
     tree["extensionsUsed"] = ["KHR_materials_unlit"]
     for material in tree["materials"]:

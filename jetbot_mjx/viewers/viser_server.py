@@ -26,12 +26,16 @@ from unittest import mock
 import rich
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
+from websockets.http11 import Request, Response
 
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.viewers.player import Player
 from jetbot_mjx.viewers.realtime import Clock
 from jetbot_mjx.viewers.viser_panel import ControlPanel
 from jetbot_mjx.viewers.viser_scene import FPS, Scene
+
+_Handler = Callable[[ServerConnection, Request], Response | None]
 
 FIRST_PORT = 8080
 _PORTS_TRIED = 100
@@ -153,8 +157,10 @@ class _OriginCheck:
         """
         serve = websockets.asyncio.server.serve
 
-        def serve_with_check(*arguments: Any, process_request: Any, **options: Any) -> Any:
-            def check(connection: Any, request: Any) -> Any:
+        def serve_with_check(
+            *arguments: Any, process_request: _Handler, **options: Any
+        ) -> websockets.asyncio.server.serve:
+            def check(connection: ServerConnection, request: Request) -> Response | None:
                 refusal = self._refusal(connection, request)
                 return process_request(connection, request) if refusal is None else refusal
 
@@ -164,7 +170,7 @@ class _OriginCheck:
         with mock.patch.object(websockets.asyncio.server, "serve", serve_with_check):
             yield
 
-    def _refusal(self, connection: Any, request: Any) -> Any:
+    def _refusal(self, connection: ServerConnection, request: Request) -> Response | None:
         """Return the HTTP response that refuses a request; None if the request is accepted."""
         headers = request.headers
         # Only websockets matter: the page is not secret. Programs other than browsers could send

@@ -16,7 +16,7 @@ from brax.training.agents.ppo import losses
 
 from helpers import gliding
 from helpers.command_modules import evaluate
-from helpers.gliding import Gliding
+from helpers.gliding import Gliding, GlidingPhysics
 from helpers.small_ppo import (
     SIZE,
     TINY,
@@ -409,11 +409,15 @@ def test_where_every_gradient_is_bad_nothing_moves_by_a_bit():
 FUSE = 5  # environment steps that a brittle world lasts; too few to reach a goal
 
 
-class Brittle(Gliding):
-    def step_physics(self, physics, ctrl, mocap_pos=None):
-        after = super().step_physics(physics, ctrl, mocap_pos)
-        spent = after.time > (FUSE - 0.5) * self.dt
+class BrittlePhysics(GlidingPhysics):
+    def step(self, state, ctrl, mocap_pos=None):
+        after = super().step(state, ctrl, mocap_pos)
+        spent = after.time > (FUSE - 0.5) * self._config.ctrl_dt
         return after.replace(qvel=jnp.where(spent, jnp.nan, after.qvel))
+
+
+class Brittle(Gliding):
+    physics_class = BrittlePhysics
 
 
 LINEAR_STEPS = 8

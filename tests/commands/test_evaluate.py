@@ -243,7 +243,7 @@ def test_another_simulator_is_told_beside_the_one_of_the_training(judged, tmp_pa
     assert f"--episodes {EPISODES} --simulator mujoco\n" in page
     # And without a report, the same again.
     again = evaluate_in_mujoco(run_dir, episodes=EPISODES)
-    assert json.loads(json.dumps(json_values(again))) == values["mujoco"]
+    assert json.loads(json.dumps(json_values(again._asdict()))) == values["mujoco"]
 
 
 def test_another_simulator_that_there_is_not_is_refused(judged, capfd):

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import motion
 from jetbot_mjx.config import RobotParams
-from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.actuators import initial_actuator_state, step_actuators
 from jetbot_mjx.envs.domain_randomization import LARGEST_TRACED
 from jetbot_mjx.envs.robot_model import WHEEL_RADIUS, WHEEL_SEPARATION
@@ -73,10 +73,10 @@ def test_unequal_motors_and_wheels_part_symmetrically():
 def test_wheels_of_another_size_and_distance_move_the_robot_as_kinematics_says(left, right):
     robot_params = RobotParams(wheel_radius=1.04, wheel_separation=0.95)
     entered = drive(robot_params, [(left, right)])[0]
-    as_entered = kinematics.body_twist(
+    as_entered = motion.body_twist(
         jnp.asarray(entered), wheel_radius=WHEEL_RADIUS, wheel_separation=WHEEL_SEPARATION
     )
-    true = kinematics.body_twist(
+    true = motion.body_twist(
         jnp.array([left, right]),
         wheel_radius=1.04 * WHEEL_RADIUS,
         wheel_separation=0.95 * WHEEL_SEPARATION,

@@ -75,10 +75,10 @@ def test_every_fault_is_found_by_its_check(name, check, told):
 
 
 def test_a_non_finite_state_is_found_during_a_drive(monkeypatch):
-    def blow_up(self, physics, ctrl, mocap_pos=None):
-        return physics.replace(qvel=physics.qvel * jnp.nan)
+    def blow_up(self, state, ctrl, mocap_pos=None):
+        return state.replace(qvel=state.qvel * jnp.nan)
 
-    monkeypatch.setattr(gliding.Gliding, "step_physics", blow_up)
+    monkeypatch.setattr(gliding.GlidingPhysics, "step", blow_up)
     check, messages = first_findings(config_of("helpers.broken_tasks:Sound"))
     assert check == "drive"
     assert "1024 of 1024 steps are not finite" in messages[0]

@@ -21,7 +21,7 @@ def made(choice):
 def test_the_choice_decides_whether_physics_calls_a_library(choice, calls):
     env = made(choice)
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    text = jax.jit(env.step_physics).lower(state, jnp.zeros(2)).as_text()
+    text = jax.jit(env.physics.step).lower(state, jnp.zeros(2)).as_text()
     assert any(call in text for call in CALLS) == calls
 
 
@@ -30,7 +30,7 @@ def test_both_choices_make_the_same_step():
     for choice in ("unrolled", "library"):
         env = made(choice)
         states.append(env.reset(jax.random.PRNGKey(0)).pipeline_state)
-        step = jax.jit(env.step_physics)
+        step = jax.jit(env.physics.step)
         for _ in range(5):
             states[-1] = step(states[-1], jnp.array([4.0, 9.0]))
     np.testing.assert_allclose(states[0].qvel, states[1].qvel, atol=2e-5)
@@ -47,5 +47,5 @@ def test_nothing_of_jax_is_replaced_while_physics_is_traced(monkeypatch):
     monkeypatch.setattr(mjx, "step", looking_round)
     env = made("unrolled")
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    jax.eval_shape(env.step_physics, state, jnp.zeros(2))
+    jax.eval_shape(env.physics.step, state, jnp.zeros(2))
     assert set(seen) == {library}

@@ -49,9 +49,9 @@ def test_physics_as_one_kernel_raises_errors_of_the_user():
     env = make_env(parse_config({"physics": {"impl": "llvm"}}))
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
     with pytest.raises(UserError, match=r"^physics as one kernel cannot be .*physics\.impl = xla"):
-        jax.grad(lambda ctrl: env.step_physics(state, ctrl).qvel[0])(jnp.ones(2))
+        jax.grad(lambda ctrl: env.physics.step(state, ctrl).qvel[0])(jnp.ones(2))
     with pytest.raises(UserError, match=r"^physics\.impl = llvm: this program is for cuda: choose"):
-        jax.jit(env.step_physics).trace(state, jnp.ones(2)).lower(lowering_platforms=("cuda",))
+        jax.jit(env.physics.step).trace(state, jnp.ones(2)).lower(lowering_platforms=("cuda",))
     # So do those of a whole step, in which physics is a part.
     first = env.reset(jax.random.PRNGKey(0))
     with pytest.raises(UserError, match=r"^physics as one kernel cannot be .*physics\.impl = xla"):
@@ -70,7 +70,7 @@ def test_the_remedy_helps():
     settings = {"impl": "xla", "iterations": 1}
     env = make_env(parse_config({"physics": settings}))
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    slope = jax.grad(lambda ctrl: env.step_physics(state, ctrl).qvel[0])(jnp.ones(2))
+    slope = jax.grad(lambda ctrl: env.physics.step(state, ctrl).qvel[0])(jnp.ones(2))
     assert np.isfinite(slope).all()
     assert (slope > 0).all()
 
@@ -115,4 +115,4 @@ def test_a_step_that_no_kernel_can_do_is_xlas_unless_the_kernel_was_asked_for(im
         assert env.physics.impl == "xla"
         return
     with pytest.raises(UserError, match=r"physics\.impl = llvm: one kernel cannot do.*cholesky"):
-        env.step_physics(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))
+        env.physics.step(env.reset(jax.random.PRNGKey(0)).pipeline_state, jnp.zeros(2))

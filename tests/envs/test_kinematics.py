@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from helpers import motion
 from jetbot_mjx.envs import kinematics
 
 CONTROLLER = {"wheel_radius": 0.0325, "wheel_separation": 0.1125}
@@ -49,7 +50,7 @@ def test_the_fastest_wheel_turns_at_36_rad_per_second():
 def test_inverses():
     twist = jnp.array([0.3, -1.2])
     wheels = kinematics.wheel_speeds(twist, **CONTROLLER)
-    np.testing.assert_allclose(kinematics.body_twist(wheels, **CONTROLLER), twist, rtol=1e-5)
+    np.testing.assert_allclose(motion.body_twist(wheels, **CONTROLLER), twist, rtol=1e-5)
     limits = {"max_speed": 1.0, "max_yaw_rate": math.pi}
     action = kinematics.action_from_twist(twist, **limits)
     np.testing.assert_allclose(kinematics.twist_from_action(action, **limits), twist, rtol=1e-5)
@@ -65,7 +66,7 @@ def test_rotations_match_scipy():
     np.testing.assert_allclose(
         jax.vmap(kinematics.yaw)(quats), np.arctan2(x_axis[:, 1], x_axis[:, 0]), atol=1e-5
     )
-    np.testing.assert_allclose(jax.vmap(kinematics.tilt)(quats), np.arccos(z_axis[:, 2]), atol=2e-3)
+    np.testing.assert_allclose(jax.vmap(motion.tilt)(quats), np.arccos(z_axis[:, 2]), atol=2e-3)
 
 
 def test_pitching_turns_a_body_about_its_own_y_axis():

@@ -76,7 +76,7 @@ def test_a_physics_step_ends_where_c_mujoco_converges(name, impl):
     env = make_env(parse_config({"physics": {"ctrl_dt": 1 / 120, "impl": impl}}))
     robot = dataclasses.replace(env.robot, friction=friction)
     model = make_mj_model(robot, env.config.physics, visual=False)
-    after = jax.jit(env.with_model(mjx.put_model(model)).step_physics)(state, ctrl)
+    after = jax.jit(env.with_model(mjx.put_model(model)).physics.step)(state, ctrl)
 
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)

@@ -11,6 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from helpers import motion
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs import kinematics, mjx, robot_model
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -43,7 +44,7 @@ def driver(request):
 
         def step(physics, action):
             ctrl = jax.vmap(env.wheel_targets)(action)
-            physics = jax.vmap(here.step_physics)(physics, ctrl)
+            physics = jax.vmap(here.physics.step)(physics, ctrl)
             return physics, physics
 
         keys = jnp.zeros((len(actions), 2), jnp.uint32)
@@ -172,7 +173,7 @@ def test_mjx_follows_c_mujoco(driver, on_floor):
 def single_steps_agree(case, env, mjx_model, theirs, ctrl):
     """Check single control steps, from each state of the converged path to the next one."""
     states = jax.tree.map(lambda x: jnp.float32(x[:-1].reshape(-1, *x.shape[2:])), theirs)
-    step = env.with_model(mjx_model).step_physics
+    step = env.with_model(mjx_model).physics.step
     ahead = jax.jit(jax.vmap(step))(states, ctrl[1:].reshape(-1, 2))
     error = np.asarray(ahead.qvel) - theirs.qvel[1:].reshape(ahead.qvel.shape)
     error = np.linalg.norm(error[:, :3], axis=-1)
@@ -201,7 +202,7 @@ def test_straight_driving_and_spinning_match_closed_form(driver):
         "wheel_separation": robot_model.WHEEL_SEPARATION,
     }
     wheels = jax.vmap(env.wheel_targets)(actions)
-    expected = jax.vmap(lambda w: kinematics.body_twist(w, **geometry))(wheels)
+    expected = jax.vmap(lambda w: motion.body_twist(w, **geometry))(wheels)
     forward = np.asarray(physics.qpos[-1, 0, 0] - physics.qpos[120, 0, 0]) / (
         (STEPS - 121) * env.dt
     )
@@ -225,7 +226,7 @@ def test_nothing_flips_under_held_bang_bang_actions(driver, friction):
     physics = drive(mjx_model, actions)
     assert np.all(np.isfinite(physics.qpos))
     assert np.all(np.isfinite(physics.qvel))
-    tilt = np.degrees(jax.vmap(jax.vmap(kinematics.tilt))(physics.qpos[:, :, 3:7]).max())
+    tilt = np.degrees(jax.vmap(jax.vmap(motion.tilt))(physics.qpos[:, :, 3:7]).max())
     print(f"\n{env.config.robot.preset}, friction {friction}: worst tilt {tilt:.2f}°")
     assert tilt < WORST_TILT
 
@@ -243,7 +244,7 @@ def test_another_solver_is_another_kernel():
 
     def kernels(**changed):
         here = env.with_model(env.mjx_model.replace(opt=option.replace(**changed)))
-        lowered = jax.jit(here.step_physics).trace(state, jnp.zeros(2)).lower()
+        lowered = jax.jit(here.physics.step).trace(state, jnp.zeros(2)).lower()
         # On a CPU it names machine code by a hash, on a GPU it holds the PTX.
         calls = re.findall(r"custom_call @\S*(?:onekernel_|xla\.gpu\.ptx).*", lowered.as_text())
         (call,) = calls
@@ -259,7 +260,7 @@ def test_physics_keeps_full_precision_in_its_matrix_products():
     # TF32, the GPU's default for float32 products, makes the contact solver diverge.
     env = make_env(parse_config({"physics": {"impl": "xla"}}))
     state = jax.eval_shape(env.reset, jax.random.PRNGKey(0))
-    step = jax.make_jaxpr(env.step_physics)(state.pipeline_state, jnp.zeros(2))
+    step = jax.make_jaxpr(env.physics.step)(state.pipeline_state, jnp.zeros(2))
     products = [e for e in _equations(step.jaxpr) if e.primitive.name == "dot_general"]
     assert products
     highest = (jax.lax.Precision.HIGHEST, jax.lax.Precision.HIGHEST)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from helpers import motion
 from jetbot_mjx.config import RobotParams
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.sensors import initial_sensor_state, step_sensors
@@ -70,7 +71,7 @@ def test_noise_has_the_deviation_asked_for_and_no_mean(seen):
 def test_noise_leaves_height_and_level_and_is_new_at_every_step(seen):
     np.testing.assert_array_equal(np.asarray(seen.position_w)[:, 2], np.float32(0.03))
     np.testing.assert_array_equal(np.asarray(seen.angular_velocity_w)[:, :2], 0.0)
-    assert np.abs(np.asarray(jax.vmap(kinematics.tilt)(seen.quat))).max() < 1e-3
+    assert np.abs(np.asarray(jax.vmap(motion.tilt)(seen.quat))).max() < 1e-3
     assert len(np.unique(np.asarray(seen.position_w)[:, 0])) > 0.99 * SAMPLES
 
 
@@ -84,7 +85,7 @@ def test_offsets_raise_the_robot_and_lower_its_nose_whatever_its_delay_and_headi
     ahead = kinematics.rotate(now.quat, jnp.array([1.0, 0.0, 0.0]))
     np.testing.assert_allclose(ahead[2], -np.sin(0.02), atol=1e-6)
     assert float(kinematics.yaw(now.quat)) == pytest.approx(0.7, abs=1e-6)
-    assert float(kinematics.tilt(now.quat)) == pytest.approx(0.02, abs=1e-6)
+    assert float(motion.tilt(now.quat)) == pytest.approx(0.02, abs=1e-6)
 
 
 def test_an_exact_robot_sees_every_bit_and_remembers_nothing():

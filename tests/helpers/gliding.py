@@ -12,9 +12,12 @@ from unittest import mock
 
 import jax.numpy as jnp
 
+from helpers import motion
 from jetbot_mjx import cli
 from jetbot_mjx.envs import kinematics, program_key
 from jetbot_mjx.envs.jetbot_env import JetBotEnv
+from jetbot_mjx.envs.mujoco_simulator import MujocoPhysics
+from jetbot_mjx.envs.physics import Physics
 from jetbot_mjx.envs.robot_model import (
     CONTROLLER_WHEEL_RADIUS,
     CONTROLLER_WHEEL_SEPARATION,
@@ -27,30 +30,40 @@ from jetbot_mjx.envs.robot_model import (
 LAG = 0.1  # [s] of the motors, so that there is something to learn
 
 
-class Gliding(JetBotEnv):
-    def step_physics(self, physics, ctrl, mocap_pos=None):
-        wanted = kinematics.body_twist(
+class GlidingPhysics(Physics):
+    def step(self, state, ctrl, mocap_pos=None):
+        dt = self._config.ctrl_dt
+        wanted = motion.body_twist(
             ctrl,
             wheel_radius=CONTROLLER_WHEEL_RADIUS,
             wheel_separation=CONTROLLER_WHEEL_SEPARATION,
         )
-        heading = kinematics.yaw(physics.qpos[QPOS_QUAT])
+        heading = kinematics.yaw(state.qpos[QPOS_QUAT])
         ahead_w = jnp.stack([jnp.cos(heading), jnp.sin(heading), 0.0])
-        twist = jnp.stack([physics.qvel[QVEL_LINEAR_W] @ ahead_w, physics.qvel[QVEL_ANGULAR_B][2]])
-        speed, yaw_rate = twist + self.dt / LAG * (wanted - twist)
-        half = 0.5 * (heading + self.dt * yaw_rate)
+        twist = jnp.stack([state.qvel[QVEL_LINEAR_W] @ ahead_w, state.qvel[QVEL_ANGULAR_B][2]])
+        speed, yaw_rate = twist + dt / LAG * (wanted - twist)
+        half = 0.5 * (heading + dt * yaw_rate)
         quat = jnp.stack([jnp.cos(half), 0.0, 0.0, jnp.sin(half)])
-        qpos = physics.qpos.at[QPOS_XYZ].add(self.dt * speed * ahead_w).at[QPOS_QUAT].set(quat)
-        qvel = physics.qvel.at[QVEL_LINEAR_W].set(speed * ahead_w)
+        qpos = state.qpos.at[QPOS_XYZ].add(dt * speed * ahead_w).at[QPOS_QUAT].set(quat)
+        qvel = state.qvel.at[QVEL_LINEAR_W].set(speed * ahead_w)
         qvel = qvel.at[QVEL_ANGULAR_B].set(jnp.stack([0.0, 0.0, yaw_rate]))
-        return physics.replace(qpos=qpos, qvel=qvel, time=physics.time + self.dt)
+        return state.replace(qpos=qpos, qvel=qvel, time=state.time + dt)
+
+
+class Gliding(JetBotEnv):
+    physics_class = GlidingPhysics
+
+    def __init__(self, *given):
+        super().__init__(*given)
+        self.physics = self.physics_class(self.physics.mj_model, self.config.physics)
 
 
 @contextlib.contextmanager
 def everywhere():
     """A context within which every robot of this process glides, and no program is kept."""
     with (
-        mock.patch.object(JetBotEnv, "step_physics", Gliding.step_physics),
+        mock.patch.object(Physics, "step", GlidingPhysics.step),
+        mock.patch.object(MujocoPhysics, "step", GlidingPhysics.step),
         mock.patch.object(program_key, "BUILT_IN_TASKS", frozenset()),
     ):
         yield

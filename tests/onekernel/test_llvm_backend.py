@@ -85,7 +85,7 @@ def drive(env, targets):
 
     @functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 1})
     def run(states, targets):
-        step = jax.vmap(env.step_physics)
+        step = jax.vmap(env.physics.step)
 
         def hold(states, target):
             return jax.lax.fori_loop(0, 16, lambda _, s: step(s, target), states), None
@@ -141,11 +141,11 @@ def test_models_that_differ_from_robot_to_robot_go_into_the_kernel():
         here = env.with_model(env.mjx_model.replace(actuator_gainprm=gainprm))
         assert here.physics.impl == "llvm"
         state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-        return here.step_physics(state, jnp.ones(2)).qvel
+        return here.physics.step(state, jnp.ones(2)).qvel
 
     ours = jax.vmap(one)(gains)
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    np.testing.assert_allclose(ours[1], env.step_physics(state, jnp.ones(2)).qvel, atol=1e-5)
+    np.testing.assert_allclose(ours[1], env.physics.step(state, jnp.ones(2)).qvel, atol=1e-5)
     assert ours[0, 6] < 0.9 * ours[1, 6]
 
 

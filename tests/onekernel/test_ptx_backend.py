@@ -74,7 +74,7 @@ def test_it_drives_as_xla_does(preset):
         env = make_env(parse_config({"robot": {"preset": preset}, "physics": {"impl": impl}}))
         keys = jax.random.split(jax.random.PRNGKey(0), count)
         states = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
-        step = jax.jit(jax.vmap(env.step_physics))
+        step = jax.jit(jax.vmap(env.physics.step))
         for ctrl in np.repeat(targets, 16, 0):
             states = step(states, ctrl)
         ends.append(np.asarray(states.qpos))
@@ -88,7 +88,7 @@ def test_a_robots_bits_do_not_depend_on_those_beside_it():
     states = jax.jit(jax.vmap(env.reset))(keys).pipeline_state
     ctrl = np.random.default_rng(0).choice([-12.0, 31.0], (1000, 2)).astype(np.float32)
     step = jax.jit(
-        lambda s, c: jax.lax.fori_loop(0, 20, lambda _, s: jax.vmap(env.step_physics)(s, c), s)
+        lambda s, c: jax.lax.fori_loop(0, 20, lambda _, s: jax.vmap(env.physics.step)(s, c), s)
     )
     together = step(states, ctrl)
     for few in (1, 31, 33):
@@ -100,8 +100,8 @@ def test_a_robots_bits_do_not_depend_on_those_beside_it():
 def test_a_program_for_the_cpu_steps_by_its_own_kernel_beside_it():
     env = make_env(parse_config({}))
     state = env.reset(jax.random.PRNGKey(0)).pipeline_state
-    here = env.step_physics(state, jnp.ones(2))
+    here = env.physics.step(state, jnp.ones(2))
     on_cpu = jax.device_put((state, jnp.ones(2)), jax.devices("cpu")[0])
-    there = jax.jit(env.step_physics)(*on_cpu)
+    there = jax.jit(env.physics.step)(*on_cpu)
     assert there.qpos.devices() == {jax.devices("cpu")[0]}
     np.testing.assert_allclose(here.qpos, there.qpos, atol=1e-5)

@@ -282,7 +282,6 @@ def test_an_error_of_orbax_while_writing_is_one_line(run_dir, monkeypatch, metho
     def use():
         with CheckpointStore(run_dir, keep=50) as store:
             store.save(2, {"tree": TREE}, {}, None)
-            store.wait()
 
     save(run_dir, 1)
     monkeypatch.setattr(ocp.CheckpointManager, method, fail)

@@ -17,7 +17,6 @@ from jetbot_mjx.runs.run_dir import DamagedRunError
 from jetbot_mjx.runs.run_finder import (
     PRETRAINED,
     find_run,
-    list_runs,
     read_info,
     runs_table,
     scan_runs,
@@ -82,7 +81,7 @@ def test_results_of_the_package_s_runs_go_to_the_current_folder():
 
 
 def test_runs_are_listed_the_latest_first(runs):
-    newer, older = list_runs()
+    newer, older = scan_runs()[0]
     assert (newer.name, older.name) == ("newer", "older")
     assert (newer.env_steps, newer.success_rate, newer.changed) == (600_000, 0.7, 50.0)
     assert older.task == "jetbot_mjx:GoalTask isaac world"
@@ -131,7 +130,7 @@ HARMS = {
 @pytest.mark.parametrize(("harm", "said"), HARMS.values(), ids=HARMS)
 def test_a_damaged_run_is_listed_with_the_reason_and_stops_no_other(runs, capsys, harm, said):
     harm(runs / "runs/newer/config.yaml")
-    assert [run.name for run in list_runs()] == ["older"]
+    assert [run.name for run in scan_runs()[0]] == ["older"]
     assert str(find_run("latest")) == "runs/older"
     with pytest.raises(DamagedRunError, match=re.escape(said)):
         read_info(runs / "runs/newer")
@@ -160,8 +159,8 @@ def test_a_damaged_run_is_listed_with_the_reason_and_stops_no_other(runs, capsys
 def test_a_line_that_no_training_wrote_is_left_out(runs, line):
     with (runs / "runs/newer/metrics.jsonl").open("a") as file:
         file.write(line + "\n")
-    assert (list_runs()[0].env_steps, list_runs()[0].changed) == (600_000, 50.0)
-    assert len(runs_table(list_runs()).splitlines()) == 4
+    assert (scan_runs()[0][0].env_steps, scan_runs()[0][0].changed) == (600_000, 50.0)
+    assert len(runs_table(scan_runs()[0]).splitlines()) == 4
 
 
 @pytest.mark.parametrize("make", [Path.mkdir, os.mkfifo], ids=["folder", "pipe"])

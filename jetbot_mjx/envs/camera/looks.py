@@ -81,10 +81,13 @@ def _styled_checker(geom: SceneGeom, tint: Sequence[Scalar] | None, params: Look
     even, odd = checker.even, checker.odd
     if params.differs("floor_contrast"):
         means = [0.5 * (a + b) for a, b in zip(even, odd, strict=True)]
-        even, odd = (
-            tuple(m + params.floor_contrast * (x - m) for x, m in zip(rgb, means, strict=True))
-            for rgb in (even, odd)
-        )
+
+        def spread(rgb: Rgb) -> Rgb:
+            pairs = zip(rgb, means, strict=True)
+            red, green, blue = (m + params.floor_contrast * (x - m) for x, m in pairs)
+            return red, green, blue
+
+        even, odd = spread(even), spread(odd)
     if tint is not None:
         even, odd = _tinted(even, tint), _tinted(odd, tint)
     checker = checker._replace(even=even, odd=odd)

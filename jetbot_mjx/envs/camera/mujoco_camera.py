@@ -17,7 +17,7 @@ import math
 import os
 import weakref
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import mujoco
@@ -191,9 +191,9 @@ class MujocoCamera(Camera):
 
     def pictures(
         self,
-        positions: Float[Any, "*n 3"],
-        rotations: Float[Any, "*n 3 3"],
-        mocap_positions: Mapping[str, Float[Any, "*n 3"]],
+        positions: Float[Array | np.ndarray, "*n 3"],
+        rotations: Float[Array | np.ndarray, "*n 3 3"],
+        mocap_positions: Mapping[str, Float[Array | np.ndarray, "*n 3"]],
     ) -> UInt8[np.ndarray, "*n h w c"]:
         """Return the images of any number of robots, on the host.
 

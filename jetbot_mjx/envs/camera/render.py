@@ -9,8 +9,8 @@ frame and kept apart from what is computed per pixel, so that XLA does not repea
 """
 
 import functools
-from collections.abc import Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Hashable, Mapping, Sequence
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -124,18 +124,18 @@ class Camera:
         leaves, structure = jax.tree.flatten(self._frame(pose, mocap_positions, appearance))
         shared = jnp.stack(leaves)
         # The structure says what differs between episodes.
-        lower = functools.partial(self._make_kernel, structure)
+        lower = functools.partial(self._make_kernel, structure, len(leaves))
         kernel = self.kernel_impl.find_kernel(structure, lower)
         values = self._fallback(structure, shared)[0] if kernel is None else kernel.as_map()(shared)
         return values.reshape(self.shape)
 
-    def _make_kernel(self, structure: Any) -> Kernel:
-        """Lower an image to a kernel.
+    def _make_kernel(self, structure: Hashable, leaves: int) -> Kernel:
+        """Lower an image to a kernel, which takes a frame with a structure and a number of leaves.
 
         Raises:
           UnsupportedError: an operation cannot be lowered.
         """
-        sizes = structure.num_leaves, len(self._table)
+        sizes = leaves, len(self._table)
         arguments = [jax.ShapeDtypeStruct((n,), jnp.float32) for n in sizes]
         program = scalarize(functools.partial(self._pixel, structure), *arguments)
         return self.kernel_impl.kernel_class(
@@ -147,7 +147,7 @@ class Camera:
         )
 
     def _fallback(
-        self, structure: Any, shared: Float[Array, " shared"]
+        self, structure: Hashable, shared: Float[Array, " shared"]
     ) -> list[UInt8[Array, " bytes"]]:
         """Compute all pixels by XLA."""
         # Keep the stages apart: XLA would compute what the pixels share in every pixel, and all
@@ -169,8 +169,11 @@ class Camera:
         return looks.squared_length(self._grid.expand(self._grid.columns)[1].centre)
 
     def _pixel(
-        self, structure: Any, shared: Float[Array, " shared"], columns: Float[Array, " columns"]
-    ) -> Any:
+        self,
+        structure: Hashable,
+        shared: Float[Array, " shared"],
+        columns: Float[Array, " columns"],
+    ) -> list[Float[Array, ""]]:
         """Return the channels of a pixel, whole numbers from 0 to 255 as floats."""
         frame: pixel.Frame = jax.tree.unflatten(structure, list(shared))
         scene = with_clutter(self.scene, frame.clutter)
@@ -253,13 +256,13 @@ class Camera:
 
 def _mounted(
     position: Float[np.ndarray, "3"], rotation: Float[np.ndarray, "3 3"], params: LookParams
-) -> tuple[Any, Any]:
+) -> tuple[Float[Array | np.ndarray, "3"], Float[Array | np.ndarray, "3 3"]]:
     """Return place and axes of the camera, body frame, for another mount."""
     names = ("camera_x", "camera_y", "camera_z")
-    place: Any = position
+    place: Float[Array | np.ndarray, 3] = position
     if params.differs(*names):
         place = position + jnp.stack([jnp.asarray(getattr(params, name)) for name in names])
-    axes: Any = rotation
+    axes: Float[Array | np.ndarray, "3 3"] = rotation
     if params.differs("camera_pitch", "camera_roll", "camera_yaw"):
         right, down, forward = jnp.asarray(rotation).T
         cosine, sine = jnp.cos(params.camera_roll), jnp.sin(params.camera_roll)
@@ -273,7 +276,7 @@ def _mounted(
 
 def _faces(
     scene: Scene, geom: SceneGeom, origin: Vector, lights: Sequence[Vector]
-) -> tuple[tuple[Any, Any, Any], ...]:
+) -> tuple[Vector, ...]:
     """Return the light on the flat faces of a geom that the camera can see."""
     faces = []
     ambient, *diffuse = pixel.strengths(scene, geom)
@@ -288,7 +291,9 @@ def _faces(
     return tuple(faces)
 
 
-def _into(rotation: Float[np.ndarray | Array, "3 3"], vector: Any) -> Vector:
+def _into(
+    rotation: Float[Array | np.ndarray, "3 3"], vector: Float[Array | np.ndarray, "3"]
+) -> Vector:
     """Rotate a vector into a frame with the given axes; by nothing if they are the world's."""
     if isinstance(rotation, np.ndarray) and np.array_equal(rotation, np.eye(3)):
         return vector[0], vector[1], vector[2]

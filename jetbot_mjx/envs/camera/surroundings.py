@@ -89,13 +89,10 @@ def draw_surroundings(
             gap = jnp.linalg.norm(place - goal_w[:2, None], axis=0)
             # On the other side of the origin there is room.
             place = jnp.where(gap < _FREE, -place, place)
-        colours = _other_hues(_goal_rgb(scene), u[2], 0.15 + 0.65 * u[3], 0.4 * u[4])
+        goal_rgb = next((x.rgb for x in scene.geoms if x.mocap == GOAL), (1.0, 0.0, 0.0))
+        colours = _other_hues(goal_rgb, u[2], 0.15 + 0.65 * u[3], 0.4 * u[4])
         clutter = jnp.concatenate([place, colours]).T
     return Surroundings(walls, clutter)
-
-
-def _goal_rgb(scene: Scene) -> Rgb:
-    return next((geom.rgb for geom in scene.geoms if geom.mocap == GOAL), (1.0, 0.0, 0.0))
 
 
 def _other_hues(rgb: Rgb, u: Array, value: Array, chroma: Array) -> Float[Array, "3 n"]:

@@ -6,7 +6,7 @@ pure function of one robot, and is data of its episode.
 """
 
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -92,7 +92,7 @@ def step_camera(camera: CameraState, now: SeenPose, step: Int[Array, ""]) -> Cam
     params, seen, waiting = camera.params, camera.seen, camera.waiting
     if seen is None:
         return camera
-    due: Any = now
+    due = now
     if waiting is not None:
         history = jax.tree.map(lambda x, y: jnp.concatenate([x[None], y]), now, waiting)
         delay = jnp.round(jnp.asarray(params.camera_delay)).astype(jnp.int32)

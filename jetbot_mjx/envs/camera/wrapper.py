@@ -1,17 +1,19 @@
 """Add what the robot's camera sees to the observation of an environment."""
 
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, UInt8, UInt32
 
 from jetbot_mjx.envs.camera.looks import Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.timing import SeenPose, noise_seed
-from jetbot_mjx.envs.state import State, robot_state
-from jetbot_mjx.mjx_import import Wrapper
+from jetbot_mjx.envs.state import Obs, State, robot_state
+from jetbot_mjx.envs.task import Goal
+from jetbot_mjx.mjx_import import Env, Wrapper
 from jetbot_mjx.packed import Packed, pack
 
 PIXELS = "pixels/front"
@@ -21,15 +23,30 @@ NUMBERS = "state"
 """Key of the task's numbers in the observation, if it has any."""
 
 
+_Env = TypeVar("_Env", bound=Env)
+
+
 class _Task(Protocol):
     """The method of a task by which a camera sees its bodies."""
 
-    def markers(self, goal: Any) -> Mapping[str, Float[Array, "3"]]: ...
+    def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]: ...
 
 
-def numbers_of(obs: Any) -> Any:
+def numbers_of(obs: Obs) -> Obs:
     """Return an observation without images: the vector of numbers, or an empty dictionary."""
     return obs.get(NUMBERS, {}) if isinstance(obs, dict) else obs
+
+
+class _Seen(Protocol):
+    """The interface that a `CameraWrapper` requires of the environment inside it."""
+
+    task: _Task
+    observation_size: int
+    observation_min_std: np.ndarray
+
+    def reset(self, rng: UInt32[Array, "2"]) -> State: ...
+
+    def step(self, state: State, action: Float[Array, "2"]) -> State: ...
 
 
 def see(
@@ -57,7 +74,7 @@ def see(
             later = jnp.concatenate([before[..., camera.shape[2] :], image], axis=-1)
             image = jnp.where(begins, first, later)
     obs = {PIXELS: image}
-    if jax.tree.leaves(state.obs):
+    if not isinstance(state.obs, dict):
         obs[NUMBERS] = state.obs
     return state.replace(obs=obs)
 
@@ -113,9 +130,9 @@ class CameraWrapper(Wrapper):
     newest last; an episode begins with copies of its first image.
     """
 
-    env: Any
+    env: _Seen
 
-    def __init__(self, env: Any, camera: Camera) -> None:
+    def __init__(self, env: Env, camera: Camera) -> None:
         """Wrap one environment.
 
         Args:
@@ -158,12 +175,12 @@ class CameraWrapper(Wrapper):
         return observation_shapes(self.camera, self.env.observation_size)
 
     @property
-    def observation_min_std(self) -> dict[str, Any]:
+    def observation_min_std(self) -> dict[str, np.ndarray]:
         """Smallest standard deviations by which training normalises the numbers."""
         return {NUMBERS: self.env.observation_min_std} if self.env.observation_size else {}
 
 
-def with_camera(env: Any, camera: Camera | None) -> Any:
+def with_camera(env: _Env, camera: Camera | None) -> _Env | CameraWrapper:
     """Wrap the environment of one robot so that it sees, if it has a camera.
 
     Args:

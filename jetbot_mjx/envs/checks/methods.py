@@ -2,7 +2,6 @@
 
 import contextlib
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,6 +10,7 @@ import numpy as np
 from jetbot_mjx.envs.checks.probe import (
     DRAWS,
     TERMS,
+    Call,
     TaskProbe,
     call_methods,
     first_key,
@@ -55,7 +55,7 @@ def purity(probe: TaskProbe) -> Iterator[str]:
     """Check that methods trace, twice into the same program, and leave `self` alone."""
     task = probe.task
     before = _attributes(task)
-    calls: dict[str, tuple[Any, ...]] = {"sample": (task.sample, first_key())}
+    calls: dict[str, Call] = {"sample": (task.sample, first_key())}
     # If `sample` itself fails, there is no example, and tracing it below reports the error.
     with contextlib.suppress(Exception):
         calls |= method_calls(task, probe.example)
@@ -126,9 +126,11 @@ def types(probe: TaskProbe) -> Iterator[str]:
         yield from _other_tree("advance", results["advance"], goal)
 
 
-def _unlike(name: str, got: Any, shape: Any, dtype: str, meaning: str) -> Iterator[str]:
+def _unlike(
+    name: str, got: object, shape: tuple[int, ...], dtype: str, meaning: str
+) -> Iterator[str]:
     """Compare the shape and dtype of a result with those required."""
-    if not hasattr(got, "shape"):
+    if not isinstance(got, jax.ShapeDtypeStruct):
         yield f"{name} returns {type(got).__name__}: it should be an array, {meaning}"
     elif got.shape != shape:
         yield f"{name} has the shape {list(got.shape)}: it should be {list(shape)}, {meaning}"

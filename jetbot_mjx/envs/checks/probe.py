@@ -5,20 +5,24 @@ import sys
 import traceback
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
 from jetbot_mjx.config import Config
-from jetbot_mjx.envs.task import METHODS, AdvancesGoal, RobotState, Task
+from jetbot_mjx.envs.task import METHODS, AdvancesGoal, Goal, RobotState, Task
 
 DRAWS = 256
 """Number of goals, and of robots of each kind."""
 
 TERMS = "the terms of reward"
 """Key of the reward terms among the results of `call_methods`."""
+
+Call = tuple[Callable[..., PyTree], *tuple[PyTree, ...]]
+"""A method and its arguments."""
 
 _PACKAGE = Path(__file__).parents[2]
 _AXLE_HEIGHT = 0.0325  # [m]
@@ -77,7 +81,7 @@ class Transition(NamedTuple):
     """Robot state before the step."""
     after: RobotState
     """Robot state after the step."""
-    goal: Any
+    goal: Goal
     """Goal of the episode."""
     action: jax.Array
     """Action of the step."""
@@ -118,7 +122,7 @@ class TaskProbe:
         )
 
     @functools.cached_property
-    def goals(self) -> Any:
+    def goals(self) -> Goal:
         """Return the goals of `DRAWS` episodes, as a batch."""
         return jax.jit(jax.vmap(self.task.sample))(jax.random.split(first_key(), DRAWS))
 
@@ -168,7 +172,7 @@ class TaskProbe:
         }
 
     @functools.cached_property
-    def results(self) -> dict[str, dict[str, Any]]:
+    def results(self) -> dict[str, dict[str, PyTree]]:
         """Return the results of all methods, on the host, by kind of robot and by method."""
         call = jax.jit(jax.vmap(call_methods(self.task)))
         return {where: jax.device_get(call(batch)) for where, batch in self.transitions.items()}
@@ -179,7 +183,7 @@ def first_key() -> jax.Array:
     return jax.random.PRNGKey(0)
 
 
-def method_calls(task: Task, transition: Transition) -> dict[str, tuple[Any, ...]]:
+def method_calls(task: Task, transition: Transition) -> dict[str, Call]:
     """Return the calls of all methods of a task for one transition.
 
     Args:
@@ -190,7 +194,7 @@ def method_calls(task: Task, transition: Transition) -> dict[str, tuple[Any, ...
       The function and its arguments, by the name of the method.
     """
     before, after, goal, action = transition
-    calls: dict[str, tuple[Any, ...]] = {
+    calls: dict[str, Call] = {
         "observe": (task.observe, after, goal),
         "reward": (task.reward, before, after, goal, action),
         "terminated": (task.terminated, after, goal),
@@ -203,7 +207,7 @@ def method_calls(task: Task, transition: Transition) -> dict[str, tuple[Any, ...
     return calls
 
 
-def call_methods(task: Task) -> Callable[[Transition], dict[str, Any]]:
+def call_methods(task: Task) -> Callable[[Transition], dict[str, PyTree]]:
     """Return a function that calls all methods of a task for one transition.
 
     Args:
@@ -213,7 +217,7 @@ def call_methods(task: Task) -> Callable[[Transition], dict[str, Any]]:
       A function from a transition to the results, by the name of the method.
     """
 
-    def call(transition: Transition) -> dict[str, Any]:
+    def call(transition: Transition) -> dict[str, PyTree]:
         calls = method_calls(task, transition)
         results = {name: function(*given) for name, (function, *given) in calls.items()}
         reward, terms = results["reward"]

@@ -6,7 +6,6 @@ an error message, but on another problem than intended.
 
 import collections
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -24,6 +23,7 @@ from jetbot_mjx.envs.checks.probe import (
 )
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.robot_model import ROBOTS, make_mj_model, mocap_ids
+from jetbot_mjx.envs.state import State
 from jetbot_mjx.envs.task import Task, layout_size, make_task
 from jetbot_mjx.envs.wrappers import wrap_for_training
 from jetbot_mjx.errors import InvalidError, UserError
@@ -177,7 +177,7 @@ def _drive(probe: TaskProbe) -> Iterator[str]:
     batch = wrap_for_training(env, episode_length=DRIVE_STEPS // 2)
     traces = 0
 
-    def step(state: Any, action: jax.Array) -> Any:
+    def step(state: State, action: jax.Array) -> State:
         nonlocal traces
         traces += 1
         return batch.step(state, action)
@@ -204,14 +204,14 @@ def _changed(first: object, last: object) -> str:
     """Return the first leaf whose shape or dtype differs between two states; empty if none."""
     sides = [dict(jax.tree_util.tree_leaves_with_path(state)) for state in (first, last)]
     for path in (*sides[0], *sides[1]):
-        one, other = (side.get(path) for side in sides)
-        if one is None or other is None or _type(one) != _type(other):
+        one, other = (_type(side.get(path)) for side in sides)
+        if one != other:
             return jax.tree_util.keystr(path).lstrip(".")
     return ""
 
 
-def _type(leaf: Any) -> tuple[Any, ...]:
-    return leaf.shape, leaf.dtype, leaf.weak_type
+def _type(leaf: jax.ShapeDtypeStruct | None) -> object:
+    return None if leaf is None else (leaf.shape, leaf.dtype, leaf.weak_type)
 
 
 CHECKS: Mapping[str, tuple[Callable[[TaskProbe], Iterator[str]], str]] = {

@@ -1,5 +1,6 @@
 """Images beside those of `mujoco.Renderer`: outlines, colours, checkers, sky and light."""
 
+import importlib
 from unittest import mock
 
 import jax
@@ -14,7 +15,7 @@ from helpers.camera_scenes import Scenes, make_model, turned
 from jetbot_mjx.config import CameraConfig, Config
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.jetbot_env import make_env
-from jetbot_mjx.envs.opengl import context_class
+from jetbot_mjx.envs.opengl import find_backend
 from jetbot_mjx.envs.state import robot_state
 from jetbot_mjx.errors import UserError
 from onekernel import Kernel
@@ -87,7 +88,7 @@ def two_planes():
 @pytest.fixture(scope="module")
 def opengl():
     try:
-        context = context_class()
+        context = importlib.import_module(f"mujoco.{find_backend()}").GLContext
     except UserError as error:
         pytest.skip(str(error))
     with mock.patch.object(gl_context, "GLContext", context, create=True):
