@@ -23,7 +23,9 @@ from typing import TYPE_CHECKING, Literal, NoReturn, TypeVar
 from jetbot_mjx import startup
 from jetbot_mjx.errors import (
     READER_LEFT,
+    NotFoundError,
     UserError,
+    os_errors,
     printable,
     printable_lines,
     ran_out,
@@ -334,16 +336,24 @@ def origin(text: str) -> str:
     return f"{parts.scheme}://{host}" + ("" if port in (None, default) else f":{port}")
 
 
-def find_run(name: str) -> Path:
+def find_policy(name: str) -> Path:
     """Return the path of the run or checkpoint that an argument names, after all are parsed.
 
+    Call it before importing what uses the policy: a wrong name is then reported at once.
+
     Raises:
-      NotFoundError: as for `runs.find_run`.
+      NotFoundError: as for `runs.find_run`, or there is no folder at the path.
+      UserError: the path cannot be looked up.
     """
     with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import find_run
-
-    return find_run(name)
+        from jetbot_mjx.runs import explain_missing, find_run
+    path = find_run(name)
+    what = f"no checkpoint at {path.absolute()}"
+    with os_errors(what):
+        reason = explain_missing(path.absolute())
+    if reason:
+        raise NotFoundError(f"{what}: {reason}")
+    return path
 
 
 def add_checkpoint_arguments(

@@ -67,7 +67,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0, or 1 if a success rate is below `--min-success`.
     """
     options = _parser().parse_args(arguments)
-    runs = [cli.find_run(name) for name in options.run]
+    runs = [cli.find_policy(name) for name in options.run]
     with startup.exit_on_interrupt():
         from jetbot_mjx.evaluation import (
             below_target,

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0.
     """
     options = _parser().parse_args(arguments)
-    run = cli.find_run(options.run)
+    run = cli.find_policy(options.run)
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import export_policy, summarize_export
     cli.prepare_device()

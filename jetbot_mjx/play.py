@@ -72,7 +72,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0.
     """
     options = _parser().parse_args(arguments)
-    run = cli.find_run(options.run or f"pretrained:{_DEFAULT_POLICY}")
+    run = cli.find_policy(options.run or f"pretrained:{_DEFAULT_POLICY}")
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live
     cli.prepare_device()

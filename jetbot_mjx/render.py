@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    run, which, episodes = cli.find_run(options.run), options.checkpoint, options.episodes
+    run, which, episodes = cli.find_policy(options.run), options.checkpoint, options.episodes
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,

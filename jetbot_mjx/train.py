@@ -43,8 +43,8 @@ def _parser() -> cli.Parser:
 
 def _config_and_folder(options: argparse.Namespace) -> "tuple[Config, Path]":
     with startup.exit_on_interrupt():
-        from jetbot_mjx.runs import default_run_dir, find_run_config
-    resumed = cli.find_run(options.resume) if options.resume else None
+        from jetbot_mjx.runs import default_run_dir, find_run, find_run_config
+    resumed = find_run(options.resume) if options.resume else None
     if resumed:
         options.config = find_run_config(resumed)
     given = {"seed": options.seed, "seeds": options.seeds, "init_from": options.init_from}

@@ -72,7 +72,8 @@ def parse_yaml(text: str, source: str) -> dict[str, object]:
     """
     if len(text) > _MOST_YAML_CHARACTERS:
         raise ConfigError(
-            f"{source} has more than {_MOST_YAML_CHARACTERS:,} characters: that is no configuration"
+            f"{source} has more than {_MOST_YAML_CHARACTERS:,} characters: that is not a"
+            " configuration"
         )
     values = parse_any(text, source)
     if values is None:

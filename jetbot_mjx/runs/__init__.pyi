@@ -1,5 +1,4 @@
 from .checkpoint import POLICY as POLICY
-from .checkpoint import PRETRAINED as PRETRAINED
 from .checkpoint import Checkpoint as Checkpoint
 from .checkpoint import Which as Which
 from .checkpoint import about_policy as about_policy
@@ -48,8 +47,10 @@ from .run_dir import write_json as write_json
 from .run_dir import write_run as write_run
 from .run_dir import write_text as write_text
 from .run_dir import writing_to as writing_to
+from .run_finder import PRETRAINED as PRETRAINED
 from .run_finder import ROOT as ROOT
 from .run_finder import copy_pretrained as copy_pretrained
+from .run_finder import explain_missing as explain_missing
 from .run_finder import find_run as find_run
 from .run_finder import find_run_config as find_run_config
 from .run_finder import runs_table as runs_table

@@ -27,7 +27,7 @@ from jetbot_mjx.runs import checkpoint_store
 from jetbot_mjx.runs.checkpoint_store import FOLDER, CheckpointError, CheckpointNotFoundError
 from jetbot_mjx.runs.run_dir import JsonObject
 from jetbot_mjx.runs.run_finder import PRETRAINED as PRETRAINED
-from jetbot_mjx.runs.run_finder import ROOT, find_run, scan_runs, suggest_run
+from jetbot_mjx.runs.run_finder import ROOT, explain_missing, find_run, scan_runs, suggest_run
 from jetbot_mjx.runs.setup import Setup
 from jetbot_mjx.runs.task_code import stored_task_class
 
@@ -298,9 +298,8 @@ def _find(path: Path, which: Which) -> Path:
     def missing(reason: str) -> CheckpointNotFoundError:
         return CheckpointNotFoundError(f"no checkpoint at {path}: {reason}")
 
-    if not path.is_dir():
-        what = "a file" if path.is_file() else "no such folder"
-        raise missing(f"{what}; {suggest_run(path)}")
+    if reason := explain_missing(path):
+        raise missing(reason)
     # A run folder may contain `policy/` too, which `export` writes.
     if (path / POLICY).is_dir() and not (path / FOLDER).is_dir():
         return path

@@ -37,7 +37,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
 
-import jax
 from tensorboardX import summary as tensorboard_summary
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
@@ -324,6 +323,9 @@ class CompileClock:
         """Number of programs that were found in the persistent cache."""
         self.saved_seconds = 0.0
         """Time that compiling the programs found in the cache would have taken [s]."""
+        # The commands that list and find runs read metrics without JAX.
+        import jax
+
         jax.monitoring.register_event_duration_secs_listener(self._listen)
         jax.monitoring.register_event_listener(self._count)
 
@@ -358,5 +360,7 @@ class CompileClock:
 
     def __exit__(self, *exception: object) -> None:
         """Unregister the listeners."""
+        import jax
+
         jax.monitoring.unregister_event_duration_listener(self._listen)
         jax.monitoring.unregister_event_listener(self._count)

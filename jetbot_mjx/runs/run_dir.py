@@ -20,8 +20,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import jax
-
 from jetbot_mjx.config import Config, ConfigError, parse_config, parse_yaml
 from jetbot_mjx.envs import LIBRARIES, installed_version
 from jetbot_mjx.errors import UserError, clipped, os_errors
@@ -285,6 +283,9 @@ def shortened(path: Path) -> Path:
 
 def versions() -> JsonObject:
     """Return the versions of packages and Python, the machine, the devices and the git state."""
+    # The commands that list and find runs start without it.
+    import jax
+
     devices = jax.devices()
     packages = ("jetbot_mjx", *LIBRARIES, "orbax-checkpoint")
     return {

@@ -225,6 +225,18 @@ def copy_pretrained(folder: Path) -> tuple[Path, ...]:
     return tuple(runs.values())
 
 
+def explain_missing(path: Path) -> str:
+    """Return why a path is not a folder, and what to give instead; nothing if it is one.
+
+    Raises:
+      OSError: the path cannot be looked up.
+    """
+    if path.is_dir():
+        return ""
+    what = "a file" if path.is_file() else "no such folder"
+    return f"{what}; {suggest_run(path)}"
+
+
 def suggest_run(path: Path, what: str = "a run folder or a checkpoint in it") -> str:
     """Return a remedy for a path at which there is no run.
 

@@ -335,10 +335,12 @@ def test_help_is_no_mistake(capfd, name):
     ("arguments", "code"),
     [([], 0), (["--min-success", "0.5"], 0), (["--min-success", "0.51"], 1)],
 )
-def test_only_a_success_rate_below_the_target_gives_1(monkeypatch, capfd, arguments, code):
+def test_only_a_success_rate_below_the_target_gives_1(
+    monkeypatch, tmp_path, capfd, arguments, code
+):
     report = make_report(make_episodes([[1, 0], [0, 1]], [1, 0]))
     monkeypatch.setattr(evaluation, "evaluate_run", lambda *args, **kwargs: report)
-    assert evaluate.main(["run", *arguments]) == code
+    assert evaluate.main([str(tmp_path), *arguments]) == code
     assert ("is below the 51.00% asked for" in capfd.readouterr().out) == (code == 1)
 
 

@@ -16,6 +16,7 @@ from jetbot_mjx import cli
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.errors import UserError
+from jetbot_mjx.terminal import progress
 
 PAGE = Path(__file__).parents[2] / "docs" / "mistakes.md"
 ROWS = re.findall(r"^\| `(jetbot-mjx.*?)` \| `+ ?(.*?) ?`+ \|$", PAGE.read_text("utf-8"), re.M)
@@ -74,6 +75,8 @@ def type_(home, monkeypatch, capfd):
     """Types a command as a user would; returns the exit code and all that it prints."""
     monkeypatch.chdir(home)
     monkeypatch.setenv("COLUMNS", "80")
+    # A slow machine would show what it is doing, too.
+    monkeypatch.setattr(progress, "_SECONDS_BEFORE_LINE", 3600.0)
 
     def type_(line):
         words = shlex.split(line)[1:]

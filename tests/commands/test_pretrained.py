@@ -96,7 +96,9 @@ def test_it_tells_where_the_runs_are(tmp_path, capsys):
     assert f"jetbot-mjx play {tmp_path / 'here' / NAMES[0]}\n" in printed
 
 
-def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys):
+def test_play_takes_it_where_no_run_is_named(monkeypatch, capsys, tmp_path):
+    monkeypatch.chdir(tmp_path)
+    Path("runs/mine").mkdir(parents=True)
     given = []
     monkeypatch.setattr(
         viewers,

@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+from importlib.metadata import version
 
 import brax.training.agents.ppo.train as brax_ppo_train
 import jax
@@ -28,7 +29,8 @@ def test_the_run_folder_holds_what_is_promised(smoke_run, root):
     assert (smoke_run / "tensorboard").is_dir()
     assert load_config(smoke_run / "config.yaml") == load_config(root / "configs" / "smoke.yaml")
     found = json.loads((smoke_run / "versions.json").read_text())
-    assert found["packages"]["mujoco"] == found["packages"]["mujoco-mjx"]
+    assert found["packages"]["mujoco-mjx"] == version("mujoco-mjx")
+    assert found["packages"]["mujoco"] == version("mujoco")
     assert found["device_count"] == jax.device_count()
 
 

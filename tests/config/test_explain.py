@@ -67,6 +67,12 @@ BAD_VALUES = {
         "ppo.network.value_hidden_layer_sizes = []",
         "at least 1 item",
     ),
+    # JAX would abort the process.
+    "more devices than a CPU is divided into": (
+        "cpu_devices: 20000",
+        "cpu_devices = 20000",
+        "less than or equal to 1024",
+    ),
     "no steps": ("ppo: {num_timesteps: 0}", "ppo.num_timesteps = 0", "than or equal to 1"),
     "no episodes": ("evaluation: {episodes: 0}", "evaluation.episodes = 0", "or equal to 1"),
     "no solver": ("physics: {iterations: 0}", "physics.iterations = 0", "or equal to 1"),

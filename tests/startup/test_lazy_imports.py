@@ -156,3 +156,40 @@ def test_a_usage_error_is_reported_before_anything_heavy_is_imported():
     assert done.stdout.splitlines() == [f"{name} 2" for name in (*MISTYPED, "-")], done.stderr
     assert len(done.stderr.splitlines()) == len(MISTYPED) + 1
     assert set(MISTYPED) == set(COMMANDS)
+
+
+MISNAMED = {
+    "train": ["smok"],
+    "evaluate": ["mine"],
+    "render": ["mine"],
+    "play": ["mine"],
+    "check-env": ["--config", "smok"],
+    "plan": ["smoke", "--set", "lr=1"],
+    "tune": ["smoke", "--space", "ppo", "--set", "ppo.lerning_rate=1"],
+    "export": ["mine"],
+}
+
+LISTED = """
+import importlib, sys
+from jetbot_mjx import __main__ as entry
+from jetbot_mjx.errors import UserError
+for name, arguments in {misnamed}.items():
+    module = importlib.import_module(f"jetbot_mjx.{{entry.COMMANDS[name][0]}}")
+    try:
+        module.main(arguments)
+    except UserError:
+        print(name, *[one for one in {heavy} if one in sys.modules], flush=True)
+from jetbot_mjx import list_runs
+list_runs.main([])
+print("runs", *[one for one in {heavy} if one in sys.modules])
+"""
+
+
+def test_a_wrong_name_is_reported_and_runs_are_listed_without_jax(tmp_path):
+    heavy = ["jax", "brax", "mujoco", "matplotlib", "scipy", "orbax", "optuna", "PIL"]
+    code = LISTED.format(misnamed=MISNAMED, heavy=heavy)
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    lines = done.stdout.splitlines()
+    assert lines[: len(MISNAMED)] == list(MISNAMED), done.stderr
+    assert lines[-1] == "runs", done.stderr

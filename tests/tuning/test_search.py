@@ -8,6 +8,7 @@ import pytest
 import sqlalchemy.exc
 
 from helpers.quick_trials import Quick
+from helpers.stages import noted_stages
 from jetbot_mjx.config import load_config, parse_config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.terminal import progress
@@ -275,6 +276,22 @@ def test_without_final_trainings_the_best_trial_is_the_best(tmp_path):
 def test_a_storage_that_cannot_be_used_is_named(tmp_path):
     with pytest.raises(UserError, match="--storage nonsense cannot be used"):
         search.Search(CONFIG, SPACE, tmp_path / "s", storage="nonsense")
+
+
+def test_every_phase_is_a_stage_that_a_command_shows(tmp_path):
+    with noted_stages() as shown:
+        one = search.Search(CONFIG, SPACE, tmp_path / "s")
+        assert shown == ["opening the study"]
+        one.run(2, 2)
+        phases = ["drawing values", "preparing the environment and the networks", "storing trials"]
+        assert {"trials", *phases} == {*shown[1:]}
+        shown.clear()
+        entrants = one.confirm(1, 1, 2)
+        assert shown[0] == "final trainings"
+        assert "episodes of the report's goals" in shown
+        shown.clear()
+        results.write_results(tmp_path / "s", CONFIG, one, entrants)
+        assert shown == ["plots"]
 
 
 def test_results_are_written(tmp_path):

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import gliding
+from helpers.stages import noted_stages
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.evaluation.evaluator import report_keys
 from jetbot_mjx.tuning.space import with_values
@@ -95,6 +96,12 @@ def test_outcomes_are_measured(trials, outcomes):
         assert 0 < one.mean_seconds <= 40 / 60 + 1e-6
     stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
     assert trials.evaluate(stacked, report_keys(5)).success.shape == (3, 5)
+
+
+def test_compiling_and_training_are_stages_that_a_command_shows(trials):
+    with noted_stages() as shown:
+        trials.run(VALUES, [3, 3, 4])
+    assert shown == ["compiling the training of 4 policies", "intervals of training 3 policies"]
 
 
 def test_trials_begin_with_another_policy(trials, tmp_path):
