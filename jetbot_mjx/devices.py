@@ -20,7 +20,7 @@ from jetbot_mjx.errors import UserError
 from jetbot_mjx.fallbacks import Fallback, report
 from onekernel import cache_folder, known_options
 
-Options = dict[str, bool | int | str]
+Options = dict[str, bool | int | float | str]
 
 _ON_CPU: Options = {
     "xla_backend_optimization_level": 1,

@@ -8,6 +8,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Hashable
 from types import ModuleType
+from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -112,7 +113,8 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     if not words:
         batch = leaves[0].shape[:batch_axes] if leaves else (0,) * batch_axes
         words = [library.zeros((*batch, 0), np.float32)]
-    return Packed(library.concatenate(words, axis=-1), others, structure, shapes)
+    joined = cast(Array, library.concatenate(words, axis=-1))
+    return Packed(joined, others, structure, shapes)
 
 
 class Condensed(struct.PyTreeNode):

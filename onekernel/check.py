@@ -71,7 +71,7 @@ def _draw(random: np.random.Generator, dtype: np.dtype, shape: tuple[int, ...]) 
     full = (_INSTANCES, *shape)
     if dtype.kind == "f":
         scale = np.exp(random.normal(size=(_INSTANCES, *[1] * len(shape))))
-        return np.float32(random.normal(size=full) * scale)
+        return (random.normal(size=full) * scale).astype(np.float32)
     if dtype.kind == "b":
         return random.random(full) < 0.5
     if dtype.kind == "u":
@@ -82,7 +82,7 @@ def _draw(random: np.random.Generator, dtype: np.dtype, shape: tuple[int, ...]) 
 def _shaken(random: np.random.Generator, x: np.ndarray) -> np.ndarray:
     if x.dtype.kind != "f":
         return x
-    return np.float32(x * (1 + _SHAKE * random.uniform(-1, 1, x.shape)))
+    return (x * (1 + _SHAKE * random.uniform(-1, 1, x.shape))).astype(np.float32)
 
 
 def _run(

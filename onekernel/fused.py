@@ -225,7 +225,7 @@ class Fused:
             name = getattr(self, "__name__", "a function")
             warnings.warn(f"XLA computes {name}, slower: {reason}", stacklevel=4)
 
-    def _find(self, structure: jax.tree_util.PyTreeDef, avals: Sequence[ShapedArray]) -> "_Lowered":
+    def _find(self, structure: Hashable, avals: Sequence[ShapedArray]) -> "_Lowered":
         # The same function lowers differently under other settings of JAX.
         settings = tuple(jax.config.values.get(name) for name in _SETTINGS)
         # Inside of `jax.shard_map`, JAX traces another jaxpr for arrays that vary along its axes.
@@ -240,7 +240,7 @@ class Fused:
         return lowered
 
     def _trace_and_lower(
-        self, structure: jax.tree_util.PyTreeDef, avals: Sequence[ShapedArray]
+        self, structure: Hashable, avals: Sequence[ShapedArray]
     ) -> "_Lowered":
         def flat(*words: Array) -> list[Array]:
             # Random keys are arguments as the words that they consist of.
@@ -292,8 +292,8 @@ class _Lowered:
     """A `_Lowered` is a function for arguments of some shapes, traced and lowered."""
 
     traced: ClosedJaxpr
-    structure: jax.tree_util.PyTreeDef
-    """Tree structure of the results."""
+    structure: Hashable
+    """Tree structure of the results, a `PyTreeDef`."""
     results: list[ShapedArray]
     """Shapes and dtypes of the results, with random keys."""
     places: list[int]
