@@ -239,9 +239,7 @@ class Fused:
             self._known[key] = lowered
         return lowered
 
-    def _trace_and_lower(
-        self, structure: Hashable, avals: Sequence[ShapedArray]
-    ) -> "_Lowered":
+    def _trace_and_lower(self, structure: Hashable, avals: Sequence[ShapedArray]) -> "_Lowered":
         def flat(*words: Array) -> list[Array]:
             # Random keys are arguments as the words that they consist of.
             arguments, keywords = jax.tree.unflatten(structure, map(_with_key, avals, words))

@@ -9,16 +9,23 @@ A lane that ends earlier keeps its values, and its results do not depend on the 
 of a branch is skipped only if no lane takes it. A mask says which lanes execute a block: those that
 have left an enclosing loop, or took the other side of an enclosing branch, do not count.
 
+An array is in memory of the function, where on a CPU a vector holds an element for all lanes. In a
+counted loop, all lanes are in the same iteration, so one load or store serves them; by any other
+index, each lane loads its element alone. Lanes that do not execute a block store whatever they
+have: they do not load it again, because a load is inside of the block that stores.
+
 Source: LLVM Language Reference Manual.
 """
 
+import functools
+import hashlib
 import math
 import operator
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 
 import numpy as np
 
-from onekernel.codegen.writer import LlvmWriter, Value, vector
+from onekernel.codegen.writer import LlvmWriter, Value, llvm_type, vector
 from onekernel.errors import UnsupportedError
 from onekernel.lower import (
     COMPARISONS,
@@ -30,6 +37,8 @@ from onekernel.lower import (
     Scalar,
     ScalarProgram,
     is_constant,
+    is_table,
+    length_of,
 )
 
 STEP = "step"
@@ -60,7 +69,7 @@ def run_program(
     Raises:
       UnsupportedError: the program has an operation that has no LLVM instruction here.
     """
-    return ProgramWriter(writer, program, for_gpu=for_gpu).finish(arguments)
+    return list(ProgramWriter(writer, program, for_gpu=for_gpu).finish(arguments))
 
 
 def tile_function(
@@ -84,10 +93,29 @@ def tile_function(
     # stores.
     w = LlvmWriter(name, "ptr noalias tile", lanes=lanes)
     (tile,) = w.parameters
-    arguments = [tile.at(row, w.vector).load(w.vector, align=4 * lanes) for row in rows]
-    for row, result in enumerate(run_program(w, program, arguments)):
+
+    def load(row: int) -> Value:
+        return tile.at(row, w.vector).load(w.vector, align=4 * lanes)
+
+    # An argument that goes to an array is loaded when it is stored there: of thousands of them, few
+    # wait in registers. One that is a result, too, must be loaded before results replace it.
+    body = ProgramWriter(w, program)
+    in_arrays = _sources(x for array in program.block.arrays() for x in array.operands)
+    in_arrays -= _sources(x for array in program.outputs for x in array.ravel())
+    scalars = [x for array in program.inputs for x in array.ravel()]
+    arguments = [
+        functools.partial(load, row) if x.index in in_arrays else load(row)
+        for x, row in zip(scalars, rows, strict=True)
+    ]
+    for row, result in enumerate(body.finish(arguments)):
+        w.divide(row)
         tile.at(row, w.vector).store(result, align=4 * lanes)
     return w
+
+
+def _sources(scalars: Iterable[Scalar]) -> set[int]:
+    """Return the indices of the scalars from which some words are converted."""
+    return {x.index for x in map(_source, scalars) if not is_constant(x)}
 
 
 def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWriter:
@@ -123,7 +151,7 @@ def map_function(program: ScalarProgram, *, lanes: int, items: int) -> LlvmWrite
         item = w.select(group > items - lanes, items - lanes, group)
         # Neighbouring items of a row are neighbours in memory: one load fills all lanes.
         columns = [(table + j * items + item).load(w.vector) for j in range(row)]
-        results = body.finish(columns)
+        results = list(body.finish(columns))
         out.at(item * len(results), "u8").store(_interleaved(w, results))
         following = group + lanes
         loop.again(following < items, following)
@@ -153,7 +181,8 @@ def require(program: ScalarProgram) -> None:
     """
     _inputs(program)
     for value in program.block.values():
-        _write_of(value)
+        if value.op not in ("array", "load"):
+            _write_of(value)
 
 
 def _inputs(program: ScalarProgram) -> list[Expr]:
@@ -196,7 +225,10 @@ class ProgramWriter:
         self.flags = "afn" if approximate else ""
         self._program = program
         self._rest: list[Item] = program.block.items
-        self._values: dict[int, Value] = {}
+        self._values: dict[int, Value | Callable[[], Value]] = {}
+        # The addresses of arrays, and the counters of loops, one number for all lanes.
+        self._addresses: dict[int, Value] = {}
+        self._counters: dict[int, Value] = {}
         # A vector of truth values: the lanes that execute the current block; None: all lanes.
         self._mask: Value | None = None
 
@@ -220,21 +252,22 @@ class ProgramWriter:
                 rest.append(item)
         self._rest = rest
 
-    def finish(self, arguments: Iterable[Value]) -> list[Value]:
+    def finish(self, arguments: Iterable[Value | Callable[[], Value]]) -> Iterator[Value]:
         """Append the other operations.
 
         Args:
-          arguments: the scalars of the arguments that `hoist` was not given.
+          arguments: the scalars of the arguments that `hoist` was not given, or functions that load
+            them anew for every use.
 
         Returns:
-          The scalars of the program's results.
+          The scalars of the program's results, of which those in memory are loaded one by one.
         """
         # The other arguments are known only now, such as the columns of a table in a loop over its
         # items.
         others = [x for x in self._inputs if x.index not in self._values]
         self._values |= {x.index: value for x, value in zip(others, arguments, strict=True)}
         self._block(Block(items=list(self._rest)))
-        return [self._operand(x) for array in self._program.outputs for x in array.ravel()]
+        return (self._operand(x) for array in self._program.outputs for x in array.ravel())
 
     def type(self, kind: str) -> str:
         """Return the type of a value by the kind of its dtype."""
@@ -242,7 +275,12 @@ class ProgramWriter:
 
     def _operand(self, x: Scalar) -> Value:
         if not is_constant(x):
-            return self._values[x.index]
+            if self._is_deferred(x):
+                return self._load(x) if x.op == "load" else self._computed(x)
+            if x.op == "counter":
+                return self._counters[x.index].splat(self.writer.lanes)
+            value = self._values[x.index]
+            return value if isinstance(value, Value) else value()
         if x.dtype.kind == "f" and np.isnan(x):
             # The bits of an integer that is passed as a float may be those of a NaN. LLVM's text of
             # a NaN would not keep all of them: write the integer, and reinterpret it.
@@ -261,7 +299,9 @@ class ProgramWriter:
 
     def _block(self, block: Block) -> None:
         for item in block.items:
-            if isinstance(item, PlacedLoop):
+            if isinstance(item, PlacedLoop) and item.loop.counter is not None:
+                self._counted_loop(item)
+            elif isinstance(item, PlacedLoop):
                 self._loop(item)
             elif isinstance(item, PlacedBranch):
                 self._branch(item)
@@ -275,6 +315,43 @@ class ProgramWriter:
         self._mask = mask if self.writer.lanes > 1 else None
         self._block(block)
         self._mask = enclosing
+
+    def _counted_loop(self, item: PlacedLoop) -> None:
+        w, loop = self.writer, item.loop
+        counter, length = loop.counter, loop.length
+        assert counter is not None
+        assert length is not None
+        for stack in item.stacks:
+            self._addresses[stack.index] = self._allocated(stack)
+        # As in `_loop`, but the counter alone decides. Lanes that do not execute the enclosing
+        # block go through the iterations, too, and nobody takes their values.
+        carries = [loop.carries[place] for place in item.places]
+        first = w.constant(length - 1 if loop.reverse else 0, "i32")
+        initial = [first, *(self._operand(loop.initial[place]) for place in item.places)]
+        head, body, end = w.labels("head", "body", "end")
+        before = w.label
+        w.jump(head)
+        w.begin(head)
+        phis = [w.phi(value.type) for value in initial]
+        count = self._counters[counter.index] = phis[0].value
+        self._values |= {x.index: phi.value for x, phi in zip(carries, phis[1:], strict=True)}
+        self._block(item.head)
+        w.branch(count >= 0 if loop.reverse else count < length, body, end)
+        w.begin(body)
+        self._block(item.body)
+        # Store what the iteration returns.
+        for stack in item.stacks:
+            value = self._operand(loop.stacked[stack.place])
+            self._store(self._addresses[stack.index], count, value)
+        following = count + (-1 if loop.reverse else 1)
+        updated = [following, *(self._operand(loop.updated[place]) for place in item.places)]
+        for phi, start, new in zip(phis, initial, updated, strict=True):
+            phi.joins(start, before)
+            phi.joins(new)
+        w.jump(head)
+        w.begin(end)
+        for result in item.results:
+            self._values[result.index] = self._operand(loop.results[result.place])
 
     def _loop(self, item: PlacedLoop) -> None:
         # The loop has two blocks of code: `head` computes the condition, and `body` an iteration.
@@ -375,10 +452,104 @@ class ProgramWriter:
             phi.joins(other, before)
         return [phi.value for phi in phis]
 
+    # Arrays.
+
+    def _allocated(self, array: Expr) -> Value:
+        """Return the address of memory for the scalars of an array."""
+        lanes = self.writer.lanes
+        return self.writer.allocate(length_of(array), self.type(array.dtype.kind), align=4 * lanes)
+
+    def _store(self, array: Value, place: Value | int, value: Value) -> None:
+        array.at(place, value.type).store(value, align=4 * self.writer.lanes)
+
+    def _array(self, array: Expr) -> Value:
+        """Append an array of given scalars, and return its address."""
+        if is_table(array):
+            return self._table(array)
+        address = self._allocated(array)
+        for i, x in enumerate(array.operands):
+            self.writer.divide(i)
+            self._store(address, i, self._operand(x))
+        return address
+
+    def _table(self, array: Expr) -> Value:
+        """Return the address of an array of constants, of which the module has one for all lanes.
+
+        Its words are written as integers, which keep the bits of a NaN.
+        """
+        numbers = np.array([np.asarray(x) for x in array.operands]).view(np.int32)
+        name = f"@table_{hashlib.sha256(numbers.tobytes()).hexdigest()[:16]}"
+        words = ", ".join(f"i32 {number}" for number in numbers)
+        # On a GPU, it is in address space 1, as the arrays of XLA.
+        space = " addrspace(1)" if self.for_gpu else ""
+        self.writer.declare(
+            f"{name} = internal{space} constant [{len(numbers)} x i32] [{words}], align 4"
+        )
+        return Value(self.writer, name, f"ptr{space}")
+
+    def _load(self, value: Expr) -> Value:
+        """Append a load of a scalar of an array."""
+        w = self.writer
+        array, index = value.operands
+        assert isinstance(array, Expr)
+        address, is_one = self._addresses[array.index], is_table(array)
+        element, vectors = _ELEMENTS[value.dtype.kind], self.type(value.dtype.kind)
+        # A constant or a counter is the same in all lanes: load the vector of all of them, or the
+        # one number of a table.
+        if is_constant(index) or index.op == "counter":
+            place = int(index) if is_constant(index) else self._counters[index.index]
+            if is_one:
+                return address.at(place, element).load(element).splat(w.lanes)
+            return address.at(place, vectors).load(vectors, align=4 * w.lanes)
+        places = self._operand(index)
+        if w.lanes == 1:
+            return address.at(places, element).load(element)
+        # Otherwise each lane loads its own number, which in memory is among those of its vector.
+        result = Value(w, "poison", vectors)
+        for lane in range(w.lanes):
+            place = w.let(f"extractelement {places.typed}, i64 {lane}", "i32")
+            word = place if is_one else place * w.lanes + lane
+            number = address.at(word, element).load(element)
+            result = w.let(
+                f"insertelement {llvm_type(vectors)} {result.text}, {number.typed}, i64 {lane}",
+                vectors,
+            )
+        return result
+
     def _operation(self, value: Expr) -> None:
+        if value.op == "array":
+            self._addresses[value.index] = self._array(value)
+            return
+        if self._is_deferred(value):
+            return
+        write = self._load if value.op == "load" else self._computed
+        self._values[value.index] = write(value)
+
+    def _is_deferred(self, x: Expr) -> bool:
+        """Return whether a number is loaded, and its bits converted, wherever it is used.
+
+        Of the thousands of numbers that an array may hold, few wait in registers then.
+        """
+        source = _source(x)
+        if is_constant(source):
+            return False
+        if source.op == "load":
+            return is_constant(source.operands[1])
+        return source is not x and callable(self._values.get(source.index))
+
+    def _computed(self, value: Expr) -> Value:
         write = _write_of(value, for_gpu=self.for_gpu)
-        operands = [self._operand(x) for x in value.operands]
-        self._values[value.index] = write(self, value, operands)
+        return write(self, value, [self._operand(x) for x in value.operands])
+
+
+def _source(x: Scalar) -> Scalar:
+    """Return the scalar from which a word is converted, or the scalar itself."""
+    while not is_constant(x):
+        is_truth = x.op == "ne" and is_constant(x.operands[1])
+        if not is_truth and x.op not in ("bitcast", "convert"):
+            break
+        x = x.operands[0]
+    return x
 
 
 # Operations: each function appends those of one scalar of a program, and returns it.

@@ -7,7 +7,8 @@ LLVM IR is a typed assembly language with any number of registers. To read its t
   label or to one of two, or with `ret`. There are no other loops and branches.
 - Where two ways meet in a block, `%v5 = phi float [%v3, %here], [%v4, %there]` is `%v3` if the
   block `here` was run last, and `%v4` if it was `there`. So a loop carries a value.
-- `load` and `store` access memory; `getelementptr` only computes an address.
+- `load` and `store` access memory; `getelementptr` only computes an address. `alloca` takes memory
+  from the stack until the function returns.
 - `llvm.sqrt.f32` and the like are LLVM's own functions (intrinsics), which the compiler replaces by
   instructions. Their names contain the types of their operands.
 - `poison` is a value that nobody uses.
@@ -38,6 +39,9 @@ import functools
 import re
 import struct
 from collections.abc import Iterable, Iterator, Sequence
+
+_MAX_ACCESSES = 256
+"""Most accesses of memory in a row in one block."""
 
 Number = bool | int | float
 """A number that is known when the function is written."""
@@ -395,6 +399,8 @@ class LlvmWriter:
         """The block that instructions are appended to."""
         self.declared: dict[str, None] = {}
         """Lines that the module needs beside the function, each of them once."""
+        # Memory of the function, which the start of `entry` allocates.
+        self._allocations: list[str] = []
         self._lines: list[str | Phi] = []
         self._count = 0
         # The last word of a parameter is its name, the first one its type.
@@ -414,7 +420,8 @@ class LlvmWriter:
     def text(self) -> str:
         """Return the text of the function; without `ret` at its end, it returns nothing."""
         last = [] if self._has_ended() else ["ret void"]
-        return "\n  ".join([self._head + "\nentry:", *map(str, self._lines), *last]) + "\n}\n"
+        lines = [*self._allocations, *map(str, self._lines), *last]
+        return "\n  ".join([self._head + "\nentry:", *lines]) + "\n}\n"
 
     # Instructions.
 
@@ -428,6 +435,21 @@ class LlvmWriter:
         name = f"%v{self._count}"
         self._lines.append(f"{name} = {instruction}")
         return Value(self, name, type)
+
+    def allocate(self, count: int, type: str, *, align: int) -> Value:
+        """Return the address of memory that the function has until it returns.
+
+        Args:
+          count: the number of elements.
+          type: their type.
+          align: bytes that the address is a multiple of.
+        """
+        # Wherever it is used, memory is taken where the function begins: an `alloca` in a loop
+        # would take more in every iteration.
+        self._count += 1
+        name = f"%v{self._count}"
+        self._allocations.append(f"{name} = alloca [{count} x {llvm_type(type)}], align {align}")
+        return Value(self, name, "ptr")
 
     def constant(self, number: Number, type: str = "float") -> Value:
         """Return a number that is known now; of a vector, all lanes hold it."""
@@ -551,6 +573,19 @@ class LlvmWriter:
         """Begin a block."""
         self._lines.append(f"{label}:")
         self.label = label
+
+    def divide(self, place: int) -> None:
+        """Begin another block in front of every 256th of many accesses of memory.
+
+        LLVM compares the accesses of a block with each other, in a time quadratic in their number.
+
+        Args:
+          place: how many accesses came before.
+        """
+        if place and place % _MAX_ACCESSES == 0:
+            (label,) = self.labels("more")
+            self.jump(label)
+            self.begin(label)
 
     def jump(self, label: str) -> None:
         """End a block, and go on at another one."""

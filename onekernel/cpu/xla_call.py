@@ -11,7 +11,7 @@ its size, and the function returns without a result if a size differs from the e
 """
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from importlib import resources
 
 from onekernel.codegen import STEP, LlvmWriter, Value, map_function, module_text, tile_function
@@ -24,6 +24,9 @@ SYMBOLS = ("malloc", "aligned_alloc", "free", "sched_yield")
 
 _BLOCKS_PER_THREAD = 4
 """Smallest number of blocks per thread; with fewer, a thread finishes before the next wakes up."""
+
+MAX_WRITTEN_OUT = 256
+"""Largest array of an instance that is copied without a loop."""
 
 _ASSETS = resources.files("onekernel").joinpath("cpu")
 
@@ -194,10 +197,10 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
         row = start
         for array, size in zip(arrays, sizes, strict=False):
             begin = instance * size
-            for i in range(size):
+            for i in _indices(w, size):
                 value = array[begin + i]
-                (tile + row * lanes)[lane] = value
-                row += 1
+                (tile + (i + row) * lanes)[lane] = value
+            row += size
         following = lane + 1
         loop.again(following < lanes, following)
     # Step.
@@ -217,14 +220,27 @@ def _instances(kernel: Kernel, lanes: int, start: int, height: int) -> LlvmWrite
         instance, row = first + lane, 0
         for array, size in zip(arrays[len(sizes) :], results, strict=True):
             begin = instance * size
-            for i in range(size):
-                value = (tile + row * lanes)[lane]
+            for i in _indices(w, size):
+                value = (tile + (i + row) * lanes)[lane]
                 array[begin + i] = value
-                row += 1
+            row += size
         following = lane + 1
         # Do not store the lanes beyond the last instance.
         loop.again((following < lanes) & (instance + 1 < instances), following)
     return w
+
+
+def _indices(w: LlvmWriter, size: int) -> Iterator[Value | int]:
+    """Yield the indices of an array, for each of which what is appended is run.
+
+    Those of a large array are one index, in a loop.
+    """
+    # LLVM takes a time quadratic in the number of accesses: 20 s for 2,000.
+    if size <= MAX_WRITTEN_OUT:
+        yield from range(size)
+        return
+    with w.loop(size) as i:
+        yield i
 
 
 def _map_functions(kernel: Kernel, items: int, lanes: int) -> list[LlvmWriter]:

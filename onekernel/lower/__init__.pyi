@@ -7,6 +7,8 @@ from .scalar_ir import COMPARISONS as COMPARISONS
 from .scalar_ir import Expr as Expr
 from .scalar_ir import Scalar as Scalar
 from .scalar_ir import is_constant as is_constant
+from .scalar_ir import is_table as is_table
+from .scalar_ir import length_of as length_of
 from .schedule import Block as Block
 from .schedule import Item as Item
 from .schedule import PlacedBranch as PlacedBranch

@@ -24,15 +24,41 @@ from onekernel.lower.indexing import (
     scalar_array,
     shape_of,
 )
-from onekernel.lower.scalar_ir import ExprGraph, Scalar, is_constant
+from onekernel.lower.scalar_ir import (
+    ExprGraph,
+    Scalar,
+    check_scalars,
+    is_constant,
+    is_same,
+)
+
+_INT = np.dtype(np.int32)
 
 MAX_PLACES = 256
-"""Largest number of places among which an index may choose; beyond, an address is faster."""
+"""Largest number of places among which an index may choose; beyond, numbers are read from memory,
+and none are written."""
 
 
 def _check_places(count: int) -> None:
     if count > MAX_PLACES:
         raise UnsupportedError(f"an index that depends on the state, with {count} places")
+
+
+def read_at(graph: ExprGraph, scalars: Sequence[Scalar], index: Scalar) -> Scalar:
+    """Read one of some scalars of one dtype from memory.
+
+    Args:
+      graph: the graph.
+      scalars: the scalars, at least one.
+      index: which of them, int32; the caller makes sure that there is one.
+    """
+    check_scalars(scalars)
+    first, *others = scalars
+    if all(is_same(first, x) for x in others):
+        return first
+    # Memory holds words of 32 bits: a bool is 0 or 1.
+    words = [graph.convert(x, _INT) if x.dtype == bool else x for x in scalars]
+    return graph.convert(graph.load(graph.array(words), index), first.dtype)
 
 
 def _clipped(graph: ExprGraph, start: Scalar, last: int) -> Scalar:
@@ -78,8 +104,16 @@ def _read_along(
     graph: ExprGraph, x: ScalarArray, axis: int, at: Scalar, last: int, size: int
 ) -> ScalarArray:
     """Return `size` entries of one axis from an index on, which is in 0 ... last."""
-    _check_places(last + 1)
     kind = at.dtype.type
+    # Among many places, read each number of the window at an address.
+    if last >= MAX_PLACES:
+        columns = np.moveaxis(x, axis, 0)
+        begin = graph.convert(at, _INT)
+        window = np.empty((size, *columns.shape[1:]), object)
+        for place in np.ndindex(*window.shape):
+            index = graph.apply("add", begin, np.int32(place[0]))
+            window[place] = read_at(graph, list(columns[(slice(None), *place[1:])]), index)
+        return np.moveaxis(window, 0, axis)
     # All windows that may be meant, in order; one of them remains.
     cases = [np.take(x, range(i, i + size), axis) for i in range(last + 1)]
     # Halve the candidates in each round, like a tournament: of two neighbours, the index keeps the

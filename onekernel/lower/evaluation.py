@@ -42,6 +42,15 @@ def evaluate(program: ScalarProgram, scalars: Sequence[np.ndarray]) -> list[np.n
             if item.op == "select":
                 condition, if_false, if_true = operands
                 values[item.index] = np.where(condition, if_true, if_false)
+            elif item.op == "array":
+                # The scalars are along the last axis.
+                values[item.index] = np.stack(np.broadcast_arrays(*operands), -1)
+            elif item.op == "load":
+                array, index = operands
+                instances = np.broadcast_shapes(array.shape[:-1], index.shape)
+                rows = np.broadcast_to(array, (*instances, array.shape[-1]))
+                places = np.broadcast_to(index, instances)[..., None]
+                values[item.index] = np.take_along_axis(rows, places, -1)[..., 0]
             elif item.op == "convert":
                 values[item.index] = convert_constant(operands[0], item.dtype)
             else:

@@ -19,6 +19,8 @@ Protocol, in the order in which a function passes through the package:
    - A carried value that is the same function of other carried values before the loop and after
      each iteration is not carried, but computed at the start of the iteration (`_find_derived`). In
      a solver that prepares the next iteration at the end of each one, this saves the last one.
+   - What a scan reads and returns step by step is in arrays in memory: an iteration loads the
+     scalars of its step, and stores those that it returns (`_rolled_scan`).
 
 4. `schedule` places the operations in blocks, and `onekernel.codegen` writes the blocks as LLVM IR.
 
@@ -43,7 +45,7 @@ from jaxtyping import Array, PyTree
 from numpy.typing import ArrayLike
 
 from onekernel.errors import UnsupportedError
-from onekernel.lower.dynamic_indexing import DYNAMIC_RULES
+from onekernel.lower.dynamic_indexing import DYNAMIC_RULES, read_at
 from onekernel.lower.expansions import EXPANSIONS, power, round_away_from_zero
 from onekernel.lower.indexing import (
     RULES,
@@ -67,6 +69,7 @@ from onekernel.lower.scalar_ir import (
     identity,
     is_constant,
     is_same,
+    length_of,
 )
 from onekernel.lower.schedule import Block, schedule
 
@@ -79,6 +82,10 @@ MAX_UNROLLED_OPERATIONS = 512
 MAX_PROGRAM_OPERATIONS = 100_000
 """Largest number of operations of a program; LLVM takes 15 s to compile that many for a CPU."""
 
+MAX_ARRAY_BYTES = 64 * 1024
+"""Most memory for the arrays of one instance: the lanes of a CPU have up to 1 MiB together on the
+stack of a thread, and a GPU reserves it for every thread that it can hold."""
+
 MIN_BRANCH_OPERATIONS = 24
 """Smallest number of operations for which a branch is faster than computing both sides."""
 
@@ -86,9 +93,9 @@ MIN_BRANCH_OPERATIONS = 24
 _GRAPH_RULES = {**RANDOM_RULES, **DYNAMIC_RULES}
 """Lowering rules that take the graph before the equation and its operands."""
 
-_FLOAT = np.dtype(np.float32)
+_FLOAT, _INT = np.dtype(np.float32), np.dtype(np.int32)
 _PairKey = tuple[Hashable, ...]
-_WORDS = {_FLOAT, np.dtype(np.int32), np.dtype(np.uint32), np.dtype(bool)}
+_WORDS = {_FLOAT, _INT, np.dtype(np.uint32), np.dtype(bool)}
 
 
 @dataclasses.dataclass(frozen=True, repr=False)
@@ -104,8 +111,14 @@ class ScalarProgram:
 
     @property
     def size(self) -> int:
-        """Return the number of recorded operations."""
-        return sum(1 for _ in self.block.values())
+        """Return the number of operations; each scalar that is stored in an array is one, too."""
+        stores = sum(len(array.operands) for array in self.block.arrays())
+        return stores + sum(1 for _ in self.block.values())
+
+    @property
+    def array_bytes(self) -> int:
+        """Return the bytes of memory that the arrays of one instance take."""
+        return sum(4 * length_of(array) for array in self.block.arrays())
 
 
 def scalarize(
@@ -185,7 +198,16 @@ def scalarize_part(
     program = ScalarProgram(inputs, outputs, block)
     if program.size > MAX_PROGRAM_OPERATIONS:
         raise UnsupportedError(f"{program.size:,} operations, more than {MAX_PROGRAM_OPERATIONS:,}")
+    _check_bytes(program.array_bytes)
     return program
+
+
+def _check_bytes(count: int) -> None:
+    """Raise an `UnsupportedError` if the arrays of an instance take too much memory."""
+    if count > MAX_ARRAY_BYTES:
+        raise UnsupportedError(
+            f"arrays of {count:,} bytes for each instance, more than {MAX_ARRAY_BYTES:,}"
+        )
 
 
 class _JaxprLowering:
@@ -368,25 +390,96 @@ class _JaxprLowering:
         last = len(operands) - scanned
         constants, carry = operands[: last - carried], list(operands[last - carried : last])
         sequences = operands[last:]
-        # Record a scan without sequences as a loop, and unroll all others.
+        # Record the scan as a loop, and unroll it if it is short or no loop can do it.
+        reverse = equation.params["reverse"]
+        obstacle = None
         if not scanned and not stacked:
             rolled = self._counted_loop(body, length, constants, carry)
             if rolled is not None:
                 return rolled
-        # Lower the body once for each iteration, with this iteration's rows of the sequences.
+        elif length > MAX_UNROLLED_TRIPS:
+            try:
+                return self._rolled_scan(body, length, reverse, constants, carry, sequences)
+            except UnsupportedError as error:
+                # For example, what an index of the step chooses is to be written.
+                obstacle = error
+        try:
+            return self._unrolled_scan(body, length, reverse, constants, carry, sequences)
+        except UnsupportedError as error:
+            raise obstacle or error from None
+
+    def _unrolled_scan(
+        self,
+        body: ClosedJaxpr,
+        length: int,
+        reverse: bool,
+        constants: Sequence[ScalarArray],
+        carry: list[ScalarArray],
+        sequences: Sequence[ScalarArray],
+    ) -> list[ScalarArray]:
+        """Lower the body of a scan once for each iteration, with its rows of the sequences."""
         order = range(length)
         rows: dict[int, list[ScalarArray]] = {}
-        for i in reversed(order) if equation.params["reverse"] else order:
+        carried = len(carry)
+        for i in reversed(order) if reverse else order:
             slices = [_at(sequence, i) for sequence in sequences]
             results = self.lower(body, [*constants, *carry, *slices])
             carry, rows[i] = results[:carried], results[carried:]
-        # Stack the rows that the iterations returned.
-        shapes = [shape_of(variable) for variable in equation.outvars[carried:]]
-        columns = [
-            scalar_array((x for i in order for x in rows[i][k].ravel()), shape)
-            for k, shape in enumerate(shapes)
-        ]
-        return [*carry, *columns]
+        stacked = body.jaxpr.outvars[carried:]
+        return [*carry, *_columns([rows[i] for i in order], [shape_of(x) for x in stacked])]
+
+    def _rolled_scan(
+        self,
+        body: ClosedJaxpr,
+        length: int,
+        reverse: bool,
+        constants: Sequence[ScalarArray],
+        carry: list[ScalarArray],
+        sequences: Sequence[ScalarArray],
+    ) -> list[ScalarArray]:
+        """Lower a scan to a counted loop, whose sequences are arrays in memory.
+
+        Raises:
+          UnsupportedError: an operation cannot be in a loop, or the arrays take too much memory.
+        """
+        graph = self._graph
+        loop = graph.begin_loop(_flatten(carry), length, reverse=reverse)
+        counter = loop.counter
+        assert counter is not None
+        # Load this iteration's rows of the sequences. All of them have the same scalars, so one row
+        # shows how theirs are arranged.
+        slices = []
+        for sequence in sequences:
+            flat = [_flatten([_at(sequence, i)]) for i in range(length)]
+            loaded = [read_at(graph, column, counter) for column in zip(*flat, strict=True)]
+            slices += _unflatten([_at(sequence, 0)], loaded)
+        # Record an iteration until all values that it carries are found. The rows that it returns
+        # are those of the last attempt.
+        rows: list[ScalarArray] = []
+
+        def next_state(state: list[ScalarArray]) -> list[ScalarArray]:
+            results = self.lower(body, [*constants, *state, *slices])
+            rows[:] = results[len(carry) :]
+            return results[: len(carry)]
+
+        carried = self._record_iteration(loop, carry, next_state)
+        # Store what differs between the iterations, and load it again behind the loop.
+        returned = _flatten(rows)
+        changing = [k for k, x in enumerate(returned) if _index(x) > counter.index]
+        _check_bytes(4 * length * len(changing))
+        words = (returned[k] for k in changing)
+        loop.stacked = [graph.convert(x, _INT) if x.dtype == bool else x for x in words]
+        end = self._end_loop(loop, carry, carried)
+        stacks = dict(zip(changing, graph.stacks(loop), strict=True))
+
+        def row(i: int) -> list[ScalarArray]:
+            flat = [
+                graph.convert(graph.load(stacks[k], np.int32(i)), x.dtype) if k in stacks else x
+                for k, x in enumerate(returned)
+            ]
+            return _unflatten(rows, flat)
+
+        return [*end, *_columns([row(i) for i in range(length)], [x.shape for x in rows])]
 
     def _counted_loop(
         self,
@@ -506,10 +599,30 @@ class _JaxprLowering:
         Returns:
           The state after the last iteration.
         """
+        loop = self._graph.begin_loop(_flatten(state))
+        carried = self._record_iteration(loop, state, next_state)
+        loop.condition = condition(_unflatten(state, loop.results))
+        return self._end_loop(loop, state, carried)
+
+    def _record_iteration(
+        self,
+        loop: Loop,
+        state: list[ScalarArray],
+        next_state: Callable[..., list[ScalarArray]],
+    ) -> set[int]:
+        """Record an iteration of a loop, and find the values that it carries.
+
+        Args:
+          loop: the loop, which is given its `updated` values and its `results`.
+          state: the carried values before the first iteration.
+          next_state: a function of a state that returns the next state.
+
+        Returns:
+          The places of the values that change between iterations.
+        """
         # Every scalar of the state is a candidate for a carried value, with a placeholder
         # (`carries`) for its value at the start of an iteration.
-        initial = _flatten(state)
-        loop = self._graph.begin_loop(initial)
+        initial = loop.initial
         carried: set[int] = set()
         # Find the values that change between iterations, until a round finds no more of them.
         while True:
@@ -528,11 +641,16 @@ class _JaxprLowering:
         if derived:
             start = [derived.get(k, x) for k, x in enumerate(start)]
             loop.updated = _flatten(next_state(_unflatten(state, start)))
-        # Finish the loop; values that it does not carry keep their initial value.
-        loop.condition = condition(_unflatten(state, start))
+        # Values that the loop does not carry keep their initial value.
         loop.results = start
+        return carried
+
+    def _end_loop(
+        self, loop: Loop, state: list[ScalarArray], carried: set[int]
+    ) -> list[ScalarArray]:
+        """Finish a loop, and return the state after the last iteration."""
         results = self._graph.end_loop(loop)
-        end = [results[k] if k in carried else x for k, x in enumerate(initial)]
+        end = [results[k] if k in carried else x for k, x in enumerate(loop.initial)]
         return _unflatten(state, end)
 
     def _cond(
@@ -832,6 +950,9 @@ def _parts(before: Scalar, after: Scalar) -> list[tuple[Scalar, Scalar]] | None:
         return None
     if before.op != after.op or before.dtype != after.dtype or before.op == "input":
         return None
+    # Arrays may have different lengths.
+    if len(before.operands) != len(after.operands):
+        return None
     return list(zip(before.operands, after.operands, strict=True))
 
 
@@ -843,6 +964,21 @@ def _pair_key(pair: tuple[Scalar, Scalar]) -> _PairKey:
 
 def _index(x: Scalar) -> int:
     return -1 if is_constant(x) else x.index
+
+
+def _columns(
+    rows: Sequence[Sequence[ScalarArray]], shapes: Sequence[tuple[int, ...]]
+) -> list[ScalarArray]:
+    """Stack the rows that the iterations of a scan return.
+
+    Args:
+      rows: one array for each result, of each iteration.
+      shapes: the shapes of these arrays.
+    """
+    return [
+        scalar_array((x for row in rows for x in row[k].ravel()), (len(rows), *shape))
+        for k, shape in enumerate(shapes)
+    ]
 
 
 def _flatten(arrays: Sequence[ScalarArray]) -> list[Scalar]:

@@ -5,6 +5,12 @@ with zero. Most entries of the matrices of physics are zeros, so most of the ari
 A `Loop` and a `Branch` are recorded as units; `schedule` decides in which block of the program each
 operation is computed.
 
+Scalars are in registers, which no index can choose. What an index that is not constant reads is in
+an array instead, in memory of the instance's own: one that holds given scalars (`ExprGraph.array`),
+or one to which a loop adds a scalar in every iteration (`Loop.stacked`). Both are operations
+whose value is an address, and which only `ExprGraph.load` takes as an operand. An array is never
+changed after it is complete, so loads have no order among each other.
+
 Three simplifications hold for finite numbers only: 0·x, 0/x and x - x are 0. A graph for numbers
 that may be infinite or NaN goes without them, and reduces angles of any size.
 
@@ -38,21 +44,26 @@ class Expr:
 
     op: str
     """Name of the operation, as in `jax.lax`; `input` is an input of the program, `carry` a value
-    that a loop carries between iterations, `result` a result of a loop or branch."""
+    that a loop carries between iterations, `counter` the index of an iteration, `result` a result
+    of a loop or branch. `array` and `stack` are arrays, of given scalars and of a scalar of every
+    iteration, and `load` is a scalar of an array."""
     operands: tuple[Scalar, ...]
     dtype: np.dtype
-    """dtype of the result: float32, int32, uint32 or bool."""
+    """dtype of the result, or of the scalars of an array: float32, int32, uint32 or bool."""
     index: int
     """Position in the order of recording; operands have smaller indices."""
     owner: "Loop | Branch | None" = None
-    """The loop or branch that a `carry` or `result` belongs to."""
+    """The loop or branch that a `carry`, `counter`, `result` or `stack` belongs to."""
     place: int = 0
-    """Position of a `carry` or `result` among those of its owner."""
+    """Position of a `carry`, `result` or `stack` among those of its owner."""
 
 
 @dataclasses.dataclass(eq=False, repr=False)
 class Loop:
-    """A `Loop` is a while loop that carries scalars."""
+    """A `Loop` is a while loop that carries scalars, or a counted one, as of `jax.lax.scan`.
+
+    All instances that run side by side make the iterations of a counted loop together.
+    """
 
     index: int
     """Position in the order of recording, after all operations of an iteration."""
@@ -63,9 +74,18 @@ class Loop:
     updated: list[Scalar] = dataclasses.field(default_factory=list)
     """The carried values at the end of an iteration, as functions of `carries`."""
     condition: Scalar = dataclasses.field(init=False)
-    """Whether there is another iteration, as a function of `carries`."""
+    """Whether there is another iteration, as a function of `carries`; True in a counted loop."""
     results: list[Scalar] = dataclasses.field(default_factory=list)
-    """The results of the loop, as functions of the `carries` for which `condition` is false."""
+    """The results of the loop, as functions of the `carries` after the last iteration."""
+    length: int | None = None
+    """The number of iterations of a counted loop; None: `condition` decides."""
+    reverse: bool = False
+    """Whether the counter of a counted loop goes from `length - 1` to 0 instead of upwards."""
+    counter: Expr | None = None
+    """The index of an iteration of a counted loop, int32."""
+    stacked: list[Scalar] = dataclasses.field(default_factory=list)
+    """The scalars that an iteration of a counted loop stores at the index `counter`, each in an
+    array of its own."""
 
 
 @dataclasses.dataclass(eq=False, repr=False)
@@ -292,9 +312,57 @@ class ExprGraph:
         """Record an operation again with other operands, without simplifying it."""
         return self._record(value.op, tuple(operands), value.dtype)
 
-    def begin_loop(self, initial: Sequence[Scalar]) -> Loop:
-        """Begin a loop; the operations of its iterations are recorded before `end_loop`."""
-        loop = Loop(-1, [], list(initial))
+    def array(self, scalars: Sequence[Scalar]) -> Expr:
+        """Record an array of at least one scalar, all of one dtype, float32, int32 or uint32."""
+        first = scalars[0]
+        if first.dtype not in (_FLOAT, _INT, _UINT) or any(x.dtype != first.dtype for x in scalars):
+            raise UnsupportedError(f"an array of {', '.join({str(x.dtype) for x in scalars})}")
+        # What a loop has stacked is an array already.
+        stack = first.operands[0] if isinstance(first, Expr) and first.op == "load" else None
+        if (
+            isinstance(stack, Expr)
+            and length_of(stack) == len(scalars)
+            and all(
+                isinstance(x, Expr)
+                and x.op == "load"
+                and is_same(x.operands[0], stack)
+                and _equals(x.operands[1], i)
+                for i, x in enumerate(scalars)
+            )
+        ):
+            return stack
+        return self._record("array", tuple(scalars), first.dtype)
+
+    def load(self, array: Expr, index: Scalar) -> Scalar:
+        """Read a scalar of an array (`array` or `stack`).
+
+        Args:
+          array: the array.
+          index: an int32, which must be inside of the array.
+        """
+        if array.op == "array":
+            # At a constant index, an array of given scalars has one of them.
+            if is_constant(index):
+                return array.operands[int(index)]
+            # `jnp.arange` has its index everywhere.
+            if array.dtype == _INT and all(_equals(x, i) for i, x in enumerate(array.operands)):
+                return index
+        return self._record("load", (array, index), array.dtype)
+
+    def begin_loop(
+        self, initial: Sequence[Scalar], length: int | None = None, *, reverse: bool = False
+    ) -> Loop:
+        """Begin a loop; the operations of its iterations are recorded before `end_loop`.
+
+        Args:
+          initial: the carried values at the start of the first iteration.
+          length: the number of iterations of a counted loop; None: its condition decides.
+          reverse: whether a counted loop counts downwards.
+        """
+        loop = Loop(-1, [], list(initial), length=length, reverse=reverse)
+        if length is not None:
+            loop.condition = np.bool_(True)
+            loop.counter = self._new("counter", (), _INT, loop)
         for place, scalar in enumerate(initial):
             # Whether a carry is needed is found later: `schedule` drops those that nothing uses.
             loop.carries.append(self._new("carry", (), scalar.dtype, loop, place))
@@ -306,6 +374,13 @@ class ExprGraph:
         return [
             self._new("result", (), scalar.dtype, loop, place)
             for place, scalar in enumerate(loop.results)
+        ]
+
+    def stacks(self, loop: Loop) -> list[Expr]:
+        """Return the arrays that a loop has stacked, after `end_loop`; none may be of bool."""
+        return [
+            self._new("stack", (), scalar.dtype, loop, place)
+            for place, scalar in enumerate(loop.stacked)
         ]
 
     def branch(
@@ -343,6 +418,19 @@ class ExprGraph:
             raise UnsupportedError(f"more than {MAX_OPERATIONS:,} operations")
         self.count += 1
         return self.count - 1
+
+
+def length_of(array: Expr) -> int:
+    """Return the number of scalars of an `array` or `stack`."""
+    if isinstance(array.owner, Loop):
+        assert array.owner.length is not None
+        return array.owner.length
+    return len(array.operands)
+
+
+def is_table(array: Expr) -> bool:
+    """Return whether an array consists of constants, so that all instances can share it."""
+    return array.op == "array" and all(map(is_constant, array.operands))
 
 
 def check_scalars(values: Iterable[object]) -> None:

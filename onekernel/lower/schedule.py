@@ -12,10 +12,16 @@ import dataclasses
 from collections.abc import Iterable, Iterator
 from typing import TypeAlias
 
-from onekernel.lower.scalar_ir import Branch, Expr, Loop, Scalar, is_constant
+from onekernel.lower.scalar_ir import Branch, Expr, Loop, Scalar, is_constant, is_table
 
 Item: TypeAlias = "Expr | PlacedLoop | PlacedBranch"
 _Node: TypeAlias = Expr | Loop | Branch
+
+_OF_ITERATION = ("carry", "counter")
+"""Operations whose value a loop gives to an iteration."""
+
+_AFTERWARDS = ("result", "stack")
+"""Operations whose value is there after a loop or branch."""
 
 
 @dataclasses.dataclass(eq=False, repr=False)
@@ -44,6 +50,18 @@ class Block:
                 for block in item.blocks:
                     yield from block.values()
 
+    def arrays(self) -> Iterator[Expr]:
+        """Yield the arrays in memory, here and in the blocks inside, but those of constants."""
+        for item in self.items:
+            if isinstance(item, Expr):
+                if item.op == "array" and not is_table(item):
+                    yield item
+            else:
+                if isinstance(item, PlacedLoop):
+                    yield from item.stacks
+                for block in item.blocks:
+                    yield from block.arrays()
+
 
 @dataclasses.dataclass(eq=False, repr=False)
 class PlacedLoop:
@@ -54,6 +72,8 @@ class PlacedLoop:
     """Indices of the carries that are needed; the others are not computed."""
     results: list[Expr]
     """The results that are needed."""
+    stacks: list[Expr]
+    """The arrays with a scalar of every iteration that are needed."""
     head: Block
     body: Block
 
@@ -99,8 +119,10 @@ class _Scheduler:
         # A node is an operation, a loop or a branch. All tables are by the index of a node. The
         # first one has all nodes that an output needs.
         self._reached: dict[int, _Node] = {}
-        # The needed results of each loop or branch, and the places of the needed carries of a loop.
+        # The needed results of each loop or branch, and the needed arrays of a loop and the places
+        # of its needed carries.
         self._results: dict[int, list[Expr]] = {}
+        self._stacks: dict[int, list[Expr]] = {}
         self._carries: dict[int, list[int]] = {}
         # Indices of the loops whose iterations a node depends on: it must be inside of them.
         self._loops: dict[int, frozenset[int]] = {}
@@ -113,11 +135,11 @@ class _Scheduler:
         self._reach(outputs)
         nodes = sorted(self._reached.values(), key=lambda node: node.index)
         for node in nodes:
-            # A node depends on the loops of its inputs, and a carry on its own loop. Behind a loop,
-            # its results no longer do.
+            # A node depends on the loops of its inputs, and a carry or counter on its own loop.
+            # Behind a loop, its results no longer do.
             inputs = [self._loops[x.index] for x in self._inputs(node)]
             own = {node.index} if isinstance(node, Loop) else set()
-            carried = {self._owner(node).index} if _op(node) == "carry" else set()
+            carried = {self._owner(node).index} if _op(node) in _OF_ITERATION else set()
             self._loops[node.index] = frozenset().union(*inputs, carried) - own
         # Place the operations in reverse order, so that all users of one are placed before it.
         self._add_uses(root, outputs)
@@ -153,6 +175,12 @@ class _Scheduler:
             # A carry needs its first value and the one at the end of an iteration.
             self._carries.setdefault(owner.index, []).append(place)
             return [owner, *_expressions([owner.initial[place], owner.updated[place]])]
+        if value.op == "counter":
+            return [owner]
+        if value.op == "stack":
+            assert isinstance(owner, Loop)
+            self._stacks.setdefault(owner.index, []).append(value)
+            return [owner, *_expressions([owner.stacked[place]])]
         # A result needs what it is inside of the loop, or on both sides of the branch.
         self._results.setdefault(owner.index, []).append(value)
         sides = (
@@ -170,23 +198,25 @@ class _Scheduler:
     def _inputs(self, node: _Node) -> list[_Node]:
         """Return all dependencies of a node, except the next value of a carry of the same loop."""
         if isinstance(node, Expr):
-            if node.op == "carry":
+            if node.op in _OF_ITERATION:
                 return []
-            return [self._owner(node)] if node.op == "result" else [*_expressions(node.operands)]
+            is_owned = node.op in _AFTERWARDS
+            return [self._owner(node)] if is_owned else [*_expressions(node.operands)]
         results = [value.place for value in self._results.get(node.index, [])]
         if isinstance(node, Branch):
             sides = [side[place] for place in results for side in (node.if_false, node.if_true)]
             return [*_expressions([node.condition, *sides])]
         places = self._carries.get(node.index, [])
         scalars = [side[place] for place in places for side in (node.initial, node.updated)]
+        scalars += [node.stacked[x.place] for x in self._stacks.get(node.index, [])]
         return [*_expressions([node.condition, *scalars, *(node.results[i] for i in results)])]
 
     def _place_value(self, value: Expr) -> None:
-        # Inputs and carries are there when their block begins.
-        if value.op in ("input", "carry"):
+        # Inputs, carries and counters are there when their block begins.
+        if value.op == "input" or value.op in _OF_ITERATION:
             return
-        # A result is computed where its loop or branch is.
-        if value.op == "result":
+        # A result or stack is computed where its loop or branch is.
+        if value.op in _AFTERWARDS:
             self._add_uses(self._use[value.index], [self._owner(value)])
             return
         block = self._place(value)
@@ -209,12 +239,14 @@ class _Scheduler:
         head = Block(block, node)
         body = Block(head)
         carries = sorted(self._carries.get(node.index, []))
-        block.items.append(PlacedLoop(node, carries, results, head, body))
+        stacks = sorted(self._stacks.get(node.index, []), key=lambda value: value.place)
+        block.items.append(PlacedLoop(node, carries, results, stacks, head, body))
         self._add_uses(block, _expressions(node.initial[place] for place in carries))
         self._add_uses(
             head, _expressions([node.condition, *(node.results[place] for place in places)])
         )
         self._add_uses(body, _expressions(node.updated[place] for place in carries))
+        self._add_uses(body, _expressions(node.stacked[stack.place] for stack in stacks))
         return head, body
 
     def _place(self, node: _Node) -> Block:

@@ -139,6 +139,111 @@ LOOPS = {
     ),
 }
 
+
+def _ends(*columns):
+    """Four numbers of what a scan returns."""
+    return jnp.stack([columns[i % len(columns)][place] for i, place in enumerate((0, 57, -2, -1))])
+
+
+def _sums(x, reverse=False):
+    """What a step is given, and a number that depends on all before, in every step."""
+    given = x[0] * jnp.arange(100) + x[1]
+    last, sums = jax.lax.scan(lambda c, a: (c * 0.9 + a, c - a), x[2], given, reverse=reverse)
+    return _ends(sums) * 0.01 + last
+
+
+def _trajectory(x):
+    """Euler's method for an oscillator, whose states are returned by step."""
+
+    def step(y, _):
+        y = y + 0.05 * jnp.array([y[1], -y[0] - 0.1 * y[1]])
+        return y, y
+
+    states = jax.lax.scan(step, x[:2], length=200)[1]
+    return _ends(states[:, 0], states[:, 1]) + states.sum() * 0.01
+
+
+def _several_sequences(x):
+    """Floats, both kinds of whole numbers, truths and keys, given and returned."""
+    n, whole = 70, jax.lax.bitcast_convert_type(x[0], jnp.uint32)
+    counts = (x[1] * 8).astype(jnp.int32) - jnp.arange(n) * 3
+    given = x[2] * jnp.arange(n), counts, whole + jnp.arange(n, dtype=jnp.uint32), counts % 2 == 0
+    keys = jax.vmap(lambda i: jax.random.wrap_key_data(jnp.stack([whole, i])))(
+        jnp.arange(n, dtype=jnp.uint32)
+    )
+
+    def step(carry, row):
+        (number, count, word, truth), key = row
+        drawn = jax.random.bits(key)
+        carry = carry + jnp.where(truth, number, count.astype(jnp.float32))
+        return carry, (
+            carry,
+            count * 2,
+            word ^ drawn,
+            truth != (carry > 0),
+            jax.random.split(key)[0],
+        )
+
+    total, (floats, counts, words, truths, made) = jax.lax.scan(step, x[3], (given, keys))
+    bits = (words ^ jax.random.key_data(made)[:, 1]) >> 24
+    return _ends(floats, counts, bits, truths.astype(jnp.float32)) * 0.01 + total
+
+
+def _scan_in_scan(x):
+    """An inner scan returns its steps anew in every step of the outer one."""
+
+    def outer(y, a):
+        end, inner = jax.lax.scan(lambda c, b: (c * 0.5 + b * a, c + b), y, jnp.arange(80) * x[0])
+        return end * 0.5, inner[::-1][a % 7] + inner[40]
+
+    end, returned = jax.lax.scan(outer, x[1], jnp.arange(66))
+    return _ends(returned) * 1e-3 + end * 1e-3
+
+
+def _scan_in_loop(x):
+    """Each robot makes as many rounds as it needs, of a scan and what follows from its steps."""
+
+    def trip(state):
+        y, count = state
+        steps = jax.lax.scan(lambda c, a: (c + a * 1e-3, c * a), y, jnp.arange(65) * x[1])[1]
+        return 0.5 * y + 1e-4 * steps[64] + 1e-4 * jnp.flip(steps)[60], count + 1
+
+    y, count = jax.lax.while_loop(
+        lambda s: (jnp.abs(s[0]) > 0.05) & (s[1] < 9), trip, (x[0] * 4, 0)
+    )
+    return jnp.stack([y, count, x[1], y * x[2]])
+
+
+def _derivative(x):
+    def loss(x):
+        def step(c, a):
+            c = jnp.sin(c * x[0] * 0.5) + a
+            return c, c
+
+        return (jax.lax.scan(step, x[3], x[1] * jnp.arange(90))[1] ** 2).mean() * 1e-3
+
+    return jax.grad(loss)(x)
+
+
+_TABLE = np.float32(np.random.default_rng(9).normal(size=300))
+
+SCANS = {
+    "given and returned by step": _sums,
+    "from the last step to the first": lambda x: _sums(x, reverse=True),
+    "states by step": _trajectory,
+    "several sequences": _several_sequences,
+    "a scan in a scan": _scan_in_scan,
+    "a scan in a loop": _scan_in_loop,
+    "a scan on one side": lambda x: jax.lax.cond(x[0] > 0, _sums, lambda x: x, x),
+    "a derivative": _derivative,
+    "a place in a table": lambda x: jnp.array(_TABLE)[(jnp.abs(x) * 100).astype(int)],
+    "a place among numbers": lambda x: (x[0] * jnp.array(_TABLE))[(jnp.abs(x) * 100).astype(int)],
+    "a window": lambda x: jax.lax.dynamic_slice(
+        x[0] * jnp.array(_TABLE), [(x[1] * 200).astype(int)], [4]
+    ),
+}
+"""Functions with arrays in memory."""
+
 FUNCTIONS = {**ARITHMETIC, **LOOPS}
 
 

@@ -51,6 +51,13 @@ class _Evaluation:
         operands = [self.look_up(x) for x in value.operands]
         if value.op == "select":
             return np.where(operands[0], operands[2], operands[1])
+        if value.op == "array":
+            return np.stack(operands, -1)
+        if value.op == "load":
+            array, index = operands
+            # Robots that do not execute the block may have any index.
+            index = np.where(self._mask, index, 0)
+            return np.take_along_axis(array, index[..., None], -1)[..., 0]
         if value.op == "convert":
             return convert_constant(operands[0], value.dtype)
         return EVALUATE[value.op](*operands)
@@ -59,14 +66,25 @@ class _Evaluation:
         loop = item.loop
         state = [self.look_up(loop.initial[place]) for place in item.places]
         active = self._mask
+        for stack in item.stacks:
+            nothing = np.full((*self._batch, loop.length), 77, stack.dtype)
+            self.values[stack.index] = nothing
+        counts = iter(range(loop.length or 0)[:: -1 if loop.reverse else 1])
         while True:
             for place, value in zip(item.places, state, strict=True):
                 self.values[loop.carries[place].index] = value
             self.block(item.head)
+            count = next(counts, None)
             active = active & self.look_up(loop.condition)
-            if not active.any():
+            if not active.any() or (loop.length is not None and count is None):
                 break
+            if loop.counter is not None:
+                self.values[loop.counter.index] = np.full(self._batch, count, np.int32)
             self._masked_block(item.body, active)
+            for stack in item.stacks:
+                kept = self.values[stack.index][..., count]
+                new = np.where(active, self.look_up(loop.stacked[stack.place]), kept)
+                self.values[stack.index][..., count] = new
             updated = [self.look_up(loop.updated[place]) for place in item.places]
             state = [np.where(active, b, a) for a, b in zip(state, updated, strict=True)]
         for result in item.results:

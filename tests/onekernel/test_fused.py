@@ -108,10 +108,88 @@ def test_a_function_is_one_kernel_that_does_what_it_did(name):
 
 def test_whole_numbers_reach_their_kernel_as_they_are():
     # XLA would compile each conversion for a CPU to a kernel of its own.
-    one = OneKernel(lambda key, count: (key ^ key[::-1], count + 1))
+    one = fuse(lambda key, count: (key ^ key[::-1], count + 1))
     text = jax.jit(jax.vmap(one)).lower(keys(17), np.arange(17, dtype=np.int32)).as_text()
     assert text.count("custom_call") == 1
     assert "bitcast_convert" not in text
+
+
+LONG = 2_000
+
+
+def trajectory(state):
+    """Euler's method for the Lorenz system, whose states are returned by step."""
+
+    def step(y, _):
+        slope = (10 * (y[1] - y[0]), y[0] * (28 - y[2]) - y[1], y[0] * y[1] - 8 / 3 * y[2])
+        y = y + 1e-4 * jnp.stack(slope)
+        return y, y
+
+    return jax.lax.scan(step, state, length=LONG)[1]
+
+
+def sums_until_small(x, rows):
+    """As many rounds as an instance needs, of sums whose steps the next round begins with."""
+
+    def trip(state):
+        rows, y, count = state
+        y, rows = jax.lax.scan(lambda c, a: (c * 0.5 + a, a * 0.4 + c * 0.1), y, rows)
+        return rows, y, count + 1
+
+    def goes_on(state):
+        return (jnp.abs(state[1]) > 0.01) & (state[2] < 20)
+
+    return jax.lax.while_loop(goes_on, trip, (rows, x * 9, 0))
+
+
+def of_several_dtypes(numbers, counts, flags, key):
+    def step(carry, row):
+        total, key = carry
+        number, count, flag = row
+        key, drawn = jax.random.split(key)
+        word = jax.random.bits(drawn)
+        total = total + jnp.where(flag, count, -1)
+        return (total, key), (number * 2, total, word, flag ^ (word % 2 == 0), drawn)
+
+    return jax.lax.scan(step, (0, key), (numbers, counts, flags), reverse=True)
+
+
+def decayed_error(decay, rows):
+    def step(state, a):
+        state = state * jnp.tanh(decay) * 0.9 + a
+        return state, state
+
+    return (jax.lax.scan(step, jnp.float32(0.5), rows)[1] ** 2).mean()
+
+
+LONG_SCANS = {
+    "cumulative sums": (
+        lambda x: jax.lax.scan(lambda c, a: (c + a, c + a), jnp.float32(0), x),
+        robots(17, LONG),
+    ),
+    "a trajectory": (trajectory, robots(17, 3)),
+    "rounds": (sums_until_small, robots(17), robots(17, 100, seed=1)),
+    "several dtypes": (
+        of_several_dtypes,
+        robots(17, 300),
+        (robots(17, 300) * 9).astype(np.int32),
+        robots(17, 300, seed=1) > 0,
+        keys(17),
+    ),
+    "a derivative": (
+        jax.value_and_grad(decayed_error, argnums=(0, 1)),
+        robots(17),
+        robots(17, LONG, seed=1),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LONG_SCANS)
+def test_a_long_scan_is_one_kernel(name):
+    function, *arguments = LONG_SCANS[name]
+    batched = jax.vmap(fuse(function))
+    assert is_one_kernel(batched, *arguments)
+    agree(jax.jit(batched)(*arguments), jax.jit(jax.vmap(function))(*arguments), atol=2e-5)
 
 
 def test_numbers_that_are_no_arrays_will_do():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers import simt
-from helpers.kernel_cases import FUNCTIONS, VECTOR, robots
+from helpers.kernel_cases import FUNCTIONS, SCANS, VECTOR, robots
 from helpers.map_kernels import make, reference
 from helpers.map_kernels import robots as of_map
 from onekernel import gpu
@@ -26,12 +26,13 @@ def expected(function, *leaves):
         return jax.jit(jax.vmap(function))(*leaves)
 
 
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", {**FUNCTIONS, **SCANS})
 def test_a_kernel_does_what_the_function_does(name, model):
-    kernel = Kernel(scalarize(FUNCTIONS[name], VECTOR), carried=1, steps=1, fallback=None)
+    function = {**FUNCTIONS, **SCANS}[name]
+    kernel = Kernel(scalarize(function, VECTOR), carried=1, steps=1, fallback=None)
     x = robots(70)
     (ours,) = gpu.launch(kernel, [x])
-    np.testing.assert_allclose(ours, expected(FUNCTIONS[name], x), rtol=2e-5, atol=2e-6)
+    np.testing.assert_allclose(ours, expected(function, x), rtol=2e-5, atol=2e-6)
 
 
 def walk(x, force):

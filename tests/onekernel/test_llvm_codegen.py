@@ -10,7 +10,7 @@ from scipy import special
 
 from helpers import call_frame
 from helpers.call_frame import Pool
-from helpers.kernel_cases import FUNCTIONS, LOOPS, VECTOR, robots
+from helpers.kernel_cases import FUNCTIONS, LOOPS, SCANS, VECTOR, robots
 from helpers.run_program import evaluate
 from onekernel import cpu
 from onekernel.codegen import LlvmWriter, require, run_program
@@ -62,11 +62,21 @@ def test_a_kernel_does_what_the_function_does(name, lanes):
     np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
 
 
-@pytest.mark.parametrize("name", LOOPS)
+@pytest.mark.parametrize("name", SCANS)
+def test_arrays_hold_the_numbers_of_each_robot(name, lanes):
+    function, x = SCANS[name], robots(2 * LANES + 3)
+    program = scalarize(function, VECTOR)
+    theirs = jax.jit(jax.vmap(function))(x)
+    np.testing.assert_allclose(evaluate(program, [x])[0], theirs, rtol=2e-5, atol=2e-6)
+    (ours,) = run(program, [x])
+    np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
+
+
+@pytest.mark.parametrize("name", {**LOOPS, **SCANS})
 def test_a_lane_that_is_done_keeps_its_numbers(name):
     # Alone each robot ends its loops by itself; in a register the slowest keeps all of them there.
     x = robots(LANES)
-    program = scalarize(LOOPS[name], VECTOR)
+    program = scalarize({**LOOPS, **SCANS}[name], VECTOR)
     handler = compiled(program)
     together = np.zeros_like(x)
     call_frame.call(handler, [x], [together])

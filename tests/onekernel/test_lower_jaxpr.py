@@ -527,6 +527,84 @@ def test_a_robot_that_is_done_does_not_enter_an_inner_loop():
     np.testing.assert_array_equal(evaluate(program, [x])[0], 0)
 
 
+def sums(length, **options):
+    """A scan whose steps are given and return a number each."""
+
+    def function(x):
+        given = x[0] * jnp.arange(length) + x[1]
+        return jax.lax.scan(lambda c, a: (c * 0.5 + a, c), x[2], given, **options)[1]
+
+    return function
+
+
+@pytest.mark.parametrize("reverse", [False, True])
+@pytest.mark.parametrize(("length", "loops"), [(64, 0), (65, 1), (2000, 1)])
+def test_a_scan_with_rows_stays_a_loop_if_it_is_long(length, loops, reverse):
+    program = check(sums(length, reverse=reverse), robots=3)
+    found = list(items(program.block, PlacedLoop))
+    assert len(found) == loops
+    for loop in found:
+        assert [x.op for x in loop.body.items] == ["load", "mul", "add"]
+        assert program.array_bytes == 2 * 4 * length
+
+
+def test_what_every_step_is_given_alike_or_knows_takes_no_memory():
+    def function(x):
+        def step(c, row):
+            i, alike, known = row
+            return c * 0.5 + alike + known, (x[1], i * 2.0, jnp.float32(3))
+
+        rows = jnp.arange(100), jnp.broadcast_to(x[0], 100), jnp.sin(jnp.arange(100.0))
+        return jax.lax.scan(step, x[2], rows)
+
+    program = check(function)
+    # The index of a step is its number; of the sines there is one table for all robots. Only what
+    # the steps return and what differs from step to step is stored.
+    (loop,) = items(program.block, PlacedLoop)
+    assert len(loop.stacks) == 1
+    assert program.array_bytes == 400
+    assert [x.op for x in program.block.items if isinstance(x, Expr)].count("array") == 1
+
+
+def test_what_one_scan_returns_is_where_the_next_one_reads_it():
+    def function(x):
+        rows = sums(300)(x)
+        return jax.lax.scan(lambda c, a: (c * 0.5 + a, None), x[3], rows, reverse=True)[0]
+
+    program = check(function)
+    assert [x.op for x in program.block.arrays()].count("stack") == 1
+    assert program.array_bytes == 2 * 4 * 300
+
+
+def test_what_nobody_needs_of_a_scan_is_not_stored():
+    def function(x):
+        given = x[0] * jnp.arange(100)
+        return jax.lax.scan(lambda c, a: (c * 0.5 + a, (c, jnp.sin(a))), x[2], given)[1][0]
+
+    program = check(function)
+    (loop,) = items(program.block, PlacedLoop)
+    assert len(loop.stacks) == 1
+    assert [x.op for x in loop.body.items] == ["load", "mul", "add"]
+
+
+def test_a_scan_that_no_loop_can_do_is_written_out():
+    def function(x):
+        # In a loop, the place to write to would be one of 300.
+        def step(table, i):
+            return table.at[i * 4].add(x[1]), None
+
+        return jax.lax.scan(step, x[0] * jnp.arange(300.0), jnp.arange(70))[0]
+
+    program = check(function)
+    assert not list(items(program.block, PlacedLoop))
+
+
+def test_arrays_that_take_too_much_memory_are_refused():
+    reason = r"^arrays of 80,000 bytes for each instance, more than 65,536$"
+    with pytest.raises(UnsupportedError, match=reason):
+        jaxpr.scalarize(sums(10_000), VECTOR)
+
+
 def test_a_program_that_is_too_large_is_refused(monkeypatch):
     monkeypatch.setattr(jaxpr, "MAX_PROGRAM_OPERATIONS", 50)
     jaxpr.scalarize(lambda x: x + 1, VECTOR)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.kernel_cases import FUNCTIONS, VECTOR, robots
+from helpers.kernel_cases import FUNCTIONS, SCANS, VECTOR, robots
 from jetbot_mjx.config import parse_config
 from jetbot_mjx.envs.jetbot_env import make_env
 from onekernel import gpu
@@ -39,6 +39,16 @@ def test_it_is_compiled_for_every_architecture(name, architecture):
     assert "call" not in text
 
 
+@pytest.mark.parametrize("name", SCANS)
+def test_arrays_are_in_the_threads_own_memory(name):
+    text = gpu.compiled(kernel(SCANS[name]), 90)
+    tables = len(re.findall(r"^\.global .*\btable_\w+\[1200\]", text, re.MULTILINE))
+    assert tables == (name == "a place in a table")
+    # What follows from constants alone, or is read from them, takes no memory of a thread.
+    assert bool(re.search(r"\bst\.local", text)) == (not tables)
+    assert text.count("st.global") == 4
+
+
 @pytest.mark.parametrize(
     ("robots", "threads"),
     [(1, 32), (4096, 32), (4097, 64), (16384, 128), (65536, 256), (10**7, 256)],
@@ -53,13 +63,14 @@ def test_without_a_gpu_there_is_none():
 
 
 @on_a_gpu
-@pytest.mark.parametrize("name", FUNCTIONS)
+@pytest.mark.parametrize("name", {**FUNCTIONS, **SCANS})
 def test_it_does_what_the_function_does(name):
     x = robots(300)
-    step = kernel(lambda x, held: FUNCTIONS[name](x), VECTOR, ()).as_step()
+    function = {**FUNCTIONS, **SCANS}[name]
+    step = kernel(lambda x, held: function(x), VECTOR, ()).as_step()
     ours = jax.jit(jax.vmap(lambda x: step(x, ())))(x)
     with jax.default_matmul_precision("highest"):
-        theirs = jax.jit(jax.vmap(FUNCTIONS[name]))(x)
+        theirs = jax.jit(jax.vmap(function))(x)
     np.testing.assert_allclose(ours, theirs, rtol=2e-5, atol=2e-6)
 
 

@@ -382,3 +382,34 @@ def test_an_expression_is_named_and_not_written_out():
     for _ in range(64):
         value = graph.apply("mul", value, value)
     assert len(repr(value)) < 200
+
+
+def test_an_array_is_read_only_where_no_scalar_is_known(graph, x):
+    index = graph.convert(x, np.dtype(np.int32))
+    array = graph.array([x, ONE, graph.apply("neg", x)])
+    assert graph.array([x, ONE, graph.apply("neg", x)]) is array
+    assert graph.load(array, np.int32(1)) is ONE
+    assert graph.load(array, index).op == "load"
+    assert graph.load(array, index) is graph.load(array, index)
+    # The numbers 0, 1, 2, ... are their own indices.
+    assert graph.load(graph.array([np.int32(i) for i in range(5)]), index) is index
+    assert graph.load(graph.array([np.int32(i) for i in (0, 2, 1)]), index).op == "load"
+    assert [scalar_ir.is_table(each) for each in (array, graph.array([ONE, TWO]))] == [False, True]
+
+
+def test_what_a_loop_has_stored_is_an_array_already(graph, x):
+    loop = graph.begin_loop([], 3)
+    loop.stacked = [graph.apply("mul", x, graph.convert(loop.counter, x.dtype)), x]
+    graph.end_loop(loop)
+    stack, other = graph.stacks(loop)
+    loads = [graph.load(stack, np.int32(i)) for i in range(3)]
+    assert graph.array(loads) is stack
+    assert scalar_ir.length_of(stack) == 3
+    for others in (loads[:2], loads[::-1], [*loads[:2], graph.load(other, np.int32(2))]):
+        assert graph.array(others).op == "array"
+
+
+def test_an_array_has_words_of_one_dtype(graph, x, flag):
+    for scalars in ([x, np.int32(1)], [flag, YES]):
+        with pytest.raises(UnsupportedError, match="an array of"):
+            graph.array(scalars)

@@ -212,3 +212,33 @@ def test_every_operand_of_a_large_program_is_there_before_it(graph, x):
 
     visit(schedule(results))
     check(results)
+
+
+def test_an_array_is_made_before_the_loop_that_reads_it(graph, x):
+    array = graph.array([x, graph.apply("sqrt", x), ONE])
+    loop = graph.begin_loop([x], 3, reverse=True)
+    loop.updated = [graph.apply("add", loop.carries[0], graph.load(array, loop.counter))]
+    loop.results = list(loop.carries)
+    loop.stacked = [graph.apply("neg", loop.updated[0]), graph.apply("floor", loop.carries[0])]
+    (end,) = graph.end_loop(loop)
+    negative, _ = graph.stacks(loop)
+    root = schedule([end, graph.load(negative, np.int32(1))])
+    assert ops(root) == ["sqrt", "array", "PlacedLoop", "load"]
+    placed = inside(root, PlacedLoop)
+    # What nobody reads is not stored.
+    assert (ops(placed.head), ops(placed.body)) == ([], ["load", "add", "neg"])
+    assert placed.stacks == [negative]
+    assert set(root.arrays()) == {array, negative}
+
+
+def test_what_a_loop_in_a_loop_stores_is_read_there(graph, x):
+    outer = graph.begin_loop([x], 3)
+    loop = graph.begin_loop([], 2)
+    loop.stacked = [graph.apply("mul", outer.carries[0], graph.convert(loop.counter, x.dtype))]
+    graph.end_loop(loop)
+    (stack,) = graph.stacks(loop)
+    outer.updated = [graph.load(stack, np.int32(1))]
+    outer.results = list(outer.carries)
+    placed = inside(schedule(graph.end_loop(outer)), PlacedLoop)
+    assert ops(placed.body) == ["PlacedLoop", "load"]
+    assert ops(inside(placed.body, PlacedLoop).body) == ["convert", "mul"]

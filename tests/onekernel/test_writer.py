@@ -265,3 +265,20 @@ def test_a_gpus_addresses_have_their_memories():
     assert "define ptx_kernel void @f(ptr addrspace(1) %array, i32 %i) {" in text
     assert isinstance(array + i, Value)
     assert (array + i).type == "ptr addrspace(1)"
+
+
+def test_memory_is_taken_where_a_function_begins():
+    w = LlvmWriter("f", "ptr out", "u32 count", lanes=4)
+    out, count = w.parameters
+    with w.loop(count):
+        own = w.allocate(3, "<4 x u32>", align=16)
+        w.divide(0)
+        w.divide(255)
+        own.at(1, "<4 x u32>").store(w.constant(7, "<4 x u32>"), align=16)
+    w.divide(256)
+    out[0] = own[4]
+    text = module_text([w])
+    assert re.search(r"entry:\n  (%v\d+) = alloca \[3 x <4 x i32>\], align 16\n", text)
+    # After many accesses of memory, another block begins.
+    assert len(re.findall(r"^  more\d+:", text, re.MULTILINE)) == 1
+    assert own.type == "ptr"

@@ -7,7 +7,7 @@ so threads that part at a branch or in a loop meet again behind it.
 
 A `Fault` is raised for
 
-- an address outside of an array or of shared memory, or misaligned;
+- an address outside of an array, of shared or of the thread's own memory, or misaligned;
 - a barrier, or an instruction of a whole warp, that only a part of a warp comes to, and a barrier
   that some of its threads never reach;
 - a race: two threads of a block access a word, one of them to change it, with no barrier that both
@@ -48,6 +48,7 @@ def run(text, arrays, grid=(1, 1, 1), threads=None, shared_memory=0):
     assert threads <= program.threads
     memories = {x.ctypes.data: Memory(x) for x in arrays}
     given = [memories[x.ctypes.data] for x in arrays]
+    given += [Memory(words) for words in program.tables.values()]
     for number, place in enumerate(np.ndindex(*grid[::-1])):
         registers = dict(zip(("ctaid.z", "ctaid.y", "ctaid.x"), place, strict=True))
         registers |= {f"nctaid.{axis}": size for axis, size in zip("xyz", grid, strict=True)}

@@ -20,9 +20,11 @@ PATTERNS = []
 """What the text of an instruction looks like, and the method of a `Block` that runs it."""
 
 _NOWHERE = -1
+_LOCAL = 0x4000
+"""Number, in an address, of the first allocation of local memory."""
 _FLAGS = r"(?: contract| afn| nsw| nuw)*"
 _TYPE = r"(ptr addrspace\(\d\)|<2 x half>|\w+)"
-_SPACE = r"ptr addrspace\((\d)\)"
+_SPACE = r"ptr(?: addrspace\((\d)\))?"
 
 
 def _runs(pattern):
@@ -45,10 +47,16 @@ class Block:
         self.registers = registers | {"tid.x": np.arange(threads), "ntid.x": threads}
         # An address: the number of the array, from 1, in its upper 16 bits.
         bases = [np.full(threads, (i + 1) << 48, np.uint64) for i in range(len(memories))]
-        self.values = dict(zip(program.parameters, bases, strict=True))
+        parameters = bases[: len(program.parameters)]
+        self.values = dict(zip(program.parameters, parameters, strict=True))
+        # The kernel's tables are behind its parameters.
+        first = len(memories) - len(program.tables)
+        for i, name in enumerate(program.tables, start=first):
+            self.values[name] = bases[i]
         self.values["@shared"] = np.zeros(threads, np.uint64)
         # What no thread has written is NaN.
         self.shared = Memory(np.full(shared_memory // 4, 0x7FFF7FFF, np.uint32))
+        self.local = []
         self.clocks = Clocks(threads // WARP)
         # Where each thread is, the basic block from which it came, and the barrier it waits at.
         self.at = np.zeros(threads, int)
@@ -228,7 +236,25 @@ class Block:
 
     # Memory.
 
-    @_runs(r"getelementptr (\w+), ptr addrspace\(\d\) (\S+), (i32|i64) (\S+)")
+    @_runs(r"alloca \[(\d+) x (?:float|i32)\], align 4")
+    def allocation(self, count):
+        """Take local memory, of which each thread has its own; it is what nobody has written."""
+        self.local.append(np.full((self.threads, int(count)), 0x7FFF7FFF, np.uint32))
+        return np.full(self.threads, (_LOCAL + len(self.local) - 1) << 48, np.uint64)
+
+    def _own(self, pointer):
+        """Return the allocation that an address is in, and the running threads' words there."""
+        addresses = self._get("ptr", pointer)[self.lanes]
+        numbers = (addresses >> np.uint64(48)).astype(int) - _LOCAL
+        offsets = (addresses & np.uint64((1 << 48) - 1)).astype(np.int64)
+        if (numbers != numbers[0]).any() or not 0 <= numbers[0] < len(self.local):
+            raise Fault("outside of an array of the thread")
+        words = self.local[numbers[0]]
+        if (offsets % 4).any() or (offsets // 4 >= words.shape[1]).any():
+            raise Fault(f"beyond the {words.shape[1]} words of an array of the thread")
+        return words, (self.lanes, offsets // 4)
+
+    @_runs(r"getelementptr (\w+), ptr(?: addrspace\(\d\))? (\S+), (i32|i64) (\S+)")
     def element(self, kind, base, index_kind, index):
         index = signed(self._get(index_kind, index)).astype(np.int64)
         return self._get("ptr", base) + (index * np.dtype(TYPES[kind]).itemsize).view(np.uint64)
@@ -250,6 +276,10 @@ class Block:
     @_runs(rf"load (\w+), {_SPACE} ([^ ,]+)(?:, align 4)?")
     def load(self, kind, space, pointer):
         result = np.zeros(self.threads, TYPES[kind])
+        if space is None:
+            words, places = self._own(pointer)
+            result[self.lanes] = words[places].view(result.dtype)
+            return result
         for memory, threads, places in self._located(space, pointer, kind):
             result[threads] = memory.load(threads, places).view(result.dtype)
         return result
@@ -257,6 +287,10 @@ class Block:
     @_runs(rf"store (\w+) (\S+), {_SPACE} ([^ ,]+)(?:, align 4)?")
     def store(self, kind, value, space, pointer):
         words = self._get(kind, value)
+        if space is None:
+            own, places = self._own(pointer)
+            own[places] = words[self.lanes].view(np.uint32)
+            return
         for memory, threads, places in self._located(space, pointer, kind):
             memory.store(threads, places, words[threads].view(memory.words.dtype))
 

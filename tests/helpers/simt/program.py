@@ -5,6 +5,8 @@ import re
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from helpers.simt.block import PATTERNS, Block
 
 
@@ -35,6 +37,8 @@ class Program(NamedTuple):
     segments: list[Segment]
     starts: dict[str, int]
     """The first segment of each basic block."""
+    tables: dict[str, np.ndarray]
+    """Words that the module brings along, by their name."""
 
 
 @functools.lru_cache(8)
@@ -55,7 +59,15 @@ def parsed(text):
             if instruction.method is Block.barrier:
                 segments.append(Segment(segments[-1].label, [], []))
     threads = int(re.search(r'"maxntidx", i32 (\d+)', text)[1])
-    return Program(re.findall(r"%[\w.]+", parameters), threads, segments, starts)
+    tables = {
+        name: np.int32([word.split()[1] for word in words.split(", ")]).view(np.uint32)
+        for name, words in re.findall(
+            r"^(@\w+) = internal addrspace\(1\) constant \[\d+ x i32\] \[(.*?)\]",
+            text,
+            re.MULTILINE,
+        )
+    }
+    return Program(re.findall(r"%[\w.]+", parameters), threads, segments, starts, tables)
 
 
 def _instruction(line):
