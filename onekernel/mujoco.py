@@ -22,6 +22,7 @@ This is the only module that needs MuJoCo and MJX: `pip install mujoco-mjx`.
 import dataclasses
 import threading
 import warnings
+from collections.abc import Mapping
 from typing import Any, Literal, get_args
 
 import jax
@@ -31,7 +32,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 from mujoco import mjx
 
-from onekernel.backends import Kernel
+from onekernel.backends import Kernel, default_backend
 from onekernel.errors import KernelError, UnsupportedError
 from onekernel.lower import scalarize
 
@@ -100,7 +101,7 @@ class FusedMjx:
                 raise UnsupportedError(f"MJX cannot step this model: {reason}") from None
         # What is in `MjData` after a reset, such as the positions of mocap bodies.
         self._first = mujoco.MjData(mj_model)
-        self._kernels: dict[tuple[str, ...], Kernel | None] = {}
+        self._kernels: dict[tuple[str, ...], Kernel | UnsupportedError] = {}
         self._warned: set[str] = set()
         # Programs are traced in several threads; only one of them lowers the step.
         self._lock = threading.RLock()
@@ -115,12 +116,9 @@ class FusedMjx:
         Raises:
           ValueError: a shape is wrong.
         """
-        given = {"qpos": qpos, "qvel": qvel}
-        fields = {
-            name: getattr(self._first, name) if given.get(name) is None else given[name]
-            for name in (*_CARRIED, *_HELD)
-        }
-        return MjxState(**self._checked(fields))
+        first = {name: getattr(self._first, name) for name in (*_CARRIED, *_HELD)}
+        given = {name: x for name, x in (("qpos", qpos), ("qvel", qvel)) if x is not None}
+        return MjxState(**self._checked({**first, **given}))
 
     def __call__(
         self,
@@ -153,19 +151,30 @@ class FusedMjx:
         words = {name: jnp.asarray(x, self._dtype) for name, x in fields.items() if x.size}
         carry = {name: x for name, x in words.items() if name in _CARRIED}
         held = {name: x for name, x in words.items() if name not in _CARRIED}
-        kernel = self._find_kernel((*held,))
-        step = self._xla_step if kernel is None else kernel.as_step()
+        found = self._find_kernel((*held,))
+        if not isinstance(found, UnsupportedError):
+            step = found.as_step()
+        elif self._on_unsupported == "raise":
+            raise found
+        else:
+            self._warn_once(_in_words(found))
+            step = self._xla_step
         return MjxState(**{name: fields[name] for name in vars(state)} | step(carry, held))
 
     @property
     def kernel(self) -> Kernel | None:
-        """Return the kernel of a step without applied forces; None: XLA compiles it.
+        """Return the kernel of a step without applied forces; None: there is none."""
+        found = self._find_kernel(self._held)
+        return None if isinstance(found, UnsupportedError) else found
 
-        Raises:
-          UnsupportedError: there is no kernel, and `on_unsupported` is `raise`.
-        """
-        names = [name for name in (*_HELD, "ctrl") if getattr(self._data, name).size]
-        return self._find_kernel((*names,))
+    @property
+    def obstacle(self) -> str | None:
+        """Return why XLA compiles the step on JAX's default device; None: it is one kernel."""
+        found = self._find_kernel(self._held)
+        if isinstance(found, UnsupportedError):
+            return _in_words(found)
+        backend = default_backend()
+        return "there is no back end for this device" if backend is None else backend.obstacle()
 
     def to_data(self, state: MjxState, ctrl: ArrayLike | None = None) -> mjx.Data:
         """Return MJX's data of a state.
@@ -189,7 +198,7 @@ class FusedMjx:
     def _dtype(self) -> np.dtype:
         return self._data.qpos.dtype
 
-    def _checked(self, fields: dict[str, ArrayLike]) -> Fields:
+    def _checked(self, fields: Mapping[str, ArrayLike]) -> Fields:
         """Return fields as arrays of the dtypes that MJX's data has.
 
         Raises:
@@ -228,17 +237,19 @@ class FusedMjx:
         """Make all physics steps with a loop that XLA compiles."""
         return jax.lax.fori_loop(0, self.n_substeps, lambda _, x: self._substep(x, held), carry)
 
-    def _find_kernel(self, held: tuple[str, ...]) -> Kernel | None:
-        """Return the kernel for some given fields, which is lowered once; None: there is none."""
+    @property
+    def _held(self) -> tuple[str, ...]:
+        """Return the names of what is given to a step without applied forces, and held."""
+        return tuple(x for x in (*_HELD, "ctrl") if getattr(self._data, x).size)
+
+    def _find_kernel(self, held: tuple[str, ...]) -> Kernel | UnsupportedError:
+        """Return the kernel for some given fields, which is lowered once, or why there is none."""
         with self._lock:
             if held not in self._kernels:
                 try:
                     self._kernels[held] = self._lower(held)
                 except UnsupportedError as error:
-                    if self._on_unsupported == "raise":
-                        raise
-                    self._warn_once(f"one kernel cannot do {error}")
-                    self._kernels[held] = None
+                    self._kernels[held] = error
             return self._kernels[held]
 
     def _lower(self, held: tuple[str, ...]) -> Kernel:
@@ -302,6 +313,11 @@ def fuse_mjx(
     if on_unsupported not in get_args(OnUnsupported):
         raise ValueError(f"on_unsupported is {on_unsupported!r}, not warn, xla or raise")
     return FusedMjx(mj_model, n_substeps, on_unsupported)
+
+
+def _in_words(error: UnsupportedError) -> str:
+    """Return why a model is not one kernel."""
+    return f"one kernel cannot do {error}"
 
 
 def _explain(error: KernelError) -> Exception:

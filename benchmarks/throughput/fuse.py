@@ -114,9 +114,9 @@ class Problem:
         shape = settings.num_envs, settings.unroll, model.nu
         low, high = model.actuator_ctrlrange.T
         limited = model.actuator_ctrllimited.astype(bool)
-        self.controls = np.float32(
-            rng.uniform(np.where(limited, low, -1.0), np.where(limited, high, 1.0), shape)
-        )
+        self.controls = rng.uniform(
+            np.where(limited, low, -1.0), np.where(limited, high, 1.0), shape
+        ).astype(np.float32)
         """Controls of each instance in each environment step of a call."""
         kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
         data = mujoco.MjData(model)
@@ -131,7 +131,7 @@ class Problem:
             # All contenders begin from numbers that float32 has.
             self.warmstarts[i] = data.qacc_warmstart
             mujoco.mj_getState(model, data, states[i], kind)
-        self.states = np.float64(np.float32(states))
+        self.states = states.astype(np.float32).astype(np.float64)
         """Distinct states, in the layout of `mujoco.rollout`."""
 
     def first(self, step: FusedMjx) -> MjxState:
@@ -142,7 +142,7 @@ class Problem:
         for state in self.states:
             mujoco.mj_setState(self.model, data, state, kind)
             for name, values in fields.items():
-                values.append(np.float32(getattr(data, name)))
+                values.append(np.array(getattr(data, name), np.float32))
         distinct = {name: np.stack(values) for name, values in fields.items()}
         distinct["qacc_warmstart"] = self.warmstarts
         which = np.arange(self.settings.num_envs) % len(self.states)
@@ -308,7 +308,7 @@ class MujocoRollout:
         which = np.arange(max(self.num_envs, len(problem.states))) % len(problem.states)
         self._states, self._warmstarts = problem.states[which], problem.warmstarts[which]
         self._distinct = len(problem.states)
-        controls = np.float64(problem.controls[: len(which)])
+        controls = problem.controls[: len(which)].astype(np.float64)
         # Each control is held for the physics steps of an environment step.
         self._controls = np.repeat(controls, self._n_substeps, axis=1)
         self._calls = warm_up(self._time_calls)
@@ -332,7 +332,7 @@ class MujocoRollout:
             self._controls[:count, :steps],
             initial_warmstart=self._warmstarts[:count],
         )
-        return states
+        return np.asarray(states)
 
     def _time_calls(self, calls: int) -> float:
         start = time.perf_counter()
@@ -379,7 +379,7 @@ def difference(one: Moved, other: Moved) -> float:
     """Return the largest difference of positions or velocities, relative to the largest number."""
     count = min(len(one[0]), len(other[0]))
     return max(
-        float(np.abs(np.float64(a[:count]) - b[:count]).max() / max(np.abs(b).max(), 1e-12))
+        float(np.abs(a[:count].astype(np.float64) - b[:count]).max() / max(np.abs(b).max(), 1e-12))
         for a, b in zip(one, other, strict=True)
     )
 
@@ -422,12 +422,12 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
             xla.close()
     for name in notes:
         contender = contenders.get(name)
-        differences = [
+        from_mujoco, from_mjx = (
             difference(moved[name], moved[other])
             if name in moved and other in moved and name not in (other, "mujoco")
             else None
             for other in ("mujoco", "mjx")
-        ]
+        )
         yield Row(
             settings.name,
             problem.model.nv,
@@ -436,7 +436,8 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
             None if contender is None else statistics.median(repeats[name]),
             None if contender is None else contender.compile_seconds,
             repeats.get(name, []),
-            *differences,
+            from_mujoco,
+            from_mjx,
             notes[name],
         )
 
@@ -474,9 +475,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       The exit code.
     """
-    parser = cli.Parser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "models",
         nargs="*",
@@ -512,9 +511,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(_HEAD)
     rows = []
     for name in options.models:
-        settings = Settings(
-            name, options.integrator, num_envs, options.n_substeps, options.unroll
-        )
+        settings = Settings(name, options.integrator, num_envs, options.n_substeps, options.unroll)
         for row in measure(settings, options.rounds, options.xla_limit):
             rows.append(row._asdict())
             print(table_line(row), flush=True)
