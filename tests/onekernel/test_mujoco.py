@@ -65,9 +65,9 @@ def compared(model, *, with_mjx=False, n_substeps=1):
     return difference(found, wanted), with_mjx and difference(found, by_mjx(step, states, ctrl))
 
 
-@pytest.mark.parametrize("integrator", ["Euler", "RK4"])
-def test_a_cart_moves_as_in_c(integrator):
-    assert compared(model_of(CART_POLE, integrator), n_substeps=3)[0] < 1e-6
+@pytest.mark.parametrize(("integrator", "n_substeps"), [("Euler", 3), ("RK4", 1)])
+def test_a_cart_moves_as_in_c(integrator, n_substeps):
+    assert compared(model_of(CART_POLE, integrator), n_substeps=n_substeps)[0] < 1e-6
 
 
 def test_a_cart_moves_as_in_mjx():
@@ -177,11 +177,10 @@ def test_a_model_too_large_for_one_kernel_is_stepped_by_xla_with_one_warning(mon
     model = mujoco.MjModel.from_xml_string(FALLS)
     step = fuse_mjx(model, 2)
     said = "XLA compiles mjx.step, which is slower: one kernel cannot do .* more than 3"
-    with pytest.warns(UserWarning, match=said) as warned:
-        # Two shapes are two traces, with one warning.
+    with pytest.warns(UserWarning, match=said):
         after = jax.jit(step)(step.init(), jnp.zeros(0))
-        jax.eval_shape(jax.vmap(step), jax.tree.map(lambda x: x[None], after), jnp.zeros((1, 0)))
-    assert len(warned) == 1
+    # Another shape is traced anew, and says nothing: a second warning would be an error.
+    jax.eval_shape(jax.vmap(step), jax.tree.map(lambda x: x[None], after), jnp.zeros((1, 0)))
     assert re.search("more than 3", step.obstacle)
     assert step.kernel is None
     np.testing.assert_allclose(after.qvel, -9.81 * 2 * model.opt.timestep, rtol=1e-6)
