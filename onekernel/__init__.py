@@ -34,6 +34,7 @@ The parts, each of which imports only from those before it:
 - `cpu`, `gpu`: these to machine code and PTX, and its launch by XLA; `backends`: both
 - `one_kernel`: a function of one instance with a kernel inside
 - `aot`: compiled programs from one process to the next
+- `mujoco`: the step of a MuJoCo model (`fuse_mjx`); the rest of the package needs no MuJoCo
 
 `onekernel.build` exports the functions with which to write a kernel around a lowered function.
 """

@@ -36,6 +36,8 @@ from onekernel.backends import Kernel, default_backend
 from onekernel.errors import KernelError, UnsupportedError
 from onekernel.lower import scalarize
 
+__all__ = ["FusedMjx", "MjxState", "fuse_mjx"]
+
 Fields = dict[str, Array]
 """Fields of `mjx.Data`, by name."""
 
