@@ -36,6 +36,7 @@ The parts, each of which imports only from those before it:
 - `fused`: a function of one instance as one kernel, with another kernel inside
 - `explanation`: what the compiler made of it
 - `aot`: compiled programs from one process to the next
+- `mujoco`: the step of a MuJoCo model (`fuse_mjx`); the rest of the package needs no MuJoCo
 
 `onekernel.build` exports the functions with which to write a kernel around a lowered function.
 """

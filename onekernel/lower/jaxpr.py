@@ -500,9 +500,49 @@ class _JaxprLowering:
         # A scan counts its iterations itself; here the counter is the first carried value.
         state = [constant_array(np.int32(0)), *carry]
         with contextlib.suppress(UnsupportedError):
-            return self._unroll_or_loop(state, condition, next_state)[1:]
+            return self._unroll(state, condition, next_state, only_short=True)[1:]
+        flags = self._end_flags(body, constants, carry)
+
+        def condition_with_flags(state: list[ScalarArray]) -> Scalar:
+            goes_on = [state[1 + place].item() for place in flags]
+            return self._fold("and", condition(state), goes_on)
+
+        with contextlib.suppress(UnsupportedError):
+            return self._record_loop(state, condition_with_flags, next_state)[1:]
         # For example, an index depends on the loop counter, which is constant once unrolled.
         return None
+
+    def _end_flags(
+        self, body: ClosedJaxpr, constants: Sequence[ScalarArray], carry: Sequence[ScalarArray]
+    ) -> list[int]:
+        """Find carried truth values that end a scan: while one is False, nothing changes.
+
+        Reverse-mode derivatives need scans, so what could be `jax.lax.while_loop` is often a scan
+        whose body is `cond(goes_on, iterate, keep, ...)`. Such a scan may end early.
+
+        Args:
+          body: the body of the scan.
+          constants: its constants.
+          carry: the carried values before the first iteration.
+
+        Returns:
+          Their places in the carry.
+        """
+        if not any(equation.primitive.name == "cond" for equation in body.jaxpr.eqns):
+            return []
+        places = [k for k, x in enumerate(carry) if x.shape == () and x.item().dtype == bool]
+        found = []
+        for place in places:
+            # Run an iteration on values of which nothing is known but that this one is False.
+            unknown = [self._graph.input(x.dtype) for x in _flatten(carry)]
+            state = _unflatten(carry, unknown)
+            state[place] = constant_array(np.bool_(False))
+            with contextlib.suppress(UnsupportedError):
+                updated = self.lower(body, [*constants, *state])
+                pairs = zip(_flatten(state), _flatten(updated), strict=True)
+                if all(is_same(*pair) for pair in pairs):
+                    found.append(place)
+        return found
 
     def _while(self, equation: JaxprEqn, *operands: ScalarArray) -> list[ScalarArray]:
         # The operands are the constants of the condition, those of the body, and the carried

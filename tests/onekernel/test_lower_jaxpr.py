@@ -448,6 +448,23 @@ def test_a_loop_of_known_length_is_written_out_only_if_it_is_small(length, loops
     assert program.size < MAX_UNROLLED_OPERATIONS
 
 
+@pytest.mark.parametrize(("rest", "ends_early"), [(0.0, True), (1.0, False)])
+def test_a_scan_that_keeps_what_is_finished_ends_early(rest, ends_early):
+    def function(x):
+        def iterate(y):
+            return jnp.cos(y), jnp.abs(jnp.cos(y) - y).max() > 1e-3
+
+        def body(carry, _):
+            y, goes_on = carry
+            return jax.lax.cond(goes_on, iterate, lambda y: (y + rest, False), y), None
+
+        return jax.lax.scan(body, (x, True), length=100)[0]
+
+    (loop,) = items(check(function).block, PlacedLoop)
+    # Only while nothing changes any more is the flag part of the condition.
+    assert loop.loop.condition.op == ("and" if ends_early else "lt")
+
+
 def test_a_loop_with_a_flag_that_is_known_at_first_stays_one():
     def function(x):
         def body(state):

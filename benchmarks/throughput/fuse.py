@@ -1,0 +1,533 @@
+"""Step any MuJoCo model as one kernel, by MJX through XLA, and by C MuJoCo.
+
+    python benchmarks/throughput/fuse.py hopper chain:14 my_robot.xml
+
+  kernel  `onekernel.mujoco.fuse_mjx`
+  mjx     `mjx.step`, compiled by XLA in a process of its own; left out if that takes too long
+  mujoco  C MuJoCo's threaded `mujoco.rollout`, one thread per core
+
+All three make the same environment steps: `--n-substeps` physics steps under constant controls,
+which are drawn before the timing starts, from the same states. Each call begins again from these
+states, in which the instances have moved under random controls for up to a hundred physics steps.
+The three are timed in turn in every round. The last columns say how far the positions and
+velocities after one environment step are from those of C MuJoCo in double precision, and from those
+of MJX, relative to the largest of them.
+"""
+
+import argparse
+import importlib.util
+import math
+import multiprocessing
+import os
+import statistics
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import mujoco.rollout
+import numpy as np
+from jaxtyping import Array, Float
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
+
+from benchmarks.harness.formatting import format_count, format_spread
+from benchmarks.harness.results import check_output, write
+from benchmarks.harness.timing import available_cores, warm_up
+from jetbot_mjx import cli
+from jetbot_mjx.errors import UserError
+from jetbot_mjx.runs.run_dir import versions
+from onekernel.mujoco import FusedMjx, MjxState, fuse_mjx
+
+GYMNASIUM = (
+    *("inverted_pendulum", "inverted_double_pendulum", "reacher", "swimmer", "hopper"),
+    *("walker2d", "half_cheetah", "ant"),
+)
+"""Models of Gymnasium that are measured unless others are named."""
+
+INTEGRATORS = {
+    "Euler": mujoco.mjtIntegrator.mjINT_EULER,
+    "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
+    "RK4": mujoco.mjtIntegrator.mjINT_RK4,
+}
+
+_DISTINCT = 1024
+"""Most states that are different from each other; more instances begin from copies of them."""
+_MOST_STEPS = 100
+"""Most physics steps by which a state is older than the model's first one."""
+_ROBOTS_PER_CORE = 256
+"""Most instances per core of C MuJoCo."""
+
+Moved = tuple[Float[np.ndarray, "n nq"], Float[np.ndarray, "n nv"]]
+"""Positions and velocities of the instances after one environment step."""
+
+
+class Settings(NamedTuple):
+    """A `Settings` holds what a contender needs to know; other processes receive it."""
+
+    name: str
+    """A model of Gymnasium, `chain:LINKS`, or the path of an MJCF."""
+    integrator: str
+    """A key of `INTEGRATORS`, or `own` for the model's."""
+    num_envs: int
+    n_substeps: int
+    unroll: int
+    """Environment steps in a call."""
+
+
+class Row(NamedTuple):
+    """A `Row` holds the rate of one contender with one model."""
+
+    model: str
+    nv: int
+    """Degrees of freedom."""
+    contender: str
+    num_envs: int
+    env_steps_per_second: float | None
+    """Median of the rounds; None: it did not compile within the limit."""
+    compile_seconds: float | None
+    """Time of tracing, lowering and compiling [s]; C MuJoCo has none."""
+    repeats: list[float]
+    """`env_steps_per_second` of each round."""
+    from_mujoco: float | None
+    """Difference to C MuJoCo after one environment step; None: not measured."""
+    from_mjx: float | None
+    """Difference to MJX through XLA after one environment step; None: not measured."""
+    note: str
+    """Why there is no rate, or no kernel."""
+
+
+class Problem:
+    """A `Problem` holds a model, and the states and controls from which contenders step it."""
+
+    def __init__(self, settings: Settings) -> None:
+        """Load the model, and move the instances to their states."""
+        self.settings, self.model = settings, load_model(settings.name)
+        if settings.integrator != "own":
+            self.model.opt.integrator = INTEGRATORS[settings.integrator]
+        model, rng = self.model, np.random.default_rng(0)
+        shape = settings.num_envs, settings.unroll, model.nu
+        low, high = model.actuator_ctrlrange.T
+        limited = model.actuator_ctrllimited.astype(bool)
+        self.controls = rng.uniform(
+            np.where(limited, low, -1.0), np.where(limited, high, 1.0), shape
+        ).astype(np.float32)
+        """Controls of each instance in each environment step of a call."""
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        data = mujoco.MjData(model)
+        states = np.zeros((min(settings.num_envs, _DISTINCT), mujoco.mj_stateSize(model, kind)))
+        self.warmstarts = np.zeros((len(states), model.nv), np.float32)
+        for i in range(len(states)):
+            mujoco.mj_resetData(model, data)
+            data.qvel[:] = rng.normal(0.0, 0.1, model.nv)
+            data.ctrl[:] = self.controls[i, -1]
+            for _ in range(rng.integers(1, _MOST_STEPS)):
+                mujoco.mj_step(model, data)
+            # All contenders begin from numbers that float32 has.
+            self.warmstarts[i] = data.qacc_warmstart
+            mujoco.mj_getState(model, data, states[i], kind)
+        self.states = states.astype(np.float32).astype(np.float64)
+        """Distinct states, in the layout of `mujoco.rollout`."""
+
+    def first(self, step: FusedMjx) -> MjxState:
+        """Return the states for MJX, with a leading axis of instances."""
+        data = mujoco.MjData(self.model)
+        kind = mujoco.mjtState.mjSTATE_FULLPHYSICS
+        fields: dict[str, list[np.ndarray]] = {"qpos": [], "qvel": [], "act": [], "time": []}
+        for state in self.states:
+            mujoco.mj_setState(self.model, data, state, kind)
+            for name, values in fields.items():
+                values.append(np.array(getattr(data, name), np.float32))
+        distinct = {name: np.stack(values) for name, values in fields.items()}
+        distinct["qacc_warmstart"] = self.warmstarts
+        which = np.arange(self.settings.num_envs) % len(self.states)
+        arrays = {name: jnp.asarray(values[which]) for name, values in distinct.items()}
+        made = jax.vmap(lambda _: step.init())(which)
+        return made.replace(**arrays)
+
+
+class Contender(Protocol):
+    """A `Contender` steps the instances of a problem in its own way."""
+
+    num_envs: int
+    compile_seconds: float | None
+
+    def repeat(self) -> float:
+        """Return the environment steps per second of one round, summed over the instances."""
+        ...
+
+    def moved(self) -> Moved:
+        """Return the first distinct instances after one environment step."""
+        ...
+
+
+class Compiled:
+    """A step of one instance that JAX compiles, for all instances of a problem."""
+
+    def __init__(self, problem: Problem, step: FusedMjx, *, by_xla: bool) -> None:
+        """Compile a call and warm it up.
+
+        Args:
+          problem: the model, states and controls.
+          step: the model's step.
+          by_xla: whether XLA compiles `mjx.step`; otherwise the step is called as it is.
+        """
+        settings = problem.settings
+        self.num_envs, self._unroll = settings.num_envs, settings.unroll
+        self._distinct = len(problem.states)
+        one = _mjx_step(step, settings.n_substeps) if by_xla else step
+
+        def call(states: MjxState, controls: Float[Array, "n t nu"], count: Array) -> MjxState:
+            return jax.lax.fori_loop(
+                0, count, lambda i, states: jax.vmap(one)(states, controls[:, i]), states
+            )
+
+        start = time.perf_counter()
+        self._arguments = problem.first(step), jnp.asarray(problem.controls)
+        count = jnp.int32(self._unroll)
+        self._program = jax.jit(call).lower(*self._arguments, count).compile()
+        self.compile_seconds: float | None = time.perf_counter() - start
+        self._calls = warm_up(self._time_calls)
+
+    def repeat(self) -> float:
+        """Return the environment steps per second of one round, summed over the instances."""
+        return self.num_envs * self._unroll * self._calls / self._time_calls(self._calls)
+
+    def moved(self) -> Moved:
+        """Return the first distinct instances after one environment step."""
+        state = self._program(*self._arguments, jnp.int32(1))
+        return np.array(state.qpos[: self._distinct]), np.array(state.qvel[: self._distinct])
+
+    def _time_calls(self, calls: int) -> float:
+        start = time.perf_counter()
+        for _ in range(calls):
+            jax.block_until_ready(self._program(*self._arguments, jnp.int32(self._unroll)))
+        return time.perf_counter() - start
+
+
+def _mjx_step(step: FusedMjx, n_substeps: int) -> Callable[[MjxState, Array], MjxState]:
+    """Return a step of one instance that calls `mjx.step`."""
+    from mujoco import mjx
+
+    def substep(state: MjxState, ctrl: Array) -> MjxState:
+        with jax.default_matmul_precision("highest"):
+            return step.from_data(mjx.step(step.model, step.to_data(state, ctrl)))
+
+    return lambda state, ctrl: jax.lax.fori_loop(
+        0, n_substeps, lambda _, state: substep(state, ctrl), state
+    )
+
+
+class InOtherProcess:
+    """MJX through XLA, in a process that can be ended while XLA compiles."""
+
+    def __init__(self, settings: Settings, limit: float) -> None:
+        """Start the process and wait until it has compiled.
+
+        Args:
+          settings: the problem.
+          limit: the longest time to compile [s].
+
+        Raises:
+          TimeoutError: it takes longer.
+          UserError: the process failed.
+        """
+        self.num_envs = settings.num_envs
+        context = multiprocessing.get_context("spawn")
+        self._connection, other = context.Pipe()
+        self._process = context.Process(target=_serve, args=(other, settings), daemon=True)
+        self._process.start()
+        other.close()
+        try:
+            # Loading the model and moving the instances take a while too: count from their end.
+            self._receive()
+            if not self._connection.poll(limit):
+                raise TimeoutError(f"XLA compiles for more than {limit:g} s")
+            self.compile_seconds = self._receive()
+        except BaseException:
+            self.close()
+            raise
+
+    def repeat(self) -> float:
+        """Return the environment steps per second of one round, summed over the instances."""
+        return self._ask("repeat")
+
+    def moved(self) -> Moved:
+        """Return the first distinct instances after one environment step."""
+        return self._ask("moved")
+
+    def close(self) -> None:
+        """End the process."""
+        self._process.kill()
+        self._process.join()
+
+    def _ask(self, what: str):  # noqa: ANN202
+        self._connection.send(what)
+        return self._receive()
+
+    def _receive(self):  # noqa: ANN202
+        try:
+            return self._connection.recv()
+        except EOFError:
+            raise UserError("the process that steps MJX through XLA failed") from None
+
+
+def _serve(connection: Connection, settings: Settings) -> None:
+    """Compile MJX through XLA, and answer for it until the other side closes the connection."""
+    problem = Problem(settings)
+    step = fuse_mjx(problem.model, settings.n_substeps)
+    connection.send("ready")
+    contender = Compiled(problem, step, by_xla=True)
+    connection.send(contender.compile_seconds)
+    while True:
+        try:
+            what = connection.recv()
+        except EOFError:
+            return
+        connection.send(getattr(contender, what)())
+
+
+class MujocoRollout:
+    """C MuJoCo's own thread pool, with one thread for each core."""
+
+    def __init__(self, problem: Problem) -> None:
+        """Start the threads and warm up."""
+        settings = problem.settings
+        threads = available_cores()
+        self.num_envs = min(settings.num_envs, threads * _ROBOTS_PER_CORE)
+        self.compile_seconds: float | None = None
+        self._model, self._n_substeps = problem.model, settings.n_substeps
+        self._unroll = settings.unroll
+        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
+        self._pool = mujoco.rollout.Rollout(nthread=threads)
+        which = np.arange(max(self.num_envs, len(problem.states))) % len(problem.states)
+        self._states, self._warmstarts = problem.states[which], problem.warmstarts[which]
+        self._distinct = len(problem.states)
+        controls = problem.controls[: len(which)].astype(np.float64)
+        # Each control is held for the physics steps of an environment step.
+        self._controls = np.repeat(controls, self._n_substeps, axis=1)
+        self._calls = warm_up(self._time_calls)
+
+    def repeat(self) -> float:
+        """Return the environment steps per second of one round, summed over the instances."""
+        return self.num_envs * self._unroll * self._calls / self._time_calls(self._calls)
+
+    def moved(self) -> Moved:
+        """Return the distinct instances after one environment step."""
+        states = self._roll(self._distinct, self._n_substeps)
+        nq, nv = self._model.nq, self._model.nv
+        last = states[:, -1, 1:]  # a state begins with the time
+        return last[:, :nq], last[:, nq : nq + nv]
+
+    def _roll(self, count: int, steps: int) -> Float[np.ndarray, "n t size"]:
+        states, _ = self._pool.rollout(
+            self._model,
+            self._data,
+            self._states[:count],
+            self._controls[:count, :steps],
+            initial_warmstart=self._warmstarts[:count],
+        )
+        return np.asarray(states)
+
+    def _time_calls(self, calls: int) -> float:
+        start = time.perf_counter()
+        for _ in range(calls):
+            self._roll(self.num_envs, self._unroll * self._n_substeps)
+        return time.perf_counter() - start
+
+
+def load_model(name: str) -> mujoco.MjModel:
+    """Return a model by its name, as in `Settings`.
+
+    Raises:
+      UserError: there is no such model.
+    """
+    kind, _, links = name.partition(":")
+    if kind == "chain" and links.isdigit() and int(links):
+        return mujoco.MjModel.from_xml_string(_chain(int(links)))
+    path = Path(name)
+    if name in GYMNASIUM:
+        found = importlib.util.find_spec("gymnasium")
+        if found is None or found.origin is None:
+            raise UserError(f"{name} is a model of Gymnasium: pip install gymnasium")
+        path = Path(found.origin).parent / "envs" / "mujoco" / "assets" / f"{name}.xml"
+    try:
+        return mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        raise UserError(f"{name}: {' '.join(str(error).split())}") from None
+
+
+def _chain(links: int) -> str:
+    """Return the MJCF of a hanging chain of hinges without motors."""
+    bodies = "".join(
+        f'<body pos="0 0 {-0.1 if i else 0}"><joint axis="{i % 2} {1 - i % 2} 0" damping="0.01"/>'
+        '<geom type="capsule" fromto="0 0 0 0 0 -0.1" size="0.01" mass="0.05"/>'
+        for i in range(links)
+    )
+    return (
+        '<mujoco><option timestep="0.002"/><default><geom contype="0" conaffinity="0"/></default>'
+        f"<worldbody>{bodies}{'</body>' * links}</worldbody></mujoco>"
+    )
+
+
+def difference(one: Moved, other: Moved) -> float:
+    """Return the largest difference of positions or velocities, relative to the largest number."""
+    count = min(len(one[0]), len(other[0]))
+    return max(
+        float(np.abs(a[:count].astype(np.float64) - b[:count]).max() / max(np.abs(b).max(), 1e-12))
+        for a, b in zip(one, other, strict=True)
+    )
+
+
+def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
+    """Measure all contenders with one model.
+
+    Args:
+      settings: the problem.
+      rounds: number of rounds, in each of which every contender is timed once.
+      xla_limit: the longest time that XLA may take to compile MJX [s]; 0: leave it out.
+
+    Yields:
+      One row for each contender.
+    """
+    problem = Problem(settings)
+    notes = {"kernel": "", "mjx": "", "mujoco": ""}
+    step = fuse_mjx(problem.model, settings.n_substeps, on_unsupported="xla")
+    contenders: dict[str, Contender] = {"mujoco": MujocoRollout(problem)}
+    if step.obstacle is None:
+        contenders["kernel"] = Compiled(problem, step, by_xla=False)
+    else:
+        notes["kernel"] = step.obstacle
+    xla = None
+    try:
+        if xla_limit:
+            xla = contenders["mjx"] = InOtherProcess(settings, xla_limit)
+        else:
+            notes["mjx"] = "left out"
+    except TimeoutError as error:
+        notes["mjx"] = str(error)
+    try:
+        repeats: dict[str, list[float]] = {name: [] for name in contenders}
+        for _ in range(rounds):
+            for name, contender in contenders.items():
+                repeats[name].append(contender.repeat())
+        moved = {name: contender.moved() for name, contender in contenders.items()}
+    finally:
+        if xla is not None:
+            xla.close()
+    for name in notes:
+        contender = contenders.get(name)
+        from_mujoco, from_mjx = (
+            difference(moved[name], moved[other])
+            if name in moved and other in moved and name not in (other, "mujoco")
+            else None
+            for other in ("mujoco", "mjx")
+        )
+        yield Row(
+            settings.name,
+            problem.model.nv,
+            name,
+            settings.num_envs if contender is None else contender.num_envs,
+            None if contender is None else statistics.median(repeats[name]),
+            None if contender is None else contender.compile_seconds,
+            repeats.get(name, []),
+            from_mujoco,
+            from_mjx,
+            notes[name],
+        )
+
+
+_HEAD = (
+    f"{'model':26}{'nv':>4} {'contender':10}{'num_envs':>9}{'env steps/s':>13}"
+    f"{'min .. max':>19}{'compile':>10}{'from mujoco':>13}{'from mjx':>10}"
+)
+
+
+def table_line(row: Row) -> str:
+    """Return a row of the printed table."""
+
+    def text(x: float | None, form: str) -> str:
+        return "" if x is None else format(x, form)
+
+    rate, spread = "-", ""
+    if row.env_steps_per_second is not None:
+        rate = format_count(row.env_steps_per_second, 4)
+        spread = format_spread(row.env_steps_per_second, row.repeats)
+    seconds = "" if row.compile_seconds is None else f"{row.compile_seconds:.1f} s"
+    return (
+        f"{row.model:26}{row.nv:4} {row.contender:10}{row.num_envs:9,}{rate:>13}{spread:>19}"
+        f"{seconds:>10}{text(row.from_mujoco, '.0e'):>13}{text(row.from_mjx, '.0e'):>10}"
+        f"{'  ' + row.note if row.note else ''}"
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line, measure, print a table and write a file.
+
+    Args:
+      arguments: The command line without the program's name; None: that of the process.
+
+    Returns:
+      The exit code.
+    """
+    parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument(
+        "models",
+        nargs="*",
+        default=list(GYMNASIUM),
+        metavar="MODEL",
+        help="names of Gymnasium's models, chain:LINKS, or MJCF files (default: eight models of"
+        " Gymnasium)",
+    )
+    positive = cli.positive_int
+    parser.add_argument("--num-envs", type=positive, help="instances (default: 65,536, CPU: 1,024)")
+    parser.add_argument("--integrator", choices=("own", *INTEGRATORS), default="own")
+    parser.add_argument("--n-substeps", type=positive, default=2, help="physics steps in a step")
+    parser.add_argument("--unroll", type=positive, default=32, help="environment steps in a call")
+    parser.add_argument("--rounds", type=positive, default=5)
+    parser.add_argument(
+        "--xla-limit",
+        type=float,
+        default=60.0,
+        metavar="SECONDS",
+        help="the longest time that XLA may take to compile MJX; 0: leave MJX out (default: 60)",
+    )
+    parser.add_argument("--output", type=Path, help="a JSON file for the results")
+    options = parser.parse_args(arguments)
+    if not 0 <= options.xla_limit < math.inf:
+        raise UserError(f"--xla-limit {options.xla_limit}: name a number of seconds, or 0")
+    if options.output:
+        check_output(options.output)
+    # Two processes share the device.
+    os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+    device = jax.devices()[0]
+    num_envs = options.num_envs or (65_536 if device.platform == "gpu" else 1024)
+    print(f"{device.device_kind}, {available_cores()} cores")
+    print(_HEAD)
+    rows = []
+    for name in options.models:
+        settings = Settings(name, options.integrator, num_envs, options.n_substeps, options.unroll)
+        for row in measure(settings, options.rounds, options.xla_limit):
+            rows.append(row._asdict())
+            print(table_line(row), flush=True)
+    if options.output:
+        about = {
+            "device": device.device_kind,
+            "cpu_cores": available_cores(),
+            "versions": versions(),
+            "integrator": options.integrator,
+            "n_substeps": options.n_substeps,
+            "unroll": options.unroll,
+        }
+        write(options.output, {**about, "rows": rows})
+        print(f"wrote {options.output}")
+    return 0
+
+
+if __name__ == "__main__":
+    cli.run_command(main)

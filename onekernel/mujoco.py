@@ -1,0 +1,334 @@
+"""Step a MuJoCo model with MJX, as one kernel.
+
+    import jax
+    import jax.numpy as jnp
+    import mujoco
+    from onekernel.mujoco import fuse_mjx
+
+    model = mujoco.MjModel.from_xml_path("hopper.xml")
+    step = fuse_mjx(model, n_substeps=4)
+    states = jax.vmap(lambda _: step.init())(jnp.arange(4096))
+    states = jax.jit(jax.vmap(step))(states, jnp.zeros((4096, model.nu)))
+
+The kernel is `mjx.step`, lowered to scalars for this one model: what follows from the model's
+constants alone is computed once, while it is lowered. The constraint solver is MJX's with the
+model's own limits (`iterations`, `ls_iterations`, `tolerance`), and its loops end as soon as it has
+converged. Results differ from those of `mjx.step` by round-off only, as long as all numbers are
+finite.
+
+This is the only module that needs MuJoCo and MJX: `pip install mujoco-mjx`.
+"""
+
+import dataclasses
+import threading
+import warnings
+from collections.abc import Mapping
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jaxtyping import Array, ArrayLike, Bool, Float
+from mujoco import mjx
+
+from onekernel.backends import Kernel, default_backend
+from onekernel.errors import KernelError, UnsupportedError
+from onekernel.lower import scalarize
+
+__all__ = ["FusedMjx", "MjxState", "fuse_mjx"]
+
+Fields = dict[str, Array]
+"""Fields of `mjx.Data`, by name."""
+
+OnUnsupported = Literal["warn", "xla", "raise"]
+
+_CARRIED = ("qpos", "qvel", "act", "qacc_warmstart", "time")
+"""What a step changes."""
+
+_HELD = ("mocap_pos", "mocap_quat", "eq_active")
+"""The rest of a state."""
+
+
+@jax.tree_util.register_dataclass
+@dataclasses.dataclass(frozen=True)
+class MjxState:
+    """A `MjxState` holds what a step of one instance needs to know of the past, and no more.
+
+    The fields are those of `mjx.Data`, float32 but for `eq_active`. What a model does not have has
+    size 0.
+    """
+
+    qpos: Float[Array, " nq"]
+    """Generalised position [m, rad, and quaternions (w, x, y, z)]."""
+    qvel: Float[Array, " nv"]
+    """Generalised velocity [m/s, rad/s]."""
+    act: Float[Array, " na"]
+    """Activation of the actuators that have one."""
+    qacc_warmstart: Float[Array, " nv"]
+    """Acceleration of the last physics step, from which the constraint solver starts."""
+    time: Float[Array, ""]
+    """Simulated time [s]."""
+    mocap_pos: Float[Array, "nmocap 3"]
+    """Positions of mocap bodies [m]; a step does not change them."""
+    mocap_quat: Float[Array, "nmocap 4"]
+    """Orientations of mocap bodies; a step does not change them."""
+    eq_active: Bool[Array, " neq"]
+    """Which equality constraints are active; a step does not change it."""
+
+    def replace(self, **changes: Any) -> "MjxState":
+        """Return a state with other values of some fields."""
+        return dataclasses.replace(self, **changes)
+
+
+class FusedMjx:
+    """A `FusedMjx` steps one instance of a model; `fuse_mjx` makes it, and `jax.vmap` batches it.
+
+    The step is lowered at its first call. It cannot be differentiated.
+    """
+
+    def __init__(
+        self, mj_model: mujoco.MjModel, n_substeps: int, on_unsupported: OnUnsupported
+    ) -> None:
+        """Prepare a step; `fuse_mjx` describes the arguments."""
+        self.mj_model, self.n_substeps = mj_model, n_substeps
+        self._on_unsupported = on_unsupported
+        # The caller may be tracing a function: the model must be known nevertheless.
+        with jax.ensure_compile_time_eval():
+            try:
+                self.model = _uncommitted(mjx.put_model(mj_model))
+                self._data = _uncommitted(mjx.make_data(mj_model))
+            except NotImplementedError as error:
+                reason = " ".join(str(error).split())
+                raise UnsupportedError(f"MJX cannot step this model: {reason}") from None
+        # What is in `MjData` after a reset, such as the positions of mocap bodies.
+        self._first = mujoco.MjData(mj_model)
+        self._kernels: dict[tuple[str, ...], Kernel | UnsupportedError] = {}
+        self._warned: set[str] = set()
+        # Programs are traced in several threads; only one of them lowers the step.
+        self._lock = threading.RLock()
+
+    def init(self, qpos: ArrayLike | None = None, qvel: ArrayLike | None = None) -> MjxState:
+        """Return a state at time 0; all other fields are as after `mujoco.mj_resetData`.
+
+        Args:
+          qpos: generalised position, shape (nq,); None: `qpos0` of the model.
+          qvel: generalised velocity, shape (nv,); None: 0.
+
+        Raises:
+          ValueError: a shape is wrong.
+        """
+        first = {name: getattr(self._first, name) for name in (*_CARRIED, *_HELD)}
+        given = {name: x for name, x in (("qpos", qpos), ("qvel", qvel)) if x is not None}
+        return MjxState(**self._checked({**first, **given}))
+
+    def __call__(
+        self,
+        state: MjxState,
+        ctrl: ArrayLike,
+        *,
+        qfrc_applied: ArrayLike | None = None,
+        xfrc_applied: ArrayLike | None = None,
+    ) -> MjxState:
+        """Make `n_substeps` physics steps under constant controls and forces.
+
+        Args:
+          state: the state of one instance.
+          ctrl: controls of the actuators, shape (nu,).
+          qfrc_applied: generalised forces [N, N·m], shape (nv,); None: 0.
+          xfrc_applied: forces [N] and torques [N·m] on the centres of mass of the bodies, world
+            frame, shape (nbody, 6); None: 0.
+
+        Returns:
+          The state `n_substeps` times `opt.timestep` later.
+
+        Raises:
+          ValueError: an array does not have the shape of one instance.
+          UnsupportedError: there is no kernel, and `on_unsupported` is `raise`.
+        """
+        inputs = {"ctrl": ctrl, "qfrc_applied": qfrc_applied, "xfrc_applied": xfrc_applied}
+        given = {name: x for name, x in inputs.items() if x is not None}
+        fields = self._checked({**vars(state), **given})
+        # A kernel takes float32 only, and nothing of size 0.
+        words = {name: jnp.asarray(x, self._dtype) for name, x in fields.items() if x.size}
+        carry = {name: x for name, x in words.items() if name in _CARRIED}
+        held = {name: x for name, x in words.items() if name not in _CARRIED}
+        found = self._find_kernel((*held,))
+        if not isinstance(found, UnsupportedError):
+            step = found.as_step()
+        elif self._on_unsupported == "raise":
+            raise found
+        else:
+            self._warn_once(_in_words(found))
+            step = self._xla_step
+        return MjxState(**{name: fields[name] for name in vars(state)} | step(carry, held))
+
+    @property
+    def kernel(self) -> Kernel | None:
+        """Return the kernel of a step without applied forces; None: there is none."""
+        found = self._find_kernel(self._held)
+        return None if isinstance(found, UnsupportedError) else found
+
+    @property
+    def obstacle(self) -> str | None:
+        """Return why XLA compiles the step on JAX's default device; None: it is one kernel."""
+        found = self._find_kernel(self._held)
+        if isinstance(found, UnsupportedError):
+            return _in_words(found)
+        backend = default_backend()
+        return "there is no back end for this device" if backend is None else backend.obstacle()
+
+    def to_data(self, state: MjxState, ctrl: ArrayLike | None = None) -> mjx.Data:
+        """Return MJX's data of a state.
+
+        What follows from the state, such as the positions of bodies, is not computed: that is what
+        `mjx.forward(step.model, data)` does.
+
+        Args:
+          state: the state of one instance.
+          ctrl: controls of the actuators, shape (nu,); None: 0.
+        """
+        controls = {} if ctrl is None else {"ctrl": ctrl}
+        return self._data.replace(**self._checked({**vars(state), **controls}))
+
+    def from_data(self, data: mjx.Data) -> MjxState:
+        """Return the state in MJX's data. Controls and applied forces are not part of it."""
+        fields = {name: getattr(data, name) for name in (*_CARRIED, *_HELD)}
+        return MjxState(**self._checked(fields))
+
+    @property
+    def _dtype(self) -> np.dtype:
+        return self._data.qpos.dtype
+
+    def _checked(self, fields: Mapping[str, ArrayLike]) -> Fields:
+        """Return fields as arrays of the dtypes that MJX's data has.
+
+        Raises:
+          ValueError: a shape is wrong.
+        """
+        arrays = {}
+        for name, x in fields.items():
+            like = getattr(self._data, name)
+            arrays[name] = jnp.asarray(x, like.dtype)
+            if arrays[name].shape != like.shape:
+                raise ValueError(
+                    f"{name} has the shape {arrays[name].shape}, not {like.shape}, which one"
+                    " instance of this model has; jax.vmap steps several"
+                )
+        return arrays
+
+    def _substep(self, carry: Fields, held: Fields) -> Fields:
+        """Make one physics step with MJX.
+
+        Args:
+          carry: the fields of `_CARRIED` before the step.
+          held: other fields that are given.
+
+        Returns:
+          The fields of `carry` after the step.
+        """
+        fields = {**carry, **held}
+        if "eq_active" in held:
+            fields["eq_active"] = held["eq_active"] != 0
+        # By default GPUs multiply float32 matrices in TF32, with which the contact solver diverges.
+        with jax.default_matmul_precision("highest"):
+            data = mjx.step(self.model, self._data.replace(**fields))
+        return {name: getattr(data, name) for name in carry}
+
+    def _xla_step(self, carry: Fields, held: Fields) -> Fields:
+        """Make all physics steps with a loop that XLA compiles."""
+        return jax.lax.fori_loop(0, self.n_substeps, lambda _, x: self._substep(x, held), carry)
+
+    @property
+    def _held(self) -> tuple[str, ...]:
+        """Return the names of what is given to a step without applied forces, and held."""
+        return tuple(x for x in (*_HELD, "ctrl") if getattr(self._data, x).size)
+
+    def _find_kernel(self, held: tuple[str, ...]) -> Kernel | UnsupportedError:
+        """Return the kernel for some given fields, which is lowered once, or why there is none."""
+        with self._lock:
+            if held not in self._kernels:
+                try:
+                    self._kernels[held] = self._lower(held)
+                except UnsupportedError as error:
+                    self._kernels[held] = error
+            return self._kernels[held]
+
+    def _lower(self, held: tuple[str, ...]) -> Kernel:
+        """Lower a physics step to a kernel that repeats it `n_substeps` times."""
+
+        def shapes(names: tuple[str, ...]) -> dict[str, jax.ShapeDtypeStruct]:
+            arrays = {name: getattr(self._data, name) for name in names}
+            return {
+                name: jax.ShapeDtypeStruct(x.shape, self._dtype)
+                for name, x in arrays.items()
+                if x.size
+            }
+
+        arguments = shapes(_CARRIED), shapes(held)
+        structure = jax.tree.structure(arguments)
+        return Kernel(
+            scalarize(self._substep, *arguments),
+            carried=len(arguments[0]),
+            steps=self.n_substeps,
+            fallback=lambda *leaves: jax.tree.leaves(
+                self._xla_step(*jax.tree.unflatten(structure, leaves))
+            ),
+            explain=_explain,
+            on_fallback=self._warn_once,
+        )
+
+    def _warn_once(self, reason: str) -> None:
+        """Warn that XLA compiles the step, once for each reason."""
+        if self._on_unsupported == "warn" and reason not in self._warned:
+            self._warned.add(reason)
+            warnings.warn(f"XLA compiles mjx.step, which is slower: {reason}", stacklevel=4)
+
+
+def fuse_mjx(
+    mj_model: mujoco.MjModel, n_substeps: int = 1, *, on_unsupported: OnUnsupported = "warn"
+) -> FusedMjx:
+    """Return a function that steps a model with MJX, as one kernel if it can be.
+
+    Otherwise XLA compiles `mjx.step`, with the same results: the model is too large for one kernel,
+    MJX uses an operation for it that cannot be lowered, or this machine has no back end.
+
+    Args:
+      mj_model: the model. Later changes of it have no effect.
+      n_substeps: number of physics steps in a step.
+      on_unsupported: what to do where a step is not one kernel. `warn`: warn once, with the reason.
+        `xla`: say nothing. `raise`: raise an error if the model cannot be lowered.
+
+    Returns:
+      A function `step(state, ctrl)` of one instance that returns the next state. `step.init` makes
+      a state.
+
+    Raises:
+      UnsupportedError: MJX cannot step this model.
+      TypeError: `mj_model` is not a compiled model of MuJoCo's.
+      ValueError: another argument is wrong.
+    """
+    if not isinstance(mj_model, mujoco.MjModel):
+        raise TypeError(f"mj_model is a {type(mj_model).__name__}, not a mujoco.MjModel")
+    if n_substeps < 1:
+        raise ValueError(f"n_substeps is {n_substeps}, not at least 1")
+    if on_unsupported not in get_args(OnUnsupported):
+        raise ValueError(f"on_unsupported is {on_unsupported!r}, not warn, xla or raise")
+    return FusedMjx(mj_model, n_substeps, on_unsupported)
+
+
+def _in_words(error: UnsupportedError) -> str:
+    """Return why a model is not one kernel."""
+    return f"one kernel cannot do {error}"
+
+
+def _explain(error: KernelError) -> Exception:
+    """Return the error that is raised for an error of the kernel."""
+    if error.kind == "derivative":
+        return KernelError("a fused step cannot be differentiated: use mjx.step", "derivative")
+    return error
+
+
+def _uncommitted(tree: Any) -> Any:
+    """Return arrays that JAX may move to any device."""
+    return jax.device_put(jax.tree.map(np.asarray, tree))

@@ -1,0 +1,130 @@
+"""Small MuJoCo models of several kinds, and C MuJoCo's answer to one step."""
+
+import mujoco
+import numpy as np
+
+CART_POLE = """
+<mujoco>
+  <option timestep="0.01"/>
+  <worldbody>
+    <body>
+      <joint name="slider" type="slide" axis="1 0 0" range="-0.5 0.5" limited="true" damping="0.3"/>
+      <geom type="box" size="0.1 0.05 0.05" mass="1"/>
+      <body>
+        <joint type="hinge" axis="0 1 0" damping="0.02"/>
+        <geom type="capsule" fromto="0 0 0 0 0 0.6" size="0.03" mass="0.3"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator>
+    <general joint="slider" dyntype="filter" dynprm="0.05" gainprm="20" ctrlrange="-1 1"/>
+  </actuator>
+</mujoco>
+"""
+"""Two joints, one of them with limits, and an actuator with an activation."""
+
+HOPPER = """
+<mujoco>
+  <option timestep="0.004"/>
+  <default><geom contype="0" conaffinity="0"/></default>
+  <worldbody>
+    <geom type="plane" size="5 5 0.1" conaffinity="1"/>
+    <body pos="0 0 0.5">
+      <joint type="slide" axis="1 0 0"/>
+      <joint type="slide" axis="0 0 1"/>
+      <geom type="sphere" size="0.1" mass="2"/>
+      <body>
+        <joint name="hip" type="hinge" axis="0 1 0" range="-60 60" limited="true" damping="0.5"/>
+        <geom type="capsule" fromto="0 0 0 0 0 -0.3" size="0.03" mass="0.5"/>
+        <geom type="sphere" pos="0 0 -0.46" size="0.05" mass="0.2" contype="1" friction="0.8"/>
+      </body>
+    </body>
+  </worldbody>
+  <actuator><motor joint="hip" gear="5" ctrlrange="-1 1"/></actuator>
+</mujoco>
+"""
+"""A leg on the floor: a contact with friction."""
+
+BUTTON = """
+<mujoco>
+  <worldbody>
+    <body name="hand" mocap="true" pos="0 0 1"/>
+    <body name="held" pos="0 0 0.9">
+      <freejoint/>
+      <geom type="box" size="0.1 0.05 0.02" mass="1"/>
+    </body>
+  </worldbody>
+  <equality><connect body1="hand" body2="held" anchor="0 0 -0.05"/></equality>
+</mujoco>
+"""
+"""A free body that an equality constraint ties to a mocap body; no actuator."""
+
+
+def chain(links):
+    """Return a chain of hinges in a gravity field, with a motor at each."""
+    bodies = "".join(
+        f'<body pos="0 0 {-0.2 if i else 0}"><joint name="j{i}" axis="{i % 2} {1 - i % 2} 0"'
+        ' damping="0.05"/><geom type="capsule" fromto="0 0 0 0 0 -0.2" size="0.02" mass="0.1"/>'
+        for i in range(links)
+    )
+    motors = "".join(f'<motor joint="j{i}" gear="0.2"/>' for i in range(links))
+    return (
+        '<mujoco><option timestep="0.005"/><default><geom contype="0" conaffinity="0"/></default>'
+        f"<worldbody>{bodies}{'</body>' * links}</worldbody><actuator>{motors}</actuator></mujoco>"
+    )
+
+
+def model_of(xml, integrator="Euler"):
+    """Return the model of an MJCF with another integrator."""
+    model = mujoco.MjModel.from_xml_string(xml)
+    model.opt.integrator = getattr(mujoco.mjtIntegrator, f"mjINT_{integrator.upper()}")
+    return model
+
+
+STATE = ("qpos", "qvel", "act", "qacc_warmstart", "time")
+
+
+def c_steps(model, count, n_substeps=1, most=100, seed=0):
+    """Return states in float32, controls, and what C MuJoCo makes of them.
+
+    Args:
+      model: the model.
+      count: number of instances. Each has moved for a time of its own under random controls.
+      n_substeps: number of physics steps from the state to the result.
+      most: the largest number of physics steps before the state.
+      seed: of the random numbers.
+
+    Returns:
+      Dictionaries of the fields of the states and of the results, with a leading axis of instances,
+      and the controls.
+    """
+    rng = np.random.default_rng(seed)
+    before, after, controls = [], [], []
+    for _ in range(count):
+        data = mujoco.MjData(model)
+        data.qvel[:] = rng.normal(0.0, 0.5, model.nv)
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu)
+        for _ in range(rng.integers(0, most)):
+            mujoco.mj_step(model, data)
+        # C MuJoCo starts from the same numbers, which are those of float32.
+        data.ctrl[:] = rng.uniform(-1.0, 1.0, model.nu).astype(np.float32)
+        before.append({x: np.float32(getattr(data, x)) for x in STATE})
+        for name, value in before[-1].items():
+            if name == "time":
+                data.time = value
+            else:
+                getattr(data, name)[:] = value
+        controls.append(data.ctrl.astype(np.float32))
+        for _ in range(n_substeps):
+            mujoco.mj_step(model, data)
+        after.append({x: np.array(getattr(data, x)) for x in STATE})
+    stacked = [{x: np.stack([one[x] for one in many]) for x in STATE} for many in (before, after)]
+    return *stacked, np.stack(controls)
+
+
+def difference(found, wanted):
+    """Return the largest difference of positions or velocities, relative to the largest number."""
+    return max(
+        np.abs(np.float64(getattr(found, x)) - wanted[x]).max() / np.abs(wanted[x]).max()
+        for x in ("qpos", "qvel")
+    )
