@@ -466,15 +466,8 @@ def table_line(row: Row) -> str:
     )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Parse the command line, measure, print a table and write a file.
-
-    Args:
-      arguments: The command line without the program's name; None: that of the process.
-
-    Returns:
-      The exit code.
-    """
+def _parser() -> cli.Parser:
+    """Return the parser of the command line."""
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
         "models",
@@ -498,7 +491,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="the longest time that XLA may take to compile MJX; 0: leave MJX out (default: 60)",
     )
     parser.add_argument("--output", type=Path, help="a JSON file for the results")
-    options = parser.parse_args(arguments)
+    return parser
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Parse the command line, measure, print a table and write a file.
+
+    Args:
+      arguments: The command line without the program's name; None: that of the process.
+
+    Returns:
+      The exit code.
+    """
+    options = _parser().parse_args(arguments)
     if not 0 <= options.xla_limit < math.inf:
         raise UserError(f"--xla-limit {options.xla_limit}: name a number of seconds, or 0")
     if options.output:
