@@ -167,6 +167,10 @@ LONG_SCANS = {
         lambda x: jax.lax.scan(lambda c, a: (c + a, c + a), jnp.float32(0), x),
         robots(17, LONG),
     ),
+    "rows that are results, too": (
+        lambda x: (x[::-1], jax.lax.scan(lambda c, a: (c + a, c + a), jnp.float32(0), x), x),
+        robots(17, 300),
+    ),
     "a trajectory": (trajectory, robots(17, 3)),
     "rounds": (sums_until_small, robots(17), robots(17, 100, seed=1)),
     "several dtypes": (

@@ -13,7 +13,7 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import PhysicsState
 from onekernel.aot import xla_options
 from onekernel.errors import UnsupportedError
-from onekernel.lower import jaxpr
+from onekernel.lower import jaxpr, scalar_ir
 from onekernel.lower.jaxpr import MAX_UNROLLED_OPERATIONS, MIN_BRANCH_OPERATIONS
 from onekernel.lower.scalar_ir import Expr
 from onekernel.lower.schedule import PlacedBranch, PlacedLoop
@@ -620,6 +620,13 @@ def test_arrays_that_take_too_much_memory_are_refused():
     reason = r"^arrays of 80,000 bytes for each instance, more than 65,536$"
     with pytest.raises(UnsupportedError, match=reason):
         jaxpr.scalarize(sums(10_000), VECTOR)
+
+
+def test_of_a_scan_that_can_be_neither_loop_nor_written_out_the_loops_reason_is_told(monkeypatch):
+    monkeypatch.setattr(jaxpr, "MAX_ARRAY_BYTES", 100)
+    monkeypatch.setattr(scalar_ir, "MAX_OPERATIONS", 250)
+    with pytest.raises(UnsupportedError, match=r"^arrays of 280 bytes"):
+        jaxpr.scalarize(sums(70), VECTOR)
 
 
 def test_a_program_that_is_too_large_is_refused(monkeypatch):
