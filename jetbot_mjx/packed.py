@@ -7,8 +7,6 @@ however small it is. The state of an environment is twenty arrays.
 import dataclasses
 import math
 from collections.abc import Callable, Hashable
-from types import ModuleType
-from typing import cast
 
 import jax
 import jax.numpy as jnp
@@ -102,7 +100,7 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     """
     leaves, structure = jax.tree.flatten(tree)
     shapes = tuple((x.shape[batch_axes:], x.dtype) for x in leaves)
-    library: ModuleType = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
+    library = np if all(isinstance(x, np.ndarray) for x in leaves) else jnp
     packed = [_is_packed(*one) for one in shapes]
     words = [
         library.asarray(x).view(np.float32).reshape(*x.shape[:batch_axes], math.prod(shape))
@@ -113,8 +111,9 @@ def pack(tree: PyTree, batch_axes: int = 0) -> Packed:
     if not words:
         batch = leaves[0].shape[:batch_axes] if leaves else (0,) * batch_axes
         words = [library.zeros((*batch, 0), np.float32)]
-    joined = cast(Array, library.concatenate(words, axis=-1))
-    return Packed(joined, others, structure, shapes)
+    joined = library.concatenate(words, axis=-1)
+    # On the host it is one of NumPy's, as the docstring of `Packed` says.
+    return Packed(joined, others, structure, shapes)  # pyright: ignore[reportArgumentType]
 
 
 class Condensed(struct.PyTreeNode):

@@ -21,16 +21,10 @@ Sources, by tag; BOM, EST and SIM are those of `envs/robot_model.py`:
 """
 
 import math
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
-if TYPE_CHECKING:
-    from jax import Array
-
-    Value = float | Array
-else:
-    # A configuration does not import JAX.
-    Value = object
-"""A number or a traced scalar."""
+Value = Any
+"""A number, or a scalar that JAX traces: a configuration does not import JAX."""
 
 
 ANGLE = math.pi + 1e-3
