@@ -150,11 +150,16 @@ class Search:
 
     def _open(self) -> optuna.storages.RDBStorage:
         """Return the database, whose tables only one of several workers can create."""
-        is_sqlite = self._url.startswith("sqlite")
+        sqlite = {
+            "connect_args": {"timeout": _LOCKED_SECONDS},
+            # Whoever holds the study may use it at any time, and nobody closes it: so that no
+            # connection stays open, each is closed when it has been used.
+            "poolclass": sqlalchemy.NullPool,
+        }
         connect = functools.partial(
             optuna.storages.RDBStorage,
             self._url,
-            {"connect_args": {"timeout": _LOCKED_SECONDS}} if is_sqlite else None,
+            sqlite if self._url.startswith("sqlite") else None,
             heartbeat_interval=_BEAT_SECONDS,
             grace_period=_STALE_SECONDS,
             heartbeat_stale_trial_callback=self._retry,

@@ -1,5 +1,6 @@
 """A study resumes, shares its trials among workers, and loses none."""
 
+import os
 import sys
 from pathlib import Path
 
@@ -276,6 +277,14 @@ def test_without_final_trainings_the_best_trial_is_the_best(tmp_path):
 def test_a_storage_that_cannot_be_used_is_named(tmp_path):
     with pytest.raises(UserError, match="--storage nonsense cannot be used"):
         search.Search(CONFIG, SPACE, tmp_path / "s", storage="nonsense")
+
+
+def test_no_connection_to_the_study_stays_open(tmp_path):
+    one = search.Search(CONFIG, SPACE, tmp_path / "s")
+    one.run(2, 2)
+    assert len(one.study.trials) == 2
+    opened = [os.path.realpath(path) for path in Path("/proc/self/fd").iterdir()]
+    assert str(tmp_path / "s" / "study.db") not in opened
 
 
 def test_every_phase_is_a_stage_that_a_command_shows(tmp_path):
