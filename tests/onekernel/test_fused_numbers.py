@@ -41,7 +41,7 @@ def test_what_is_not_finite_stays_so(name):
 @pytest.mark.parametrize("dtype", [np.int32, np.uint32])
 def test_the_bits_of_whole_numbers_are_combined(reduce, dtype):
     numbers = np.random.default_rng(0).integers(0, 2**31, (17, 5)).astype(dtype)
-    ours = jax.jit(jax.vmap(fuse(lambda x: reduce.reduce(x))))(numbers)
+    ours = jax.jit(jax.vmap(fuse(lambda x: reduce.reduce(x), on_unsupported="xla")))(numbers)
     np.testing.assert_array_equal(ours, jax.vmap(lambda x: reduce.reduce(x))(numbers))
 
 
@@ -68,7 +68,7 @@ WITH_KEYS = {
 @pytest.mark.parametrize("name", WITH_KEYS)
 def test_what_chooses_between_keys_stays_as_it_is(name):
     keys = np.random.default_rng(1).integers(0, 2**32, (9, 2), np.uint32)
-    ours = jax.jit(jax.vmap(fuse(WITH_KEYS[name])))(keys)
+    ours = jax.jit(jax.vmap(fuse(WITH_KEYS[name], on_unsupported="xla")))(keys)
     theirs = jax.jit(jax.vmap(WITH_KEYS[name]))(keys)
     if name == "a key as a result":
         ours, theirs = jax.random.key_data(ours), jax.random.key_data(theirs)
@@ -122,7 +122,7 @@ def test_nothing_divided_by_a_whole_number_is_what_jax_makes_of_it():
 
 def test_other_settings_and_weak_types_are_lowered_again():
     key = jax.random.PRNGKey(1)
-    draw = fuse(lambda key: jax.random.bits(key, (2,)))
+    draw = fuse(lambda key: jax.random.bits(key, (2,)), on_unsupported="xla")
     draw(key)
     with jax.threefry_partitionable(False):
         np.testing.assert_array_equal(draw(key), jax.random.bits(key, (2,)))
@@ -132,7 +132,7 @@ def test_other_settings_and_weak_types_are_lowered_again():
 
 
 def test_a_function_of_nothing_stays_as_it_is():
-    np.testing.assert_array_equal(fuse(lambda: jnp.ones(3))(), np.ones(3))
+    np.testing.assert_array_equal(fuse(lambda: jnp.ones(3), on_unsupported="xla")(), np.ones(3))
 
 
 def test_a_kernel_for_several_robots_stays_as_it_is():
@@ -142,5 +142,5 @@ def test_a_kernel_for_several_robots_stays_as_it_is():
         return jax.vmap(lambda row: step({"x": row, "n": row[0]}, jnp.float32(2))["x"])(x)
 
     robots = np.random.default_rng(0).normal(size=(4, 2, 3)).astype(np.float32)
-    ours = jax.jit(jax.vmap(fuse(each)))(robots)
+    ours = jax.jit(jax.vmap(fuse(each, on_unsupported="xla")))(robots)
     np.testing.assert_allclose(ours, robots * 4, rtol=1e-6)

@@ -25,7 +25,7 @@ from helpers.small_models import (
     difference,
     model_of,
 )
-from onekernel import KernelError, OneKernel, UnsupportedError
+from onekernel import KernelError, UnsupportedError, fuse
 from onekernel.lower import jaxpr
 from onekernel.mujoco import MjxState, fuse_mjx
 
@@ -162,7 +162,7 @@ def test_a_step_is_one_kernel_also_inside_an_environment(falls):
 
     states = jax.vmap(falls.init)(jnp.array([[0.0], [-2.0]]))
     forces = jnp.array([[1.0], [2.0]])
-    fused = OneKernel(env)
+    fused = fuse(env)
     assert launches(jax.vmap(fused), states, forces) == 1
     for found, wanted in zip(
         jax.tree.leaves(jax.vmap(fused)(states, forces)),
