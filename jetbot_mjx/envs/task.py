@@ -11,7 +11,7 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple, Protocol, TypedDict, runtime_checkable
+from typing import Any, NamedTuple, Protocol, TypedDict, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -354,7 +354,7 @@ def make_task(config: TaskConfig, task_class: TaskClass | None = None) -> Task:
     return task
 
 
-def _import_class(name: str) -> TaskClass:
+def _import_class(name: str) -> Any:
     """Import what a name `package.module:Class` refers to, which may not be a class."""
     module_name, separator, class_name = name.partition(":")
     if not separator or not module_name.strip(".") or module_name[0] == "." or not class_name:

@@ -51,7 +51,7 @@ def test_importing_prints_nothing(statement):
 def test_a_module_that_imports_brax_or_mjx_first_imports_what_drops_their_lines():
     package = Path(jetbot_mjx.__file__).parent
     first = re.compile(
-        r"^from jetbot_mjx(\.\w+)* import .*(mjx_import|brax_parts)|mjx_import import"
+        r"^from jetbot_mjx(\.\w+)* import .*(mjx_import|brax_parts)|(mjx_import|brax_parts) import"
     )
     theirs = re.compile(r"^(from|import) (brax|mujoco\.mjx)\b|^from mujoco import mjx")
     for path in package.rglob("*.py"):

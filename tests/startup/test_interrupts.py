@@ -8,6 +8,8 @@ import time
 
 import pytest
 
+RUN = "pretrained:jetbot_egocentric"
+
 STAND_IN = """
 import os, signal, time
 try:
@@ -37,7 +39,7 @@ def python(folder, *arguments):
 def test_a_command_that_still_loads_leaves_quietly(command, lost, tmp_path):
     (tmp_path / "jax").mkdir()
     (tmp_path / "jax" / "__init__.py").write_text(STAND_IN.format(lost=lost))
-    arguments = {"train": ["--resume", "run"], "evaluate": ["run"]}[command]
+    arguments = {"train": ["smoke", "--run-dir", "run"], "evaluate": [RUN]}[command]
     done = python(tmp_path, "-m", f"jetbot_mjx.{command}", *arguments)
     # 130, to a shell.
     assert (done.returncode, done.stdout, done.stderr) == (-signal.SIGINT, "", "")
@@ -49,7 +51,7 @@ def test_a_background_job_ignores_it_while_it_loads(tmp_path):
     background = (
         "import os, signal, sys\n"
         "signal.signal(signal.SIGINT, signal.SIG_IGN)\n"
-        "os.execv(sys.executable, [sys.executable, '-m', 'jetbot_mjx.evaluate', 'runs/mine'])"
+        f"os.execv(sys.executable, [sys.executable, '-m', 'jetbot_mjx.evaluate', '{RUN}'])"
     )
     done = python(tmp_path, "-c", background)
     assert done.returncode == 1
