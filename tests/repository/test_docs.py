@@ -165,7 +165,7 @@ def test_the_site_builds_without_a_warning(site):
     html = (site / "api/envs.html").read_text("utf-8")
     assert 'id="jetbot_mjx.envs.jetbot_env.JetBotEnv.step"' in html
     # What docstrings.py mends.
-    assert "Tilt in [0, π] [rad]" in html
+    assert "Yaw in (-π, π] [rad]" in html
     assert "seed-&lt;n&gt;" in (site / "api/runs.html").read_text("utf-8")
     assert "<code>eval/episodes  " in re.sub(
         r"<pre><span></span>", "", (site / "api/runs.html").read_text("utf-8")
