@@ -121,7 +121,7 @@ def inspect(kernel: Kernel) -> Compiled:
     return Compiled(
         f"{host.name}, {host.lanes} instances side by side",
         seconds,
-        f"{host.registers} of {host.lanes} numbers",
+        f"{host.registers} vectors of {host.lanes} numbers",
         f"{stores:,} times stored, {loads:,} times loaded",
     )
 
