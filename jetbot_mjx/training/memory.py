@@ -31,6 +31,10 @@ _LAYERS = 1.6
 """Memory of a gradient, as a multiple of the activations of a minibatch, as measured with XLA: the
 forward pass stores all of them, the backward pass some of them again."""
 
+_DRAWING = 3
+"""Memory of drawing random numbers, as a multiple of the numbers: XLA stores the counters of the
+generator and the pairs of words that it makes."""
+
 _OVERHEAD = 1.18
 """Largest measured ratio of allocated to counted memory: for one size, programs that XLA compiled
 on two occasions took 15 and 17 GiB of an H200."""
@@ -168,16 +172,17 @@ class MemoryModel(NamedTuple):
         working = max(each.physics, each.layers)
         collected = samples * each.sample + unrolls * each.unroll
         shuffled = samples * each.learned + unrolls * each.unroll
-        # The states before the unroll, as rows, and their copy.
-        rows = 2 * stepped
-        gradient = each.parameters + minibatch * each.gradient + samples * each.noise
+        # Noise is drawn before the update, which holds the states before the unroll, as rows, and
+        # their copy.
+        noise = samples * each.noise
+        updating = 2 * stepped + each.parameters + minibatch * each.gradient + noise
         return Footprint(
             num_envs=ppo.num_envs,
             batch_size=ppo.batch_size,
             parameters=config.seeds * each.parameters,
             environments=config.seeds * stepped,
             collecting=config.seeds * (collected + stepped + environments * working),
-            learning=config.seeds * (collected + shuffled + rows + gradient),
+            learning=config.seeds * (collected + shuffled + max(updating, _DRAWING * noise)),
             evaluation=config.evaluation.episodes * (2 * each.environment + working),
         )
 

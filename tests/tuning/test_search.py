@@ -199,8 +199,8 @@ def test_a_trial_that_another_worker_took_for_dead_is_left_to_it(tmp_path, monke
 
     def slow(self, values, seeds):
         monkeypatch.setattr(Quick, "run", run)
-        other = optuna.load_study(study_name="s", storage=one._url)
-        other.tell(0, state=FAIL)
+        other = search.Search(CONFIG, SPACE, tmp_path / "s")
+        other.study.tell(0, state=FAIL)
         return run(self, values, seeds)
 
     monkeypatch.setattr(Quick, "run", slow)
