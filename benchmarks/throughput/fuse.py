@@ -2,19 +2,24 @@
 
     python benchmarks/throughput/fuse.py hopper chain:14 my_robot.xml
 
-  kernel  `onekernel.mujoco.fuse_mjx`
-  mjx     `mjx.step`, compiled by XLA in a process of its own; left out if that takes too long
-  mujoco  C MuJoCo's threaded `mujoco.rollout`, one thread per core
+  kernel   `onekernel.mujoco.fuse_mjx`
+  mjx      `mjx.step`, compiled by XLA in a process of its own; left out if that takes too long
+  rollout  C MuJoCo's threaded `mujoco.rollout`, one thread per core
+  batch    C MuJoCo's threaded `mujoco.batch`, one thread per core
 
-All three make the same environment steps: `--n-substeps` physics steps under constant controls,
-which are drawn before the timing starts, from the same states. Each call begins again from these
-states, in which the instances have moved under random controls for up to a hundred physics steps.
-The three are timed in turn in every round. The last columns say how far the positions and
-velocities after one environment step are from those of C MuJoCo in double precision, and from those
-of MJX, relative to the largest of them.
+All make the same environment steps: `--n-substeps` physics steps under constant controls, which are
+drawn before the timing starts, from the same states. Each call begins again from these states, in
+which the instances have moved under random controls for up to a hundred physics steps. The
+contenders are timed in turn in every round. The last columns say how far the positions and
+velocities after one environment step are from those of C MuJoCo in double precision, whose solver
+may make 1,000 iterations, and from those of MJX, relative to the largest of them.
+
+The solver stops as the model's options say. A tolerance of 1e-8, MuJoCo's default, is below what
+float32 can show, so that MJX iterates on where nothing changes any more: `--tolerance 1e-6`.
 """
 
 import argparse
+import copy
 import importlib.util
 import math
 import multiprocessing
@@ -50,6 +55,13 @@ GYMNASIUM = (
 )
 """Models of Gymnasium that are measured unless others are named."""
 
+PACKAGES = {
+    **{name: f"gymnasium/envs/mujoco/assets/{name}.xml" for name in (*GYMNASIUM, "humanoid")},
+    "cartpole_balance": "mujoco_playground/_src/dm_control_suite/xmls/cartpole.xml",
+    "quadruped": "dm_control/suite/quadruped.xml",
+}
+"""Where packages have the models that are known by name."""
+
 INTEGRATORS = {
     "Euler": mujoco.mjtIntegrator.mjINT_EULER,
     "implicitfast": mujoco.mjtIntegrator.mjINT_IMPLICITFAST,
@@ -74,6 +86,8 @@ class Settings(NamedTuple):
     """A model of Gymnasium, `chain:LINKS`, or the path of an MJCF."""
     integrator: str
     """A key of `INTEGRATORS`, or `own` for the model's."""
+    solver: tuple[tuple[str, float], ...]
+    """Options of the solver by their names in `mujoco.MjOption`; others are the model's."""
     num_envs: int
     n_substeps: int
     unroll: int
@@ -110,6 +124,8 @@ class Problem:
         self.settings, self.model = settings, load_model(settings.name)
         if settings.integrator != "own":
             self.model.opt.integrator = INTEGRATORS[settings.integrator]
+        for option, value in settings.solver:
+            setattr(self.model.opt, option, value)
         model, rng = self.model, np.random.default_rng(0)
         shape = settings.num_envs, settings.unroll, model.nu
         low, high = model.actuator_ctrlrange.T
@@ -161,10 +177,6 @@ class Contender(Protocol):
         """Return the environment steps per second of one round, summed over the instances."""
         ...
 
-    def moved(self) -> Moved:
-        """Return the first distinct instances after one environment step."""
-        ...
-
 
 class Compiled:
     """A step of one instance that JAX compiles, for all instances of a problem."""
@@ -182,15 +194,13 @@ class Compiled:
         self._distinct = len(problem.states)
         one = _mjx_step(step, settings.n_substeps) if by_xla else step
 
-        def call(states: MjxState, controls: Float[Array, "n t nu"], count: Array) -> MjxState:
-            return jax.lax.fori_loop(
-                0, count, lambda i, states: jax.vmap(one)(states, controls[:, i]), states
-            )
+        def call(states: MjxState, controls: Float[Array, "t n nu"]) -> MjxState:
+            return jax.lax.scan(lambda x, u: (jax.vmap(one)(x, u), None), states, controls)[0]
 
         start = time.perf_counter()
-        self._arguments = problem.first(step), jnp.asarray(problem.controls)
-        count = jnp.int32(self._unroll)
-        self._program = jax.jit(call).lower(*self._arguments, count).compile()
+        self._states, self._call = problem.first(step), jax.jit(call)
+        self._controls = jnp.asarray(problem.controls.swapaxes(0, 1))
+        self._program = self._call.lower(self._states, self._controls).compile()
         self.compile_seconds: float | None = time.perf_counter() - start
         self._calls = warm_up(self._time_calls)
 
@@ -200,13 +210,13 @@ class Compiled:
 
     def moved(self) -> Moved:
         """Return the first distinct instances after one environment step."""
-        state = self._program(*self._arguments, jnp.int32(1))
+        state = self._call(self._states, self._controls[:1])
         return np.array(state.qpos[: self._distinct]), np.array(state.qvel[: self._distinct])
 
     def _time_calls(self, calls: int) -> float:
         start = time.perf_counter()
         for _ in range(calls):
-            jax.block_until_ready(self._program(*self._arguments, jnp.int32(self._unroll)))
+            jax.block_until_ready(self._program(self._states, self._controls))
         return time.perf_counter() - start
 
 
@@ -292,53 +302,80 @@ def _serve(connection: Connection, settings: Settings) -> None:
         connection.send(getattr(contender, what)())
 
 
-class MujocoRollout:
-    """C MuJoCo's own thread pool, with one thread for each core."""
+class Mujoco:
+    """C MuJoCo on a pool of threads, one for each core."""
 
-    def __init__(self, problem: Problem) -> None:
-        """Start the threads and warm up."""
+    def __init__(self, problem: Problem, *, is_batch: bool) -> None:
+        """Start the threads and warm up.
+
+        Args:
+          problem: the model, states and controls.
+          is_batch: whether `mujoco.batch` steps; otherwise `mujoco.rollout`.
+        """
         settings = problem.settings
         threads = available_cores()
         self.num_envs = min(settings.num_envs, threads * _ROBOTS_PER_CORE)
         self.compile_seconds: float | None = None
-        self._model, self._n_substeps = problem.model, settings.n_substeps
-        self._unroll = settings.unroll
-        self._data = [mujoco.MjData(self._model) for _ in range(threads)]
-        self._pool = mujoco.rollout.Rollout(nthread=threads)
-        which = np.arange(max(self.num_envs, len(problem.states))) % len(problem.states)
+        self._n_substeps, self._unroll = settings.n_substeps, settings.unroll
+        which = np.arange(self.num_envs) % len(problem.states)
         self._states, self._warmstarts = problem.states[which], problem.warmstarts[which]
-        self._distinct = len(problem.states)
-        controls = problem.controls[: len(which)].astype(np.float64)
         # Each control is held for the physics steps of an environment step.
+        controls = problem.controls[: self.num_envs].astype(np.float64)
         self._controls = np.repeat(controls, self._n_substeps, axis=1)
+        self._roll = self._batch(problem) if is_batch else self._rollout(problem)
         self._calls = warm_up(self._time_calls)
 
     def repeat(self) -> float:
         """Return the environment steps per second of one round, summed over the instances."""
         return self.num_envs * self._unroll * self._calls / self._time_calls(self._calls)
 
-    def moved(self) -> Moved:
-        """Return the distinct instances after one environment step."""
-        states = self._roll(self._distinct, self._n_substeps)
-        nq, nv = self._model.nq, self._model.nv
-        last = states[:, -1, 1:]  # a state begins with the time
-        return last[:, :nq], last[:, nq : nq + nv]
+    def _rollout(self, problem: Problem) -> Callable[[], object]:
+        """Return a call of `mujoco.rollout`."""
+        pool = mujoco.rollout.Rollout(nthread=available_cores())
+        data = [mujoco.MjData(problem.model) for _ in range(available_cores())]
+        arguments = problem.model, data, self._states, self._controls
+        return lambda: pool.rollout(*arguments, initial_warmstart=self._warmstarts)
 
-    def _roll(self, count: int, steps: int) -> Float[np.ndarray, "n t size"]:
-        states, _ = self._pool.rollout(
-            self._model,
-            self._data,
-            self._states[:count],
-            self._controls[:count, :steps],
-            initial_warmstart=self._warmstarts[:count],
-        )
-        return np.asarray(states)
+    def _batch(self, problem: Problem) -> Callable[[], object]:
+        """Return a call of `mujoco.batch`."""
+        from mujoco.batch import Batch
+
+        batch = Batch(problem.model, self.num_envs, available_cores())
+        for state, warmstart, row in zip(self._states, self._warmstarts, batch.state, strict=True):
+            data = mujoco.MjData(problem.model)
+            mujoco.mj_setState(problem.model, data, state, mujoco.mjtState.mjSTATE_FULLPHYSICS)
+            data.qacc_warmstart[:] = warmstart
+            kind = mujoco.mjtState.mjSTATE_INTEGRATION
+            mujoco.mj_getState(problem.model, data, row, kind)
+        first = batch.state.copy()
+
+        def roll() -> object:
+            batch.state[:] = first
+            return batch.rollout(self._controls.shape[1], self._controls)
+
+        return roll
 
     def _time_calls(self, calls: int) -> float:
         start = time.perf_counter()
         for _ in range(calls):
-            self._roll(self.num_envs, self._unroll * self._n_substeps)
+            self._roll()
         return time.perf_counter() - start
+
+
+def converged(problem: Problem) -> Moved:
+    """Return the distinct instances after one step of C MuJoCo whose solver has converged."""
+    model = copy.copy(problem.model)
+    model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 1000, 100, 1e-12
+    controls = problem.controls[: len(problem.states), 0].astype(np.float64)
+    qpos, qvel = np.zeros((len(controls), model.nq)), np.zeros((len(controls), model.nv))
+    for i, ctrl in enumerate(controls):
+        data = mujoco.MjData(model)
+        mujoco.mj_setState(model, data, problem.states[i], mujoco.mjtState.mjSTATE_FULLPHYSICS)
+        data.ctrl[:], data.qacc_warmstart[:] = ctrl, problem.warmstarts[i]
+        for _ in range(problem.settings.n_substeps):
+            mujoco.mj_step(model, data)
+        qpos[i], qvel[i] = data.qpos, data.qvel
+    return qpos, qvel
 
 
 def load_model(name: str) -> mujoco.MjModel:
@@ -351,11 +388,12 @@ def load_model(name: str) -> mujoco.MjModel:
     if kind == "chain" and links.isdigit() and int(links):
         return mujoco.MjModel.from_xml_string(_chain(int(links)))
     path = Path(name)
-    if name in GYMNASIUM:
-        found = importlib.util.find_spec("gymnasium")
+    if name in PACKAGES:
+        package, _, inside = PACKAGES[name].partition("/")
+        found = importlib.util.find_spec(package)
         if found is None or found.origin is None:
-            raise UserError(f"{name} is a model of Gymnasium: pip install gymnasium")
-        path = Path(found.origin).parent / "envs" / "mujoco" / "assets" / f"{name}.xml"
+            raise UserError(f"{name} is a model of {package}, which is not installed")
+        path = Path(found.origin).parent / inside
     try:
         return mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
@@ -396,38 +434,41 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
       One row for each contender.
     """
     problem = Problem(settings)
-    notes = {"kernel": "", "mjx": "", "mujoco": ""}
+    notes = {"kernel": "", "mjx": "", "rollout": "", "batch": ""}
     step = fuse_mjx(problem.model, settings.n_substeps, on_unsupported="xla")
-    contenders: dict[str, Contender] = {"mujoco": MujocoRollout(problem)}
+    compiled: dict[str, Compiled | InOtherProcess] = {}
+    contenders: dict[str, Contender] = {
+        "rollout": Mujoco(problem, is_batch=False),
+        "batch": Mujoco(problem, is_batch=True),
+    }
     if step.obstacle is None:
-        contenders["kernel"] = Compiled(problem, step, by_xla=False)
+        compiled["kernel"] = Compiled(problem, step, by_xla=False)
     else:
         notes["kernel"] = step.obstacle
     xla = None
     try:
         if xla_limit:
-            xla = contenders["mjx"] = InOtherProcess(settings, xla_limit)
+            xla = compiled["mjx"] = InOtherProcess(settings, xla_limit)
         else:
             notes["mjx"] = "left out"
     except TimeoutError as error:
         notes["mjx"] = str(error)
     try:
+        contenders |= compiled
         repeats: dict[str, list[float]] = {name: [] for name in contenders}
         for _ in range(rounds):
             for name, contender in contenders.items():
                 repeats[name].append(contender.repeat())
-        moved = {name: contender.moved() for name, contender in contenders.items()}
+        moved = {name: contender.moved() for name, contender in compiled.items()}
     finally:
         if xla is not None:
             xla.close()
+    reference = converged(problem)
     for name in notes:
         contender = contenders.get(name)
-        from_mujoco, from_mjx = (
-            difference(moved[name], moved[other])
-            if name in moved and other in moved and name not in (other, "mujoco")
-            else None
-            for other in ("mujoco", "mjx")
-        )
+        from_mujoco = difference(moved[name], reference) if name in moved else None
+        both = name == "kernel" and {"kernel", "mjx"} <= moved.keys()
+        from_mjx = difference(moved["kernel"], moved["mjx"]) if both else None
         yield Row(
             settings.name,
             problem.model.nv,
@@ -474,12 +515,14 @@ def _parser() -> cli.Parser:
         nargs="*",
         default=list(GYMNASIUM),
         metavar="MODEL",
-        help="names of Gymnasium's models, chain:LINKS, or MJCF files (default: eight models of"
-        " Gymnasium)",
+        help=f"chain:LINKS, MJCF files, or of {', '.join(PACKAGES)} (default: the first eight)",
     )
     positive = cli.positive_int
     parser.add_argument("--num-envs", type=positive, help="instances (default: 65,536, CPU: 1,024)")
     parser.add_argument("--integrator", choices=("own", *INTEGRATORS), default="own")
+    parser.add_argument("--iterations", type=positive, help="most iterations of the solver")
+    parser.add_argument("--ls-iterations", type=positive, help="most of each line search")
+    parser.add_argument("--tolerance", type=float, help="improvement at which the solver stops")
     parser.add_argument("--n-substeps", type=positive, default=2, help="physics steps in a step")
     parser.add_argument("--unroll", type=positive, default=32, help="environment steps in a call")
     parser.add_argument("--rounds", type=positive, default=5)
@@ -506,6 +549,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     if not 0 <= options.xla_limit < math.inf:
         raise UserError(f"--xla-limit {options.xla_limit}: name a number of seconds, or 0")
+    solver = {name: getattr(options, name) for name in ("iterations", "ls_iterations", "tolerance")}
+    solver = {name: value for name, value in solver.items() if value is not None}
+    if not 0 <= solver.get("tolerance", 0) < 1:
+        raise UserError(f"--tolerance {options.tolerance}: name a number from 0 to 1, such as 1e-6")
     if options.output:
         check_output(options.output)
     # Two processes share the device.
@@ -516,7 +563,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(_HEAD)
     rows = []
     for name in options.models:
-        settings = Settings(name, options.integrator, num_envs, options.n_substeps, options.unroll)
+        numbers = num_envs, options.n_substeps, options.unroll
+        settings = Settings(name, options.integrator, tuple(solver.items()), *numbers)
         for row in measure(settings, options.rounds, options.xla_limit):
             rows.append(row._asdict())
             print(table_line(row), flush=True)
@@ -526,6 +574,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "cpu_cores": available_cores(),
             "versions": versions(),
             "integrator": options.integrator,
+            "solver": solver,
             "n_substeps": options.n_substeps,
             "unroll": options.unroll,
         }
