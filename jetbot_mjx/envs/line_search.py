@@ -92,16 +92,20 @@ def _relative_point(
       *cone: quantities of elliptic cones.
     """
     _, create = _library
-    without_constant = jnp.array([0.0, 1.0, 1.0])
-    point = create(
-        m, d, ctx, alpha, jv, quad * without_constant, quad_gauss * without_constant, *cone
-    )
     rows = d._impl
     assert isinstance(rows, solver.DataJAX)
-    contacts = slice(rows.ne, None)  # after the equality constraints, which are always active
-    before = ctx.Jaref[contacts] < 0
-    after = ctx.Jaref[contacts] + alpha * jv[contacts] < 0
-    constant = quad[contacts, 0]
+    # Equality constraints, which come first, are always active.
+    is_equality = jnp.arange(len(jv)) < rows.ne
+    before = is_equality | (ctx.Jaref < 0)
+    after = is_equality | (ctx.Jaref + alpha * jv < 0)
+    # A row that stays active has no constant part; one that no longer is takes its own along.
+    constant = quad[:, 0]
     appears, disappears = jnp.where(before, 0.0, constant), jnp.where(before, -constant, 0.0)
-    change = jnp.sum(jnp.where(after, appears, disappears))
-    return point.replace(cost=point.cost + change)
+    stays = quad.at[:, 0].set(appears)
+    goes = jnp.zeros_like(quad).at[:, 0].set(disappears)
+    chosen = jnp.where(after[:, None], stays, goes)
+    # MJX would decide once more which rows are active, and at the boundary otherwise: XLA may round
+    # the same sum differently in two places. For MJX, all of them are.
+    always = ctx.replace(Jaref=-jnp.ones_like(ctx.Jaref))
+    quad_gauss *= jnp.array([0.0, 1.0, 1.0])
+    return create(m, d, always, alpha, jnp.zeros_like(jv), chosen, quad_gauss, *cone)

@@ -503,23 +503,24 @@ def check_script(script, arguments, monkeypatch):
         return
     monkeypatch.syspath_prepend(str((ROOT / script).parent))
 
-    def stop_after_parsing(parser, given=None):
-        raise Parsed(parse(parser, given))
-
-    parse = argparse.ArgumentParser.parse_args
-    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", stop_after_parsing)
+    for kind in (argparse.ArgumentParser, cli.Parser):
+        monkeypatch.setattr(kind, "parse_args", stop_after(kind.parse_args))
     with pytest.raises(Parsed):
         load(ROOT / script).main(arguments)
 
 
-def check_arguments(command, arguments, monkeypatch):
-    """The parser takes the arguments, and the configuration the settings."""
-    parse = cli.Parser.parse_args
+def stop_after(parse):
+    """The parser's method, which raises what it has parsed."""
 
-    def stop_after_parsing(parser, given=None):
+    def stop(parser, given=None):
         raise Parsed(parse(parser, given))
 
-    monkeypatch.setattr(cli.Parser, "parse_args", stop_after_parsing)
+    return stop
+
+
+def check_arguments(command, arguments, monkeypatch):
+    """The parser takes the arguments, and the configuration the settings."""
+    monkeypatch.setattr(cli.Parser, "parse_args", stop_after(cli.Parser.parse_args))
     with pytest.raises(Parsed) as asked:
         command.main(arguments)
     options = vars(asked.value.args[0])
