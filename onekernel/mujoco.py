@@ -182,7 +182,7 @@ class FusedMjx:
         """Return MJX's data of a state.
 
         What follows from the state, such as the positions of bodies, is not computed: that is what
-        `mjx.forward(step.model, data)` does.
+        `forward` does.
 
         Args:
           state: the state of one instance.
@@ -190,6 +190,19 @@ class FusedMjx:
         """
         controls = {} if ctrl is None else {"ctrl": ctrl}
         return self._data.replace(**self._checked({**vars(state), **controls}))
+
+    def forward(self, state: MjxState, ctrl: ArrayLike | None = None) -> mjx.Data:
+        """Return MJX's data with all that follows from a state, as `mjx.forward` computes it.
+
+        In a function that `onekernel.fuse` compiles, only what is used of it is computed: positions
+        of sites (`site_xpos`), sensors (`sensordata`), contacts (`_impl.contact`) and more.
+
+        Args:
+          state: the state of one instance.
+          ctrl: controls of the actuators, shape (nu,); None: 0.
+        """
+        with jax.default_matmul_precision("highest"):
+            return mjx.forward(self.model, self.to_data(state, ctrl))
 
     def from_data(self, data: mjx.Data) -> MjxState:
         """Return the state in MJX's data. Controls and applied forces are not part of it."""

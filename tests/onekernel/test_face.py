@@ -37,6 +37,7 @@ def test_it_runs(program, number):
 
 
 @pytest.mark.skipif(cpu.obstacle() is not None, reason="there are no kernels here")
+@pytest.mark.cpu
 def test_it_is_one_kernel():
     assert "kernel" in EXAMPLE
     lowered = EXAMPLE.replace("(jnp.zeros", ".lower(jnp.zeros", 1) + "print(states.as_text())"
