@@ -23,8 +23,10 @@ from benchmarks.throughput import (
     adapters,
     baselines,
     compare,
+    fuse,
     kernels,
     one_robot,
+    programs,
     randomization_cost,
     rate_plots,
 )
@@ -452,3 +454,41 @@ def test_both_settings_are_tabulated_with_mean_and_worst_seed():
     lines = {line.get_label(): list(line.get_ydata()) for line in axes.lines}
     assert lines["nominal"] == pytest.approx([0.6, 1.0])
     assert lines["randomised"] == pytest.approx([0.9, 1.0])
+
+
+def test_a_model_is_stepped_alike_by_all_contenders(tmp_path, monkeypatch):
+    monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
+    output = tmp_path / "rates.json"
+    # XLA takes too long to compile for a test, as the row then says.
+    options = "chain:2 --num-envs 64 --unroll 2 --rounds 1 --xla-limit 0 --tolerance 1e-6"
+    assert fuse.main([*options.split(), "--output", str(output)]) == 0
+    stored = json.loads(output.read_text())
+    rows = {row["contender"]: row for row in stored["rows"]}
+    assert stored["solver"] == {"tolerance": 1e-6}
+    assert list(rows) == ["kernel", "mjx", "rollout", "batch"]
+    assert rows["kernel"]["from_mujoco"] < 1e-5
+    assert rows["mjx"]["note"] == "left out"
+    assert all(rows[name]["env_steps_per_second"] > 0 for name in ("kernel", "rollout", "batch"))
+
+
+def test_mujocos_batch_and_rollout_start_from_the_same_states():
+    settings = fuse.Settings("chain:2", "own", (), 4, 1, 3)
+    problem = fuse.Problem(settings)
+    ends = []
+    for is_batch in (False, True):
+        done = fuse.Mujoco(problem, is_batch=is_batch)._roll()
+        ends.append(done["qpos"][:, -1] if is_batch else done[0][:, -1, 1:3])
+    np.testing.assert_allclose(*ends, rtol=1e-12)
+    assert np.ptp(ends[0][:, 0]) > 1e-3
+
+
+@pytest.mark.parametrize("name", ["small_solves", "search"])
+def test_a_program_is_the_same_as_one_kernel_and_by_xla(name, capsys, monkeypatch):
+    monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
+    assert programs.main([name, "--num-instances", "3", "--rounds", "1"]) == 0
+    assert name in capsys.readouterr().out
+    row = programs.measure(name, 1, 1)
+    assert row.difference < 1e-6
+    assert row.kernel_seconds > 0
+    with pytest.raises(UserError, match="there is no program nothing: choose of"):
+        programs.main(["nothing"])
