@@ -10,7 +10,7 @@ from helpers.run_program import evaluate
 from onekernel import cpu, gpu
 from onekernel.cpu import xla_call
 from onekernel.kernel import Kernel
-from onekernel.lower import jaxpr
+from onekernel.lower import control_flow, scalarize
 
 if cpu.obstacle():
     pytest.skip("llvmlite compiles nothing here", allow_module_level=True)
@@ -58,9 +58,9 @@ def check(seed, monkeypatch):
     theirs = np.asarray(jax.jit(jax.vmap(function), compiler_options=_quick())(x))
     if seed % 2:
         # Loops and branches where there would be none: all are small here.
-        monkeypatch.setattr(jaxpr, "MIN_BRANCH_OPERATIONS", 2)
-        monkeypatch.setattr(jaxpr, "MAX_UNROLLED_OPERATIONS", 8)
-    program = jaxpr.scalarize(lambda result, x: function(x), RESULT, ARGUMENT)
+        monkeypatch.setattr(control_flow, "MIN_BRANCH_OPERATIONS", 2)
+        monkeypatch.setattr(control_flow, "MAX_UNROLLED_OPERATIONS", 8)
+    program = scalarize(lambda result, x: function(x), RESULT, ARGUMENT)
     monkeypatch.undo()
     arguments = [np.zeros_like(theirs), x]
     agree(evaluate(program, arguments)[0], theirs, function.errors, "in NumPy")

@@ -13,8 +13,8 @@ from jetbot_mjx.envs.jetbot_env import make_env
 from jetbot_mjx.envs.state import PhysicsState
 from onekernel.aot import xla_options
 from onekernel.errors import UnsupportedError
-from onekernel.lower import jaxpr, scalar_ir
-from onekernel.lower.jaxpr import MAX_UNROLLED_OPERATIONS, MIN_BRANCH_OPERATIONS
+from onekernel.lower import control_flow, jaxpr, scalar_ir
+from onekernel.lower.control_flow import MAX_UNROLLED_OPERATIONS, MIN_BRANCH_OPERATIONS
 from onekernel.lower.scalar_ir import Expr
 from onekernel.lower.schedule import PlacedBranch, PlacedLoop
 
@@ -623,7 +623,7 @@ def test_arrays_that_take_too_much_memory_are_refused():
 
 
 def test_of_a_scan_that_can_be_neither_loop_nor_written_out_the_loops_reason_is_told(monkeypatch):
-    monkeypatch.setattr(jaxpr, "MAX_ARRAY_BYTES", 100)
+    monkeypatch.setattr(control_flow, "MAX_ARRAY_BYTES", 100)
     monkeypatch.setattr(scalar_ir, "MAX_OPERATIONS", 250)
     with pytest.raises(UnsupportedError, match=r"^arrays of 280 bytes"):
         jaxpr.scalarize(sums(70), VECTOR)

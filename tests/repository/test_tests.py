@@ -52,8 +52,10 @@ TOGETHER = {
     "onekernel/test_fuse": "onekernel.check onekernel.explanation",
     "onekernel/test_llvm_backend": "onekernel.cpu",
     "onekernel/test_llvm_codegen": "onekernel.codegen onekernel.cpu",
-    "onekernel/test_lower_jaxpr": "onekernel.lower.jaxpr",
-    "onekernel/test_operations": "onekernel.lower.dynamic_indexing onekernel.lower.expansions",
+    "onekernel/test_lower_jaxpr": "onekernel.lower.jaxpr onekernel.lower.control_flow"
+    " onekernel.lower.derived_carries",
+    "onekernel/test_operations": "onekernel.lower.arithmetic onekernel.lower.dynamic_indexing"
+    " onekernel.lower.expansions",
     "onekernel/test_program_cache": "envs.program_key",
     "onekernel/test_ptx_backend": "onekernel.gpu",
     "onekernel/test_scalar_ir": "onekernel.lower.indexing",

@@ -1,0 +1,267 @@
+"""Lower operations with arithmetic: those on each element, reductions, products of matrices.
+
+A rule is a function of the graph, the equation and its operands, one array of scalars each.
+"""
+
+import functools
+from collections.abc import Callable, Iterable, Sequence
+
+import numpy as np
+from jax.extend.core import JaxprEqn
+
+from onekernel.errors import UnsupportedError
+from onekernel.lower.indexing import (
+    Rule,
+    ScalarArray,
+    constant_array,
+    dtype_of,
+    full_array,
+    scalar_array,
+    shape_of,
+)
+from onekernel.lower.random_rules import Key, like, words_of
+from onekernel.lower.scalar_ir import ExprGraph, Scalar
+
+_FLOAT, _INT = np.dtype(np.float32), np.dtype(np.int32)
+_WORDS = {_FLOAT, _INT, np.dtype(np.uint32), np.dtype(bool)}
+
+# Functions that other modules use, too.
+
+
+def elementwise(graph: ExprGraph, op: str, *operands: ScalarArray) -> ScalarArray:
+    """Apply an operation of the graph to each element; the operands broadcast."""
+    arrays = np.broadcast_arrays(*operands)
+    rows = zip(*(array.ravel() for array in arrays), strict=True)
+    return scalar_array((graph.apply(op, *row) for row in rows), arrays[0].shape)
+
+
+def where(
+    graph: ExprGraph, condition: Scalar | ScalarArray, if_false: ScalarArray, if_true: ScalarArray
+) -> ScalarArray:
+    """Select between two arrays by one condition, or one for each index of leading axes."""
+    if not isinstance(condition, np.ndarray):
+        condition = scalar_array([condition], ())
+    # Give the condition axes of length 1 behind its own, so that it broadcasts along the
+    # others.
+    trailing = [1] * (if_false.ndim - condition.ndim)
+    arrays = np.broadcast_arrays(
+        condition.reshape((*condition.shape, *trailing)), if_false, if_true
+    )
+    rows = zip(*(array.ravel() for array in arrays), strict=True)
+    return scalar_array((_select(graph, *row) for row in rows), if_false.shape)
+
+
+def _select(
+    graph: ExprGraph, condition: Scalar, if_false: Scalar | Key, if_true: Scalar | Key
+) -> Scalar | Key:
+    """Select between two scalars, or the words of two random keys."""
+    pairs = zip(words_of(if_false), words_of(if_true), strict=True)
+    return like(if_true, (graph.select(condition, *pair) for pair in pairs))
+
+
+def fold(graph: ExprGraph, op: str, initial: Scalar, scalars: Iterable[Scalar]) -> Scalar:
+    """Combine scalars by an operation, one after the other."""
+    return functools.reduce(functools.partial(graph.apply, op), scalars, initial)
+
+
+def at(array: ScalarArray, i: int) -> ScalarArray:
+    """Return one entry along the leading axis, as an array even if it is a single scalar."""
+    return array[i : i + 1].reshape(array.shape[1:])
+
+
+def bitcast(graph: ExprGraph, x: ScalarArray, source: np.dtype, to: np.dtype) -> ScalarArray:
+    """Return the same bits as another dtype; a bool is 0 or 1.
+
+    Args:
+      graph: the graph.
+      x: the scalars.
+      source: their dtype.
+      to: the dtype of the result.
+    """
+    if source == to:
+        return x
+    if not {source, to} <= _WORDS:
+        raise UnsupportedError(f"the bits of {source} as {to}")
+
+    def cast(one: Scalar) -> Scalar:
+        # Between a float32 and an integer, take the bits as they are. Between integers of 32
+        # bits, a conversion keeps them.
+        if {source.kind, to.kind} in ({"f", "i"}, {"f", "u"}):
+            # The graph's `bitcast` is between float32 and int32 only.
+            whole = one if source.kind == "f" else graph.convert(one, np.dtype(np.int32))
+            one = graph.apply("bitcast", whole)
+        return graph.convert(one, to)
+
+    return scalar_array(map(cast, x.ravel()), x.shape)
+
+
+# The rules.
+
+
+def _convert_element_type(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    dtype = np.dtype(equation.params["new_dtype"])
+    return scalar_array((graph.convert(one, dtype) for one in x.ravel()), x.shape)
+
+
+def _bitcast_convert_type(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    source, to = dtype_of(equation.invars[0]), equation.params["new_dtype"]
+    if bool in (source, to):
+        raise UnsupportedError("a bitcast of truth values")
+    return bitcast(graph, x, np.dtype(source), np.dtype(to))
+
+
+def _select_n(
+    graph: ExprGraph, equation: JaxprEqn, which: ScalarArray, *cases: ScalarArray
+) -> ScalarArray:
+    result = cases[-1]
+    for i in reversed(range(len(cases) - 1)):
+        # The index of a case is a bool or an integer.
+        later = [
+            x if x.dtype == bool else graph.apply("gt", x, x.dtype.type(i)) for x in which.ravel()
+        ]
+        result = where(graph, scalar_array(later, which.shape), cases[i], result)
+    return result
+
+
+def _clamp(
+    graph: ExprGraph, equation: JaxprEqn, low: ScalarArray, x: ScalarArray, high: ScalarArray
+) -> ScalarArray:
+    return elementwise(graph, "min", elementwise(graph, "max", x, low), high)
+
+
+def _square(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    return elementwise(graph, "mul", x, x)
+
+
+def _integer_pow(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    one = constant_array(np.ones(x.shape, dtype_of(equation.outvars[0])))
+    # x⁻ⁿ is (1/x)ⁿ. Where a derivative needs it, the function mostly has 1/x already.
+    base = x if equation.params["y"] >= 0 else elementwise(graph, "div", one, x)
+    result = one
+    for _ in range(abs(equation.params["y"])):
+        result = elementwise(graph, "mul", result, base)
+    return result
+
+
+def _logistic(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    one = constant_array(np.float32(1))
+    exp = elementwise(graph, "exp", elementwise(graph, "neg", x))
+    return elementwise(graph, "div", one, elementwise(graph, "add", one, exp))
+
+
+def _rsqrt(graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    return elementwise(graph, "div", constant_array(np.float32(1)), elementwise(graph, "sqrt", x))
+
+
+def _reduce(
+    op: str,
+    initial: Callable[[np.dtype], Scalar],
+    graph: ExprGraph,
+    equation: JaxprEqn,
+    x: ScalarArray,
+) -> ScalarArray:
+    # Each group holds the scalars of one result, which are combined in their order.
+    (groups,) = _group_axes(x, (), equation.params["axes"])
+    first = initial(np.dtype(dtype_of(equation.outvars[0])))
+    scalars = (fold(graph, op, first, group) for group in groups)
+    return scalar_array(scalars, shape_of(equation.outvars[0]))
+
+
+def _cumulate(op: str, graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    # Go along the axis, and combine each entry with the one before it (behind it, if reversed).
+    result = np.moveaxis(x.copy(), equation.params["axis"], 0)
+    order = range(1, len(result))
+    for i in [len(result) - 1 - i for i in order] if equation.params["reverse"] else order:
+        previous = at(result, i + 1 if equation.params["reverse"] else i - 1)
+        # Assign to a slice: assigned to an element, the array would become a nested object.
+        result[i : i + 1] = elementwise(graph, op, previous, at(result, i))[None]
+    return np.moveaxis(result, 0, equation.params["axis"])
+
+
+def _arg_extreme(better: str, graph: ExprGraph, equation: JaxprEqn, x: ScalarArray) -> ScalarArray:
+    (axis,) = equation.params["axes"]
+    kind = dtype_of(equation.outvars[0]).type
+    # The graph cannot compare truth values.
+    if dtype_of(equation.invars[0]) == np.dtype(bool):
+        x = scalar_array((graph.convert(one, np.dtype(np.int32)) for one in x.ravel()), x.shape)
+    x = np.moveaxis(x, axis, -1)
+    places = full_array(x.shape[:-1], lambda: kind(0))
+    # Keep the best scalar so far and its place; a later one must be better, so the first of
+    # equals wins.
+    for row in np.ndindex(*x.shape[:-1]):
+        best = x[row][0]
+        for i, scalar in enumerate(x[row][1:], start=1):
+            wins = graph.apply(better, scalar, best)
+            if not graph.finite and scalar.dtype.kind == "f":
+                # The first NaN wins.
+                is_nan = graph.apply("ne", scalar, scalar)
+                is_first = graph.apply("eq", best, best)
+                wins = graph.apply("or", wins, graph.apply("and", is_nan, is_first))
+            best = graph.select(wins, best, scalar)
+            places[row] = graph.select(wins, places.item(*row), kind(i))
+    return places
+
+
+def _dot_general(
+    graph: ExprGraph, equation: JaxprEqn, a: ScalarArray, b: ScalarArray
+) -> ScalarArray:
+    # Group the axes of both operands as (batch, free, summed); the result has (batch, free a,
+    # free b).
+    (sum_a, sum_b), (batch_a, batch_b) = equation.params["dimension_numbers"]
+    rows = _group_axes(a, batch_a, sum_a)
+    columns = _group_axes(b, batch_b, sum_b)
+    dtype = np.dtype(dtype_of(equation.outvars[0]))
+    sums = []
+    for row_group, column_group in zip(rows, columns, strict=True):
+        for row in row_group:
+            for column in column_group:
+                total: Scalar = dtype.type(0)
+                for pair in zip(row, column, strict=True):
+                    # The operands may have different dtypes, such as int32 and float32.
+                    x, y = (graph.convert(scalar, dtype) for scalar in pair)
+                    product = graph.apply("mul", x, y)
+                    total = graph.apply("add", total, product)
+                sums.append(total)
+    return scalar_array(sums, shape_of(equation.outvars[0]))
+
+
+def _lowest(dtype: np.dtype) -> np.floating:
+    """Return the number that changes no maximum: max(-inf, x) is x."""
+    if dtype.kind != "f":
+        raise UnsupportedError(f"the extreme of {dtype}")
+    return dtype.type(-np.inf)
+
+
+def _group_axes(x: ScalarArray, batch: Sequence[int], summed: Sequence[int]) -> ScalarArray:
+    """Return an array with its axes grouped as (batch, free, summed)."""
+    free = [axis for axis in range(x.ndim) if axis not in batch and axis not in summed]
+    sizes = [
+        int(np.prod([x.shape[axis] for axis in axes], dtype=int)) for axes in (batch, free, summed)
+    ]
+    return x.transpose(*batch, *free, *summed).reshape(sizes)
+
+
+ARITHMETIC_RULES: dict[str, Rule] = {
+    "convert_element_type": _convert_element_type,
+    "bitcast_convert_type": _bitcast_convert_type,
+    "select_n": _select_n,
+    "clamp": _clamp,
+    "square": _square,
+    "integer_pow": _integer_pow,
+    "logistic": _logistic,
+    "rsqrt": _rsqrt,
+    "reduce_sum": functools.partial(_reduce, "add", lambda dtype: dtype.type(0)),
+    "reduce_prod": functools.partial(_reduce, "mul", lambda dtype: dtype.type(1)),
+    "reduce_and": functools.partial(_reduce, "and", lambda dtype: ~dtype.type(0)),
+    "reduce_or": functools.partial(_reduce, "or", lambda dtype: dtype.type(0)),
+    "reduce_max": functools.partial(_reduce, "max", _lowest),
+    "reduce_min": functools.partial(_reduce, "min", lambda dtype: -_lowest(dtype)),
+    "cummax": functools.partial(_cumulate, "max"),
+    "cummin": functools.partial(_cumulate, "min"),
+    "cumprod": functools.partial(_cumulate, "mul"),
+    "cumsum": functools.partial(_cumulate, "add"),
+    "argmin": functools.partial(_arg_extreme, "lt"),
+    "argmax": functools.partial(_arg_extreme, "gt"),
+    "dot_general": _dot_general,
+}
+"""The rules by the names of JAX's primitives."""
