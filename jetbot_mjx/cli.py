@@ -379,6 +379,7 @@ def add_checkpoint_arguments(
     parser.add_argument("run", nargs=nargs, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
+        dest="which",
         type=which_checkpoint,
         default="best",
         metavar="best|last|STEPS",

@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         exported = export_policy(
             run,
             formats=tuple(dict.fromkeys(options.format or ("numpy",))),
-            which=options.checkpoint,
+            which=options.which,
             output=options.output,
         )
     cli.tell(summarize_export(exported))

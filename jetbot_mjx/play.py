@@ -52,6 +52,7 @@ def _parser() -> cli.Parser:
     )
     parser.add_argument(
         "--allow-origin",
+        dest="allow",
         type=cli.origin,
         action="append",
         default=[],
@@ -71,25 +72,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    options = _parser().parse_args(arguments)
-    run = cli.find_policy(options.run or f"pretrained:{_DEFAULT_POLICY}")
+    # The other options are named as the arguments of `play_live`.
+    options = vars(_parser().parse_args(arguments))
+    given = options.pop("run")
+    run = cli.find_policy(given or f"pretrained:{_DEFAULT_POLICY}")
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live
     cli.prepare_device()
-    if options.run is None:
+    if given is None:
         cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
-    successes, episodes = play_live(
-        run,
-        viewer=options.viewer,
-        agent=options.agent,
-        which=options.checkpoint,
-        seed=options.seed,
-        robots=options.robots,
-        host=options.host,
-        port=options.port,
-        allow=options.allow_origin,
-        tell=cli.tell,
-    )
+    successes, episodes = play_live(run, **options, tell=cli.tell)
     cli.tell(f"{successes} of {episodes} goals reached")
     return 0
 

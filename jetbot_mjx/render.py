@@ -48,7 +48,7 @@ def _parser() -> cli.Parser:
 
 def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
-    chosen = options.checkpoint != "best"
+    chosen = options.which != "best"
     for both, option, other in (
         (options.gallery and options.goals, "--goals", "--gallery"),
         (options.gallery and chosen, "--checkpoint", "--gallery"),
@@ -74,7 +74,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    run, which, episodes = cli.find_policy(options.run), options.checkpoint, options.episodes
+    run, which, episodes = cli.find_policy(options.run), options.which, options.episodes
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,
