@@ -16,25 +16,11 @@ BELOW_TARGET = 1
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx evaluate", description=__doc__)
     cli.add_checkpoint_arguments(parser, several=True)
-    parser.add_argument(
-        "--episodes",
-        type=cli.whole_number(1, MOST_GOALS),
-        default=REPORT_GOALS,
-        metavar="N",
-        help=f"drive to the first N of the fixed goals (default: {REPORT_GOALS:,})",
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="DIR",
-        help="folder for the report, or for the comparison of several runs or seeds",
-    )
-    parser.add_argument(
-        "--robustness",
-        action="store_true",
-        help="evaluate also on robots that differ from the preset in friction, mass, motors and"
-        " delay, and in C MuJoCo",
-    )
+    first = "drive to the first N of the fixed goals"
+    cli.add_count(parser, "--episodes", first, most=MOST_GOALS, default=REPORT_GOALS)
+    cli.add_output(parser, "folder for the report, or for the comparison of several runs or seeds")
+    others = "robots that differ from the preset in friction, mass, motors and delay"
+    cli.add_flag(parser, "--robustness", f"evaluate also on {others}, and in C MuJoCo")
     parser.add_argument(
         "--simulator",
         choices=("mujoco",),

@@ -16,32 +16,17 @@ def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx play", description=__doc__)
     default = f"pretrained:{_DEFAULT_POLICY}"
     cli.add_checkpoint_arguments(parser, default=default)
-    parser.add_argument(
-        "--viewer",
-        choices=("browser", "native"),
-        default="browser",
-        help="a page in the browser, or MuJoCo's own window (default: browser)",
-    )
-    parser.add_argument(
-        "--agent",
-        choices=_AGENTS,
-        default="policy",
-        help="initial driver; the page can switch it (default: policy)",
-    )
+    viewers = "a page in the browser, or MuJoCo's own window"
+    cli.add_choice(parser, "--viewer", ("browser", "native"), viewers)
+    cli.add_choice(parser, "--agent", _AGENTS, "initial driver; the page can switch it")
     parser.add_argument(
         "--seed",
         type=cli.whole_number(0),
         default=0,
         help="random seed of the goals (default: 0)",
     )
-    robots = cli.whole_number(1, 256)  # what two CPU cores still drive in real time
-    parser.add_argument(
-        "--robots",
-        type=robots,
-        default=1,
-        metavar="N",
-        help="number of robots that drive at once (default: 1)",
-    )
+    # At most as many as two CPU cores still drive in real time.
+    cli.add_count(parser, "--robots", "number of robots that drive at once", most=256, default=1)
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: this machine alone)"
     )
