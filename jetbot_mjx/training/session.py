@@ -468,14 +468,11 @@ def _open_folders(
 
 
 def _result(training: Training, recorder: RunRecorder | None, *, finished: bool) -> Result:
-    return Result(
-        run_dir=training.run_dir,
-        run_dirs=training.run_dirs,
-        standings=recorder.standings if recorder else [],
-        fingerprints=[seed.fingerprint for seed in recorder.seeds] if recorder else [],
-        finished=finished,
-        wall_seconds=recorder.wall_seconds if recorder else 0.0,
-    )
+    folders = training.run_dir, training.run_dirs
+    if recorder is None:
+        return Result(*folders, [], [], finished, 0.0)
+    fingerprints = [seed.fingerprint for seed in recorder.seeds]
+    return Result(*folders, recorder.standings, fingerprints, finished, recorder.wall_seconds)
 
 
 def _complete_message(config: Config, standings: Sequence[Standing]) -> str:
