@@ -297,6 +297,54 @@ seed = whole_number(0, 2**32 - 1)
 fraction = number(float, 0, 1)
 
 
+def add_count(
+    parser: argparse._ActionsContainer,
+    name: str,
+    text: str,
+    *,
+    least: int = 1,
+    most: int = _LARGEST,
+    default: int | None = None,
+) -> None:
+    """Add an option that takes a whole number.
+
+    Args:
+      parser: the parser of the command, or a group of its arguments.
+      name: the name of the option.
+      text: the help, to which a default is added.
+      least: the smallest accepted value.
+      most: the largest accepted value.
+      default: the value where the option is absent; None: the help says what that means.
+    """
+    shown = "" if default is None else f" (default: {default:,})"
+    kind = whole_number(least, most)
+    parser.add_argument(name, type=kind, default=default, metavar="N", help=text + shown)
+
+
+def add_flag(parser: argparse.ArgumentParser, name: str, text: str) -> None:
+    """Add an option without a value, with a name and a help."""
+    parser.add_argument(name, action="store_true", help=text)
+
+
+def add_choice(
+    parser: argparse.ArgumentParser, name: str, choices: Sequence[str], text: str
+) -> None:
+    """Add an option that takes one of several words, by default the first; the help says so."""
+    text = f"{text} (default: {choices[0]})"
+    parser.add_argument(name, choices=choices, default=choices[0], help=text)
+
+
+def add_output(parser: argparse.ArgumentParser, text: str, default: Path | None = None) -> None:
+    """Add the option `--output`, which names a folder.
+
+    Args:
+      parser: the parser of the command.
+      text: the help.
+      default: the folder where the option is absent; None: the help says what that means.
+    """
+    parser.add_argument("--output", type=Path, default=default, metavar="DIR", help=text)
+
+
 def which_checkpoint(text: str) -> Literal["best", "last"] | int:
     """Parse an argument that names a checkpoint of a run."""
     if text == "best" or text == "last":
@@ -379,6 +427,7 @@ def add_checkpoint_arguments(
     parser.add_argument("run", nargs=nargs, metavar="RUN", help=what)
     parser.add_argument(
         "--checkpoint",
+        dest="which",
         type=which_checkpoint,
         default="best",
         metavar="best|last|STEPS",

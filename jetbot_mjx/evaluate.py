@@ -16,25 +16,11 @@ BELOW_TARGET = 1
 def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx evaluate", description=__doc__)
     cli.add_checkpoint_arguments(parser, several=True)
-    parser.add_argument(
-        "--episodes",
-        type=cli.whole_number(1, MOST_GOALS),
-        default=REPORT_GOALS,
-        metavar="N",
-        help=f"drive to the first N of the fixed goals (default: {REPORT_GOALS:,})",
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="DIR",
-        help="folder for the report, or for the comparison of several runs or seeds",
-    )
-    parser.add_argument(
-        "--robustness",
-        action="store_true",
-        help="evaluate also on robots that differ from the preset in friction, mass, motors and"
-        " delay, and in C MuJoCo",
-    )
+    first = "drive to the first N of the fixed goals"
+    cli.add_count(parser, "--episodes", first, most=MOST_GOALS, default=REPORT_GOALS)
+    cli.add_output(parser, "folder for the report, or for the comparison of several runs or seeds")
+    others = "robots that differ from the preset in friction, mass, motors and delay"
+    cli.add_flag(parser, "--robustness", f"evaluate also on {others}, and in C MuJoCo")
     parser.add_argument(
         "--simulator",
         choices=("mujoco",),
@@ -66,8 +52,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0, or 1 if a success rate is below `--min-success`.
     """
-    options = _parser().parse_args(arguments)
-    runs = [cli.find_policy(name) for name in options.run]
+    # The other options are named as the arguments of the functions that evaluate.
+    options = vars(_parser().parse_args(arguments))
+    runs = [cli.find_policy(name) for name in options.pop("run")]
+    target = options.pop("min_success")
     with startup.exit_on_interrupt():
         from jetbot_mjx.evaluation import (
             below_target,
@@ -78,23 +66,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         )
         from jetbot_mjx.runs import seed_folders
     cli.prepare_device()
-    settings = {
-        "episodes": options.episodes,
-        "which": options.checkpoint,
-        "output": options.output,
-        "robustness": options.robustness,
-        "ranges": options.ranges,
-        "simulator": options.simulator,
-    }
     with cli.show_progress():
         if len(runs) > 1 or seed_folders(runs[0]):
-            result = compare_runs(runs, **settings)
+            result = compare_runs(runs, **options)
             text = summarize_comparison(result)
         else:
-            result = evaluate_run(runs[0], **settings)
+            result = evaluate_run(runs[0], **options)
             text = summarize_report(result)
     cli.tell(text)
-    below = below_target(result, options.min_success)
+    below = below_target(result, target)
     if below:
         cli.tell("\n".join(below))
     return BELOW_TARGET if below else 0

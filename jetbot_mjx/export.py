@@ -8,7 +8,6 @@ If a file differs from JAX by more than the tolerance, nothing is written.
 
 import argparse
 from collections.abc import Sequence
-from pathlib import Path
 
 from jetbot_mjx import cli, startup
 
@@ -35,9 +34,7 @@ def _parser() -> cli.Parser:
         metavar="|".join([*_FORMATS, "all"]),
         help="file format to write, or several with commas between them (default: numpy)",
     )
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help=f"folder to write (default: RUN/{_FOLDER})"
-    )
+    cli.add_output(parser, f"folder to write (default: RUN/{_FOLDER})")
     return parser
 
 
@@ -59,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         exported = export_policy(
             run,
             formats=tuple(dict.fromkeys(options.format or ("numpy",))),
-            which=options.checkpoint,
+            which=options.which,
             output=options.output,
         )
     cli.tell(summarize_export(exported))

@@ -16,32 +16,17 @@ def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx play", description=__doc__)
     default = f"pretrained:{_DEFAULT_POLICY}"
     cli.add_checkpoint_arguments(parser, default=default)
-    parser.add_argument(
-        "--viewer",
-        choices=("browser", "native"),
-        default="browser",
-        help="a page in the browser, or MuJoCo's own window (default: browser)",
-    )
-    parser.add_argument(
-        "--agent",
-        choices=_AGENTS,
-        default="policy",
-        help="initial driver; the page can switch it (default: policy)",
-    )
+    viewers = "a page in the browser, or MuJoCo's own window"
+    cli.add_choice(parser, "--viewer", ("browser", "native"), viewers)
+    cli.add_choice(parser, "--agent", _AGENTS, "initial driver; the page can switch it")
     parser.add_argument(
         "--seed",
         type=cli.whole_number(0),
         default=0,
         help="random seed of the goals (default: 0)",
     )
-    robots = cli.whole_number(1, 256)  # what two CPU cores still drive in real time
-    parser.add_argument(
-        "--robots",
-        type=robots,
-        default=1,
-        metavar="N",
-        help="number of robots that drive at once (default: 1)",
-    )
+    # At most as many as two CPU cores still drive in real time.
+    cli.add_count(parser, "--robots", "number of robots that drive at once", most=256, default=1)
     parser.add_argument(
         "--host", default="127.0.0.1", help="address to listen on (default: this machine alone)"
     )
@@ -52,6 +37,7 @@ def _parser() -> cli.Parser:
     )
     parser.add_argument(
         "--allow-origin",
+        dest="allow",
         type=cli.origin,
         action="append",
         default=[],
@@ -71,25 +57,16 @@ def main(arguments: Sequence[str] | None = None) -> int:
     Returns:
       0.
     """
-    options = _parser().parse_args(arguments)
-    run = cli.find_policy(options.run or f"pretrained:{_DEFAULT_POLICY}")
+    # The other options are named as the arguments of `play_live`.
+    options = vars(_parser().parse_args(arguments))
+    given = options.pop("run")
+    run = cli.find_policy(given or f"pretrained:{_DEFAULT_POLICY}")
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import play_live
     cli.prepare_device()
-    if options.run is None:
+    if given is None:
         cli.tell(f"no RUN given: playing pretrained:{_DEFAULT_POLICY}")
-    successes, episodes = play_live(
-        run,
-        viewer=options.viewer,
-        agent=options.agent,
-        which=options.checkpoint,
-        seed=options.seed,
-        robots=options.robots,
-        host=options.host,
-        port=options.port,
-        allow=options.allow_origin,
-        tell=cli.tell,
-    )
+    successes, episodes = play_live(run, **options, tell=cli.tell)
     cli.tell(f"{successes} of {episodes} goals reached")
     return 0
 

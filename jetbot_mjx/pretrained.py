@@ -23,13 +23,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
       0.
     """
     parser = cli.Parser(prog="jetbot-mjx pretrained", description=__doc__)
-    parser.add_argument(
-        "--output",
-        type=Path,
-        default=FOLDER,
-        metavar="DIR",
-        help=f"folder for the copies (default: {FOLDER})",
-    )
+    cli.add_output(parser, f"folder for the copies (default: {FOLDER})", FOLDER)
     options = parser.parse_args(arguments)
     with startup.exit_on_interrupt():
         from jetbot_mjx.runs import copy_pretrained

@@ -17,38 +17,25 @@ def _parser() -> cli.Parser:
     parser = cli.Parser(prog="jetbot-mjx render", description=__doc__)
     cli.add_checkpoint_arguments(parser)
     group = parser.add_mutually_exclusive_group()
-    group.add_argument(
-        "--episodes",
-        type=cli.whole_number(1, REPORT_GOALS),
-        metavar="N",
-        help="drive to the first N of the fixed goals (default: 20; 4 with --gallery)",
-    )
+    first = "drive to the first N of the fixed goals (default: 20; 4 with --gallery)"
+    cli.add_count(group, "--episodes", first, most=REPORT_GOALS)
     group.add_argument(
         "--goals",
         type=cli.goals,
         metavar="I,J-K",
         help="drive to these of the fixed goals, such as 3,17 or 0-7",
     )
-    number = cli.whole_number(1, REPORT_GOALS)
-    group.add_argument(
-        "--many", type=number, metavar="N", help="N robots in one scene, each with its own goal"
-    )
-    parser.add_argument(
-        "--gallery",
-        action="store_true",
-        help="the first, the middle and the last checkpoint of the run side by side",
-    )
-    parser.add_argument(
-        "--strip",
-        action="store_true",
-        help="one image of an untrained, an early and a trained policy",
-    )
+    many = "N robots in one scene, each with its own goal"
+    cli.add_count(group, "--many", many, most=REPORT_GOALS)
+    gallery = "the first, the middle and the last checkpoint of the run side by side"
+    cli.add_flag(parser, "--gallery", gallery)
+    cli.add_flag(parser, "--strip", "one image of an untrained, an early and a trained policy")
     return parser
 
 
 def _check(parser: cli.Parser, options: argparse.Namespace) -> None:
     """Refuse options that do not go together."""
-    chosen = options.checkpoint != "best"
+    chosen = options.which != "best"
     for both, option, other in (
         (options.gallery and options.goals, "--goals", "--gallery"),
         (options.gallery and chosen, "--checkpoint", "--gallery"),
@@ -74,7 +61,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     options = parser.parse_args(arguments)
     _check(parser, options)
-    run, which, episodes = cli.find_policy(options.run), options.checkpoint, options.episodes
+    run, which, episodes = cli.find_policy(options.run), options.which, options.episodes
     with startup.exit_on_interrupt():
         from jetbot_mjx.viewers import (
             GALLERY_EPISODES,

@@ -22,26 +22,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     parser = cli.Parser(prog="jetbot-mjx sim2real", description=__doc__)
     parser.add_argument("log", type=Path, metavar="LOG", help="a file of deploy/drive.py --log")
-    seconds = cli.number(float, 0)
-    parser.add_argument(
-        "--delay",
-        type=seconds,
-        default=0.0,
-        metavar="S",
-        help="delay of the motors [s] (default: 0)",
-    )
-    parser.add_argument(
-        "--lag",
-        type=seconds,
-        metavar="S",
-        help="lag of the motors [s] (default: that of the calibration)",
-    )
-    parser.add_argument(
-        "--output",
-        type=Path,
-        metavar="DIR",
-        help="folder of the results (default: that of the log)",
-    )
+    for name, default, text in (
+        ("--delay", 0.0, "delay of the motors [s] (default: 0)"),
+        ("--lag", None, "lag of the motors [s] (default: that of the calibration)"),
+    ):
+        seconds = cli.number(float, 0)
+        parser.add_argument(name, type=seconds, default=default, metavar="S", help=text)
+    cli.add_output(parser, "folder of the results (default: that of the log)")
     options = parser.parse_args(arguments)
     with startup.exit_on_interrupt():
         from jetbot_mjx.deployment import compare_drive, summarize_drive

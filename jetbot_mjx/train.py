@@ -32,12 +32,10 @@ def _parser() -> cli.Parser:
     parser.add_argument(
         "--run-dir", type=Path, help="run folder (default: runs/<config>-<date>-<time>)"
     )
-    parser.add_argument(
-        "--distributed",
-        action="store_true",
-        help="this is one of several processes that train one policy, under srun, mpirun, or with"
-        " JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID",
-    )
+    variables = "JAX_COORDINATOR_ADDRESS, JAX_NUM_PROCESSES and JAX_PROCESS_ID"
+    started = f"under srun, mpirun, or with {variables}"
+    text = f"this is one of several processes that train one policy, {started}"
+    cli.add_flag(parser, "--distributed", text)
     return parser
 
 

@@ -16,34 +16,15 @@ def _parser() -> cli.Parser:
     cli.add_config_arguments(parser)
     what = "YAML file with the settings to search, or `ppo`, which comes with the package"
     parser.add_argument("--space", type=Path, required=True, metavar="SPACE", help=what)
-    parser.add_argument(
-        "--trials",
-        type=cli.positive_int,
-        default=64,
-        metavar="N",
-        help="how many trials the study shall have (default: 64)",
-    )
-    parser.add_argument(
-        "--round",
-        type=cli.whole_number(1, 1024),
-        default=16,
-        metavar="N",
-        help="how many trials to train at once (default: 16)",
-    )
+    cli.add_count(parser, "--trials", "how many trials the study shall have", default=64)
+    cli.add_count(parser, "--round", "how many trials to train at once", most=1024, default=16)
     parser.add_argument(
         "--storage", metavar="URL", help="database of the study (default: SQLite in --output)"
     )
-    parser.add_argument(
-        "--confirm",
-        type=cli.whole_number(0),
-        default=3,
-        metavar="N",
-        help="how many of the best trials to retrain with new seeds, beside the configuration as"
-        " given; 0: none (default: 3)",
-    )
-    parser.add_argument(
-        "--output", type=Path, metavar="DIR", help="default: runs/tune-<config>-<date>-<time>"
-    )
+    given = "beside the configuration as given; 0: none"
+    text = f"how many of the best trials to retrain with new seeds, {given}"
+    cli.add_count(parser, "--confirm", text, least=0, default=3)
+    cli.add_output(parser, "default: runs/tune-<config>-<date>-<time>")
     return parser
 
 

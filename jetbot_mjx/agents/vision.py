@@ -126,21 +126,18 @@ def make_vision_networks(
     )
 
     # For inference: encode and apply one network.
-    def apply_policy(normalizer: Normalizer, params: PyTree, obs: Images) -> Array:
-        encoded = {_POLICY: encode_one(normalizer, params, obs)}
-        return heads.policy_network.apply(None, params, encoded)
+    def with_encoder(
+        name: str, head: brax_networks.FeedForwardNetwork
+    ) -> brax_networks.FeedForwardNetwork:
+        def apply(normalizer: Normalizer, params: PyTree, obs: Images) -> Array:
+            return head.apply(None, params, {name: encode_one(normalizer, params, obs)})
 
-    def apply_value(normalizer: Normalizer, params: PyTree, obs: Images) -> Array:
-        encoded = {_VALUE: encode_one(normalizer, params, obs)}
-        return heads.value_network.apply(None, params, encoded)
+        return brax_networks.FeedForwardNetwork(init=head.init, apply=apply)
 
+    on_images = with_encoder(_VALUE, heads.value_network)
     return VisionNetworks(
-        policy_network=brax_networks.FeedForwardNetwork(
-            init=heads.policy_network.init, apply=apply_policy
-        ),
-        value_network=heads.value_network
-        if config.shared_cnn
-        else brax_networks.FeedForwardNetwork(init=heads.value_network.init, apply=apply_value),
+        policy_network=with_encoder(_POLICY, heads.policy_network),
+        value_network=heads.value_network if config.shared_cnn else on_images,
         parametric_action_distribution=heads.parametric_action_distribution,
         heads=heads,
         encode=encode,

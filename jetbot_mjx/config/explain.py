@@ -17,6 +17,7 @@ _KINDS = {
     "boolean": "true or false",
     "string": "text",
     "dictionary": "a dictionary",
+    "tuple": "a list",
 }
 """Pydantic's names of types, in words."""
 
@@ -36,8 +37,6 @@ def explain(error: ErrorDetails) -> str:
         case "missing" if isinstance(error["input"], list | tuple):
             value = shown(list(error["input"]))
             return f"{'.'.join(location[:-1])} = {value} is wrong: it lacks items"
-        case "tuple_type":
-            return f"{key} = {value} is wrong: it should be a list"
         case "too_short":
             return f"{key} = {value} is wrong: it should have at least 1 item"
         case "too_long":

@@ -10,33 +10,25 @@ ALL_KEYS = tuple(Config().flat())
 
 
 _OTHER_NAMES = {
-    "lr": "ppo.learning_rate",
-    "gamma": "ppo.discounting",
-    "discount": "ppo.discounting",
-    "lam": "ppo.gae_lambda",
-    "n_envs": "ppo.num_envs",
-    "n_steps": "ppo.unroll_length",
-    "num_steps": "ppo.unroll_length",
-    "n_epochs": "ppo.num_updates_per_batch",
-    "num_epochs": "ppo.num_updates_per_batch",
-    "update_epochs": "ppo.num_updates_per_batch",
-    "total_timesteps": "ppo.num_timesteps",
-    "timesteps": "ppo.num_timesteps",
-    "minibatches": "ppo.num_minibatches",
-    "minibatch_size": "ppo.batch_size",
-    "clip_range": "ppo.clipping_epsilon",
-    "clip_coef": "ppo.clipping_epsilon",
-    "ent_coef": "ppo.entropy_cost",
-    "entropy_coef": "ppo.entropy_cost",
-    "vf_coef": "ppo.vf_loss_coefficient",
-    "target_kl": "ppo.desired_kl",
-    "net_arch": "ppo.network.policy_hidden_layer_sizes",
-    "random_seed": "seed",
-    "num_seeds": "seeds",
-    "n_seeds": "seeds",
+    "ppo.learning_rate": "lr",
+    "ppo.discounting": "gamma discount",
+    "ppo.gae_lambda": "lam",
+    "ppo.num_envs": "n_envs",
+    "ppo.unroll_length": "n_steps num_steps",
+    "ppo.num_updates_per_batch": "n_epochs num_epochs update_epochs",
+    "ppo.num_timesteps": "total_timesteps timesteps",
+    "ppo.num_minibatches": "minibatches",
+    "ppo.batch_size": "minibatch_size",
+    "ppo.clipping_epsilon": "clip_range clip_coef",
+    "ppo.entropy_cost": "ent_coef entropy_coef",
+    "ppo.vf_loss_coefficient": "vf_coef",
+    "ppo.desired_kl": "target_kl",
+    "ppo.network.policy_hidden_layer_sizes": "net_arch",
+    "seed": "random_seed",
+    "seeds": "num_seeds n_seeds",
 }
-"""Settings by the names that Stable-Baselines3, CleanRL, rsl_rl and Brax have for them; they are
-suggested, and not accepted."""
+"""The names that Stable-Baselines3, CleanRL, rsl_rl and Brax have for settings; they are suggested,
+and not accepted."""
 
 
 def keys_meant_by(key: str, *, similar: bool = True) -> list[str]:
@@ -47,8 +39,8 @@ def keys_meant_by(key: str, *, similar: bool = True) -> list[str]:
       similar: whether keys that are only spelt like it count too.
     """
     section, _, last = key.rpartition(".")
-    if last in _OTHER_NAMES:
-        return [_OTHER_NAMES[last]]
+    if meant := [known for known, names in _OTHER_NAMES.items() if last in names.split()]:
+        return meant
     # A key may be that of another section, such as learning_rate without `ppo.`.
     names = {known: known.rpartition(".")[2] for known in ALL_KEYS}
     likely = [known for known, name in names.items() if last == name]

@@ -82,33 +82,28 @@ class Config(Section):
     @model_validator(mode="after")
     def _settings_fit(self) -> Self:
         step = self.ppo.steps_per_training_step
-        unseen = None if self.task.sees else next(iter(self.randomization.looks), None)
-        for is_wrong, message in (
-            (
-                self.seed + self.seeds > 2**32,
+        if self.seed + self.seeds > 2**32:
+            raise ValueError(
                 f"seeds = {self.seeds} from seed = {self.seed} on go beyond {2**32 - 1}:"
-                f" make seed at most {2**32 - self.seeds}",
-            ),
-            (
-                unseen is not None,
-                f"randomization.{unseen} = {list(self.randomization.drawn.get(str(unseen), ()))}"
+                f" make seed at most {2**32 - self.seeds}"
+            )
+        if (looks := self.randomization.looks) and not self.task.sees:
+            raise ValueError(
+                f"randomization.{looks[0]} = {list(self.randomization.drawn[looks[0]])}"
                 f" changes an image, and task.observation = {self.task.observation!r} sees none:"
-                " set task.observation: camera, or leave it out",
-            ),
-            (
-                self.task.sees and self.init_from is not None,
+                " set task.observation: camera, or leave it out"
+            )
+        if self.task.sees and self.init_from is not None:
+            raise ValueError(
                 f"init_from = {shown(self.init_from)}: a policy with task.observation ="
-                f" {self.task.observation!r} cannot begin with another's: leave it out",
-            ),
-            (
-                self.checkpoint_interval < step,
+                f" {self.task.observation!r} cannot begin with another's: leave it out"
+            )
+        if self.checkpoint_interval < step:
+            raise ValueError(
                 f"checkpoint_interval = {self.checkpoint_interval} is shorter than one training"
                 f" step of {step} environment steps (ppo.batch_size * ppo.num_minibatches *"
-                f" ppo.unroll_length): make it at least {step}",
-            ),
-        ):
-            if is_wrong:
-                raise ValueError(message)
+                f" ppo.unroll_length): make it at least {step}"
+            )
         return self
 
     @model_validator(mode="after")

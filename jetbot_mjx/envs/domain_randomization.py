@@ -7,7 +7,7 @@ all robots.
 """
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -32,6 +32,8 @@ from jetbot_mjx.mjx_import import Wrapper
 LARGEST_TRACED = {"action_delay": 9, "observation_delay": 6, "camera_delay": 9, "clutter": 4}
 """Largest values of the quantities for which a program reserves memory, if they are traced: delays
 [control steps], 150 and 100 ms at the default `ctrl_dt`, and objects around."""
+
+_Params = TypeVar("_Params", RobotParams, LookParams)
 
 _MODEL = ("friction", "mass", "com_x", "com_y", "com_z")
 _START = ("start_x", "start_y", "start_yaw")
@@ -133,17 +135,12 @@ class DomainRandomizationWrapper(Wrapper):
         Args:
           state: a state of this environment.
         """
-        return self._robot_params(state.episode_params.drawn)
+        return self._with_drawn(self._constant, state.episode_params.drawn)
 
-    def _robot_params(self, drawn: Float[Array, " quantities"]) -> RobotParams:
-        return self._constant._replace(**self._drawn_of(RobotParams, drawn))
-
-    def _drawn_of(
-        self, kind: type[RobotParams | LookParams], drawn: Float[Array, " quantities"]
-    ) -> dict[str, Array]:
-        """Return the drawn parameters of one kind, by name."""
+    def _with_drawn(self, params: _Params, drawn: Float[Array, " quantities"]) -> _Params:
+        """Return parameters of one kind, of which those that are drawn replace the others."""
         named = zip(self._ranges.drawn, drawn, strict=True)
-        return {name: value for name, value in named if name in kind._fields}
+        return params._replace(**{name: x for name, x in named if name in params._fields})
 
     def _begin_camera(
         self, state: State, drawn: Float[Array, " quantities"], rng: UInt32[Array, "2"]
@@ -152,7 +149,7 @@ class DomainRandomizationWrapper(Wrapper):
         if not self._sees_looks:
             return None
         assert self.camera is not None
-        params = self._constant_looks._replace(**self._drawn_of(LookParams, drawn))
+        params = self._with_drawn(self._constant_looks, drawn)
         key, image_key = jax.random.split(jax.random.fold_in(rng, _KEY_SALT + 2))
         start = seen_pose(self.env.task, state)
         surroundings = draw_surroundings(
@@ -169,7 +166,7 @@ class DomainRandomizationWrapper(Wrapper):
         """
         state = self.env.reset(rng)
         drawn = draw(self._ranges, jax.random.fold_in(rng, _KEY_SALT))
-        robot_params = self._robot_params(drawn)
+        robot_params = self._with_drawn(self._constant, drawn)
         physics = _at_start_pose(state.pipeline_state, robot_params)
         robot = robot_state(physics)
         noise_key = jax.random.fold_in(rng, _KEY_SALT + 1)
@@ -191,7 +188,7 @@ class DomainRandomizationWrapper(Wrapper):
           action: the action, in [-1, 1]².
         """
         drawn, motors, sensors, camera = state.episode_params
-        robot_params = self._robot_params(drawn)
+        robot_params = self._with_drawn(self._constant, drawn)
         # The limit is electronic: it applies before the motor lag.
         command = jnp.clip(self.env.wheel_targets(action), -self._limit, self._limit)
         motors, ctrl = step_actuators(

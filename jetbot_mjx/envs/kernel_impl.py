@@ -1,6 +1,5 @@
 """Choose what computes physics and images: one kernel, or XLA."""
 
-import dataclasses
 import functools
 import threading
 from collections.abc import Callable, Hashable
@@ -11,21 +10,20 @@ from onekernel import Kernel, KernelError, UnsupportedError, default_backend
 from onekernel.build import BACKENDS, Backend
 
 
-@dataclasses.dataclass(frozen=True)
 class KernelImpl:
     """A `KernelImpl` is a setting that chooses the implementation, with its value and kernels."""
 
-    setting: str
-    """The setting's full key."""
-    impl: str
-    """Its value: the name of a back end, `auto` or `xla`."""
-    kernels: dict[Hashable, Kernel | UnsupportedError] = dataclasses.field(
-        default_factory=dict, init=False, compare=False
-    )
-    """Kernels that were looked for, by what they depend on, or why there is none."""
-    _lock: threading.Lock = dataclasses.field(
-        default_factory=threading.Lock, init=False, compare=False
-    )
+    def __init__(self, setting: str, impl: str) -> None:
+        """Hold a setting; no kernel has been looked for yet.
+
+        Args:
+          setting: the setting's full key.
+          impl: its value: the name of a back end, `auto` or `xla`.
+        """
+        self.setting, self.impl = setting, impl
+        self.kernels: dict[Hashable, Kernel | UnsupportedError] = {}
+        """Kernels that were looked for, by what they depend on, or why there is none."""
+        self._lock = threading.Lock()
 
     @property
     def kernel_class(self) -> Callable[..., Kernel]:

@@ -15,19 +15,10 @@ from jetbot_mjx.devices import default_device_cpu
 
 # isort: split
 from mujoco import mjx
-from mujoco.mjx import ConeType, Data, Model, step
-from mujoco.mjx._src import solver
-
-__all__ = [
-    "ConeType",
-    "Data",
-    "Model",
-    "make_data",
-    "put_model",
-    "solver",
-    "step",
-]
-
+from mujoco.mjx import ConeType as ConeType
+from mujoco.mjx import Data, Model
+from mujoco.mjx import step as step
+from mujoco.mjx._src import solver as solver
 
 _Tree = TypeVar("_Tree", Model, Data)
 

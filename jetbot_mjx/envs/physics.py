@@ -141,13 +141,7 @@ class Physics:
         for index, leaf in zip(self._traced_leaves, traced, strict=True):
             leaves[index] = leaf
         # Build the simulation data from the state.
-        data = self._data.replace(
-            qpos=state.qpos,
-            qvel=state.qvel,
-            qacc_warmstart=state.qacc_warmstart,
-            time=state.time,
-            ctrl=ctrl,
-        )
+        data = self._data.replace(**vars(state), ctrl=ctrl)
         if mocap_pos:
             data = data.replace(mocap_pos=mocap_pos[0])
         # By default GPUs multiply float32 matrices in TF32, with which the contact solver diverges.

@@ -160,7 +160,7 @@ def make_mj_model(
     text = resources.files("jetbot_mjx").joinpath("assets/jetbot.xml").read_text()
     spec = mujoco.MjSpec.from_string(text)
     _check_stable(robot, physics)
-    _set_options(spec, physics, robot)
+    _set_options(spec, physics)
     _set_robot(spec, robot)
     build_scene(spec)
     if not visual:
@@ -185,7 +185,7 @@ def _check_stable(robot: Robot, physics: PhysicsConfig) -> None:
         )
 
 
-def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig, robot: Robot) -> None:
+def _set_options(spec: mujoco.MjSpec, physics: PhysicsConfig) -> None:
     option = spec.option
     option.timestep = physics.ctrl_dt / physics.n_substeps
     # Explicit Euler is the cheapest, and stable as long as `_check_stable` holds.

@@ -16,6 +16,7 @@ from jetbot_mjx.envs import mjx
 
 _CHASSIS = "jetbot"
 _SIDES = ("left", "right")
+_COM = ("com_x", "com_y", "com_z")
 
 
 def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotParams) -> mjx.Model:
@@ -45,18 +46,16 @@ def vary_model(model: mjx.Model, mj_model: mujoco.MjModel, robot_params: RobotPa
         mass = jnp.where(chassis, robot_params.mass, 1.0)
         changed["body_mass"] = model.body_mass * mass
         changed["body_inertia"] = model.body_inertia * mass[:, None]
-    if robot_params.differs("com_x", "com_y", "com_z"):
+    if robot_params.differs(*_COM):
         shift = jnp.where(chassis[:, None], _com_shift(robot_params), 0.0)
         changed["body_ipos"] = model.body_ipos + shift
-    if robot_params.differs("mass", "com_x", "com_y", "com_z"):
+    if robot_params.differs("mass", *_COM):
         changed["body_invweight0"] = _invweights(model, mj_model, robot_params)
     return model.replace(**changed)
 
 
 def _com_shift(robot_params: RobotParams) -> Float[Array, "3"]:
-    return jnp.stack(
-        [jnp.asarray(x) for x in (robot_params.com_x, robot_params.com_y, robot_params.com_z)]
-    )
+    return jnp.stack([jnp.asarray(getattr(robot_params, name)) for name in _COM])
 
 
 def _invweights(

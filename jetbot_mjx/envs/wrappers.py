@@ -316,7 +316,7 @@ class BatchWrapper(Wrapper):
         Args:
           rng: one random key per environment.
         """
-        return jax.vmap(self.env.reset)(rng)
+        return self._call("reset", rng)
 
     def step(self, state: State, action: Float[Array, "n 2"]) -> State:
         """Step every environment.
@@ -325,7 +325,11 @@ class BatchWrapper(Wrapper):
           state: the batch of states.
           action: one action per environment, in [-1, 1]².
         """
-        return jax.vmap(self.env.step)(state, action)
+        return self._call("step", state, action)
+
+    def _call(self, method: str, *batch: PyTree) -> State:
+        """Call a method of every environment."""
+        return jax.vmap(getattr(self.env, method))(*batch)
 
     @property
     def step_packed(self) -> PackedStep:
@@ -368,23 +372,6 @@ class RandomizedBatchWrapper(BatchWrapper):
         super().__init__(env)
         self._wrap_one = wrap_one
         self._models, self._axes = randomization_fn(env.mjx_model)
-
-    def reset(self, rng: UInt32[Array, "n 2"]) -> State:
-        """Begin an episode in every environment.
-
-        Args:
-          rng: one random key per environment.
-        """
-        return self._call("reset", rng)
-
-    def step(self, state: State, action: Float[Array, "n 2"]) -> State:
-        """Step every environment.
-
-        Args:
-          state: the batch of states.
-          action: one action per environment, in [-1, 1]².
-        """
-        return self._call("step", state, action)
 
     def _call(self, method: str, *batch: PyTree) -> State:
         """Call a method of every environment, each with its own model."""

@@ -2,8 +2,8 @@ from .distributed import check_processes as check_processes
 from .distributed import is_primary as is_primary
 from .distributed import join_processes as join_processes
 from .distributed import leave_processes as leave_processes
-from .memory_plan import memory_table as memory_table
-from .memory_plan import plan_memory as plan_memory
+from .memory import memory_table as memory_table
+from .memory import plan_memory as plan_memory
 from .ppo_trainer import CompiledTrainer as CompiledTrainer
 from .preemption import STOPPED as STOPPED
 from .preemption import Preemption as Preemption

@@ -9,6 +9,7 @@ here.
 A training that still compiles has nothing to save, so its command does not wait for the compiler.
 """
 
+import contextlib
 import os
 import signal
 import threading
@@ -36,7 +37,7 @@ _COMPILING_SECONDS = 1.0
 _WITHOUT_SAVING = "leaving without another save; the last complete checkpoint is intact"
 
 
-class StopRequest:
+class StopRequest(contextlib.AbstractContextManager["StopRequest"]):
     """A `StopRequest` says whether a training was asked to stop; this base class never was."""
 
     def __init__(self, notice: float) -> None:
@@ -70,10 +71,6 @@ class StopRequest:
     def begin_training(self) -> None:
         """Record that the training has compiled: it saves from now on when it is asked to stop."""
         self._compiling = None
-
-    def __enter__(self) -> Self:
-        """Return the object itself."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Restore the former handlers."""

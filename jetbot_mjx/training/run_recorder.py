@@ -6,7 +6,7 @@ import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Self
+from typing import TYPE_CHECKING, Annotated
 
 from pydantic import Field, TypeAdapter, ValidationError
 
@@ -94,7 +94,7 @@ def open_sinks(
 
 
 @dataclasses.dataclass(eq=False)
-class RunRecorder(TrainerCallback):
+class RunRecorder(TrainerCallback, contextlib.AbstractContextManager["RunRecorder"]):
     """A `RunRecorder` records the training of one run; it is a context manager.
 
     Args:
@@ -129,11 +129,6 @@ class RunRecorder(TrainerCallback):
     def standings(self) -> list[Standing]:
         """Return the progress of each seed."""
         return [seed.standing for seed in self.seeds]
-
-    @property
-    def fingerprints(self) -> list[str]:
-        """Return the SHA-256 of each seed's last parameters."""
-        return [seed.fingerprint for seed in self.seeds]
 
     @property
     def complete(self) -> bool:
@@ -278,10 +273,6 @@ class RunRecorder(TrainerCallback):
         self._compile_seconds += seconds
         self._unlogged_compile_seconds += seconds
         return seconds
-
-    def __enter__(self) -> Self:
-        """Return the recorder itself."""
-        return self
 
     def __exit__(self, *exception: object) -> None:
         """Wait until all files are written."""

@@ -127,11 +127,6 @@ class Training:
         """Return the versions that the folders of all seeds store."""
         return runs.versions()
 
-    def log_and_tell(self, text: str) -> None:
-        """Write a message to the log of the run, and to standard error without a long wait."""
-        runs.log_message(self.run_dir, text)
-        tell(text)
-
 
 def run(
     config: Config,
@@ -284,11 +279,17 @@ def _train(training: Training, stop: StopRequest) -> Result:
     config = training.config
     recorder: RunRecorder | None = None
     stored: list[TrainState] = []
+
+    def say_stopped() -> None:
+        text = stop_message(training)
+        runs.log_message(training.run_dir, text)
+        tell(text)
+
     with contextlib.ExitStack() as stack:
         clock = stack.enter_context(CompileClock())
         # Several processes end together, after the first checkpoint.
         if jax.process_count() == 1:
-            stop.begin_compiling(lambda: training.log_and_tell(stop_message(training)))
+            stop.begin_compiling(say_stopped)
         stack.enter_context(stop)
         seeds = [one.seed for one in config.of_each_seed()]
         trainer = ppo_trainer.CompiledTrainer(training.ppo, seeds, training.setup.programs)
@@ -467,14 +468,11 @@ def _open_folders(
 
 
 def _result(training: Training, recorder: RunRecorder | None, *, finished: bool) -> Result:
-    return Result(
-        run_dir=training.run_dir,
-        run_dirs=training.run_dirs,
-        standings=recorder.standings if recorder else [],
-        fingerprints=recorder.fingerprints if recorder else [],
-        finished=finished,
-        wall_seconds=recorder.wall_seconds if recorder else 0.0,
-    )
+    folders = training.run_dir, training.run_dirs
+    if recorder is None:
+        return Result(*folders, [], [], finished, 0.0)
+    fingerprints = [seed.fingerprint for seed in recorder.seeds]
+    return Result(*folders, recorder.standings, fingerprints, finished, recorder.wall_seconds)
 
 
 def _complete_message(config: Config, standings: Sequence[Standing]) -> str:

@@ -8,7 +8,7 @@ import pytest
 from jetbot_mjx import plan
 from jetbot_mjx.config import load_config
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.training import memory_plan
+from jetbot_mjx.training import memory
 
 
 @pytest.fixture(scope="module")
@@ -43,9 +43,9 @@ def test_a_configuration_that_does_not_fit_gives_1(smoke, capsys):
 
 
 def test_a_device_that_does_not_tell_its_memory_is_asked_about(smoke, monkeypatch):
-    monkeypatch.setattr(memory_plan, "device_memory", lambda: None)
+    monkeypatch.setattr(memory, "device_memory", lambda: None)
     with pytest.raises(UserError, match="give --memory GIB"):
-        memory_plan.plan_memory(load_config(smoke))
+        memory.plan_memory(load_config(smoke))
 
 
 @pytest.mark.parametrize("value", ["0", "-1", "nan", "inf", "1e308", "much"])

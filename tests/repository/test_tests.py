@@ -29,7 +29,6 @@ TOGETHER = {
     " deployment.policy_spec",
     "commands/test_main": "__main__",
     "commands/test_new_task": "envs.task_template",
-    "commands/test_plan": "training.memory_plan",
     "commands/test_play": "viewers.live",
     "commands/test_render": "viewers.gallery",
     "commands/test_replay": "runs.nan_dump",

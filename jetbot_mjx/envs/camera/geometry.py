@@ -13,7 +13,7 @@ Source of the quadratic in its stable form: t = c / (-b + √(b² - ac)), the sm
 product of both is c/a.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import jax
@@ -47,6 +47,12 @@ class Hit(NamedTuple):
     """For a box, which axis the entered face is perpendicular to: the first two of three."""
 
 
+def triple(values: Iterable[Scalar]) -> Vector:
+    """Return three values as a vector, or as a colour."""
+    x, y, z = values
+    return x, y, z
+
+
 def dot(a: Vector, b: Vector) -> Scalar:
     """Return the scalar product."""
     return a[0] * b[0] + (a[1] * b[1] + a[2] * b[2])
@@ -54,8 +60,7 @@ def dot(a: Vector, b: Vector) -> Scalar:
 
 def along(origin: Vector, direction: Vector, depth: Scalar) -> Vector:
     """Return the points of rays at a depth [m]."""
-    x, y, z = (o + depth * d for o, d in zip(origin, direction, strict=True))
-    return x, y, z
+    return triple(o + depth * d for o, d in zip(origin, direction, strict=True))
 
 
 def hit_plane(origin: Vector, direction: Vector, size: Size) -> Hit:
@@ -176,8 +181,7 @@ def _enter(a: Scalar, b: Scalar, c: Scalar) -> Hit:
 
 
 def _scaled(vector: Vector, size: Sequence[float]) -> Vector:
-    x, y, z = (v / s for v, s in zip(vector, size, strict=True))
-    return x, y, z
+    return triple(v / s for v, s in zip(vector, size, strict=True))
 
 
 def normal_ellipsoid(point: Vector, size: Size) -> Vector:
@@ -208,5 +212,4 @@ def normal_capsule(point: Vector, size: Size) -> Vector:
 
 def _unit(vector: Vector) -> Vector:
     scale = jax.lax.rsqrt(jnp.maximum(dot(vector, vector), _TINY))
-    x, y, z = (v * scale for v in vector)
-    return x, y, z
+    return triple(v * scale for v in vector)

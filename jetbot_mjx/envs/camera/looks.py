@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, UInt8, UInt32
 
 from jetbot_mjx.config import LookParams
-from jetbot_mjx.envs.camera.geometry import Scalar
+from jetbot_mjx.envs.camera.geometry import Scalar, triple
 from jetbot_mjx.envs.camera.lens import Footprint, Rays
 from jetbot_mjx.envs.camera.scene import GOAL, Checker, Rgb, Scene, SceneGeom, ground_of
 from jetbot_mjx.envs.camera.surroundings import Surroundings
@@ -84,8 +84,7 @@ def _styled_checker(geom: SceneGeom, tint: Sequence[Scalar] | None, params: Look
 
         def spread(rgb: Rgb) -> Rgb:
             pairs = zip(rgb, means, strict=True)
-            red, green, blue = (m + params.floor_contrast * (x - m) for x, m in pairs)
-            return red, green, blue
+            return triple(m + params.floor_contrast * (x - m) for x, m in pairs)
 
         even, odd = spread(even), spread(odd)
     if tint is not None:
@@ -102,19 +101,17 @@ def _styled_checker(geom: SceneGeom, tint: Sequence[Scalar] | None, params: Look
 def _lit(scene: Scene, params: LookParams) -> Scene:
     """Return a scene with other lights."""
     if params.differs("ambient"):
-        red, green, blue = (params.ambient * x for x in scene.ambient)
-        scene = scene._replace(ambient=(red, green, blue))
+        scene = scene._replace(ambient=triple(params.ambient * x for x in scene.ambient))
     if params.differs("light", "light_x", "light_y"):
         lights = []
         for light in scene.lights:
-            red, green, blue = (params.light * x for x in light.diffuse)
-            direction = light.direction
+            diffuse, direction = triple(params.light * x for x in light.diffuse), light.direction
             if params.differs("light_x", "light_y"):
                 slope = jnp.stack([jnp.asarray(params.light_x), jnp.asarray(params.light_y)])
                 tilt = jnp.append(slope, 0.0) * abs(light.direction[2])
                 direction = light.direction + tilt
                 direction = direction / jnp.linalg.norm(direction)
-            lights.append(light._replace(direction=direction, diffuse=(red, green, blue)))
+            lights.append(light._replace(direction=direction, diffuse=diffuse))
         scene = scene._replace(lights=tuple(lights))
     return scene
 
@@ -210,8 +207,3 @@ def turned(rotation: np.ndarray | Array, yaw: Scalar) -> Float[Array, "3 3"]:
     x, y, z = jnp.asarray(rotation)
     cosine, sine = jnp.cos(yaw), jnp.sin(yaw)
     return jnp.stack([cosine * x - sine * y, sine * x + cosine * y, z])
-
-
-def squared_length(rays: Rays) -> float:
-    """Return the largest x² + y² of the directions of all pixels."""
-    return float(np.max(np.asarray(rays.x) ** 2 + np.asarray(rays.y) ** 2))

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.envs.camera import geometry
-from jetbot_mjx.envs.camera.geometry import Hit, Mask, Scalar, Vector
+from jetbot_mjx.envs.camera.geometry import Hit, Mask, Scalar, Vector, triple
 from jetbot_mjx.envs.camera.lens import Footprint, Rays
 from jetbot_mjx.envs.camera.scene import Checker, Rgb, Scene, SceneGeom, ground_of
 from jetbot_mjx.envs.camera.surroundings import Room, wall_colour, wall_slope
@@ -178,16 +178,12 @@ def _radius(geom: SceneGeom) -> float:
     """Return the radius of a sphere around a geom [m]; 0: the geom is infinite."""
     x, y, z = geom.size
     match geom.kind:
-        case "plane":
+        case "plane" | "cylinder":
             return float(np.hypot(x, y)) if x > 0 and y > 0 else 0.0
-        case "sphere":
-            return x
+        case "sphere" | "ellipsoid":
+            return max(geom.size)
         case "capsule":
             return x + y
-        case "cylinder":
-            return float(np.hypot(x, y))
-        case "ellipsoid":
-            return max(geom.size)
         case _:
             return float(np.sqrt(x * x + y * y + z * z))
 
@@ -249,8 +245,7 @@ def _meet(
         colour = geom.rgb
         if geom.checker is not None:
             colour = _checker_colours(geom.checker, look.origin, axes, None, footprint)
-        red, green, blue = (colour[k] * light[k] for k in range(3))
-        new = _Sample(hit.depth, (red, green, blue))
+        new = _Sample(hit.depth, triple(colour[k] * light[k] for k in range(3)))
         after.append(jax.tree.map(functools.partial(jnp.where, closer), new, sample))
     return after
 
@@ -285,14 +280,13 @@ def _sum(found: Sequence[_Sample], slopes: Sequence[_Slopes]) -> _Sums:
         is_behind = (slope.nearest > 0) & (sample.depth * slope.nearest > 1.0)
         wall = None if slope.wall is None else is_behind & slope.is_wall
         ground = is_behind if wall is None else is_behind & ~wall
-        red, green, blue = (jnp.where(is_behind, 0.0, x) for x in sample.rgb)
-        rays.append(_Sums((red, green, blue), ground, is_free & ~is_behind, wall))
+        rgb = triple(jnp.where(is_behind, 0.0, x) for x in sample.rgb)
+        rays.append(_Sums(rgb, ground, is_free & ~is_behind, wall))
     return jax.tree.map(lambda *x: sum((y.astype(jnp.float32) for y in x), jnp.zeros(())), *rays)
 
 
 def _black() -> Rgb:
-    zero = jnp.zeros(())
-    return zero, zero, zero
+    return triple([jnp.zeros(())] * 3)
 
 
 def _plane_colour(
@@ -312,15 +306,14 @@ def _plane_colour(
 
 def strengths(scene: Scene, geom: SceneGeom) -> list[Rgb]:
     """Return the light on a geom from all sides, and that of each light, the headlight last."""
-    red, green, blue = (value + geom.emission for value in scene.ambient)
-    return [(red, green, blue), *(light.diffuse for light in scene.lights), scene.headlight]
+    ambient = triple(value + geom.emission for value in scene.ambient)
+    return [ambient, *(light.diffuse for light in scene.lights), scene.headlight]
 
 
 def directions(axes: Axes, rays: Rays) -> Vector:
     """Return the directions of rays in the axes of a geom."""
     right, down, forward = axes.image
-    x, y, z = (right[k] * rays.x + (down[k] * rays.y + forward[k]) for k in range(3))
-    return x, y, z
+    return triple(right[k] * rays.x + (down[k] * rays.y + forward[k]) for k in range(3))
 
 
 def _checker_colours(
@@ -338,8 +331,7 @@ def _checker_colours(
     """
     if turn is not None:
         origin = _unturned(origin, turn)
-        right, down, forward = (_unturned(vector, turn) for vector in axes.image)
-        axes = axes._replace(image=(right, down, forward))
+        axes = axes._replace(image=tuple(_unturned(vector, turn) for vector in axes.image))
     direction = directions(axes, pixel.centre)
     # A pixel at or above the horizon sees the plane far away, if any of its rays does.
     down = jnp.minimum(direction[2], -1e-4)

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float, Int, UInt8
 from jetbot_mjx.config import CameraConfig, LookParams
 from jetbot_mjx.envs import kinematics
 from jetbot_mjx.envs.camera import looks, pixel
-from jetbot_mjx.envs.camera.geometry import Vector
+from jetbot_mjx.envs.camera.geometry import Vector, triple
 from jetbot_mjx.envs.camera.lens import pixel_grid
 from jetbot_mjx.envs.camera.scene import Scene, SceneGeom, read_scene
 from jetbot_mjx.envs.camera.surroundings import clutter_positions, make_room, with_clutter
@@ -166,7 +166,8 @@ class Camera:
     @functools.cached_property
     def _farthest(self) -> float:
         """The largest x² + y² of the directions of all pixels."""
-        return looks.squared_length(self._grid.expand(self._grid.columns)[1].centre)
+        x, y = self._grid.expand(self._grid.columns)[1].centre
+        return float(np.max(np.asarray(x) ** 2 + np.asarray(y) ** 2))
 
     def _pixel(
         self,
@@ -245,7 +246,7 @@ class Camera:
         frame = pixel.Frame(
             axes,
             drawn,
-            up=(pose.rotation[2, 0], pose.rotation[2, 1], pose.rotation[2, 2]),
+            up=triple(pose.rotation[2, k] for k in range(3)),
             params=looks.pixel_values(params),
             clutter=colours,
             room=None if walls is None else make_room(walls, params.walls, *pose),
@@ -283,11 +284,11 @@ def _faces(
     for axis in {"plane": (2,), "box": (0, 1, 2)}.get(geom.kind, ()):
         side = 1.0 if geom.kind == "plane" else jnp.sign(origin[axis])
         cosines = [jnp.maximum(side * light[axis], 0.0) for light in lights]
-        red, green, blue = (
+        light = (
             ambient[k] + sum(c * s[k] for c, s in zip(cosines, diffuse, strict=True))
             for k in range(3)
         )
-        faces.append((red, green, blue))
+        faces.append(triple(light))
     return tuple(faces)
 
 
@@ -296,9 +297,8 @@ def _into(
 ) -> Vector:
     """Rotate a vector into a frame with the given axes; by nothing if they are the world's."""
     if isinstance(rotation, np.ndarray) and np.array_equal(rotation, np.eye(3)):
-        return vector[0], vector[1], vector[2]
-    x, y, z = (
+        return triple(vector[k] for k in range(3))
+    return triple(
         rotation[0, k] * vector[0] + (rotation[1, k] * vector[1] + rotation[2, k] * vector[2])
         for k in range(3)
     )
-    return x, y, z

@@ -7,7 +7,7 @@ import mujoco
 import numpy as np
 from jaxtyping import Array, Float, UInt8
 
-from jetbot_mjx.envs.camera.geometry import Scalar, Vector
+from jetbot_mjx.envs.camera.geometry import Scalar, Size, Vector
 from jetbot_mjx.errors import UserError
 
 Rgb = Vector
@@ -16,14 +16,9 @@ Rgb = Vector
 GOAL = "goal"
 """Mocap body that marks the goal."""
 
-_KINDS = {
-    mujoco.mjtGeom.mjGEOM_PLANE: "plane",
-    mujoco.mjtGeom.mjGEOM_SPHERE: "sphere",
-    mujoco.mjtGeom.mjGEOM_CAPSULE: "capsule",
-    mujoco.mjtGeom.mjGEOM_ELLIPSOID: "ellipsoid",
-    mujoco.mjtGeom.mjGEOM_CYLINDER: "cylinder",
-    mujoco.mjtGeom.mjGEOM_BOX: "box",
-}
+_KINDS = ("plane", "sphere", "capsule", "ellipsoid", "cylinder", "box")
+"""MuJoCo's names of the geoms that can be drawn."""
+
 _HIDDEN_GROUPS = 3
 """Geoms of this group and above are hidden, as in MuJoCo's viewers."""
 
@@ -53,14 +48,14 @@ class SceneGeom(NamedTuple):
     size: tuple[float, float, float]
     """Sizes [m] as in MuJoCo; a sphere has its radius three times."""
     rgb: Rgb
-    emission: float
-    checker: Checker | None
     mocap: str | None
     """The mocap body whose position is added to `position`; None: it stands still."""
     position: Float[np.ndarray, "3"]
     """Position [m] in the axes of the world."""
     rotation: Float[np.ndarray, "3 3"]
     """Axes of the geom, as columns, in the axes of the world."""
+    emission: float = 0.0
+    checker: Checker | None = None
     yaw: Scalar | None = None
     """Further turn about the vertical through the body [rad]; None: it is not turned."""
 
@@ -152,8 +147,8 @@ def _ancestors(model: mujoco.MjModel, body: int) -> list[int]:
     return chain
 
 
-def _rgb(values: Sequence[float] | np.ndarray) -> tuple[float, float, float]:
-    red, green, blue = (float(value) for value in values)
+def _rgb(values: Sequence[float] | np.ndarray) -> Size:
+    red, green, blue = map(float, values)
     return red, green, blue
 
 
@@ -169,13 +164,12 @@ def geom_rgba(model: mujoco.MjModel, geom: int) -> tuple[float, float, float, fl
 def _read_geom(
     model: mujoco.MjModel, data: mujoco.MjData, geom: int, chain: Sequence[int]
 ) -> SceneGeom:
-    kind = _KINDS.get(mujoco.mjtGeom(model.geom_type[geom]))
+    kind = mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
     name = model.geom(geom).name or f"geom {geom}"
-    if kind is None:
+    if kind not in _KINDS:
         raise UserError(
-            f"task.observation: the camera cannot draw {name!r}, a"
-            f" {mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix('mjGEOM_').lower()}: build"
-            f" it of {', '.join(_KINDS.values())}, or hide it (group={_HIDDEN_GROUPS})"
+            f"task.observation: the camera cannot draw {name!r}, a {kind}: build it of"
+            f" {', '.join(_KINDS)}, or hide it (group={_HIDDEN_GROUPS})"
         )
     if any(model.body_jntnum[body] for body in chain):
         raise UserError(

@@ -149,8 +149,6 @@ def with_clutter(scene: Scene, colours: Sequence[Rgb]) -> Scene:
                 kind=kind,
                 size=size,
                 rgb=(rgb[0], rgb[1], rgb[2]),
-                emission=0.0,
-                checker=None,
                 mocap=_clutter_name(index),
                 position=np.array([0.0, 0.0, height], np.float32),
                 rotation=np.eye(3, dtype=np.float32),

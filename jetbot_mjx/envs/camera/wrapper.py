@@ -1,6 +1,5 @@
 """Add what the robot's camera sees to the observation of an environment."""
 
-from collections.abc import Mapping
 from typing import Protocol, TypeVar
 
 import jax
@@ -12,7 +11,7 @@ from jetbot_mjx.envs.camera.looks import Appearance, add_noise
 from jetbot_mjx.envs.camera.render import Camera
 from jetbot_mjx.envs.camera.timing import SeenPose, noise_seed
 from jetbot_mjx.envs.state import Obs, State, robot_state
-from jetbot_mjx.envs.task import Goal
+from jetbot_mjx.envs.task import Task
 from jetbot_mjx.mjx_import import Env, Wrapper
 from jetbot_mjx.packed import Packed, pack
 
@@ -26,12 +25,6 @@ NUMBERS = "state"
 _Env = TypeVar("_Env", bound=Env)
 
 
-class _Task(Protocol):
-    """The method of a task by which a camera sees its bodies."""
-
-    def markers(self, goal: Goal) -> Mapping[str, Float[Array, "3"]]: ...
-
-
 def numbers_of(obs: Obs) -> Obs:
     """Return an observation without images: the vector of numbers, or an empty dictionary."""
     return obs.get(NUMBERS, {}) if isinstance(obs, dict) else obs
@@ -40,7 +33,7 @@ def numbers_of(obs: Obs) -> Obs:
 class _Seen(Protocol):
     """The interface that a `CameraWrapper` requires of the environment inside it."""
 
-    task: _Task
+    task: Task
     observation_size: int
     observation_min_std: np.ndarray
 
@@ -51,7 +44,7 @@ class _Seen(Protocol):
 
 def see(
     camera: Camera,
-    task: _Task,
+    task: Task,
     state: State,
     before: UInt8[Array, "h w c"] | None = None,
     begins: Bool[Array, ""] | bool = True,
@@ -79,7 +72,7 @@ def see(
     return state.replace(obs=obs)
 
 
-def seen_pose(task: _Task, state: State) -> SeenPose:
+def seen_pose(task: Task, state: State) -> SeenPose:
     """Return the pose that a camera without delay sees.
 
     Args:
@@ -91,7 +84,7 @@ def seen_pose(task: _Task, state: State) -> SeenPose:
     return SeenPose(robot.position_w, robot.quat, markers, state.pipeline_state.time)
 
 
-def _render(camera: Camera, task: _Task, state: State) -> UInt8[Array, "h w c"]:
+def _render(camera: Camera, task: Task, state: State) -> UInt8[Array, "h w c"]:
     """Return the image of a state, with the looks of its episode."""
     now = seen_pose(task, state)
     looks = state.episode_params.camera if state.episode_params is not None else None
