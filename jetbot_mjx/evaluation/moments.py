@@ -113,10 +113,6 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> _Replay:
         EpisodeWrapper(env.blind(), env.config.task.episode_length), env.camera
     )
 
-    def step(state: State, action: Float[Array, "2"]) -> State:
-        nstate = episode_env.step(state, action)
-        return jax.tree.map(lambda a, b: jnp.where(state.done > 0, b, a), nstate, state)
-
     def run(
         params: PolicyParams, keys: UInt32[Array, "n 2"], times: Int[Array, "n moments"]
     ) -> _Seen:
@@ -124,7 +120,8 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> _Replay:
 
         def advance(carry: tuple[Array, State, PyTree]) -> tuple[Array, State, PyTree]:
             time, state, seen = carry
-            state = jax.vmap(step)(state, policy(state.obs))
+            # What an episode does after its end is not kept.
+            state = jax.vmap(episode_env.step)(state, policy(state.obs))
             now = times == time + 1
 
             def keep(old: Array, obs: Array) -> Array:
