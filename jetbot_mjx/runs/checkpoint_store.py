@@ -218,23 +218,20 @@ def _without_log() -> Iterator[None]:
     tracebacks from each of its threads for errors that it raises as well.
     """
     orbax, root = logging.getLogger("absl"), logging.getLogger()
-    quiet, none = _NotOfOrbax(), logging.NullHandler()
-    orbax.addFilter(quiet)
+    none = logging.NullHandler()
+    orbax.addFilter(_is_not_of_orbax)
     # As long as there is no handler, its logger adds one that writes to standard error.
     root.addHandler(none)
     try:
         yield
     finally:
         root.removeHandler(none)
-        orbax.removeFilter(quiet)
+        orbax.removeFilter(_is_not_of_orbax)
 
 
-class _NotOfOrbax(logging.Filter):
-    """A filter of log records that drops those of Orbax."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to log the record."""
-        return "orbax" not in Path(record.pathname).parts
+def _is_not_of_orbax(record: logging.LogRecord) -> bool:
+    """Return whether to log a record: not if Orbax logs it."""
+    return "orbax" not in Path(record.pathname).parts
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:
