@@ -56,7 +56,7 @@ class DamagedRunError(UserError):
         super().__init__(
             f"the run {run_dir} is damaged: {reason}: restore the file, or train into a new folder"
         )
-        self.reason = reason
+        self.run_dir, self.reason = run_dir, reason
 
 
 def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
