@@ -241,7 +241,7 @@ class Search:
             for name, values in chosen.items()
             for index in range(seeds)
         ]
-        done: dict[str, list[tuple[Outcome, float, float]]] = {name: [] for name in chosen}
+        done: dict[str, list[tuple[float, float, float]]] = {name: [] for name in chosen}
         with stage("final trainings", len(work)) as advance:
             for key, members in self._groups([values for _, values, _ in work]).items():
                 # In parts of one size, which the program of a round can train.
@@ -251,13 +251,7 @@ class Search:
                         done[work[i][0]].append(result)
                     advance(len(part))
         return [
-            Entrant(
-                name,
-                dict(chosen[name]),
-                tuple(one.area for one, _, _ in found),
-                tuple(rate for _, rate, _ in found),
-                tuple(seconds for _, _, seconds in found),
-            )
+            Entrant(name, dict(chosen[name]), *zip(*found, strict=True))
             for name, found in done.items()
         ]
 
@@ -267,15 +261,16 @@ class Search:
 
     def _final(
         self, work: Sequence[tuple[str, Values, int]], key: _Static
-    ) -> list[tuple[Outcome, float, float]]:
-        """Train values with seeds; return the outcomes, and success and time on the report."""
+    ) -> list[tuple[float, float, float]]:
+        """Train values with seeds; return mean success, and success and time on the report."""
         batch = self._batch(key)
         outcomes = self._outcomes(batch, [values for _, values, _ in work], [x[2] for x in work])
         stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
         with stage("episodes of the report's goals", len(work) * REPORT_GOALS):
             episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
         rates = np.asarray(episodes.success).mean(axis=1).tolist()
-        return list(zip(outcomes, rates, mean_seconds(episodes, batch.config), strict=True))
+        areas, seconds = [one.area for one in outcomes], mean_seconds(episodes, batch.config)
+        return list(zip(areas, rates, seconds, strict=True))
 
     def _check_study(self) -> None:
         """Refuse a study that was begun with another space or configuration."""
