@@ -32,23 +32,6 @@ _OPTIONAL_FIGURES = {
 }
 """Names of the figures that a page may lack."""
 
-_FORMS = {
-    "percent": "{:.2%}",
-    "whole percent": "{:.0%}",
-    "seconds": "{:.2f} s",
-    "milliseconds": "{:.3f} s",
-    "metres": "{:.2f} m",
-    "signed metres": "{:+.3f} m",
-    "count": "{:,}",
-    "plain": "{}",
-    "short": "{:g}",
-    "degrees": "{:+.0f}°",
-    "signed percent": "{:+.2%}",
-    "signed seconds": "{:+.3f} s",
-    "p": "{:.2g}",
-    "change": "{:.2f}",
-}
-
 _PAGES = jinja2.Environment(
     loader=jinja2.PackageLoader("jetbot_mjx", "assets"),
     autoescape=jinja2.select_autoescape(["html"]),
@@ -177,13 +160,13 @@ def _data_uri(png: bytes) -> str:
 
 
 def _numbers(values: JsonObject, suffix: str) -> Callable[[str, str], str]:
-    """Return a function that formats a JSON value by its path, such as `policy.success_rate`."""
+    """Return a function of a JSON value's path, such as `policy.success_rate`, and its format."""
 
     def number(place: str, form: str) -> str:
         value: PyTree = values
         for key in place.split("."):
             value = value[int(key)] if isinstance(value, list) else value[key]
-        text = "-" if value is None else _FORMS[form].format(value)
+        text = "-" if value is None else form.format(value)
         if suffix != ".html":
             return text
         exact = json.dumps(value)
