@@ -74,7 +74,11 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
     """
     text = str(name)
     if text.startswith(_PREFIX):
-        return _find_pretrained(text.removeprefix(_PREFIX))
+        known = sorted(path.name for path in PRETRAINED.iterdir())
+        if (own := text.removeprefix(_PREFIX)) in known:
+            return PRETRAINED / own
+        names = ", ".join(known)
+        raise NotFoundError(f"{text} does not come with the package: there are {names}")
     if os.path.lexists(text):
         return Path(name)
     if text == _LATEST:
@@ -184,15 +188,6 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ())
         lines.append("* stopped before its last step, or reached stop_at_success")
     lines += [printable(f"damaged: {_shortest_name(one.run_dir)}: {one.reason}") for one in damaged]
     return "\n".join(lines)
-
-
-def _find_pretrained(name: str) -> Path:
-    known = sorted(path.name for path in PRETRAINED.iterdir())
-    if name in known:
-        return PRETRAINED / name
-    raise NotFoundError(
-        f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}"
-    )
 
 
 def copy_pretrained(folder: Path) -> tuple[Path, ...]:
