@@ -45,7 +45,7 @@ from tensorboardX.proto import event_pb2, summary_pb2
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import read_bytes, write_text
-from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
+from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -214,7 +214,6 @@ class TensorBoardSink:
         self,
         folder: Path,
         history: Sequence[History] = (),
-        names: Mapping[str, Alias] | None = None,
         config: Config | None = None,
     ) -> None:
         """Open an event file.
@@ -222,10 +221,9 @@ class TensorBoardSink:
         Args:
           folder: folder for `tensorboard --logdir`; event files of an earlier training are removed.
           history: metrics that are written first, in place of the removed ones.
-          names: metrics that are also written under another tag, from `sb3_tags.aliases`.
-          config: the configuration of the run, or None to write metrics only.
+          config: the configuration of the run, or None to write metrics only, without other tags.
         """
-        self._names = names or {}
+        self._names = aliases(config.ppo) if config else {}
         folder.mkdir(exist_ok=True)
         for events in folder.glob("events.out.tfevents.*"):
             events.unlink()
