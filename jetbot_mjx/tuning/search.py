@@ -36,6 +36,8 @@ with requires_extra("tune", "tune"):
     import sqlalchemy.exc
     from optuna.trial import FrozenTrial
 
+_EVALUATIONS = 8
+"""Number of evaluations of each trial, whose mean success is maximised."""
 _BEAT_SECONDS = 5
 """Time between two heartbeats of a worker [s]."""
 _STALE_SECONDS = 30
@@ -98,7 +100,6 @@ class Search:
         folder: Path,
         *,
         storage: str | None = None,
-        evaluations: int = 8,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Open the study, or create it.
@@ -108,7 +109,6 @@ class Search:
           space: the settings and their values.
           folder: where the study and its results are stored.
           storage: a database URL; None: SQLite in the folder.
-          evaluations: how often each trial is evaluated; their mean success is maximised.
           say: called with one line about each round.
 
         Raises:
@@ -122,7 +122,6 @@ class Search:
         flat = config.flat()
         # An option of a task may be searched that the configuration does not have.
         self._given = {one.name: _frozen(flat[one.name]) for one in space if one.name in flat}
-        self._evaluations = evaluations
         self._say = say
         self._batches: dict[_Static, Trials] = {}
         folder = folder.resolve()
@@ -457,7 +456,7 @@ class Search:
                 one.name for one in self._space if one.name in TRACED and one.name not in static
             ]
             with stage("preparing the environment and the networks"):
-                self._batches[key] = Trials(config, traced, self._evaluations)
+                self._batches[key] = Trials(config, traced, _EVALUATIONS)
         return self._batches[key]
 
 
