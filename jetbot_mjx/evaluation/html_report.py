@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from jetbot_mjx.evaluation import learning_curves, plots
 from jetbot_mjx.evaluation.comparison import Comparison
-from jetbot_mjx.evaluation.moments import plot_moments
+from jetbot_mjx.evaluation.moments import plot_moments, shown_goals
 from jetbot_mjx.evaluation.report import Report, replay_command
 from jetbot_mjx.runs import JsonObject, make_folder, write_bytes, write_json, write_text, writing_to
 
@@ -61,7 +61,8 @@ def write_report(report: Report) -> Path:
     """
     # Choose the figures.
     episodes = report.episodes
-    shown = plots.shown_trajectories(episodes)
+    # A plan view stays readable with so many; the failures are drawn on top.
+    shown = shown_goals(episodes, successes=100, failures=200)
     successes = sum(bool(episodes.success[index] > 0) for index in shown)
     figures = {
         "by_goal": lambda: plots.plot_by_goal(report.goal_bins),

@@ -49,15 +49,17 @@ class SeenEpisode(NamedTuple):
     """Occlusion maps, as of `occlusion_map`."""
 
 
-def shown_goals(episodes: Episodes) -> list[int]:
-    """Return the goals to show: the first success and the first failures.
+def shown_goals(episodes: Episodes, successes: int = 1, failures: int = MOST_FAILURES) -> list[int]:
+    """Return the goals to show: the first successes, then the first failures.
 
     Args:
       episodes: the episodes of a report, on the host.
+      successes: the largest number of successes.
+      failures: the largest number of failures.
     """
     won = np.asarray(episodes.success) > 0
-    failures = np.flatnonzero(~won)[:MOST_FAILURES]
-    return [*np.flatnonzero(won)[:1].tolist(), *failures.tolist()]
+    first = np.flatnonzero(won)[:successes], np.flatnonzero(~won)[:failures]
+    return np.concatenate(first).tolist()
 
 
 class MomentFinder:

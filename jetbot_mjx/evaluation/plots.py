@@ -35,9 +35,6 @@ _REACHED, _MISSED = "C0", "C1"
 
 _DPI = 160
 
-_MAX_SUCCESSES = 100
-_MAX_FAILURES = 200
-
 
 @contextlib.contextmanager
 def theme(name: Theme) -> Iterator[None]:
@@ -54,20 +51,6 @@ def to_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
-
-
-def shown_trajectories(episodes: Episodes) -> list[int]:
-    """Return the indices of the episodes to show in a readable plan view.
-
-    They are the first successes and the first failures. The failures come last, so that they are
-    drawn on top.
-
-    Args:
-      episodes: episodes on the host.
-    """
-    won = np.asarray(episodes.success) > 0
-    failures, successes = np.flatnonzero(~won), np.flatnonzero(won)
-    return [*successes[:_MAX_SUCCESSES].tolist(), *failures[:_MAX_FAILURES].tolist()]
 
 
 def plot_trajectories(
