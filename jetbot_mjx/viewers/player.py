@@ -75,10 +75,8 @@ class Player:
         """How the last episode ended, in words; None before the first end."""
         self.robots = robots
         """Number of robots."""
-        self.ticks = Rate()
-        """Counter of control steps, including those of pauses."""
-        self.frames = Rate()
-        """Frame counter of the viewer, which counts every frame that it shows."""
+        self.ticks, self.frames = Rate(), Rate()
+        """Counters of control steps, pauses included, and of the frames that the viewer shows."""
         # A few robots are faster on a CPU than on a GPU.
         self._device = host_cpu()
         self._fns = make_viewer_fns(self.env, checkpoint.networks)
