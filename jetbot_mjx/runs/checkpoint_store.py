@@ -38,7 +38,7 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import jax
 import numpy as np
@@ -72,14 +72,8 @@ _SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
 
 
-class _Typed(Protocol):
-    """An array, or the description of one: of NumPy, JAX or TensorStore."""
-
-    @property
-    def shape(self) -> Sequence[int]: ...
-
-    @property
-    def dtype(self) -> object: ...
+_Typed = np.ndarray | jax.ShapeDtypeStruct | ts.TensorStore
+"""An array, or the description of one."""
 
 
 class CheckpointError(UserError):
