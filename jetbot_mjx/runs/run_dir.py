@@ -305,7 +305,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
       OSError: it cannot be read, is not a regular file, or is larger than any that a run has.
     """
-    with open(path, "rb", opener=_open_at_once) as file:
+    with open(path, "rb", opener=open_at_once) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file")
         content = file.read(_MOST_BYTES + 1)
@@ -324,9 +324,9 @@ def read_text(path: Path) -> str:
     return read_bytes(path).decode()
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    """Open a file as `os.open` does, but a named pipe without waiting for its writer."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+def open_at_once(path: str, flags: int) -> int:
+    """Open a file as `open` does, but a named pipe without waiting for its other end."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
 
 
 def write_json(path: Path, values: object) -> None:
