@@ -1,6 +1,7 @@
 """The policy spec `policy.json`: all that a program needs to use an exported policy."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 
@@ -11,13 +12,8 @@ from jetbot_mjx.runs import Checkpoint, JsonObject, read_text, versions
 
 FILE = "policy.json"
 
-FORMAT = "jetbot_mjx-policy/1"
-"""The format that `policy.json` names."""
-
-FRAMES = {
-    "world": "fixed to the floor, z up; training starts at its origin, heading along x",
-    "body": "moves with the robot: axle midpoint, x forward, y left, z up",
-}
+_TEMPLATE = Path(__file__).parents[1] / "assets" / "policy_spec.json"
+"""The keys in their order, and the values that are the same for every policy."""
 
 _VECTORS = ("position", "linear_velocity", "angular_velocity", "goal_position", "goal_direction")
 _COMPONENTS = {"quaternion": "wxyz", **dict.fromkeys(_VECTORS, "xyz")}
@@ -36,8 +32,20 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
     """
     config, encoder = checkpoint.config, policy.encoder
     rest = env.mj_model.qpos0
-    return {
-        "format": FORMAT,
+    spec = _template()
+    # Describe what belongs to an image, or leave it out.
+    if encoder:
+        spec["image"] = _image(config.camera, env.dt)
+        spec["inside"] = ["pixels / 255", "convolutions", *spec["inside"]]
+        spec["outside"] = ["resizing the camera's image", "stacking images", *spec["outside"]]
+    else:
+        del spec["image"]
+    if policy.mean.size:
+        spec["inside"].insert(-3, "normaliser")
+    # Fill in what differs between policies; the limit of wheel speeds is in rad/s.
+    spec["wheel_speeds"] |= policy.controller._asdict()
+    spec["wheel_speeds"]["limit_in_training"] = env.robot.max_wheel_speed
+    return spec | {
         "run": checkpoint.run_dir.name,
         "env_steps": checkpoint.env_steps,
         "task": config.task.name,
@@ -49,28 +57,12 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
             for name, one in policy.inputs.items()
         ],
         "observation": _observations(env.task.layout),
-        **({"image": _image(config.camera, env.dt)} if encoder else {}),
-        "action": [
-            {"name": "drive", "index": 0, "unit": "1", "low": -1.0, "high": 1.0},
-            {"name": "turn", "index": 1, "unit": "1", "low": -1.0, "high": 1.0},
-        ],
-        "wheel_speeds": _wheel_speeds(policy, env.robot.max_wheel_speed),
-        "inside": [
-            *(["pixels / 255", "convolutions"] if encoder else []),
-            *(["normaliser"] if policy.mean.size else []),
-            *("network", "clip to [-1, 1]", "action to wheel speeds"),
-        ],
-        "outside": [
-            *(["resizing the camera's image", "stacking images"] if encoder else []),
-            *("limits and dead-band of the motors", "wheel speed to motor value"),
-        ],
         "network": {
             **(_sizes(encoder) if encoder else {}),
             "layers": [layer.bias.size for layer in policy.layers],
             "activation": policy.activation,
             "squash": "tanh" if policy.squash else None,
         },
-        "frames": FRAMES,
         "success_radius": config.task.success_radius,
         "goal_height": GOAL_HEIGHT,
         "rest_height": float(rest[QPOS_XYZ][2]),
@@ -78,22 +70,6 @@ def policy_spec(checkpoint: Checkpoint, env: JetBotEnv, policy: PortablePolicy) 
         "episode_seconds": config.task.episode_length * env.dt,
         "evaluation": _evaluation(checkpoint),
         "versions": versions(),
-    }
-
-
-def _wheel_speeds(policy: PortablePolicy, limit: float | None) -> JsonObject:
-    """Return how wheel speeds follow from an action; `limit` is that of training [rad/s]."""
-    return {
-        "order": ["left", "right"],
-        "unit": "rad/s",
-        "formula": [
-            "v = (drive + 1)/2 * max_speed",
-            "w = turn * max_yaw_rate",
-            "left = (v - w * wheel_separation/2) / wheel_radius",
-            "right = (v + w * wheel_separation/2) / wheel_radius",
-        ],
-        **policy.controller._asdict(),
-        "limit_in_training": limit,
     }
 
 
@@ -107,6 +83,10 @@ def _sizes(encoder: Encoder) -> JsonObject:
     }
 
 
+def _template() -> JsonObject:
+    return json.loads(_TEMPLATE.read_text(encoding="utf-8"))
+
+
 def _image(camera: CameraConfig, period: float) -> JsonObject:
     """Return the description of the image, and of the camera that takes it.
 
@@ -114,31 +94,24 @@ def _image(camera: CameraConfig, period: float) -> JsonObject:
       camera: the camera section.
       period: the time from one image to the next [s].
     """
-    fx, fy, cx, cy = (float(one) for one in intrinsics(camera))
-    return {
+    image, is_grey = _template()["image"], camera.colour == "grey"
+    image |= {
         "height": camera.height,
         "width": camera.width,
-        "channels": ["red", "green", "blue"] if camera.colour == "rgb" else ["grey"],
-        "grey": "0.299 red + 0.587 green + 0.114 blue" if camera.colour == "grey" else None,
-        "axes": ["row from above", "column from the left", "channel"],
-        "dtype": "uint8",
-        "range": [0, 255],
-        "resize": "area mean: a pixel is the mean of all that it covers of the camera's image",
+        "channels": ["grey"] if is_grey else ["red", "green", "blue"],
+        "grey": "0.299 red + 0.587 green + 0.114 blue" if is_grey else None,
         "frames": camera.frames,
         "frame_period": period,
-        "frame_order": "along the channels, the newest last; a drive begins with copies",
-        "stacked_by": "the caller, by stack() of policy.py",
-        "camera": {
-            "position": list(camera.position),
-            "frame": "body",
-            "unit": "m",
-            "pitch_down_degrees": camera.pitch,
-            "lens": camera.lens,
-            "matrix": {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "unit": "pixels of the image"},
-            "distortion": list(camera.distortion),
-            "distortion_order": "OpenCV's",
-        },
     }
+    image["camera"] |= {
+        "position": list(camera.position),
+        "pitch_down_degrees": camera.pitch,
+        "lens": camera.lens,
+        "distortion": list(camera.distortion),
+    }
+    focal = zip(("fx", "fy", "cx", "cy"), intrinsics(camera), strict=True)
+    image["camera"]["matrix"] |= {name: float(one) for name, one in focal}
+    return image
 
 
 def _observations(layout: Layout) -> list[JsonObject]:

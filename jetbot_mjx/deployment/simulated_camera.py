@@ -67,7 +67,6 @@ class SimulatedCamera:
         model: CameraModel | None = None,
         *,
         appearance: SceneryKind = "plain",
-        seed: int = 0,
     ) -> None:
         """Build the scene.
 
@@ -76,7 +75,6 @@ class SimulatedCamera:
           config: the camera section of the pictures.
           model: delays and losses; None: the defaults of `CameraModel`.
           appearance: `plain` or `varied`.
-          seed: seed of noise and losses.
 
         Raises:
           UserError: this machine has no OpenGL.
@@ -84,7 +82,7 @@ class SimulatedCamera:
         self.model = CameraModel() if model is None else model
         scene = make_mj_model(REAL, PhysicsConfig())
         self._camera = MujocoCamera(config, scene, appearance=appearance)
-        self._robot, self._rng = robot, np.random.default_rng(seed)
+        self._robot, self._rng = robot, np.random.default_rng(0)
         robot.watchers.append(self._look)
         self.begin(None)
 

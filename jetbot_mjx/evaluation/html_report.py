@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 
 from jetbot_mjx.evaluation import learning_curves, plots
 from jetbot_mjx.evaluation.comparison import Comparison
-from jetbot_mjx.evaluation.moments import plot_moments
+from jetbot_mjx.evaluation.moments import plot_moments, shown_goals
 from jetbot_mjx.evaluation.report import Report, replay_command
 from jetbot_mjx.runs import JsonObject, make_folder, write_bytes, write_json, write_text, writing_to
 
@@ -31,23 +31,6 @@ _OPTIONAL_FIGURES = {
     "comparison": {"learning_curves"},
 }
 """Names of the figures that a page may lack."""
-
-_FORMS = {
-    "percent": "{:.2%}",
-    "whole percent": "{:.0%}",
-    "seconds": "{:.2f} s",
-    "milliseconds": "{:.3f} s",
-    "metres": "{:.2f} m",
-    "signed metres": "{:+.3f} m",
-    "count": "{:,}",
-    "plain": "{}",
-    "short": "{:g}",
-    "degrees": "{:+.0f}°",
-    "signed percent": "{:+.2%}",
-    "signed seconds": "{:+.3f} s",
-    "p": "{:.2g}",
-    "change": "{:.2f}",
-}
 
 _PAGES = jinja2.Environment(
     loader=jinja2.PackageLoader("jetbot_mjx", "assets"),
@@ -78,7 +61,8 @@ def write_report(report: Report) -> Path:
     """
     # Choose the figures.
     episodes = report.episodes
-    shown = plots.shown_trajectories(episodes)
+    # A plan view stays readable with so many; the failures are drawn on top.
+    shown = shown_goals(episodes, successes=100, failures=200)
     successes = sum(bool(episodes.success[index] > 0) for index in shown)
     figures = {
         "by_goal": lambda: plots.plot_by_goal(report.goal_bins),
@@ -177,13 +161,13 @@ def _data_uri(png: bytes) -> str:
 
 
 def _numbers(values: JsonObject, suffix: str) -> Callable[[str, str], str]:
-    """Return a function that formats a JSON value by its path, such as `policy.success_rate`."""
+    """Return a function of a JSON value's path, such as `policy.success_rate`, and its format."""
 
     def number(place: str, form: str) -> str:
         value: PyTree = values
         for key in place.split("."):
             value = value[int(key)] if isinstance(value, list) else value[key]
-        text = "-" if value is None else _FORMS[form].format(value)
+        text = "-" if value is None else form.format(value)
         if suffix != ".html":
             return text
         exact = json.dumps(value)

@@ -49,15 +49,17 @@ class SeenEpisode(NamedTuple):
     """Occlusion maps, as of `occlusion_map`."""
 
 
-def shown_goals(episodes: Episodes) -> list[int]:
-    """Return the goals to show: the first success and the first failures.
+def shown_goals(episodes: Episodes, successes: int = 1, failures: int = MOST_FAILURES) -> list[int]:
+    """Return the goals to show: the first successes, then the first failures.
 
     Args:
       episodes: the episodes of a report, on the host.
+      successes: the largest number of successes.
+      failures: the largest number of failures.
     """
     won = np.asarray(episodes.success) > 0
-    failures = np.flatnonzero(~won)[:MOST_FAILURES]
-    return [*np.flatnonzero(won)[:1].tolist(), *failures.tolist()]
+    first = np.flatnonzero(won)[:successes], np.flatnonzero(~won)[:failures]
+    return np.concatenate(first).tolist()
 
 
 class MomentFinder:
@@ -113,10 +115,6 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> _Replay:
         EpisodeWrapper(env.blind(), env.config.task.episode_length), env.camera
     )
 
-    def step(state: State, action: Float[Array, "2"]) -> State:
-        nstate = episode_env.step(state, action)
-        return jax.tree.map(lambda a, b: jnp.where(state.done > 0, b, a), nstate, state)
-
     def run(
         params: PolicyParams, keys: UInt32[Array, "n 2"], times: Int[Array, "n moments"]
     ) -> _Seen:
@@ -124,7 +122,8 @@ def _replay_fn(env: JetBotEnv, networks: Networks) -> _Replay:
 
         def advance(carry: tuple[Array, State, PyTree]) -> tuple[Array, State, PyTree]:
             time, state, seen = carry
-            state = jax.vmap(step)(state, policy(state.obs))
+            # What an episode does after its end is not kept.
+            state = jax.vmap(episode_env.step)(state, policy(state.obs))
             now = times == time + 1
 
             def keep(old: Array, obs: Array) -> Array:

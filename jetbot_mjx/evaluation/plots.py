@@ -6,17 +6,18 @@ The colours come from the theme in which a figure is drawn: `with theme("dark"):
 import contextlib
 import io
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 from typing import Literal
 
 import matplotlib
 import numpy as np
 from jaxtyping import Float
+from matplotlib import rc_params_from_file
 from matplotlib.axes import Axes
 from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 from matplotlib.projections.polar import PolarAxes
-from matplotlib.rcsetup import cycler
 from matplotlib.ticker import FuncFormatter, PercentFormatter
 from matplotlib.typing import ColorType
 
@@ -28,41 +29,20 @@ from jetbot_mjx.evaluation.rollout import Episodes
 Theme = Literal["light", "dark"]
 THEMES: tuple[Theme, ...] = ("light", "dark")
 
-# Background, text, grid lines, and line colours that colour-blind readers can tell apart. The first
-# two line colours are for goals that were reached and missed.
-_COLOURS = {
-    "light": ("#ffffff", "#22272e", "#d5dae1", "#1f6fd0 #d9480f #2b8a3e #862e9c #b08900 #0b7285"),
-    "dark": ("#161b22", "#d5dbe3", "#363e49", "#5aa2f5 #ff8a4c #5bbd6e #c98be0 #e0b73c #4dbfd0"),
-}
-_FACES = ("figure", "savefig", "axes", "legend")
+_ASSETS = Path(__file__).parents[1] / "assets"
+
 _REACHED, _MISSED = "C0", "C1"
 
 _DPI = 160
-
-_MAX_SUCCESSES = 100
-_MAX_FAILURES = 200
 
 
 @contextlib.contextmanager
 def theme(name: Theme) -> Iterator[None]:
     """Set the colours of figures that are drawn inside the context to a light or dark theme."""
-    paper, ink, faint, cycle = _COLOURS[name]
-    style = {
-        **dict.fromkeys((f"{part}.facecolor" for part in _FACES), paper),
-        **dict.fromkeys(("legend.edgecolor", "axes.edgecolor", "grid.color", "hatch.color"), faint),
-        **dict.fromkeys(("text.color", "axes.labelcolor", "xtick.color", "ytick.color"), ink),
-        "legend.framealpha": 0.85,
-        "grid.linewidth": 0.7,
-        "axes.prop_cycle": cycler(color=cycle.split()),
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.titlesize": 11,
-        "axes.titleweight": "bold",
-        "axes.titlelocation": "left",
-        "font.size": 10,
-    }
-    # The stub lists all names, and some of these are composed.
-    with matplotlib.rc_context(style):  # pyright: ignore[reportArgumentType]
+    with matplotlib.rc_context():
+        for style in ("plots", name):
+            path = _ASSETS / f"{style}.mplstyle"
+            matplotlib.rcParams.update(rc_params_from_file(path, use_default_template=False))
         yield
 
 
@@ -71,20 +51,6 @@ def to_png(figure: Figure) -> bytes:
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=_DPI, metadata={"Software": None})
     return buffer.getvalue()
-
-
-def shown_trajectories(episodes: Episodes) -> list[int]:
-    """Return the indices of the episodes to show in a readable plan view.
-
-    They are the first successes and the first failures. The failures come last, so that they are
-    drawn on top.
-
-    Args:
-      episodes: episodes on the host.
-    """
-    won = np.asarray(episodes.success) > 0
-    failures, successes = np.flatnonzero(~won), np.flatnonzero(won)
-    return [*successes[:_MAX_SUCCESSES].tolist(), *failures[:_MAX_FAILURES].tolist()]
 
 
 def plot_trajectories(

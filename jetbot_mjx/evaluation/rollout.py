@@ -22,8 +22,8 @@ from jetbot_mjx.packed import Packed, pack
 # episodes draw from the same key.
 _ACTION_DRAWS = 0x61637473
 
-_TALLY = "tally"
-"""Key of the episode's statistics in the state's `info`."""
+_PATH = "path_length"
+"""Key of the distance travelled in the state's `info` [m]."""
 
 Controller = Callable[[PyTree, State, UInt32[Array, "2"]], Float[Array, "2"]]
 
@@ -62,18 +62,6 @@ Rollout = Callable[[int | Int[Array, ""], PyTree, UInt32[Array, "n 2"]], Episode
 """A function of (index of the controller, its parameters, reset keys)."""
 
 
-class _Tally(NamedTuple):
-    """A `_Tally` holds the episode statistics so far; `alive` is 1 until the episode has ended."""
-
-    alive: Float[Array, ""]
-    success: Float[Array, ""]
-    steps: Float[Array, ""]
-    episode_return: Float[Array, ""]
-    terminated: Float[Array, ""]
-    nonfinite: Float[Array, ""]
-    path_length: Float[Array, ""]
-
-
 class _Carry(NamedTuple):
     """A `_Carry` holds what the loop over the environment steps carries."""
 
@@ -83,37 +71,23 @@ class _Carry(NamedTuple):
 
 
 class _OneEpisodeWrapper(Wrapper):
-    """A wrapper that sums up the first episode in `info`, and then keeps its final state."""
+    """A wrapper that measures the way of the first episode, and then keeps its final state."""
 
     env: envs.EpisodeWrapper
 
     def reset(self, rng: UInt32[Array, "2"]) -> State:
-        """Begin the episode with empty statistics."""
+        """Begin the episode."""
         state = self.env.reset(rng)
-        zero = jnp.zeros(())
-        return state.replace(info={**state.info, _TALLY: _Tally(jnp.ones(()), *[zero] * 6)})
+        return state.replace(info={**state.info, _PATH: jnp.zeros(())})
 
     def step(self, state: State, action: Float[Array, "2"]) -> State:
-        """Make one step and add to the statistics, unless the episode has ended."""
+        """Make one step, unless the episode has ended."""
         nstate: PyTree = self.env.step(state, action)
-        tally: _Tally = state.info[_TALLY]
         moved = jnp.linalg.norm(
             nstate.pipeline_state.qpos[QPOS_XYZ][:2] - state.pipeline_state.qpos[QPOS_XYZ][:2]
         )
-        now = _Tally(
-            alive=-nstate.done,
-            success=nstate.metrics["success"],
-            steps=jnp.ones(()),
-            episode_return=nstate.reward,
-            terminated=nstate.info["terminated"],
-            nonfinite=nstate.metrics["nonfinite_envs"],
-            path_length=moved,
-        )
-        added = jax.tree.map(lambda total, x: total + tally.alive * x, tally, now)
-        # Keep the final state of an episode that has ended.
-        nstate = nstate.replace(info={**nstate.info, _TALLY: tally})
-        kept = jax.tree.map(lambda a, b: jnp.where(tally.alive > 0, a, b), nstate, state)
-        return kept.replace(info={**kept.info, _TALLY: added})
+        nstate = nstate.replace(info={**nstate.info, _PATH: state.info[_PATH] + moved})
+        return jax.tree.map(lambda a, b: jnp.where(state.done > 0, a, b), state, nstate)
 
 
 def rollout_fn(
@@ -153,8 +127,8 @@ def rollout_fn(
 
         def goes_on(carry: _Carry) -> Bool[Array, ""]:
             # Stop early, because most policies reach all goals long before the time limit.
-            alive = carry.states.unpack().info[_TALLY].alive
-            return (carry.time < episode_length) & (alive > 0).any()
+            done = carry.states.unpack().done
+            return (carry.time < episode_length) & (done == 0).any()
 
         def body(carry: _Carry) -> _Carry:
             step_keys = fold_in(fold_in(keys, _ACTION_DRAWS), carry.time)
@@ -182,10 +156,15 @@ def _to_episodes(env: JetBotEnv | Wrapper, first: State, end: _Carry) -> Episode
         # Repeat the final state in the rows that were not reached.
         ended = jnp.arange(qpos.shape[1]) > end.time
         qpos = jnp.where(ended[:, None], last.pipeline_state.qpos[:, None], qpos)
-    # All episodes have ended: the other statistics are those of whole episodes.
-    statistics = {name: x for name, x in last.info[_TALLY]._asdict().items() if name != "alive"}
+    # All episodes have ended: the sums are those of whole episodes.
+    sums = last.info["episode_metrics"]
     return Episodes(
-        **statistics,
+        success=sums["success"],
+        steps=last.info["steps"],
+        episode_return=sums["sum_reward"],
+        terminated=last.info["terminated"],
+        nonfinite=sums["nonfinite_envs"],
+        path_length=last.info[_PATH],
         start_w=start[:, QPOS_XYZ][:, :2],
         start_yaw=jax.vmap(envs.yaw)(start[:, envs.QPOS_QUAT]),
         end_w=last.pipeline_state.qpos[:, QPOS_XYZ][:, :2],

@@ -55,7 +55,6 @@ from .run_finder import find_run as find_run
 from .run_finder import find_run_config as find_run_config
 from .run_finder import runs_table as runs_table
 from .run_finder import scan_runs as scan_runs
-from .sb3_tags import aliases as aliases
 from .setup import Setup as Setup
 from .task_code import TaskCode as TaskCode
 from .task_code import collect_task_code as collect_task_code

@@ -38,7 +38,7 @@ import shutil
 import stat
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, Self
+from typing import TYPE_CHECKING, Self
 
 import jax
 import numpy as np
@@ -72,14 +72,8 @@ _SOURCE_LOCATIONS = re.compile(r"\s*\[source locations='[^']*'\]")
 """Matches the list of its own source files that some releases of TensorStore add to an error."""
 
 
-class _Typed(Protocol):
-    """An array, or the description of one: of NumPy, JAX or TensorStore."""
-
-    @property
-    def shape(self) -> Sequence[int]: ...
-
-    @property
-    def dtype(self) -> object: ...
+_Typed = np.ndarray | jax.ShapeDtypeStruct | ts.TensorStore
+"""An array, or the description of one."""
 
 
 class CheckpointError(UserError):
@@ -218,23 +212,20 @@ def _without_log() -> Iterator[None]:
     tracebacks from each of its threads for errors that it raises as well.
     """
     orbax, root = logging.getLogger("absl"), logging.getLogger()
-    quiet, none = _NotOfOrbax(), logging.NullHandler()
-    orbax.addFilter(quiet)
+    none = logging.NullHandler()
+    orbax.addFilter(_is_not_of_orbax)
     # As long as there is no handler, its logger adds one that writes to standard error.
     root.addHandler(none)
     try:
         yield
     finally:
         root.removeHandler(none)
-        orbax.removeFilter(quiet)
+        orbax.removeFilter(_is_not_of_orbax)
 
 
-class _NotOfOrbax(logging.Filter):
-    """A filter of log records that drops those of Orbax."""
-
-    def filter(self, record: logging.LogRecord) -> bool:
-        """Return whether to log the record."""
-        return "orbax" not in Path(record.pathname).parts
+def _is_not_of_orbax(record: logging.LogRecord) -> bool:
+    """Return whether to log a record: not if Orbax logs it."""
+    return "orbax" not in Path(record.pathname).parts
 
 
 def checkpoint_steps(run_dir: Path) -> list[int]:

@@ -35,8 +35,9 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple, Protocol, Self
+from typing import TYPE_CHECKING, Annotated, NamedTuple, Protocol, Self
 
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from tensorboardX import summary as tensorboard_summary
 from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
@@ -44,7 +45,7 @@ from tensorboardX.proto import event_pb2, summary_pb2
 from jetbot_mjx.config import Config
 from jetbot_mjx.errors import UserError
 from jetbot_mjx.runs.run_dir import read_bytes, write_text
-from jetbot_mjx.runs.sb3_tags import Alias, with_aliases
+from jetbot_mjx.runs.sb3_tags import aliases, with_aliases
 
 if TYPE_CHECKING:
     from google.protobuf.message import Message
@@ -62,6 +63,9 @@ _LATEST = 253_402_300_799
 """Last second of the year 9999, after which no time can be shown [s since 1970]."""
 
 MetricValues = Mapping[str, float | None]
+
+_Number = Annotated[int | float, Field(ge=-sys.float_info.max, le=sys.float_info.max)]
+"""A number that a float can hold; a whole one stays whole."""
 
 
 class Sink(Protocol):
@@ -84,6 +88,16 @@ def mean_of(metrics: Sequence[MetricValues]) -> MetricValues:
         values = [value for one in metrics if (value := one.get(name)) is not None]
         means[name] = sum(values) / len(values) if values else None
     return means
+
+
+class _Line(BaseModel):
+    """A line of `metrics.jsonl` that a training can have written; other keys are metrics."""
+
+    model_config = ConfigDict(strict=True, extra="allow")
+    __pydantic_extra__: dict[str, _Number | None]
+
+    env_steps: Annotated[int, Field(ge=0, lt=2**53)]
+    timestamp: Annotated[_Number, Field(ge=0, le=_LATEST)]
 
 
 class History(NamedTuple):
@@ -121,26 +135,10 @@ def read_history(path: Path, last: float = math.inf) -> list[History]:
 def _parse_line(line: str) -> History | None:
     """Return what a line holds; None if it is incomplete or no training can have written it."""
     try:
-        values = json.loads(line)
-        env_steps, timestamp = values.pop("env_steps"), values.pop("timestamp")
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        found = _Line.model_validate_json(line)
+    except ValidationError:
         return None
-    is_valid = (
-        isinstance(env_steps, int)
-        and not isinstance(env_steps, bool)
-        and 0 <= env_steps < 2**53
-        and _is_number(timestamp)
-        and 0 <= timestamp <= _LATEST
-        and all(value is None or _is_number(value) for value in values.values())
-    )
-    return History(env_steps, timestamp, values) if is_valid else None
-
-
-def _is_number(value: object) -> bool:
-    """Return whether a JSON value is a number that a float can hold."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) <= sys.float_info.max
+    return History(found.env_steps, found.timestamp, found.model_extra or {})
 
 
 class JsonlSink:
@@ -216,7 +214,6 @@ class TensorBoardSink:
         self,
         folder: Path,
         history: Sequence[History] = (),
-        names: Mapping[str, Alias] | None = None,
         config: Config | None = None,
     ) -> None:
         """Open an event file.
@@ -224,10 +221,9 @@ class TensorBoardSink:
         Args:
           folder: folder for `tensorboard --logdir`; event files of an earlier training are removed.
           history: metrics that are written first, in place of the removed ones.
-          names: metrics that are also written under another tag, from `sb3_tags.aliases`.
-          config: the configuration of the run, or None to write metrics only.
+          config: the configuration of the run, or None to write metrics only, without other tags.
         """
-        self._names = names or {}
+        self._names = aliases(config.ppo) if config else {}
         folder.mkdir(exist_ok=True)
         for events in folder.glob("events.out.tfevents.*"):
             events.unlink()

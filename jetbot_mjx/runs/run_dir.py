@@ -56,13 +56,13 @@ class DamagedRunError(UserError):
         super().__init__(
             f"the run {run_dir} is damaged: {reason}: restore the file, or train into a new folder"
         )
-        self.reason = reason
+        self.run_dir, self.reason = run_dir, reason
 
 
-def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
+def default_run_dir(config_path: Path) -> Path:
     """Return `runs/<config>-<date>-<time>`, in local time."""
     now = datetime.datetime.now().astimezone()
-    return root / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
+    return Path("runs") / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
 
 
 def seed_dirs(run_dir: Path, config: Config) -> list[Path]:
@@ -305,7 +305,7 @@ def read_bytes(path: Path) -> bytes:
     Raises:
       OSError: it cannot be read, is not a regular file, or is larger than any that a run has.
     """
-    with open(path, "rb", opener=_open_at_once) as file:
+    with open(path, "rb", opener=open_at_once) as file:
         if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
             raise OSError(errno.EINVAL, "it is not a regular file")
         content = file.read(_MOST_BYTES + 1)
@@ -324,9 +324,9 @@ def read_text(path: Path) -> str:
     return read_bytes(path).decode()
 
 
-def _open_at_once(path: str, flags: int) -> int:
-    """Open a file as `os.open` does, but a named pipe without waiting for its writer."""
-    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0))
+def open_at_once(path: str, flags: int) -> int:
+    """Open a file as `open` does, but a named pipe without waiting for its other end."""
+    return os.open(path, flags | getattr(os, "O_NONBLOCK", 0), 0o666)
 
 
 def write_json(path: Path, values: object) -> None:

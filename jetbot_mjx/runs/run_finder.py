@@ -56,14 +56,6 @@ class RunInfo(NamedTuple):
         return _shortest_name(self.path)
 
 
-class DamagedRun(NamedTuple):
-    """A `DamagedRun` holds what a list of runs says about a run that cannot be read."""
-
-    path: Path
-    reason: str
-    """The reason, with the name of the file that is damaged."""
-
-
 def _shortest_name(path: Path) -> str:
     if path.parent == PRETRAINED:
         return _PREFIX + path.name
@@ -82,7 +74,11 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
     """
     text = str(name)
     if text.startswith(_PREFIX):
-        return _find_pretrained(text.removeprefix(_PREFIX))
+        known = sorted(path.name for path in PRETRAINED.iterdir())
+        if (own := text.removeprefix(_PREFIX)) in known:
+            return PRETRAINED / own
+        names = ", ".join(known)
+        raise NotFoundError(f"{text} does not come with the package: there are {names}")
     if os.path.lexists(text):
         return Path(name)
     if text == _LATEST:
@@ -91,8 +87,8 @@ def find_run(name: str | Path, root: Path = ROOT) -> Path:
             return runs[0].path
         reason = f"there is no run in {root}/: train one first"
         if damaged:
-            path, why = damaged[0]
-            reason = f"every run in {root}/ is damaged, such as {path.name}: {why}"
+            one = damaged[0]
+            reason = f"every run in {root}/ is damaged, such as {one.run_dir.name}: {one.reason}"
         raise NotFoundError(f"{_LATEST}: {reason}")
     if Path(text).name == text and os.path.lexists(root / text):
         return root / text
@@ -118,8 +114,8 @@ def find_run_config(run_dir: Path) -> Path:
     return run_dir / CONFIG
 
 
-def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRun]]:
-    """Return the runs in the subfolders of a folder, the latest first, and the damaged ones.
+def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRunError]]:
+    """Return the runs in the subfolders of a folder, the latest first, and the errors of the others.
 
     Args:
       root: the folder, which may be missing.
@@ -137,7 +133,7 @@ def scan_runs(root: Path = ROOT) -> tuple[list[RunInfo], list[DamagedRun]]:
             try:
                 runs.append(read_info(folder))
             except DamagedRunError as error:
-                damaged.append(DamagedRun(folder, error.reason))
+                damaged.append(error)
     return sorted(runs, key=lambda run: -run.changed), damaged
 
 
@@ -167,12 +163,12 @@ def read_info(run_dir: Path) -> RunInfo:
     )
 
 
-def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRun] = ()) -> str:
+def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRunError] = ()) -> str:
     """Return a list of runs as text, one line each, or a line that says there are none.
 
     Args:
       runs: the runs.
-      damaged: runs that cannot be read, which follow with the reason.
+      damaged: the errors of runs that cannot be read, which follow with the reason.
     """
     rows = [("run", "task", "steps", "success", "age")]
     rows += [
@@ -190,17 +186,8 @@ def runs_table(runs: Sequence[RunInfo], damaged: Sequence[DamagedRun] = ()) -> s
         lines = ["no runs here: train one, or use one that comes with the package: pretrained:NAME"]
     if any(run.env_steps < run.num_timesteps for run in runs):
         lines.append("* stopped before its last step, or reached stop_at_success")
-    lines += [printable(f"damaged: {_shortest_name(one.path)}: {one.reason}") for one in damaged]
+    lines += [printable(f"damaged: {_shortest_name(one.run_dir)}: {one.reason}") for one in damaged]
     return "\n".join(lines)
-
-
-def _find_pretrained(name: str) -> Path:
-    known = sorted(path.name for path in PRETRAINED.iterdir())
-    if name in known:
-        return PRETRAINED / name
-    raise NotFoundError(
-        f"{_PREFIX}{name} does not come with the package: there are {', '.join(known)}"
-    )
 
 
 def copy_pretrained(folder: Path) -> tuple[Path, ...]:

@@ -1,9 +1,10 @@
 """Keep the messages of a training in its run folder, for when nobody reads its terminal."""
 
 import contextlib
-import os
 import time
 from pathlib import Path
+
+from jetbot_mjx.runs.run_dir import open_at_once
 
 TRAIN_LOG = "train.log"
 """Name of the file of messages in a run folder."""
@@ -22,9 +23,8 @@ def log_message(run_dir: Path, text: str) -> None:
     now = time.strftime("%Y-%m-%d %H:%M:%S")
     lines = "".join(f"{now}  {line}\n" for line in text.splitlines())
     # A pipe in its place, which nobody reads, must not hold the training up.
-    flags = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NONBLOCK", 0)
     with (
         contextlib.suppress(OSError),
-        open(os.open(run_dir / TRAIN_LOG, flags, 0o666), "a", encoding="utf-8") as file,
+        open(run_dir / TRAIN_LOG, "a", encoding="utf-8", opener=open_at_once) as file,
     ):
         file.write(lines)

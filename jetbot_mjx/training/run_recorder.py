@@ -87,7 +87,7 @@ def open_sinks(
         sinks: list[runs.Sink] = [runs.JsonlSink(run_dir / runs.METRICS, history)]
         if config.tensorboard:
             folder = run_dir / "tensorboard"
-            sinks.append(runs.TensorBoardSink(folder, history, runs.aliases(config.ppo), config))
+            sinks.append(runs.TensorBoardSink(folder, history, config))
         if config.wandb is not None:
             sinks.append(runs.WandbSink(config, run_dir, history, say, seeds))
     return sinks

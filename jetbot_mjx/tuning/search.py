@@ -36,6 +36,8 @@ with requires_extra("tune", "tune"):
     import sqlalchemy.exc
     from optuna.trial import FrozenTrial
 
+_EVALUATIONS = 8
+"""Number of evaluations of each trial, whose mean success is maximised."""
 _BEAT_SECONDS = 5
 """Time between two heartbeats of a worker [s]."""
 _STALE_SECONDS = 30
@@ -98,7 +100,6 @@ class Search:
         folder: Path,
         *,
         storage: str | None = None,
-        evaluations: int = 8,
         say: Callable[[str], None] = lambda text: None,
     ) -> None:
         """Open the study, or create it.
@@ -108,7 +109,6 @@ class Search:
           space: the settings and their values.
           folder: where the study and its results are stored.
           storage: a database URL; None: SQLite in the folder.
-          evaluations: how often each trial is evaluated; their mean success is maximised.
           say: called with one line about each round.
 
         Raises:
@@ -122,7 +122,6 @@ class Search:
         flat = config.flat()
         # An option of a task may be searched that the configuration does not have.
         self._given = {one.name: _frozen(flat[one.name]) for one in space if one.name in flat}
-        self._evaluations = evaluations
         self._say = say
         self._batches: dict[_Static, Trials] = {}
         folder = folder.resolve()
@@ -241,7 +240,7 @@ class Search:
             for name, values in chosen.items()
             for index in range(seeds)
         ]
-        done: dict[str, list[tuple[Outcome, float, float]]] = {name: [] for name in chosen}
+        done: dict[str, list[tuple[float, float, float]]] = {name: [] for name in chosen}
         with stage("final trainings", len(work)) as advance:
             for key, members in self._groups([values for _, values, _ in work]).items():
                 # In parts of one size, which the program of a round can train.
@@ -251,13 +250,7 @@ class Search:
                         done[work[i][0]].append(result)
                     advance(len(part))
         return [
-            Entrant(
-                name,
-                dict(chosen[name]),
-                tuple(one.area for one, _, _ in found),
-                tuple(rate for _, rate, _ in found),
-                tuple(seconds for _, _, seconds in found),
-            )
+            Entrant(name, dict(chosen[name]), *zip(*found, strict=True))
             for name, found in done.items()
         ]
 
@@ -267,15 +260,16 @@ class Search:
 
     def _final(
         self, work: Sequence[tuple[str, Values, int]], key: _Static
-    ) -> list[tuple[Outcome, float, float]]:
-        """Train values with seeds; return the outcomes, and success and time on the report."""
+    ) -> list[tuple[float, float, float]]:
+        """Train values with seeds; return mean success, and success and time on the report."""
         batch = self._batch(key)
         outcomes = self._outcomes(batch, [values for _, values, _ in work], [x[2] for x in work])
         stacked = jax.tree.map(lambda *x: np.stack(x), *(one.params for one in outcomes))
         with stage("episodes of the report's goals", len(work) * REPORT_GOALS):
             episodes = jax.device_get(batch.evaluate(stacked, report_keys(REPORT_GOALS)))
         rates = np.asarray(episodes.success).mean(axis=1).tolist()
-        return list(zip(outcomes, rates, mean_seconds(episodes, batch.config), strict=True))
+        areas, seconds = [one.area for one in outcomes], mean_seconds(episodes, batch.config)
+        return list(zip(areas, rates, seconds, strict=True))
 
     def _check_study(self) -> None:
         """Refuse a study that was begun with another space or configuration."""
@@ -462,7 +456,7 @@ class Search:
                 one.name for one in self._space if one.name in TRACED and one.name not in static
             ]
             with stage("preparing the environment and the networks"):
-                self._batches[key] = Trials(config, traced, self._evaluations)
+                self._batches[key] = Trials(config, traced, _EVALUATIONS)
         return self._batches[key]
 
 

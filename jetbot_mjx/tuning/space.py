@@ -66,11 +66,6 @@ class Parameter(NamedTuple):
     """Whether the logarithm is drawn uniformly."""
     choices: tuple[Value, ...] = ()
 
-    @property
-    def whole(self) -> bool:
-        """Return whether the range holds whole numbers only."""
-        return isinstance(self.low, int)
-
     def contains(self, value: Value) -> bool:
         """Return whether the setting may take this value."""
         if self.choices:

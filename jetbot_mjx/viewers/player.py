@@ -75,15 +75,15 @@ class Player:
         """How the last episode ended, in words; None before the first end."""
         self.robots = robots
         """Number of robots."""
-        self.frames = Rate()
-        """Frame counter of the viewer, which counts every frame that it shows."""
+        self.ticks, self.frames = Rate(), Rate()
+        """Counters of control steps, pauses included, and of the frames that the viewer shows."""
         # A few robots are faster on a CPU than on a GPU.
         self._device = host_cpu()
         self._fns = make_viewer_fns(self.env, checkpoint.networks)
         self._key, key = self._put(tuple(jax.random.split(jax.random.PRNGKey(seed))))
         # The first robot's goals do not depend on the number of robots.
         keys = [key, *(jax.random.fold_in(key, robot) for robot in range(1, robots))]
-        self._count, self._rate, self._speed = 0, Rate(), 1.0
+        self._count, self._speed = 0, 1.0
         self.drive(0.0, 0.0)
         self._use(checkpoint)
         self._hold = np.zeros(robots, int)
@@ -127,7 +127,7 @@ class Player:
         steps = self._clock.due(time.monotonic())
         for _ in range(steps):
             self.tick()
-        self._rate.count(time.monotonic(), steps)
+        self.ticks.count(time.monotonic(), steps)
         return steps
 
     def wait(self) -> float:
@@ -220,11 +220,6 @@ class Player:
         return float(self.snapshot.steps) * self.env.dt
 
     @property
-    def time_limit(self) -> float:
-        """Simulated time after which an episode is truncated [s]."""
-        return self.env.config.task.episode_length * self.env.dt
-
-    @property
     def distance(self) -> float:
         """Horizontal distance from the axle midpoint to the goal [m]."""
         offset = self.snapshot.goal_w - self.snapshot.qpos[QPOS_XYZ]
@@ -249,22 +244,14 @@ class Player:
     def describe(self) -> dict[str, str]:
         """Return the texts that a viewer shows about the chosen robot and the pace, by label."""
         ended = f", {self.outcome}" if self.snapshot.done else ""
+        limit, now = self.env.config.task.episode_length * self.env.dt, time.monotonic()
+        steps, frames = self.ticks.per_second(now), self.frames.per_second(now)
         return {
             "Goals": f"{self.successes} of {self.episodes} reached",
-            "Episode": f"{self.time:.1f} of {self.time_limit:.1f} s{ended}",
+            "Episode": f"{self.time:.1f} of {limit:.1f} s{ended}",
             "Distance": f"{self.distance:.2f} m",
-            "Pace": f"{self.steps_per_second:.0f} steps/s, {self.frames_per_second:.0f} frames/s",
+            "Pace": f"{steps:.0f} steps/s, {frames:.0f} frames/s",
         }
-
-    @property
-    def steps_per_second(self) -> float:
-        """Control steps within the last second, including those of pauses [1/s]."""
-        return self._rate.per_second(time.monotonic())
-
-    @property
-    def frames_per_second(self) -> float:
-        """Return how many frames the viewer showed within the last second [1/s]."""
-        return self.frames.per_second(time.monotonic())
 
     def _use(self, checkpoint: Checkpoint) -> None:
         self._params = self._put(checkpoint.params)

@@ -34,13 +34,11 @@ _LAG = 0.095  # share of the robot's turn that it makes up for per frame
 
 @dataclasses.dataclass
 class _Move:
-    """A `_Move` holds where the camera of a client is and where it goes [m]."""
+    """A `_Move` holds where the camera of a client and its target are, and where they go [m]."""
 
     shown: Float[np.ndarray, "2 4"]
-    eye_w: Float[np.ndarray, "3"]
-    look_at_w: Float[np.ndarray, "3"]
-    to_eye_w: Float[np.ndarray, "3"]
-    to_look_at_w: Float[np.ndarray, "3"]
+    at_w: Float[np.ndarray, "2 3"]
+    to_w: Float[np.ndarray, "2 3"]
     frames_since_arrival: int = -1
 
 
@@ -117,14 +115,12 @@ class Cameras:
 
 def _advance(camera: viser.CameraHandle, move: _Move) -> None:
     """Go a share of the remaining way."""
-    left = np.abs([move.to_eye_w - move.eye_w, move.to_look_at_w - move.look_at_w]).max()
-    share = 1.0 if left < _ARRIVED else _GLIDE
-    move.frames_since_arrival = 0 if share == 1.0 else -1
-    move.eye_w = move.eye_w + share * (move.to_eye_w - move.eye_w)
-    move.look_at_w = move.look_at_w + share * (move.to_look_at_w - move.look_at_w)
+    way_w = move.to_w - move.at_w
+    arrives = np.abs(way_w).max() < _ARRIVED
+    move.frames_since_arrival = 0 if arrives else -1
+    move.at_w = move.at_w + (1.0 if arrives else _GLIDE) * way_w
     # Setting the position shifts the target too, so it comes first.
-    camera.position = move.eye_w
-    camera.look_at = move.look_at_w
+    camera.position, camera.look_at = move.at_w
 
 
 def _plan(
@@ -136,21 +132,19 @@ def _plan(
     """Plan a move from where the camera is; a new page's camera looks along `ahead_w` at once."""
     # The page reports its camera with a delay, and meanwhile in parts.
     if before is None:
-        eye_w, look_at_w = -ahead_w, np.zeros(3)
+        at_w = np.stack([-ahead_w, np.zeros(3)])
     elif before.frames_since_arrival > _REPORTED_FRAMES:
-        eye_w, look_at_w = np.array(camera.position), np.array(camera.look_at)
+        at_w = np.array([camera.position, camera.look_at])
     else:
-        eye_w, look_at_w = before.eye_w, before.look_at_w
-    axes_w = camera_axes(look_at_w - eye_w)
+        at_w = before.at_w
+    axes_w = camera_axes(at_w[1] - at_w[0])
     corners_w = np.array(list(itertools.product(*shown[:, :3].T)))
     width, height = shown[0, 3], shown[1, 3]
-    to_eye_w = eye_that_sees(corners_w, axes_w, _slopes(camera.fov, width, height), _NEAREST)
+    eye_w = eye_that_sees(corners_w, axes_w, _slopes(camera.fov, width, height), _NEAREST)
     # The user turns the camera around the middle of the box, as deep as it lies in the view.
-    depth = axes_w[2] @ (corners_w.mean(axis=0) - to_eye_w)
-    to_look_at_w = to_eye_w + depth * axes_w[2]
-    if before is None:
-        eye_w, look_at_w = to_eye_w, to_look_at_w
-    return _Move(shown, eye_w, look_at_w, to_eye_w, to_look_at_w)
+    depth = axes_w[2] @ (corners_w.mean(axis=0) - eye_w)
+    to_w = np.stack([eye_w, eye_w + depth * axes_w[2]])
+    return _Move(shown, to_w if before is None else at_w, to_w)
 
 
 def _slopes(fov: float, width: float, height: float) -> Float[np.ndarray, "4"]:

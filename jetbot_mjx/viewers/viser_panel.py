@@ -1,10 +1,10 @@
 """Build the control panel of a player's page in viser."""
 
-import html
 import math
 from collections.abc import Callable
 from typing import Literal
 
+import jinja2
 import viser
 
 from jetbot_mjx.errors import UserError
@@ -16,17 +16,8 @@ from jetbot_mjx.viewers.viser_scene import Scene
 
 _BUTTONS = ("Step", "New episode")
 
-_REWARD_BOX = '<div style="font-size:0.8em; padding:0.2em 0.8em">{}</div>'
-_REWARD_TITLE = (
-    '<div style="display:flex; opacity:0.6"><span style="flex:1">Reward of this step</span>'
-    "<span>of this episode</span></div>"
-)
-_REWARD_BAR = (
-    '<div style="display:flex"><span style="flex:1">{name} {value:+.4f}</span>'
-    "<span>{total:+.3f}</span></div>"
-    '<div style="position:relative; height:0.7em; background:rgba(128,128,128,0.2)">'
-    '<div style="position:absolute; {side}:50%; width:{width:.1f}%; height:100%;'
-    ' background:{color}"></div></div>'
+_PAGES = jinja2.Environment(
+    loader=jinja2.PackageLoader("jetbot_mjx", "assets"), autoescape=True, trim_blocks=True
 )
 
 
@@ -51,6 +42,7 @@ class ControlPanel:
         labels = player.describe()
         self.texts = {label: gui.add_text(label, "", disabled=True) for label in labels}
         self.policy_view = PolicyView(gui, player) if player.sees else None
+        self._bars = _PAGES.get_template("rewards.html")
         self._largest = dict.fromkeys(player.snapshot.rewards, 1e-9)
         self.rewards = gui.add_html("")
         self._add_choices()
@@ -82,21 +74,11 @@ class ControlPanel:
     def _reward_bars(self) -> str:
         """Return a bar for each term of the reward, relative to the largest value it has had."""
         snapshot = self._player.snapshot
-        rows = [_REWARD_TITLE]
         for name, reward in snapshot.rewards.items():
-            value = float(reward)
-            self._largest[name] = max(self._largest[name], abs(value))
-            rows.append(
-                _REWARD_BAR.format(
-                    name=html.escape(name),
-                    value=value,
-                    total=float(snapshot.returns[name]),
-                    side="left" if value >= 0 else "right",
-                    width=50 * abs(value) / self._largest[name],
-                    color="#2f9e44" if value >= 0 else "#e03131",
-                )
-            )
-        return _REWARD_BOX.format("".join(rows))
+            self._largest[name] = max(self._largest[name], abs(float(reward)))
+        return self._bars.render(
+            rewards=snapshot.rewards, returns=snapshot.returns, largest=self._largest
+        )
 
     def _add_choices(self) -> None:
         gui, player = self._server.gui, self._player

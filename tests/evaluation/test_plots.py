@@ -15,6 +15,7 @@ from jetbot_mjx.evaluation.learning_curves import (
     plot_learning_curves,
     plot_runs,
 )
+from jetbot_mjx.evaluation.moments import shown_goals
 from jetbot_mjx.evaluation.report import CurvePoint, by_goal
 
 
@@ -61,9 +62,9 @@ def test_left_is_left_on_the_map():
 
 def test_a_plan_view_shows_every_kind_and_failures_on_top():
     won = np.arange(1000) >= 400
-    shown = plots.shown_trajectories(make_episodes(np.ones((1000, 2)), won))
+    shown = shown_goals(make_episodes(np.ones((1000, 2)), won), 100, 200)
     assert shown == [*range(400, 500), *range(200)]
-    assert plots.shown_trajectories(make_episodes(np.ones((3, 2)), [0, 1, 0])) == [1, 0, 2]
+    assert shown_goals(make_episodes(np.ones((3, 2)), [0, 1, 0]), 100, 200) == [1, 0, 2]
 
 
 def test_a_policy_without_a_success_has_no_path_efficiency_to_show():

@@ -19,7 +19,7 @@ from tensorboardX.proto.event_pb2 import Event
 from tensorboardX.proto.layout_pb2 import Layout
 from tensorboardX.proto.plugin_hparams_pb2 import HParamsPluginData
 
-from jetbot_mjx.config import PPOConfig, parse_config
+from jetbot_mjx.config import Config, parse_config
 from jetbot_mjx.runs import metrics
 from jetbot_mjx.runs.metrics import (
     CompileClock,
@@ -29,7 +29,6 @@ from jetbot_mjx.runs.metrics import (
     mean_of,
     read_history,
 )
-from jetbot_mjx.runs.sb3_tags import aliases
 from helpers.tensorboard_files import events, read_events
 
 
@@ -205,7 +204,7 @@ def test_tensorboard_keeps_the_time_at_which_something_was_reported(tmp_path):
 def test_tensorboard_tells_the_configuration_and_shows_success_first(tmp_path):
     config = parse_config({"seed": 7, "ppo": {"learning_rate": 0.5}})
     folder = tmp_path / "tensorboard"
-    sink = TensorBoardSink(folder, HISTORY, aliases(config.ppo), config)
+    sink = TensorBoardSink(folder, HISTORY, config)
     sink.write(2_048, {"eval/success_rate": 0.75})
     sink.close()
     values = {value.tag: value for event in events(folder) for value in event.summary.value}
@@ -298,7 +297,7 @@ def test_tensorboard_is_written_again_with_the_same_other_names(tmp_path):
         history = read_history(tmp_path / "metrics.jsonl", 120)
         folder = tmp_path / name
         sinks = [JsonlSink(tmp_path / "metrics.jsonl", history)]
-        sinks.append(TensorBoardSink(folder, history, aliases(PPOConfig())))
+        sinks.append(TensorBoardSink(folder, history, Config()))
         if not history:
             for sink in sinks:
                 sink.write(120, metrics)

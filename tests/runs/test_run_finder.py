@@ -169,7 +169,7 @@ def test_metrics_that_cannot_be_read_are_told(runs, make):
     path.unlink()
     make(path)
     (healthy,), (damaged,) = scan_runs()
-    assert (healthy.name, damaged.path.name) == ("older", "newer")
+    assert (healthy.name, damaged.run_dir.name) == ("older", "newer")
     assert "metrics.jsonl cannot be read: " in damaged.reason
 
 

@@ -92,7 +92,7 @@ def test_control_keeps_the_rate_of_the_environment(player, wall):
         wall.now += passed
         steps.append(player.advance())
     assert sum(steps) == pytest.approx(60 * 1.98, abs=1)
-    assert player.steps_per_second == pytest.approx(60, abs=2)
+    assert player.ticks.per_second(wall.now) == pytest.approx(60, abs=2)
 
 
 def test_twice_the_pace_is_twice_the_steps(player, wall):
@@ -156,7 +156,7 @@ def test_the_time_limit_ends_an_episode(player):
     player.agent = "keyboard"
     assert tick_to_the_end(player) == 256
     assert (player.successes, player.episodes, player.outcome) == (0, 1, "out of time")
-    assert player.time == player.time_limit
+    assert player.time == 256 * player.env.dt
 
 
 def test_a_reset_in_mid_episode_counts_no_episode(player):
