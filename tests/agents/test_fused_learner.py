@@ -12,7 +12,7 @@ from brax.training.agents.ppo.networks import PPONetworks
 
 from helpers import simt
 from helpers.kernel_ppo import ACTIONS, OBSERVATIONS, config, make_ppo, minibatch
-from jetbot_mjx.agents.fused import adam, launch, launch_gpu, probe
+from jetbot_mjx.agents.fused import launch, launch_gpu, probe
 from jetbot_mjx.agents.fused.arrays import ACTIONS as ACTION_ARRAYS
 from jetbot_mjx.agents.fused.arrays import ADAM
 from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
@@ -272,14 +272,15 @@ def modelled(shape, *arrays):
         given = [np.array(x) for x in arrays]
         params, mean, scale, rows, last, unrolls, noise, index, terms = given
         batch = Minibatch(len(rows), unrolls.shape[1], rows.shape[1], len(unrolls))
-        kernel = AdvantageKernel(Tiling(shape, 64, 1, "advantages"), batch)
-        blocks = min(2, kernel.tiles)
+        tiling = Tiling(shape, 64, 1, "advantages")
+        blocks = min(2, tiling.tiles(batch))
+        kernel = AdvantageKernel(tiling, batch, blocks)
         sizes = batch.samples, batch.samples, (blocks, 2)
         estimates = [np.full(size, np.nan, np.float32) for size in sizes]
         arrays = [params, mean, scale, rows, last, unrolls, index, terms, *estimates]
         memory = kernel.shared_memory
         simt.run(kernel.text(), arrays, (blocks, 1, 1), shared_memory=memory)
-        kernel = GradientKernel(Tiling(shape, 32, 1), batch, blocks)
+        kernel = GradientKernel(Tiling(shape, 32, 1), batch, 1, blocks)
         vector = np.full((1, shape.size), np.nan, np.float32)
         arrays = [params, mean, scale, rows, unrolls, noise, index, *estimates, terms, vector]
         simt.run(kernel.text(), arrays, (1, 2, 1), shared_memory=kernel.shared_memory)
@@ -297,7 +298,7 @@ def modelled_actions(shape, *arrays):
 
     def run(*arrays):
         drawn = [np.full(x.shape, np.nan, np.float32) for x in results]
-        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), count)
+        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), Minibatch(environments=count), 1)
         given = [*(np.array(x) for x in arrays), *drawn]
         simt.run(kernel.text(), given, shared_memory=kernel.shared_memory)
         return drawn
@@ -498,8 +499,8 @@ def modelled_adam(rule, *arrays):
     """`launch.adam` on the model of a GPU, for one policy."""
 
     def run(*arrays):
-        given = {name: np.array(x) for name, x in zip(adam.ARRAYS, arrays, strict=True)}
-        results = [given[name] for name in adam.UPDATED]
+        given = {name: np.array(x) for name, x in zip(ADAM.arguments, arrays, strict=True)}
+        results = [given[name] for name in ADAM.returns]
         kernel = AdamKernel(rule, 2)
         memory = kernel.shared_memory
         simt.run(kernel.text(), [*given.values(), *results], (2, 1, 1), shared_memory=memory)

@@ -8,50 +8,35 @@ call for each step would wake all threads twice.
 from collections.abc import Mapping
 
 from jetbot_mjx.agents.fused import sample_loss
-from jetbot_mjx.agents.fused.arrays import ACTIONS, UNROLL, Actions
+from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
 from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
-from jetbot_mjx.agents.fused.cpu_stages import Stages, sample_function
+from jetbot_mjx.agents.fused.cpu_stages import sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
 from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel.build import LlvmWriter, Value, cpu, scalarize
-
-_PART_ROWS = 2 * TILE_ROWS
-"""Environments of a part if there are no more than `MOST_PARTS` times as many; each part copies the
-weights."""
-
-
-def action_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
-    """Return the stage of `arrays.ACTIONS`.
-
-    Args:
-      shape: the networks.
-      batch: the data, of which the number of environments is used.
-      lanes: the number of float32 values in a vector register.
-    """
-    return Stages([ActionStage(shape, batch.environments, lanes, _PART_ROWS)])
 
 
 class ActionStage(NetworkStage):
     """An `ActionStage` runs the policy network and draws an action from each distribution."""
 
     name = "actions"
-    arrays_of = (*ACTIONS.arguments, *ACTIONS.returns)
 
-    def __init__(self, shape: UpdateShape, environments: int, lanes: int, part_rows: int) -> None:
+    part_rows = 2 * TILE_ROWS
+    """Environments of a part, unless there would be too many parts; each copies the weights."""
+
+    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         """Divide the environments.
 
         Args:
           shape: the networks.
-          environments: the number of environments.
+          batch: the data, of which the number of environments is used.
           lanes: the number of float32 values in a vector register.
-          part_rows: the environments of a part, unless there would be too many parts.
         """
-        self.environments = environments
         numbers = ACTIONS.counts(shape, Minibatch(environments=1))
         self.drawn = {name: numbers[name] for name in Actions._fields}
         """The numbers of an environment in each array of `Actions`."""
-        part_items = max(part_rows, -(-environments // MOST_PARTS))
-        super().__init__(shape, lanes, environments, part_items)
+        part_items = max(self.part_rows, -(-batch.environments // MOST_PARTS))
+        super().__init__(shape, lanes, batch.environments, part_items)
 
     def scratch_sizes(self) -> dict[str, int]:
         """Add what the samples read and write, a row of lanes for each number."""
@@ -112,7 +97,7 @@ class ActionStage(NetworkStage):
             noise = (first + within) * actions
             sources = [
                 (outputs, self.outputs),
-                (outputs if deviations is None else deviations, actions),
+                (deviations, actions),
                 (arrays["action_noise"] + noise, actions),
             ]
             self.gather("sample", lane, sources)
@@ -127,26 +112,22 @@ class ActionStage(NetworkStage):
                     place += 1
 
 
-def unroll_stages(unroll: Unroll, batch: Minibatch, lanes: int) -> Stages:
-    """Return the stage of `arrays.UNROLL`.
-
-    Args:
-      unroll: the networks and the environment.
-      batch: the data, of which the number of environments and the time are used.
-      lanes: the number of float32 values in a vector register.
-    """
-    return Stages([_UnrollStage(unroll, batch, lanes)])
-
-
-class _UnrollStage(ActionStage):
-    """Takes environments through all steps of an unroll."""
+class UnrollStage(ActionStage):
+    """An `UnrollStage` takes environments through all steps of an unroll."""
 
     name = "unroll"
-    arrays_of = (*UNROLL.arguments, *UNROLL.returns)
+    # The parts are smaller than those of one step: each arranges the weights for all steps.
+    part_rows = TILE_ROWS
 
     def __init__(self, unroll: Unroll, batch: Minibatch, lanes: int) -> None:
-        # The parts are smaller than those of one step: each arranges the weights for all steps.
-        super().__init__(unroll.shape, batch.environments, lanes, TILE_ROWS)
+        """Divide the environments.
+
+        Args:
+          unroll: the networks and the environment.
+          batch: the data, of which the number of environments and the time are used.
+          lanes: the number of float32 values in a vector register.
+        """
+        super().__init__(unroll.shape, batch, lanes)
         self._unroll, self._time = unroll, batch.time
         numbers = {"kept": len(unroll.kept), "unroll_noise": self.shape.actions, **self.drawn}
         self._step_sizes = {name: batch.environments * size for name, size in numbers.items()}

@@ -19,7 +19,7 @@ from jetbot_mjx.agents.fused.cpu_product import (
     transposed,
     vectors_of,
 )
-from jetbot_mjx.agents.fused.cpu_stages import Stages, SumStage, integer_at, sample_function
+from jetbot_mjx.agents.fused.cpu_stages import Stage, SumStage, integer_at, sample_function
 from jetbot_mjx.agents.fused.sample_loss import ValueStep, vector_of
 from jetbot_mjx.agents.fused.shapes import (
     POLICY_METRICS,
@@ -30,14 +30,11 @@ from jetbot_mjx.agents.fused.shapes import (
 )
 from onekernel.build import LlvmWriter, ScalarProgram, Value, scalarize
 
-_READ = ("params", "mean", "scale", "rows")
-"""Arrays that both networks read first."""
-
 _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""
 
 
-def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
+def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.GRADIENT`, from values to the sum of all parts.
 
     Args:
@@ -46,18 +43,8 @@ def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
       lanes: the number of float32 values in a vector register.
     """
     values, policy = _ValueStage(shape, batch, lanes), _PolicyStage(shape, batch, lanes)
-    (begin, end), (values_begin, values_end) = shape.ranges
-    ranges = {
-        "policy_vectors": (policy.parts, (begin, end, values_begin)),
-        "values_vectors": (values.parts, (values_begin, values_end, shape.size)),
-    }
-    between = {
-        # A gradient of each part, of its network only.
-        "values_vectors": values.parts * values.size,
-        "policy_vectors": policy.parts * policy.size,
-        "advantages": batch.samples,
-    }
-    return Stages([values, policy, SumStage(lanes, ranges)], between)
+    vectors = {f"{stage.name}_vectors": stage.parts for stage in (policy, values)}
+    return [[values], [policy], [SumStage(shape, lanes, vectors)]]
 
 
 class _GradientStage(NetworkStage):
@@ -89,6 +76,8 @@ class _GradientStage(NetworkStage):
         self.batch = batch
         unrolls = max(1, round(_PART_SAMPLES / batch.time), -(-batch.unrolls // MOST_PARTS))
         super().__init__(shape, lanes, batch.unrolls, unrolls, batch.time + (not self.is_policy))
+        # A gradient of each part, of its network only.
+        self.handed_on = {f"{self.name}_vectors": self.parts * self.size}
 
     def scratch_sizes(self) -> dict[str, int]:
         shape, stride, lanes, rows = self.shape, self.stride, self.lanes, self.rows
@@ -135,12 +124,9 @@ class _GradientStage(NetworkStage):
         w, shape, places = self.w, self.shape, self.places
         self.vector = self.arrays[f"{self.name}_vectors"] + self.part.number * self.size
         # Find the unrolls and the noise of the minibatch.
-        for name, size in (
-            ("unrolls", self.batch.unrolls),
-            ("noise", self.batch.samples * shape.actions),
-        ):
-            if name in self.arrays:
-                self.arrays[name] += self.part.minibatch * size
+        noise = self.batch.samples * shape.actions
+        for name, size in (("unrolls", self.batch.unrolls), ("noise", noise)):
+            self.arrays[name] += self.part.minibatch * size
         # Transpose the weights for the backward pass, and set all sums to zero.
         for i, inputs, start in shape.hidden_layers:
             source = self.params + start
@@ -219,12 +205,12 @@ class _ValueStage(_GradientStage):
 
     name = "values"
     is_policy = False
-    arrays_of = (*_READ, "last", "unrolls", "terms", "values_vectors", "advantages")
 
     def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         self.slots, self.size = len(VALUE_METRICS), shape.size - shape.policy_size
         self.loss_program, self.loss_lanes = sample_loss.value_step_program(batch.samples), 1
         super().__init__(shape, batch, lanes)
+        self.handed_on = {**self.handed_on, "advantages": batch.samples}
 
     def observation(self, unroll: Value, step: Value) -> Value:
         # The row behind the steps has the observation after them. An address beyond the array is
@@ -272,7 +258,6 @@ class _PolicyStage(_GradientStage):
     """The gradient of the policy network."""
 
     name = "policy"
-    arrays_of = (*_READ, "unrolls", "noise", "terms", "policy_vectors", "advantages")
 
     def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         self.slots, self.size = shape.deviations + len(POLICY_METRICS), shape.policy_size
@@ -338,7 +323,7 @@ class _PolicyStage(_GradientStage):
     ) -> None:
         """Copy what the loss of a sample reads to a lane, in the order of `PolicySample`."""
         w, shape, batch = self.w, self.shape, self.batch
-        columns, actions, deviations = shape.columns, shape.actions, self.deviations
+        columns, actions = shape.columns, shape.actions
         outputs = self.places["outputs"] + row * HEAD
         collected = self.row_of(unroll, step)
         noise = self.arrays["noise"] + (step * batch.unrolls + unroll) * actions
@@ -348,7 +333,7 @@ class _PolicyStage(_GradientStage):
         first = columns["raw_action"]
         sources = [
             (outputs, self.outputs),
-            (outputs if deviations is None else deviations, actions),
+            (self.deviations, actions),
             (collected + first, columns["reward"] - first),
             (noise, actions),
         ]

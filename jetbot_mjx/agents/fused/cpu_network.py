@@ -44,8 +44,6 @@ class NetworkStage(Stage):
         outputs                  (rows, HEAD)
     """
 
-    arrays_of: tuple[str, ...]
-    """Names of the arrays that it reads or writes."""
     is_policy = True
     """Whether the network is the policy's."""
 
@@ -129,7 +127,7 @@ class NetworkStage(Stage):
         functions = self.own_functions()
         self.w, self.part = w, part = self.begin(self.lanes)
         # Find the arrays of the policy, the network's parameters and the scratch memory.
-        self.arrays = {name: call.array(part.job, part.policy, name) for name in self.arrays_of}
+        self.arrays = {name: call.array(part.job, part.policy, name) for name in call.sizes}
         start = 0 if self.is_policy else self.shape.policy_size
         self.params = self.arrays["params"] + start
         self.places = {
@@ -187,10 +185,8 @@ class NetworkStage(Stage):
             yield group * lanes
 
     @property
-    def deviations(self) -> Value | None:
-        """Return the address of the standard deviations that are parameters; None: none are."""
-        if not self.shape.deviations:
-            return None
+    def deviations(self) -> Value:
+        """Return the address of the standard deviations that are parameters, or of any numbers."""
         return self.params + (self.shape.hidden + (self.shape.width + 1) * self.outputs)
 
     def gather(

@@ -5,20 +5,15 @@ tiles of samples. Weights and activations are in shared memory as float16, all s
 and the sums of the gradient stay in registers until the last tile.
 """
 
-import itertools
-from collections.abc import Iterator
+import jax
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import GRADIENT
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel, estimate_shapes
 from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import PAD, Tiling, padded, shares_of
 from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, Minibatch
-from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Sums, Value
-
-ARGUMENTS = (
-    *("params", "mean", "scale", "rows", "unrolls", "noise", "index"),
-    *("advantages", "targets", "statistics", "terms"),
-)
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Value
 
 _ONES = 0x3C003C00
 """Two ones in float16."""
@@ -29,10 +24,10 @@ over many, they would be too small for float16."""
 
 
 class GradientKernel(NetworkKernel):
-    """A `GradientKernel` takes `ARGUMENTS`, and returns a vector for each block.
+    """A `GradientKernel` takes arguments of `arrays.GRADIENT` and the results of the advantages.
 
-    The arguments are those of `arrays.AXES` and the results of the kernel of the advantages. The
-    sum of the vectors is the gradient, with the sums of the metrics at their places.
+    It returns a vector for each block. The sum of the vectors is the gradient, with the sums of the
+    metrics at their places.
 
     In shared memory it also has, with a row for each sample of a tile where nothing else is said:
 
@@ -45,69 +40,84 @@ class GradientKernel(NetworkKernel):
     """
 
     name = "ppo_gradient"
+    arguments = (
+        *("params", "mean", "scale", "rows", "unrolls", "noise", "index"),
+        *(*AdvantageKernel.returns, "terms"),
+    )
+    returns = ("gradients",)
+    networks = 2
 
-    def __init__(self, tiling: Tiling, batch: Minibatch, advantage_blocks: int) -> None:
+    def __init__(
+        self, tiling: Tiling, batch: Minibatch, blocks: int, advantage_blocks: int
+    ) -> None:
         """Prepare to write.
 
         Args:
           tiling: the division of the work.
           batch: the minibatch.
+          blocks: the number of blocks of each network of a policy.
           advantage_blocks: the number of blocks of the kernel of the advantages.
         """
-        sizes = GRADIENT.counts(tiling.shape, batch) | {"statistics": 2 * advantage_blocks}
-        sizes |= {"advantages": batch.samples, "targets": batch.samples}
-        sizes = {name: sizes[name] for name in ARGUMENTS}
-        super().__init__(sizes, 1, tiling, batch, -(-batch.samples // tiling.rows))
+        shapes = GRADIENT.shapes(tiling.shape, batch) | estimate_shapes(batch, advantage_blocks)
+        shapes["gradients"] = blocks, tiling.shape.size
+        super().__init__(shapes, tiling, batch, blocks)
         self.advantage_blocks = advantage_blocks
         self.width, self.shares = self.shape.width, shares_of(self.shape)
         self.error_scale = batch.samples * _MEAN_SCALE
 
-    def text(self) -> str:
-        """Return the module."""
+    def begin(self) -> list[Value]:
+        """Load the block's network, and begin with sums of zero."""
         ir, shape = self.ir, self.shape
-        self.prepare()
         # Load what all tiles need into shared memory.
         self.load_network(self._find_data(), self.outputs)
         self._clear()
         if shape.normalizes:
             self._load_statistics()
+        # The sums of the gradient are carried from tile to tile.
+        sums = (
+            [ir.zeros(share.row_tiles, 2 * share.pairs) for share in self.shares],
+            [ir.zeros(1, 1) for _ in range(shape.layers)],
+            ir.zeros(1, 1),
+        )
+        zeros, self.sums_tree = jax.tree.flatten(sums)
+        return zeros
+
+    def tile(self, tile: Value, carried: list[Value]) -> list[Value]:
+        """Add the gradient of a tile of samples to the sums."""
+        ir = self.ir
+        self._take_sums(carried)
+        self._load_tile(tile)
+        # Warps read rows that others have loaded,
         ir.synchronize()
-        # Go through the tiles; the sums of the gradient are carried from one to the next.
-        self._take_sums(itertools.repeat(ir.constant(0.0)))
-        with ir.repeat(self.block, *self._all_sums()) as loop:
-            tile, *sums = loop.carried
-            self._take_sums(iter(sums))
-            self._load_tile(tile)
-            # Warps read rows that others have loaded,
-            ir.synchronize()
-            self.store_outputs(self.forward())
-            # the loss all outputs of a row,
-            ir.synchronize()
-            with ir.when(self.thread < self.tiling.rows):
-                self._loss(tile)
-            # and the backward pass the errors of all rows.
-            ir.synchronize()
-            self._backward()
-            # The next tile overwrites what the backward pass reads.
-            ir.synchronize()
-            self.next_tile(loop, tile, *self._all_sums())
-        self._store_gradient()
-        return ir.module(self.threads)
+        self.store_outputs(self.forward())
+        # the loss all outputs of a row,
+        ir.synchronize()
+        with ir.when(self.thread < self.tiling.rows):
+            self._loss(tile)
+        # and the backward pass the errors of all rows.
+        ir.synchronize()
+        self._backward()
+        # The next tile overwrites what the backward pass reads.
+        ir.synchronize()
+        return jax.tree.leaves((self.weight_sums, self.bias_sums, self.head_sums))
+
+    def _take_sums(self, values: list[Value]) -> None:
+        """Set the sums of the weights and biases of the layers, and those of the head."""
+        sums = jax.tree.unflatten(self.sums_tree, values)
+        self.weight_sums, self.bias_sums, self.head_sums = sums
 
     def _find_data(self) -> Value:
         """Find the data of the minibatch, and return the parameters of the block's network."""
         ir, shape, batch = self.ir, self.shape, self.batch
-        # The second axis of the grid is the network, the third one the policy.
-        self.network, policy = ir.register("ctaid.y"), ir.register("ctaid.z")
+        # The second axis of the grid is the network.
+        self.network = ir.register("ctaid.y")
         self.is_policy = self.network.equals(0)
-        self.find_arrays(policy)
         index, noise = self.arrays["index"].load("u32"), batch.samples * shape.actions
         self.unrolls = ir.row(self.arrays["unrolls"], index, batch.unrolls)
         self.noise = ir.row(self.arrays["noise"], index, noise)
         # Each block writes a gradient of its own, of one of the networks.
-        place = policy * self.blocks + self.block
         start = self.network * shape.policy_size
-        self.vector = ir.row(ir.parameters[-1], place, shape.size) + start
+        self.vector = ir.row(self.arrays["gradients"], self.block, shape.size) + start
         params = self.arrays["params"] + start
         self.load_terms()
         self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
@@ -172,22 +182,6 @@ class GradientKernel(NetworkKernel):
         pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
         for i, value in enumerate(extras):
             ir.moved(pointer, 4 * i).store(value)
-
-    # The sums of the gradient are carried from tile to tile.
-
-    def _take_sums(self, values: Iterator[Value]) -> None:
-        """Set the sums, in the order of `_all_sums`."""
-
-        def take(rows: int, columns: int) -> Sums:
-            return [[[next(values) for _ in range(4)] for _ in range(columns)] for _ in range(rows)]
-
-        self.weight_sums = [take(share.row_tiles, 2 * share.pairs) for share in self.shares]
-        self.bias_sums = [take(1, 1) for _ in range(self.shape.layers)]
-        self.head_sums = take(1, 1)
-
-    def _all_sums(self) -> list[Value]:
-        groups = [*self.weight_sums, *self.bias_sums, self.head_sums]
-        return [x for group in groups for row in group for four in row for x in four]
 
     def _extra(self, index: int) -> Value:
         """Return a number that the loss of the thread's sample reads."""
@@ -267,7 +261,7 @@ class GradientKernel(NetworkKernel):
         # The errors times the weights, transposed.
         left = self.operand("left", errors, "columns", self.row)
         right = self.operand("right", weights, "columns", self.column)
-        zeros = [[[ir.constant(0.0)] * 4] * (2 * self.pairs)] * self.tiling.row_tiles
+        zeros = ir.zeros(self.tiling.row_tiles, 2 * self.pairs)
         sums = ir.product(zeros, steps, left, right)
         # Times the slopes of the activations, which stand where the results go.
         kind = self.shape.activation
@@ -314,9 +308,10 @@ class GradientKernel(NetworkKernel):
         """Store a sum of products with errors."""
         self.vector[place] = value * (1 / self.error_scale)
 
-    def _store_gradient(self) -> None:
+    def end(self, carried: list[Value]) -> None:
         """Store the block's sums."""
         ir, shape = self.ir, self.shape
+        self._take_sums(carried)
         # A lane has four sums of each product; `tensor_core` says which.
         for layer, inputs, start in shape.hidden_layers:
             row, column = self._share_of_warp(layer)

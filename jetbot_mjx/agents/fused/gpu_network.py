@@ -1,5 +1,6 @@
 """Load a network into shared memory, and write its forward pass."""
 
+import abc
 from collections.abc import Callable, Mapping
 from typing import Literal
 
@@ -14,7 +15,6 @@ from jetbot_mjx.agents.fused.tensor_core import (
     Sums,
     Value,
 )
-from onekernel.build import Repeat
 
 
 class NetworkKernel(GpuKernel):
@@ -32,19 +32,22 @@ class NetworkKernel(GpuKernel):
     """
 
     def __init__(
-        self, sizes: Mapping[str, int], others: int, tiling: Tiling, batch: Minibatch, tiles: int
+        self,
+        shapes: Mapping[str, tuple[int, ...]],
+        tiling: Tiling,
+        batch: Minibatch,
+        blocks: int,
     ) -> None:
         """Prepare to write.
 
         Args:
-          sizes: the numbers of a policy's row of each array.
-          others: the number of arrays behind these.
+          shapes: the shapes of all arrays for one policy.
           tiling: the division of the work.
-          batch: the minibatch.
-          tiles: the number of tiles of all data.
+          batch: the data of a policy.
+          blocks: the number of blocks along the first axis of the grid.
         """
-        super().__init__(sizes, others, tiling.threads, tiling.layout["size"])
-        self.tiling, self.shape, self.batch, self.tiles = tiling, tiling.shape, batch, tiles
+        super().__init__(shapes, blocks, tiling.threads, tiling.layout["size"])
+        self.tiling, self.shape, self.batch = tiling, tiling.shape, batch
         self.stride = self.shape.width + PAD
         self.first = padded(self.shape.observations)
 
@@ -78,11 +81,46 @@ class NetworkKernel(GpuKernel):
         per = -(-total // groups)
         return self.ir.minimum(group * per, total - per)
 
-    def prepare(self) -> None:
+    @abc.abstractmethod
+    def begin(self) -> list[Value]:
+        """Load what all tiles need, and return the values that the first tile begins with."""
+
+    @abc.abstractmethod
+    def tile(self, tile: Value, carried: list[Value]) -> list[Value]:
+        """Compute a tile.
+
+        Args:
+          tile: its number.
+          carried: the values that it begins with.
+
+        Returns:
+          Those that the block's next tile begins with.
+        """
+
+    def end(self, carried: list[Value]) -> None:
+        """Store what the last tile returned."""
+
+    def text(self) -> str:
+        """Return the module."""
+        ir, tiles = self.ir, self.tiling.tiles(self.batch)
+        self._find_thread()
+        self.find_arrays(ir.register("ctaid.z"))
+        initial = self.begin()
+        ir.synchronize()
+        # The blocks take the tiles in turns. A tile overwrites nothing that is read after the last
+        # barrier of the one before.
+        with ir.repeat(self.block, *initial) as loop:
+            tile, *carried = loop.carried
+            carried = self.tile(tile, carried)
+            following = tile + self.blocks
+            loop.again(following < tiles, following, *carried)
+        self.end(carried)
+        return ir.module(self.threads)
+
+    def _find_thread(self) -> None:
         """Read the thread's place in the grid, and derive its places in the matrices."""
         ir, tiling = self.ir, self.tiling
-        self.thread = ir.register("tid.x")
-        self.block, self.blocks = ir.register("ctaid.x"), ir.register("nctaid.x")
+        self.thread, self.block = ir.register("tid.x"), ir.register("ctaid.x")
         lane, self.warp = self.thread % LANES, self.thread // LANES
         # Rows and columns of the matrices that a lane points `ldmatrix` at: see `tensor_core`.
         self.row_first = (lane % 16, lane // 16 * 8)
@@ -301,11 +339,6 @@ class NetworkKernel(GpuKernel):
             for n, four in enumerate(row)
             for half in (0, 1)
         ]
-
-    def next_tile(self, loop: Repeat, tile: Value, *carried: Value) -> None:
-        """End an iteration of the loop over a block's tiles, which carries some values."""
-        following = tile + self.blocks
-        loop.again(following < self.tiles, following, *carried)
 
 
 def _activated(ir: GpuWriter, name: str, z: Value) -> tuple[Value, Value]:

@@ -135,7 +135,7 @@ def gradient(shape: UpdateShape, *given: Array) -> Float[Array, " size"]:
     return _PRIMITIVES["gradient"].bind(*given, spec=shape)[0]
 
 
-def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
+def adam(rule: AdamRule, *given: Array) -> tuple[Array, ...]:
     """Make a step of Adam, whose equations are in `jetbot_mjx.agents.fused.adam`.
 
     Args:
@@ -145,11 +145,10 @@ def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The next parameters, means and progress.
     """
-    params, mu, nu, progress = _PRIMITIVES["adam"].bind(*given, spec=rule)
-    return params, mu, nu, progress
+    return tuple(_PRIMITIVES["adam"].bind(*given, spec=rule))
 
 
-def update(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
+def update(rule: AdamRule, *given: Array) -> tuple[Array, ...]:
     """Make a step of Adam along the gradient of each minibatch, as `gradient` and `adam` do.
 
     Args:
@@ -159,8 +158,7 @@ def update(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The parameters, means and progress after the last minibatch.
     """
-    params, mu, nu, progress = _PRIMITIVES["update"].bind(*given, spec=rule)
-    return params, mu, nu, progress
+    return tuple(_PRIMITIVES["update"].bind(*given, spec=rule))
 
 
 def _primitive(kernel: Signature) -> Primitive:

@@ -12,7 +12,7 @@ from jaxtyping import Array, PyTree
 
 from jetbot_mjx.agents.fused import adam, launch, reference
 from jetbot_mjx.agents.fused.adam import AdamRule
-from jetbot_mjx.agents.fused.arrays import Actions
+from jetbot_mjx.agents.fused.arrays import ADAM, Actions
 from jetbot_mjx.agents.fused.shapes import LossTerms, UpdateShape
 
 _SHAPE = UpdateShape(4, 16, 1, 1, "tanh_normal", "tanh", normalizes=False)
@@ -78,7 +78,7 @@ def _adam_arrays(params: Array | np.ndarray, gradient: Array | np.ndarray) -> di
     terms = np.zeros(adam.SIZES["adam_terms"], np.float32)
     terms[0] = _MOST_NORM
     arrays = gradient, params, params, abs(params), progress, np.zeros((), np.int32), terms
-    return dict(zip(adam.ARRAYS, arrays, strict=True))
+    return dict(zip(ADAM.arguments, arrays, strict=True))
 
 
 def _run(

@@ -88,11 +88,11 @@ def gradient(
 
 
 def adam_step(rule: AdamRule, arrays: dict[str, np.ndarray]) -> list[np.ndarray]:
-    """Return the arrays `adam.UPDATED` after a step, the first one of a training step.
+    """Return the arrays that `arrays.ADAM` returns after a step, the first one of a training step.
 
     Args:
       rule: what the vectors hold.
-      arrays: `adam.ARRAYS` of one policy, but for the index.
+      arrays: those of `arrays.ADAM` of one policy, but for the index.
     """
     factors, element = adam.programs(rule)
     gradient, progress = arrays["gradient"], arrays["progress"].copy()
