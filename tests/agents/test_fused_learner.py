@@ -306,14 +306,23 @@ def modelled_actions(shape, *arrays):
     return launch.Actions(*jax.pure_callback(run, results, *arrays))
 
 
+def on_the_device(monkeypatch, **functions):
+    """Lets the check launch these functions on its device, and the kernels on the CPU after it."""
+    for name, function in functions.items():
+        calls = iter([function, getattr(launch, name)])
+        monkeypatch.setattr(launch, name, lambda *arrays, calls=calls: next(calls)(*arrays))
+
+
 @pytest.mark.cpu
-def test_the_probe_agrees_with_the_model(monkeypatch):
-    monkeypatch.setattr(launch, "gradient", modelled)
-    monkeypatch.setattr(launch, "actions", modelled_actions)
-    monkeypatch.setattr(launch, "adam", modelled_adam)
-    assert probe.runs_correctly.__wrapped__()
-    monkeypatch.setattr(launch, "gradient", lambda *arrays: 1.1 * modelled(*arrays))
-    assert not probe.runs_correctly.__wrapped__()
+@pytest.mark.parametrize("factor", [1.0, 1.1])
+def test_the_probe_agrees_with_the_model(monkeypatch, factor):
+    on_the_device(
+        monkeypatch,
+        gradient=lambda *arrays: factor * modelled(*arrays),
+        actions=modelled_actions,
+        adam=modelled_adam,
+    )
+    assert probe.runs_correctly.__wrapped__() == (factor == 1.0)
 
 
 @pytest.mark.cpu
@@ -327,7 +336,7 @@ def test_the_probe_sees_wrong_actions(monkeypatch, name, error):
         return drawn._replace(**{name: getattr(drawn, name) + error})
 
     assert probe.runs_correctly.__wrapped__()
-    monkeypatch.setattr(launch, "actions", wrong)
+    on_the_device(monkeypatch, actions=wrong)
     assert not probe.runs_correctly.__wrapped__()
 
 
@@ -342,7 +351,7 @@ def test_the_probe_sees_a_wrong_step(monkeypatch, place, error):
         made[place] = made[place].at[(0,) * made[place].ndim].add(error)
         return tuple(made)
 
-    monkeypatch.setattr(launch, "adam", wrong)
+    on_the_device(monkeypatch, adam=wrong)
     assert not probe.runs_correctly.__wrapped__()
 
 

@@ -138,7 +138,7 @@ class FusedLearner(Learner):
         return launch.backend().obstacle()
 
     def failure(self) -> str | None:
-        """Return that the kernels of this GPU failed their comparison with NumPy, or None."""
+        """Return that the kernels of this GPU failed their comparison with the CPU's, or None."""
         # On a CPU, `obstacle` has tried the same compiler with a small kernel.
         if jax.default_backend() != "gpu" or probe.runs_correctly():
             return None
