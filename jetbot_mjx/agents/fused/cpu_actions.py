@@ -88,18 +88,14 @@ class ActionStage(NetworkStage):
           arrays: those of `act`.
         """
         w, shape, places = self.w, self.shape, self.places
-        lanes, actions, deviations = w.lanes, shape.actions, self.deviations
+        lanes, actions = w.lanes, shape.actions
         # Collect what the samples read, environment by environment.
         with w.loop(lanes) as lane:
             # Lanes beyond the last environment repeat it.
             within = w.minimum(lane, there - 1)
             outputs = places["outputs"] + (start + within) * HEAD
-            noise = (first + within) * actions
-            sources = [
-                (outputs, self.outputs),
-                (deviations, actions),
-                (arrays["action_noise"] + noise, actions),
-            ]
+            noise = arrays["action_noise"] + (first + within) * actions
+            sources = (outputs, self.outputs), (self.deviations, actions), (noise, actions)
             self.gather("sample", lane, sources)
         w.call("draw", places["sample"], places["drawn"])
         # Store what they draw, the numbers of each array behind those of the one before.
@@ -129,16 +125,10 @@ class UnrollStage(ActionStage):
         """
         super().__init__(unroll.shape, batch, lanes)
         self._unroll, self._time = unroll, batch.time
-        numbers = {"kept": len(unroll.kept), "unroll_noise": self.shape.actions, **self.drawn}
-        self._step_sizes = {name: batch.environments * size for name, size in numbers.items()}
-        """The numbers of a step in each array that holds all steps."""
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation, the sample and the step of the environments."""
-        return [
-            *super().own_functions(),
-            *cpu.step_functions(self._unroll.kernel, self.lanes),
-        ]
+        return [*super().own_functions(), *cpu.step_functions(self._unroll.kernel, self.lanes)]
 
     def tile(self, first: Value, count: Value) -> None:
         """Take some environments through all steps."""
@@ -146,8 +136,10 @@ class UnrollStage(ActionStage):
         limit = first + count
         with w.loop(self._time) as step:
             # Find the step's part of each array, and the states before it.
-            sizes = self._step_sizes.items()
-            here = {name: self.arrays[name] + step * size for name, size in sizes}
+            here = {
+                name: self.arrays[name] + step * (self.sizes[name] // self._time)
+                for name in ("kept", "unroll_noise", *self.drawn)
+            }
             before = w.select(step.equals(0), self.arrays["start"], end)
             here["observations"] = before + unroll.observation
             here["action_noise"] = here["unroll_noise"]
@@ -160,6 +152,5 @@ class UnrollStage(ActionStage):
                 environment = first + row
                 source = end + environment * unroll.state
                 target = here["kept"] + environment * len(unroll.kept)
-                for place, begin, last in unroll.ranges:
-                    with w.loop(last + 1 - begin) as i:
-                        (target + place)[i] = (source + begin)[i]
+                for place, number in enumerate(unroll.kept):
+                    target[place] = source[number]

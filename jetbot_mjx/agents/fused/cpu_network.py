@@ -65,8 +65,9 @@ class NetworkStage(Stage):
         self.parts = -(-items // part_items)
         self.tile_items = min(part_items, -(-TILE_ROWS // steps))
         # The rows of a tile that are stored, and the strides of those of a layer.
-        self.rows = rounded(self.tile_items * steps, ROWS)
-        self.stride, self.first_stride = shape.width + _PAD, rounded(shape.observations + 1, _PAD)
+        self.rows = -(-self.tile_items * steps // ROWS) * ROWS
+        self.stride = shape.width + _PAD
+        self.first_stride = -(-(shape.observations + 1) // _PAD) * _PAD
         self.layout = places(self.scratch_sizes(), _PAD)
         """Where each array begins in a part's scratch memory, and its `size`, in floats."""
         self.scratch = self.layout["size"]
@@ -127,6 +128,7 @@ class NetworkStage(Stage):
         functions = self.own_functions()
         self.w, self.part = w, part = self.begin(self.lanes)
         # Find the arrays of the policy, the network's parameters and the scratch memory.
+        self.sizes = call.sizes
         self.arrays = {name: call.array(part.job, part.policy, name) for name in call.sizes}
         start = 0 if self.is_policy else self.shape.policy_size
         self.params = self.arrays["params"] + start
@@ -238,8 +240,3 @@ class NetworkStage(Stage):
         # The last layer has no activation.
         head, outputs = Matrix(places["head"], HEAD), Matrix(places["outputs"], HEAD)
         multiply(layers[-1], head, outputs, (stored, HEAD, shape.width + 1))
-
-
-def rounded(size: int, multiple: int) -> int:
-    """Return a size rounded up to a multiple of another."""
-    return -(-size // multiple) * multiple

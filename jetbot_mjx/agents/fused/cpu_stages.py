@@ -14,13 +14,7 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jetbot_mjx.agents.fused.cpu_product import (
-    add_all,
-    add_to,
-    fill,
-    product_functions,
-    vectors_of,
-)
+from jetbot_mjx.agents.fused.cpu_product import add_all, add_to, fill, product_functions, vectors_of
 from jetbot_mjx.agents.fused.shapes import UpdateShape
 from onekernel.build import LlvmWriter, ScalarProgram, Value, cpu, run_program
 

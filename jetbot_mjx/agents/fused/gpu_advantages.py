@@ -11,7 +11,7 @@ from jetbot_mjx.agents.fused.arrays import GRADIENT
 from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
 from jetbot_mjx.agents.fused.shapes import Minibatch
-from jetbot_mjx.agents.fused.tensor_core import LANES, Value
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, Value
 
 
 class AdvantageKernel(NetworkKernel):
@@ -113,13 +113,11 @@ class AdvantageKernel(NetworkKernel):
 
     def _store_values(self) -> None:
         """Write the forward pass, and store the first output of each row."""
-        ir = self.ir
-        pointer = ir.shared((self.row + self.sum_row) * 4, self.bytes_of("values"))
-        sums = self.forward()
-        with ir.when(self.sum_column.equals(0)):
+        row, sums = self.row + self.sum_row, self.forward()
+        with self.ir.when(self.sum_column.equals(0)):
             for m, (four,) in enumerate(sums):
-                ir.moved(pointer, 64 * m).store(four[0])
-                ir.moved(pointer, 64 * m + 32).store(four[2])
+                self.write("values", row, four[0], TILE * m)
+                self.write("values", row, four[2], TILE * m + 8)
 
     def _accumulate(self) -> None:
         """Run backwards through an unroll, and store its value targets."""

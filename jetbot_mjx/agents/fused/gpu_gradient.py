@@ -129,11 +129,11 @@ class GradientKernel(NetworkKernel):
         # Errors beyond the outputs stay zero, and the slots begin so.
         for name, following in (("errors", "extras"), ("slots", "size")):
             for i in self.each((self.bytes_of(following) - self.bytes_of(name)) // 4):
-                ir.shared(i * 4, self.bytes_of(name)).store(zero)
+                self.write(name, i, zero)
 
     def _load_statistics(self) -> None:
         """Compute the mean of the advantages and 1 / std from the sums of all blocks."""
-        ir, place = self.ir, self.bytes_of("statistics")
+        ir = self.ir
         # A warp adds up the sums of the blocks, and a thread those of the lanes.
         with ir.when(self.thread < LANES):
             for i in range(2):
@@ -146,17 +146,15 @@ class GradientKernel(NetworkKernel):
                 self.write("statistics", self.thread, total, LANES * i)
         ir.synchronize()
         with ir.when(self.thread < 1):
-            totals = []
-            for i in range(2):
-                lanes = range(LANES * i, LANES * (i + 1))
-                total = ir.total(ir.shared(place + 4 * lane).load() for lane in lanes)
-                totals.append(total * (1 / self.batch.samples))
-            mean, square = totals
+            mean, square = (
+                ir.total(self.read("statistics", LANES * i, lane) for lane in range(LANES))
+                * (1 / self.batch.samples)
+                for i in range(2)
+            )
             variance = square - mean * mean
             variance = ir.select(variance < 0.0, ir.constant(0.0), variance)
-            ir.shared(place + 4 * 2 * LANES).store(mean)
-            scale = ir.reciprocal(ir.sqrt(variance) + 1e-8)
-            ir.shared(place + 4 * (2 * LANES + 1)).store(scale)
+            self.write("statistics", 2 * LANES, mean)
+            self.write("statistics", 2 * LANES + 1, ir.reciprocal(ir.sqrt(variance) + 1e-8))
 
     def _load_tile(self, tile: Value) -> None:
         """Copy a tile's observations and what else the loss reads to shared memory."""
@@ -179,47 +177,40 @@ class GradientKernel(NetworkKernel):
         extras += [self.arrays[name][sample] for name in ("advantages", "targets")]
         self.load_observations(lambda row: place(row)[3])
         # Store it in a row for each sample.
-        pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
+        first = own * self.tiling.extras
         for i, value in enumerate(extras):
-            ir.moved(pointer, 4 * i).store(value)
+            self.write("extras", first, value, i)
 
-    def _extra(self, index: int) -> Value:
-        """Return a number that the loss of the thread's sample reads."""
-        return self.ir.moved(self.extras, 4 * index).load()
+    def _extras(self, start: int, stop: int) -> list[Value]:
+        """Return numbers that `_load_tile` has stored for the loss of the thread's sample."""
+        first = self.thread * self.tiling.extras
+        return [self.read("extras", first, i) for i in range(start, stop)]
 
     def _loss(self, tile: Value) -> None:
         """Write the derivative of the loss by the outputs of one sample, a thread for each."""
-        ir = self.ir
+        ir, end = self.ir, self.tiling.extras
         self.is_there = tile * self.tiling.rows + self.thread < self.batch.samples
-        self.extras = ir.shared(self.thread * (4 * self.tiling.extras), self.bytes_of("extras"))
         # All threads of a block have the same network, so none of them waits here.
         with ir.when(self.is_policy):
             self._policy_loss()
         with ir.when(self.network.equals(1)):
             program = sample_loss.value_program(self.batch.samples)
-            (value,), target = self.outputs_of(self.thread, 1), self._extra(self.tiling.extras - 1)
-            slope, square = ir.run(program, [value, target, self.terms.vf_loss_coefficient])
+            given = [*self.outputs_of(self.thread, 1), *self._extras(end - 1, end)]
+            slope, square = ir.run(program, [*given, self.terms.vf_loss_coefficient])
             self._store_errors([slope], [square])
 
     def _policy_loss(self) -> None:
         ir, shape = self.ir, self.shape
+        *extras, advantage = self._extras(0, self.tiling.extras - 1)
+        if shape.normalizes:
+            mean, scale = (self.read("statistics", 2 * LANES + i) for i in (0, 1))
+            advantage = (advantage - mean) * scale
         # A `PolicySample` and the coefficients.
-        extras = [self._extra(i) for i in range(self.tiling.extras - 2)]
         outputs = self.outputs_of(self.thread, shape.outputs[0])
-        sample = [*outputs, *self.deviations(), *extras]
-        sample += [self._advantage(), ir.constant(1.0), *self.terms]
+        sample = [*outputs, *self.deviations(), *extras, advantage, ir.constant(1.0), *self.terms]
         program = sample_loss.policy_program(shape, self.batch.samples, for_gpu=True)
         results = ir.run(program, sample)
         self._store_errors(results[: shape.outputs[0]], results[shape.outputs[0] :])
-
-    def _advantage(self) -> Value:
-        """Return the advantage of the thread's sample, normalised if configured."""
-        advantage = self._extra(self.tiling.extras - 2)
-        if not self.shape.normalizes:
-            return advantage
-        place = self.bytes_of("statistics") + 4 * 2 * LANES
-        mean, scale = (self.ir.shared(place + 4 * i).load() for i in (0, 1))
-        return (advantage - mean) * scale
 
     def _store_errors(self, slopes: list[Value], sums: list[Value]) -> None:
         """Store a sample's derivatives by the outputs, and add them and the sums to their slots."""
@@ -234,10 +225,10 @@ class GradientKernel(NetworkKernel):
             packed = ir.pack(padded[i], padded[i + 1])
             ir.moved(errors, 2 * i).store(packed)
         # Sums of a row of a tile, of which one thread changes each.
-        slots = ir.shared(self.thread * 4, self.bytes_of("slots"))
         for i, value in enumerate(kept):
-            place = ir.moved(slots, 4 * i * (self.tiling.rows + 1))
-            place.store(place.load() + value)
+            offset = i * (self.tiling.rows + 1)
+            total = self.read("slots", self.thread, offset) + value
+            self.write("slots", self.thread, total, offset)
 
     def _backward(self) -> None:
         """Add a tile's gradient of all weights to the sums, from the last layer to the first."""
@@ -349,8 +340,8 @@ class GradientKernel(NetworkKernel):
         slots = ir.constant(shape.slots, "u32")
         count = ir.select(self.is_policy, slots, 1 + len(VALUE_METRICS))
         with ir.when(self.thread < count):
-            first = ir.shared(self.thread * (4 * (self.tiling.rows + 1)), self.bytes_of("slots"))
-            total = ir.total(ir.moved(first, 4 * i).load() for i in range(self.tiling.rows))
+            first = self.thread * (self.tiling.rows + 1)
+            total = ir.total(self.read("slots", first, i) for i in range(self.tiling.rows))
             self.vector[self.outputs * self.width + self.thread + offset] = total
 
 

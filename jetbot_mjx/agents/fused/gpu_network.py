@@ -4,7 +4,7 @@ import abc
 from collections.abc import Callable, Mapping
 from typing import Literal
 
-from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_BYTES, PAD, Tiling, padded
+from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_STRIDE, PAD, Tiling, padded
 from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, LossTerms, Minibatch
 from jetbot_mjx.agents.fused.tensor_core import (
     LANES,
@@ -32,11 +32,7 @@ class NetworkKernel(GpuKernel):
     """
 
     def __init__(
-        self,
-        shapes: Mapping[str, tuple[int, ...]],
-        tiling: Tiling,
-        batch: Minibatch,
-        blocks: int,
+        self, shapes: Mapping[str, tuple[int, ...]], tiling: Tiling, batch: Minibatch, blocks: int
     ) -> None:
         """Prepare to write.
 
@@ -55,11 +51,11 @@ class NetworkKernel(GpuKernel):
         """Return the byte of shared memory where an array begins."""
         return self.tiling.layout[name]
 
-    def read(self, name: str, place: Value, offset: int = 0) -> Value:
+    def read(self, name: str, place: Value | int, offset: int = 0) -> Value:
         """Return a number of an array of float32 in shared memory."""
         return self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).load()
 
-    def write(self, name: str, place: Value, value: Value, offset: int = 0) -> None:
+    def write(self, name: str, place: Value | int, value: Value, offset: int = 0) -> None:
         """Write a number of an array of float32 in shared memory."""
         self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).store(value)
 
@@ -179,6 +175,11 @@ class NetworkKernel(GpuKernel):
             numbers.append(self.ir.minimum(self.thread + threads * full, count - 1))
         return numbers
 
+    def pair_places(self, rows: int, columns: int) -> list[tuple[Value, Value]]:
+        """Return the thread's share of a matrix: the row and first column of pairs of numbers."""
+        half = columns // 2
+        return [(i // half, i % half * 2) for i in self.each(rows * half)]
+
     def load_network(self, params: Value, outputs: Value) -> None:
         """Copy a network and the observations' statistics to shared memory.
 
@@ -190,14 +191,13 @@ class NetworkKernel(GpuKernel):
         self.params = params
         # The hidden layers, eight pairs of weights of a thread at a time.
         for layer, inputs, start in shape.hidden_layers:
-            pairs = self.each(padded(inputs) * width // 2)
+            pairs = self.pair_places(padded(inputs), width)
             for first in range(0, len(pairs), 8):
-                self._load_weights(params, start, layer, pairs[first : first + 8])
+                self._load_weights(start, layer, pairs[first : first + 8])
             for i in self.each(width):
                 self.write(f"biases{layer}", i, params[i + (start + inputs * width)])
         # The last layer; its columns beyond the outputs are zero.
-        for i in self.each(width * TILE // 2):
-            row, column = i // (TILE // 2), i % (TILE // 2) * 2
+        for row, column in self.pair_places(width, TILE):
             pair = [
                 self._within(params, row * outputs + shape.hidden, column + j, outputs)
                 for j in (0, 1)
@@ -210,21 +210,19 @@ class NetworkKernel(GpuKernel):
             for i in self.each(self.first):
                 self.write(name, i, self._within(self.arrays[name], None, i, shape.observations))
 
-    def _load_weights(self, params: Value, offset: int, layer: int, places: list[Value]) -> None:
-        """Copy the thread's pairs of a hidden layer's weights, with zeros beyond its inputs."""
+    def _load_weights(self, offset: int, layer: int, places: list[tuple[Value, Value]]) -> None:
+        """Copy pairs of a hidden layer's weights, with zeros beyond its inputs."""
         ir, width, inputs = self.ir, self.shape.width, self.shape.inputs[layer]
         # Fetch all pairs before the first one is stored, so that the thread waits only once.
-        pairs = []
-        for i in places:
-            row, column = i // (width // 2), i % (width // 2) * 2
+        fetched = []
+        for row, column in places:
             kept = ir.minimum(row, inputs - 1)
-            pair = [params[kept * width + column + (offset + j)] for j in (0, 1)]
+            pair = [self.params[kept * width + column + (offset + j)] for j in (0, 1)]
             if inputs % TILE:
                 pair = [ir.select(row < inputs, x, 0.0) for x in pair]
-            pairs.append((row * (2 * self.stride) + column * 2, pair))
-        for place, pair in pairs:
-            packed = ir.pack(*pair)
-            ir.shared(place, self.bytes_of(f"weights{layer}")).store(packed)
+            fetched.append((row, column, pair))
+        for place in fetched:
+            self._store_pair(f"weights{layer}", *place)
 
     def _within(self, array: Value, start: Value | None, index: Value, count: Value | int) -> Value:
         """Return an element of a row that starts somewhere; zero beyond the row's end."""
@@ -241,8 +239,7 @@ class NetworkKernel(GpuKernel):
         ir, count = self.ir, self.shape.observations
         # Fetch all pairs of the thread before the first one is stored.
         fetched = []
-        for i in self.each(self.tiling.rows * self.first // 2):
-            row, column = i // (self.first // 2), i % (self.first // 2) * 2
+        for row, column in self.pair_places(self.tiling.rows, self.first):
             start = starts(row)
             pair = [start[ir.minimum(column + j, count - 1)] for j in (0, 1)]
             fetched.append((row, column, pair))
@@ -272,7 +269,7 @@ class NetworkKernel(GpuKernel):
             # The activations before the layer times its weights, added to its biases.
             left = self.operand("left", self.layer(layer), "columns", self.row)
             right = self.operand("right", f"weights{layer}", "rows", 0, self.column)
-            column = (self.column + self.sum_column) * 4
+            column = self.column + self.sum_column
             biases = self._biases(column, f"biases{layer}", 2 * self.pairs)
             sums = ir.product(biases, steps, left, right)
             if layer and not tiling.is_gradient:
@@ -285,23 +282,21 @@ class NetworkKernel(GpuKernel):
             steps = shape.width // TILE
         left = self.operand("left", self.layer(shape.layers), "columns", self.row)
         right = self.operand("right", "head", "rows")
-        biases = self._biases(self.sum_column * 4, "head_biases", 1)
+        biases = self._biases(self.sum_column, "head_biases", 1)
         return ir.product(biases, steps, left, right)
 
     def store_outputs(self, sums: Sums) -> None:
         """Store the outputs of the network in shared memory, a row for each sample."""
-        ir, stride = self.ir, OUTPUT_BYTES
-        pointer = ir.shared(
-            (self.row + self.sum_row) * stride + self.sum_column * 4, self.bytes_of("outputs")
-        )
+        first = (self.row + self.sum_row) * OUTPUT_STRIDE + self.sum_column
         for m, (four,) in enumerate(sums):
             for i, value in enumerate(four):
-                ir.moved(pointer, stride * (TILE * m + 8 * (i // 2)) + 4 * (i % 2)).store(value)
+                offset = OUTPUT_STRIDE * (TILE * m + 8 * (i // 2)) + i % 2
+                self.write("outputs", first, value, offset)
 
     def outputs_of(self, row: Value, count: int) -> list[Value]:
         """Return the outputs of the network for a row of the tile."""
-        place = self.ir.shared(row * OUTPUT_BYTES, self.bytes_of("outputs"))
-        return [self.ir.moved(place, 4 * i).load() for i in range(count)]
+        place = row * OUTPUT_STRIDE
+        return [self.read("outputs", place, i) for i in range(count)]
 
     def deviations(self) -> list[Value]:
         """Return the standard deviations that are parameters of the policy, or any numbers."""
@@ -313,8 +308,7 @@ class NetworkKernel(GpuKernel):
 
     def _biases(self, place: Value, name: str, columns: int) -> Sums:
         """Return the sums with which a layer's product begins: a bias for each column."""
-        ir, pointer = self.ir, self.ir.shared(place, self.bytes_of(name))
-        pairs = [[ir.moved(pointer, 32 * n + 4 * j).load() for j in (0, 1)] for n in range(columns)]
+        pairs = [[self.read(name, place, 8 * n + j) for j in (0, 1)] for n in range(columns)]
         # A lane's four sums are in two rows of the same two columns.
         return [[[*pair, *pair] for pair in pairs] for _ in range(self.tiling.row_tiles)]
 

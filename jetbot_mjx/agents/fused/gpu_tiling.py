@@ -9,8 +9,8 @@ from jetbot_mjx.agents.fused.tensor_core import LANES, TILE
 
 MOST_OUTPUTS = 8
 """Columns of the last layer that are computed."""
-OUTPUT_BYTES = 4 * (MOST_OUTPUTS + 1)
-"""Bytes from one sample's outputs to those of the next in shared memory."""
+OUTPUT_STRIDE = MOST_OUTPUTS + 1
+"""Numbers from one sample's outputs to those of the next in shared memory."""
 MOST_OBSERVATIONS = 64
 MOST_WIDTH = 128
 MOST_SUMS = 176
@@ -120,30 +120,30 @@ class Tiling:
         # Every kernel: the network, float16 but for biases and statistics, and the observations.
         shape, rows = self.shape, self.rows
         stride = shape.width + PAD
-        first, outputs = padded(shape.observations), 4 * rows * (MOST_OUTPUTS + 1)
+        first, outputs = padded(shape.observations), 4 * rows * OUTPUT_STRIDE
         sizes = {f"weights{i}": 2 * padded(n) * stride for i, n in enumerate(shape.inputs[:-1])}
         sizes["head"] = 2 * shape.width * (TILE + PAD)
         sizes |= {f"biases{i}": 4 * shape.width for i in range(shape.layers)}
         sizes |= {"head_biases": 4 * MOST_OUTPUTS, "mean": 4 * first, "scale": 4 * first}
         sizes["layer0"] = 2 * rows * (first + PAD)
+        # All layers for a backward pass, or one, in which each replaces the one before.
+        layers = range(1, 1 + (shape.layers if self.is_gradient else 1))
+        sizes |= {f"layer{i}": 2 * rows * stride for i in layers}
         if self.is_gradient:
-            # All layers for the backward pass, the loss's operands and results for each row, the
-            # statistics of the advantages, and a sum for each row and slot.
-            sizes |= {f"layer{i + 1}": 2 * rows * stride for i in range(shape.layers)}
+            # The loss's operands and results for each row, the statistics of the advantages, and a
+            # sum for each row and slot.
             if shape.activation == "swish":
-                sizes |= {f"slopes{i + 1}": 2 * rows * stride for i in range(shape.layers)}
+                sizes |= {f"slopes{i}": 2 * rows * stride for i in layers}
             sizes["outputs"] = outputs
             sizes["errors"] = 2 * rows * (TILE + PAD)
             sizes["extras"] = 4 * rows * self.extras
             sizes["statistics"] = 4 * (2 * LANES + 2)
             sizes["slots"] = 4 * shape.slots * (rows + 1)
         elif self.purpose == "actions":
-            # One layer, in which each replaces the one before.
-            sizes |= {"layer1": 2 * rows * stride, "outputs": outputs}
+            sizes["outputs"] = outputs
         else:
-            # Likewise, a number of each kind for each row and one behind it, and a pair of sums for
-            # each thread and each lane.
-            sizes["layer1"] = 2 * rows * stride
+            # A number of each kind for each row and one behind it, and a pair of sums for each
+            # thread and each lane.
             sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
             sizes["statistics"] = 4 * 2 * (self.threads + LANES)
         return places(sizes, 16)

@@ -3,7 +3,7 @@
 Their arguments are arrays of `arrays`, in the order of each kernel's signature there.
 """
 
-import math
+import functools
 from collections.abc import Collection, Sequence
 from typing import Protocol
 
@@ -174,28 +174,23 @@ def _primitive(kernel: Signature) -> Primitive:
     def abstract(*given: ShapedArray, spec: Spec) -> list[ShapedArray]:
         return [ShapedArray(shape, np.float32) for shape in result_shapes(given, spec)]
 
-    def lower_by(launcher: Launcher) -> None:
-        def lowered(*given: Array, spec: Spec) -> list[Array]:
-            # One axis of policies. XLA would copy what is changed in place if it had another shape.
-            batch = given[0].shape[:-1]
-            flat = {
-                name: x
-                if name in kernel.returns
-                else x.reshape(math.prod(batch), *x.shape[len(batch) :])
-                for name, x in zip(kernel.arguments, given, strict=True)
-            }
-            made = launcher.launch(kernel, spec, kernel.batch_of(spec, given), flat)
-            # Behind the results there may be scratch memory.
-            shapes = result_shapes(given, spec)
-            return [x.reshape(shape) for x, shape in zip(made, shapes, strict=False)]
-
-        lowering = mlir.lower_fun(lowered)
-        mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
+    def lowered(launcher: Launcher, *given: Array, spec: Spec) -> list[Array]:
+        # One axis of policies. XLA would copy what is changed in place if it had another shape.
+        batch = given[0].shape[:-1]
+        flat = {
+            name: x if name in kernel.returns else x.reshape(-1, *x.shape[len(batch) :])
+            for name, x in zip(kernel.arguments, given, strict=True)
+        }
+        made = launcher.launch(kernel, spec, kernel.batch_of(spec, given), flat)
+        # Behind the results there may be scratch memory.
+        shapes = result_shapes(given, spec)
+        return [x.reshape(shape) for x, shape in zip(made, shapes, strict=False)]
 
     # For every platform that has the kernel, whatever the default device is.
     for launcher in _LAUNCHERS.values():
         if kernel.name in launcher.NAMES:
-            lower_by(launcher)
+            rule = mlir.lower_fun(functools.partial(lowered, launcher))
+            mlir.register_lowering(primitive, rule, platform=launcher.BACKEND.PLATFORM)
     return primitive
 
 

@@ -8,7 +8,6 @@ each, which XLA adds up in a fixed order.
 import functools
 from collections.abc import Collection
 from concurrent.futures import Future
-from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -73,55 +72,47 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     return None
 
 
-class _Launch(NamedTuple):
-    """A `_Launch` is a kernel that is being compiled, for a number of policies."""
-
-    kernel: GpuKernel
-    ptx: Future[str]
-    policies: int
-
-    def __call__(self, arrays: Arrays) -> dict[str, Array]:
-        """Run the kernel on some of the arrays, and return its results by name."""
-        kernel, given = self.kernel, list(self.kernel.arguments)
-        # What it changes in place has the shape that the argument has.
-        like = [
-            jax.ShapeDtypeStruct(
-                arrays[name].shape if name in given else (self.policies, *kernel.shapes[name]),
-                np.float32,
-            )
-            for name in kernel.returns
-        ]
-        made = gpu.launch_ptx(
-            kernel.name,
-            self.ptx.result(),
-            [arrays[name] for name in given],
-            like,
-            (kernel.blocks, kernel.networks, self.policies),
-            kernel.threads,
-            kernel.shared_memory,
-            {given.index(name): i for i, name in enumerate(kernel.returns) if name in given},
-        )
-        return dict(zip(kernel.returns, made, strict=True))
+def _run(kernel: GpuKernel, ptx: str, policies: int, arrays: Arrays) -> dict[str, Array]:
+    """Launch a kernel with some of the arrays, and return its results by name."""
+    given, returns = list(kernel.arguments), kernel.returns
+    # What it changes in place has the shape that the argument has.
+    like = [
+        arrays[name].shape if name in given else (policies, *kernel.shapes[name])
+        for name in returns
+    ]
+    made = gpu.launch_ptx(
+        kernel.name,
+        ptx,
+        [arrays[name] for name in given],
+        [jax.ShapeDtypeStruct(shape, np.float32) for shape in like],
+        (kernel.blocks, kernel.networks, policies),
+        kernel.threads,
+        kernel.shared_memory,
+        {given.index(name): i for i, name in enumerate(returns) if name in given},
+    )
+    return dict(zip(returns, made, strict=True))
 
 
 @functools.cache
-def _launches(kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> list[_Launch]:
+def _kernels(
+    kernel: Signature, spec: Spec, batch: Minibatch, policies: int
+) -> list[tuple[GpuKernel, Future[str]]]:
     """Divide the work among the blocks, and begin to compile the kernels, in their order."""
     # The policies share the GPU's multiprocessors.
     most = max(1, gpu.processor_count() // policies)
     if isinstance(spec, AdamRule):
         blocks = min(most, -(-spec.shape.size // BLOCK_ELEMENTS))
-        return [_begin(AdamKernel(spec, blocks), policies)]
+        return [_begin(AdamKernel(spec, blocks))]
     assert isinstance(spec, UpdateShape)
     if kernel is ACTIONS:
         tiling, blocks = _division("actions", spec, batch, most)
-        return [_begin(ActionKernel(tiling, batch, blocks), policies)]
+        return [_begin(ActionKernel(tiling, batch, blocks))]
     # Half of the blocks compute the policy's gradient, and half the values'.
     tiling, advantage_blocks = _division("advantages", spec, batch, most)
     first = AdvantageKernel(tiling, batch, advantage_blocks)
     tiling, blocks = _division("gradient", spec, batch, max(1, most // 2))
     second = GradientKernel(tiling, batch, blocks, advantage_blocks)
-    return [_begin(first, policies), _begin(second, policies)]
+    return [_begin(first), _begin(second)]
 
 
 def _division(purpose: str, shape: UpdateShape, batch: Minibatch, most: int) -> tuple[Tiling, int]:
@@ -131,7 +122,7 @@ def _division(purpose: str, shape: UpdateShape, batch: Minibatch, most: int) -> 
     return tiling, min(most, tiling.tiles(batch))
 
 
-def _begin(kernel: GpuKernel, policies: int) -> _Launch:
+def _begin(kernel: GpuKernel) -> tuple[GpuKernel, Future[str]]:
     """Begin to compile a kernel to PTX, and that to machine code."""
     architecture = gpu.target_architecture()
 
@@ -140,7 +131,7 @@ def _begin(kernel: GpuKernel, policies: int) -> _Launch:
         gpu.assemble_ahead(ptx)
         return ptx
 
-    return _Launch(kernel, in_background(compiled), policies)
+    return kernel, in_background(compiled)
 
 
 NAMES: Collection[str] = frozenset(kernel.name for kernel in (ACTIONS, GRADIENT, ADAM))
@@ -149,14 +140,14 @@ NAMES: Collection[str] = frozenset(kernel.name for kernel in (ACTIONS, GRADIENT,
 
 def prepare(kernel: Signature, spec: Spec, batch: Minibatch, policies: int) -> None:
     """Begin to compile a kernel, as `launch.prepare`."""
-    _launches(kernel, spec, batch, policies)
+    _kernels(kernel, spec, batch, policies)
 
 
 def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> list[Array]:
     """Launch a kernel while JAX lowers a program for GPUs, as `launch.Launcher` specifies."""
-    found = dict(arrays)
-    for launched in _launches(kernel, spec, batch, len(next(iter(arrays.values())))):
-        found |= launched(found)
+    found, policies = dict(arrays), len(next(iter(arrays.values())))
+    for written, ptx in _kernels(kernel, spec, batch, policies):
+        found |= _run(written, ptx.result(), policies, found)
     # The blocks of a gradient write a vector each; they are added up in a fixed order.
     if kernel is GRADIENT:
         found["gradient"] = found["gradients"].sum(1)
