@@ -78,9 +78,8 @@ class Signature:
     @property
     def aliases(self) -> dict[int, int]:
         """Return the places of the arguments that the kernel changes, with those of the results."""
-        returned = list(self.returns)
-        places = enumerate(self.arguments)
-        return {i: returned.index(name) for i, name in places if name in returned}
+        given = self.arguments
+        return {given.index(x): i for i, x in enumerate(self.returns) if x in given}
 
     def batch_of(self, spec: Spec, arrays: Sequence[Array | ShapedArray]) -> Minibatch:
         """Return how much data there is, and refuse what a kernel would read beyond its end.

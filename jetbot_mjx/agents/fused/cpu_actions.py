@@ -46,8 +46,8 @@ class ActionStage(NetworkStage):
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation and the sample."""
-        activate = self.activation()
-        activated = scalarize(lambda z: activate(z)[0], vector_of())
+        name = self.shape.activation
+        activated = scalarize(lambda z: sample_loss.activation(name, z)[0], vector_of())
         drawn = sample_loss.action_program(self.shape)
         return [
             self.on_layers("activate", activated, (0,), (0,)),
@@ -74,38 +74,25 @@ class ActionStage(NetworkStage):
             self.load_observation(arrays["observations"] + place, row)
         self.forward(self.stored_rows(count))
         # and draw the actions, a lane for each environment.
+        places, actions = self.places, self.shape.actions
         for start in self.groups(count):
             there = w.minimum(count - start, w.lanes)
-            self._draw(first + start, start, there, arrays)
-
-    def _draw(self, first: Value, start: Value, there: Value, arrays: Mapping[str, Value]) -> None:
-        """Draw the actions of a group of environments.
-
-        Args:
-          first: the first environment.
-          start: its row.
-          there: the number of environments.
-          arrays: those of `act`.
-        """
-        w, shape, places = self.w, self.shape, self.places
-        lanes, actions = w.lanes, shape.actions
-        # Collect what the samples read, environment by environment.
-        with w.loop(lanes) as lane:
-            # Lanes beyond the last environment repeat it.
-            within = w.minimum(lane, there - 1)
-            outputs = places["outputs"] + (start + within) * HEAD
-            noise = arrays["action_noise"] + (first + within) * actions
-            sources = (outputs, self.outputs), (self.deviations, actions), (noise, actions)
-            self.gather("sample", lane, sources)
-        w.call("draw", places["sample"], places["drawn"])
-        # Store what they draw, the numbers of each array behind those of the one before.
-        with w.loop(there) as lane:
-            place = 0
-            for name, size in self.drawn.items():
-                row = arrays[name] + (first + lane) * size
-                for i in range(size):
-                    row[i] = (places["drawn"] + place * lanes)[lane]
-                    place += 1
+            # Collect what the samples read; lanes beyond the last environment repeat it.
+            with w.loop(w.lanes) as lane:
+                row = start + w.minimum(lane, there - 1)
+                outputs = places["outputs"] + row * HEAD
+                noise = arrays["action_noise"] + (first + row) * actions
+                sources = (outputs, self.outputs), (self.deviations, actions), (noise, actions)
+                self.gather("sample", lane, sources)
+            w.call("draw", places["sample"], places["drawn"])
+            # Store what they draw, the numbers of each array behind those of the one before.
+            with w.loop(there) as lane:
+                drawn = places["drawn"] + lane
+                for name, size in self.drawn.items():
+                    target = arrays[name] + (first + start + lane) * size
+                    for i in range(size):
+                        target[i] = drawn[i * w.lanes]
+                    drawn += size * w.lanes
 
 
 class UnrollStage(ActionStage):

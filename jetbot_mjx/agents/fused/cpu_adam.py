@@ -61,12 +61,9 @@ class _AdamStage(VectorStage):
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function, and those that it calls."""
         # Elements are updated a vector at a time, and those at the end one by one.
-        factors, element = adam.programs(self.rule)
-        elements = [_elements_function(element, n) for n in (self.lanes, 1)]
-        return [sample_function("factors", factors, 1), *elements, self._step(call)]
-
-    def _step(self, call: Call) -> LlvmWriter:
         rule, lanes = self.rule, self.lanes
+        factors, element = adam.programs(rule)
+        elements = [_elements_function(element, n) for n in (lanes, 1)]
         w, (job, policy, part, minibatch, scratch) = self.begin(lanes)
         names = *_VECTORS, "progress", "adam_terms", "squares"
         *vectors, rows, terms, squares = (call.array(job, policy, name) for name in names)
@@ -93,7 +90,7 @@ class _AdamStage(VectorStage):
             done = whole * lanes
             for width, begin, length in ((lanes, first, whole), (1, first + done, count - done)):
                 w.call(f"elements.{width}", *(x + begin for x in vectors), writes, length)
-        return w
+        return [sample_function("factors", factors, 1), *elements, w]
 
 
 def _elements_function(program: ScalarProgram, lanes: int) -> LlvmWriter:

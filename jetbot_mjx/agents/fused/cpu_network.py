@@ -7,12 +7,8 @@ A column of ones beside the activations has the biases as its weights, so that o
 a layer with its biases.
 """
 
-import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
-from jaxtyping import Array
-
-from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.cpu_product import ROWS, Matrix, fill, multiply, rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Call, Stage
 from jetbot_mjx.agents.fused.shapes import UpdateShape, places
@@ -119,10 +115,6 @@ class NetworkStage(Stage):
                     at[x].store(result)
         return w
 
-    def activation(self) -> Callable[[Array], tuple[Array, Array]]:
-        """Return the activation with its derivative, as a function of a scalar."""
-        return functools.partial(sample_loss.activation, self.shape.activation)
-
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function that computes one part, and those that it calls."""
         functions = self.own_functions()
@@ -132,9 +124,7 @@ class NetworkStage(Stage):
         self.arrays = {name: call.array(part.job, part.policy, name) for name in call.sizes}
         start = 0 if self.is_policy else self.shape.policy_size
         self.params = self.arrays["params"] + start
-        self.places = {
-            name: part.scratch + place for name, place in self.layout.items() if name != "size"
-        }
+        self.places = {name: part.scratch + place for name, place in self.layout.items()}
         self.begin_part()
         # Go through the items of the part in tiles.
         first = part.number * self.part_items

@@ -53,24 +53,18 @@ class Call:
     minibatches: int
     """How often to go through the stages. With an array `index`, that is the only minibatch."""
 
-    def text(self, *, lanes: int, registers: int, machine: str) -> str:
-        """Return the LLVM module.
-
-        Args:
-          lanes: the number of float32 values in a vector register.
-          registers: the number of vector registers.
-          machine: the processor, one of `MACHINES`.
-        """
+    def text(self, host: cpu.Host) -> str:
+        """Return the LLVM module for a processor."""
         # Stages share some functions, which are in the module once.
         stages = [stage for together in self.stages for stage in together]
         functions = [function for stage in stages for function in stage.functions(self)]
-        functions += [*product_functions(lanes, registers), self._needed(), self._block()]
+        functions += [*product_functions(host.lanes, host.registers), self._needed(), self._block()]
         return cpu.call_text(
             functions,
             blocks_per_instance=self._parts * self.minibatches,
             blocks_per_thread=1,
             scratch=max(64 * -(-stage.scratch // 16) for stage in stages),
-            machine=machine,
+            machine=host.machine,
         )
 
     def array(self, job: Value, policy: Value, name: str) -> Value:

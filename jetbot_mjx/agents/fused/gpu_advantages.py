@@ -43,8 +43,7 @@ class AdvantageKernel(NetworkKernel):
         index = self.arrays["index"].load("u32")
         self.unrolls = ir.row(self.arrays["unrolls"], index, self.batch.unrolls)
         self.load_terms()
-        params = self.arrays["params"] + self.shape.policy_size
-        self.load_network(params, ir.constant(1, "u32"))
+        self.load_network(self.arrays["params"] + self.shape.policy_size, ir.constant(1, "u32"))
         return [ir.constant(0.0)] * 2
 
     def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:

@@ -67,9 +67,22 @@ class GradientKernel(NetworkKernel):
 
     def begin(self) -> list[Value]:
         """Load the block's network, and begin with sums of zero."""
-        ir, shape = self.ir, self.shape
+        ir, shape, batch = self.ir, self.shape, self.batch
+        # The second axis of the grid is the network.
+        self.network = ir.register("ctaid.y")
+        self.is_policy = self.network.equals(0)
+        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
+        # The first of the 16 units behind which the warp computes the gradient of biases and head.
+        self.own_tile = ir.minimum(self.warp, self.width // TILE - 1) * TILE
+        # Find the data of the minibatch, and the block's own gradient, of one of the networks.
+        index, noise = self.arrays["index"].load("u32"), batch.samples * shape.actions
+        self.unrolls = ir.row(self.arrays["unrolls"], index, batch.unrolls)
+        self.noise = ir.row(self.arrays["noise"], index, noise)
+        start = self.network * shape.policy_size
+        self.vector = ir.row(self.arrays["gradients"], self.block, shape.size) + start
         # Load what all tiles need into shared memory.
-        self.load_network(self._find_data(), self.outputs)
+        self.load_terms()
+        self.load_network(self.arrays["params"] + start, self.outputs)
         self._clear()
         if shape.normalizes:
             self._load_statistics()
@@ -105,23 +118,6 @@ class GradientKernel(NetworkKernel):
         """Set the sums of the weights and biases of the layers, and those of the head."""
         sums = jax.tree.unflatten(self.sums_tree, values)
         self.weight_sums, self.bias_sums, self.head_sums = sums
-
-    def _find_data(self) -> Value:
-        """Find the data of the minibatch, and return the parameters of the block's network."""
-        ir, shape, batch = self.ir, self.shape, self.batch
-        # The second axis of the grid is the network.
-        self.network = ir.register("ctaid.y")
-        self.is_policy = self.network.equals(0)
-        index, noise = self.arrays["index"].load("u32"), batch.samples * shape.actions
-        self.unrolls = ir.row(self.arrays["unrolls"], index, batch.unrolls)
-        self.noise = ir.row(self.arrays["noise"], index, noise)
-        # Each block writes a gradient of its own, of one of the networks.
-        start = self.network * shape.policy_size
-        self.vector = ir.row(self.arrays["gradients"], self.block, shape.size) + start
-        params = self.arrays["params"] + start
-        self.load_terms()
-        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
-        return params
 
     def _clear(self) -> None:
         ir = self.ir
@@ -222,8 +218,7 @@ class GradientKernel(NetworkKernel):
         zero = ir.constant(0.0)
         padded = [*(x * self.error_scale for x in kept[: len(slopes)]), zero]
         for i in range(0, len(slopes), 2):
-            packed = ir.pack(padded[i], padded[i + 1])
-            ir.moved(errors, 2 * i).store(packed)
+            ir.moved(errors, 2 * i).store(ir.pack(padded[i], padded[i + 1]))
         # Sums of a row of a tile, of which one thread changes each.
         for i, value in enumerate(kept):
             offset = i * (self.tiling.rows + 1)
@@ -235,8 +230,7 @@ class GradientKernel(NetworkKernel):
         ir, shape, tiling = self.ir, self.shape, self.tiling
         samples, tiles = tiling.rows // TILE, self.width // TILE
         # The head's weights: the activations, transposed, times the errors.
-        column = ir.minimum(self.warp, tiles - 1) * TILE
-        left = self.operand("left", f"layer{shape.layers}", "rows", 0, column)
+        left = self.operand("left", f"layer{shape.layers}", "rows", 0, self.own_tile)
         right = self.operand("right", "errors", "rows")
         self.head_sums = ir.product(self.head_sums, samples, left, right)
         # Back through the layers; the weights of one need the errors behind it.
@@ -280,18 +274,15 @@ class GradientKernel(NetworkKernel):
         right = self.operand("right", self.layer(layer), "rows", 0, column)
         self.weight_sums[layer] = ir.product(self.weight_sums[layer], samples, left, right)
         # The biases: the same with ones in place of the layer's inputs.
-        place = ir.minimum(self.warp, self.width // TILE - 1) * TILE
-        left = self.operand("left", errors, "rows", 0, place)
+        left = self.operand("left", errors, "rows", 0, self.own_tile)
         ones = [ir.constant(_ONES, "u32")] * 4
         self.bias_sums[layer] = ir.product(self.bias_sums[layer], samples, left, lambda *_: ones)
 
     def _share_of_warp(self, layer: int) -> tuple[Value, Value]:
         """Return the first row (output) and column (input) of the warp's share of a gradient."""
-        share = self.shares[layer]
+        share, rows = self.shares[layer], self.width // TILE
         columns = padded(self.shape.inputs[layer]) // TILE
-        row = self.ir.minimum(
-            self.warp % share.groups * share.row_tiles, self.width // TILE - share.row_tiles
-        )
+        row = self.ir.minimum(self.warp % share.groups * share.row_tiles, rows - share.row_tiles)
         column = self.ir.minimum(self.warp // share.groups * share.pairs, columns - share.pairs)
         return row * TILE, column * TILE
 
@@ -319,8 +310,7 @@ class GradientKernel(NetworkKernel):
                             self._put_sum(value, place)
             # The bias of an output is in all columns of its sums.
             ((four,),) = self.bias_sums[layer]
-            place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
-            place += start + inputs * self.width
+            place = self.own_tile + self.sum_row + (start + inputs * self.width)
             with ir.when(self.sum_column.equals(0)):
                 self._put_sum(four[0], place)
                 self._put_sum(four[2], place + 8)
@@ -330,7 +320,7 @@ class GradientKernel(NetworkKernel):
         """Store the sums of the last layer, and of what the slots hold."""
         ir, shape = self.ir, self.shape
         ((four,),) = self.head_sums
-        row = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
+        row = self.own_tile + self.sum_row
         for i, value in enumerate(four):
             column = self.sum_column + i % 2
             place = (row + 8 * (i // 2)) * self.outputs + column + offset

@@ -6,15 +6,8 @@ from typing import Literal
 
 from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_STRIDE, PAD, Tiling, padded
 from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, LossTerms, Minibatch
-from jetbot_mjx.agents.fused.tensor_core import (
-    LANES,
-    TILE,
-    GpuKernel,
-    GpuWriter,
-    Operand,
-    Sums,
-    Value,
-)
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuKernel, GpuWriter, Operand, Sums
+from onekernel.build import Value
 
 
 class NetworkKernel(GpuKernel):
@@ -72,11 +65,6 @@ class NetworkKernel(GpuKernel):
         """Load the coefficients of the loss."""
         self.terms = LossTerms(*(self.arrays["terms"][i] for i in range(len(LossTerms._fields))))
 
-    def share(self, total: int, groups: int, group: Value) -> Value:
-        """Return the first of a group's tiles; the last group's may overlap the one before."""
-        per = -(-total // groups)
-        return self.ir.minimum(group * per, total - per)
-
     @abc.abstractmethod
     def begin(self) -> list[Value]:
         """Load what all tiles need, and return the values that the first tile begins with."""
@@ -127,8 +115,9 @@ class NetworkKernel(GpuKernel):
         self.row = self.row_group * (TILE * tiling.row_tiles)
         pairs = self.shape.width // TILE
         self.pairs = -(-pairs // tiling.column_groups)
-        column_group = self.warp % tiling.column_groups
-        self.column = self.share(pairs, tiling.column_groups, column_group) * TILE
+        # The columns of the last warp may overlap those of the one before.
+        column = self.warp % tiling.column_groups * self.pairs
+        self.column = ir.minimum(column, pairs - self.pairs) * TILE
         # Where the lane's sums are in a layer's activations.
         self.place = (self.row + self.sum_row) * (2 * self.stride) + (
             self.column + self.sum_column
@@ -252,8 +241,7 @@ class NetworkKernel(GpuKernel):
     def _store_pair(self, name: str, row: Value, column: Value, pair: list[Value]) -> None:
         """Store two neighbouring numbers of a matrix of float16."""
         place = row * (2 * self.stride_of(name)) + column * 2
-        packed = self.ir.pack(*pair)
-        self.ir.shared(place, self.bytes_of(name)).store(packed)
+        self.ir.shared(place, self.bytes_of(name)).store(self.ir.pack(*pair))
 
     def synchronize_rows(self) -> None:
         """Wait for the warps that compute the same rows."""
@@ -300,11 +288,8 @@ class NetworkKernel(GpuKernel):
 
     def deviations(self) -> list[Value]:
         """Return the standard deviations that are parameters of the policy, or any numbers."""
-        count = self.shape.actions
-        if not self.shape.deviations:
-            return [self.ir.constant(0.0)] * count
-        place = self.shape.policy_size - len(POLICY_METRICS) - count
-        return [self.params[place + i] for i in range(count)]
+        end = self.shape.policy_size - len(POLICY_METRICS)
+        return [self.params[i] for i in range(end - self.shape.actions, end)]
 
     def _biases(self, place: Value, name: str, columns: int) -> Sums:
         """Return the sums with which a layer's product begins: a bias for each column."""
@@ -318,12 +303,10 @@ class NetworkKernel(GpuKernel):
         pointer = ir.shared(self.place, self.bytes_of(self.layer(layer)))
         for offset, low, high in self.halves(sums):
             pair = [_activated(ir, self.shape.activation, z) for z in (low, high)]
-            values = ir.pack(pair[0][0], pair[1][0])
-            ir.moved(pointer, offset).store(values)
+            ir.moved(pointer, offset).store(ir.pack(pair[0][0], pair[1][0]))
             if self.shape.activation == "swish" and self.tiling.is_gradient:
                 slopes = ir.shared(self.place, self.bytes_of(f"slopes{layer}"))
-                derivatives = ir.pack(pair[0][1], pair[1][1])
-                ir.moved(slopes, offset).store(derivatives)
+                ir.moved(slopes, offset).store(ir.pack(pair[0][1], pair[1][1]))
 
     def halves(self, sums: Sums) -> list[tuple[int, Value, Value]]:
         """Return the bytes from the lane's place, and the two neighbouring sums that are there."""

@@ -77,8 +77,7 @@ def _call(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
 
 def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
     """Write the LLVM module of a kernel."""
-    call = _call(kernel, spec, batch, host.lanes)
-    return call.text(lanes=host.lanes, registers=host.registers, machine=host.machine)
+    return _call(kernel, spec, batch, host.lanes).text(host)
 
 
 _written_once = functools.cache(_written)
@@ -105,11 +104,8 @@ def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> l
     host, policies = cpu.host_processor(), len(next(iter(arrays.values())))
     # Results are as long as the call says, but for those that take the place of arguments.
     call = _call(kernel, spec, batch, host.lanes)
-    like = [
-        jax.ShapeDtypeStruct(
-            arrays[name].shape if name in arrays else (policies, call.sizes[name]), np.float32
-        )
-        for name in call.arrays[len(arrays) :]
-    ]
+    names = call.arrays[len(arrays) :]
+    shapes = [arrays[x].shape if x in arrays else (policies, call.sizes[x]) for x in names]
+    like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
     text = _text(host, kernel, spec, batch)
     return cpu.launch_text(text, list(arrays.values()), like, kernel.aliases)

@@ -74,23 +74,20 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
 
 def _run(kernel: GpuKernel, ptx: str, policies: int, arrays: Arrays) -> dict[str, Array]:
     """Launch a kernel with some of the arrays, and return its results by name."""
-    given, returns = list(kernel.arguments), kernel.returns
+    given, names = list(kernel.arguments), kernel.returns
     # What it changes in place has the shape that the argument has.
-    like = [
-        arrays[name].shape if name in given else (policies, *kernel.shapes[name])
-        for name in returns
-    ]
+    shapes = [arrays[x].shape if x in given else (policies, *kernel.shapes[x]) for x in names]
     made = gpu.launch_ptx(
         kernel.name,
         ptx,
         [arrays[name] for name in given],
-        [jax.ShapeDtypeStruct(shape, np.float32) for shape in like],
+        [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes],
         (kernel.blocks, kernel.networks, policies),
         kernel.threads,
         kernel.shared_memory,
-        {given.index(name): i for i, name in enumerate(returns) if name in given},
+        {given.index(name): i for i, name in enumerate(names) if name in given},
     )
-    return dict(zip(returns, made, strict=True))
+    return dict(zip(names, made, strict=True))
 
 
 @functools.cache
