@@ -1,7 +1,8 @@
 """Load a network into shared memory, and write its forward pass."""
 
 import abc
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Literal
 
 from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_STRIDE, PAD, Tiling, padded
@@ -96,7 +97,9 @@ class NetworkKernel(GpuKernel):
         with ir.repeat(self.block, *initial) as loop:
             tile, *carried = loop.carried
             carried = self.tile(tile, carried)
-            following = tile + self.blocks
+            # By no constant: where the assembler sees that a loop ends at once, it makes code with
+            # more registers.
+            following = tile + ir.register("nctaid.x")
             loop.again(following < tiles, following, *carried)
         self.end(carried)
         return ir.module(self.threads)
@@ -164,10 +167,11 @@ class NetworkKernel(GpuKernel):
             numbers.append(self.ir.minimum(self.thread + threads * full, count - 1))
         return numbers
 
-    def pair_places(self, rows: int, columns: int) -> list[tuple[Value, Value]]:
-        """Return the thread's share of a matrix: the row and first column of pairs of numbers."""
+    def pair_places(self, rows: int, columns: int) -> Iterator[tuple[Value, Value]]:
+        """Yield the thread's share of a matrix: the row and first column of pairs of numbers."""
         half = columns // 2
-        return [(i // half, i % half * 2) for i in self.each(rows * half)]
+        for i in self.each(rows * half):
+            yield i // half, i % half * 2
 
     def load_network(self, params: Value, outputs: Value) -> None:
         """Copy a network and the observations' statistics to shared memory.
@@ -181,8 +185,8 @@ class NetworkKernel(GpuKernel):
         # The hidden layers, eight pairs of weights of a thread at a time.
         for layer, inputs, start in shape.hidden_layers:
             pairs = self.pair_places(padded(inputs), width)
-            for first in range(0, len(pairs), 8):
-                self._load_weights(start, layer, pairs[first : first + 8])
+            while some := list(itertools.islice(pairs, 8)):
+                self._load_weights(start, layer, some)
             for i in self.each(width):
                 self.write(f"biases{layer}", i, params[i + (start + inputs * width)])
         # The last layer; its columns beyond the outputs are zero.
