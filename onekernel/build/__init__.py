@@ -9,7 +9,6 @@ from onekernel.lower import (
     ScalarProgram,
     evaluate,
     scalarize,
-    scalarize_part,
     unroll_linear_algebra,
 )
 
@@ -27,6 +26,5 @@ __all__ = [
     "make_primitive",
     "run_program",
     "scalarize",
-    "scalarize_part",
     "unroll_linear_algebra",
 ]

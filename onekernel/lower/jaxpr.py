@@ -16,8 +16,8 @@ Protocol, in the order in which a function passes through the package:
 4. `schedule` places the operations in blocks, and `onekernel.codegen` writes the blocks as LLVM IR.
 
 Arguments for this protocol: the operations and their order are those of the function, so results
-differ from JAX's by round-off only, as long as all numbers are finite. (`scalarize_part` can also
-lower functions whose numbers may not be.) The lowering knows nothing of instances.
+differ from JAX's by round-off only, as long as all numbers are finite. (With `finite=False`
+functions are lowered whose numbers may not be.) The lowering knows nothing of instances.
 """
 
 import dataclasses
@@ -92,13 +92,17 @@ class ScalarProgram:
 
 
 def scalarize(
-    function: Callable[..., PyTree], *arguments: PyTree, approximate: bool = False
+    function: Callable[..., PyTree],
+    *arguments: PyTree,
+    finite: bool = True,
+    approximate: bool = False,
 ) -> ScalarProgram:
     """Lower a function to a program on scalars; the module states the protocol.
 
     Args:
       function: a jittable function of one instance.
       *arguments: pytrees of arrays, or of objects with a shape and a dtype.
+      finite: whether all numbers are finite, as for `ExprGraph`.
       approximate: whether the program is for GPUs, and may have their approximate instructions.
 
     Returns:
@@ -109,7 +113,7 @@ def scalarize(
     """
     closed = jax.make_jaxpr(function)(*arguments)
     variables = closed.jaxpr.invars, closed.jaxpr.outvars
-    return scalarize_part(closed, *variables, approximate=approximate)
+    return scalarize_part(closed, *variables, finite=finite, approximate=approximate)
 
 
 def scalarize_part(

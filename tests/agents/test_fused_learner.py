@@ -12,7 +12,7 @@ from brax.training.agents.ppo.networks import PPONetworks
 
 from helpers import simt
 from helpers.kernel_ppo import ACTIONS, OBSERVATIONS, config, make_ppo, minibatch
-from jetbot_mjx.agents.fused import adam, launch, launch_gpu, probe
+from jetbot_mjx.agents.fused import launch, launch_gpu, probe
 from jetbot_mjx.agents.fused.arrays import ACTIONS as ACTION_ARRAYS
 from jetbot_mjx.agents.fused.arrays import ADAM
 from jetbot_mjx.agents.fused.gpu_actions import ActionKernel
@@ -272,14 +272,15 @@ def modelled(shape, *arrays):
         given = [np.array(x) for x in arrays]
         params, mean, scale, rows, last, unrolls, noise, index, terms = given
         batch = Minibatch(len(rows), unrolls.shape[1], rows.shape[1], len(unrolls))
-        kernel = AdvantageKernel(Tiling(shape, 64, 1, "advantages"), batch)
-        blocks = min(2, kernel.tiles)
+        tiling = Tiling(shape, 64, 1, "advantages")
+        blocks = min(2, tiling.tiles(batch))
+        kernel = AdvantageKernel(tiling, batch, blocks)
         sizes = batch.samples, batch.samples, (blocks, 2)
         estimates = [np.full(size, np.nan, np.float32) for size in sizes]
         arrays = [params, mean, scale, rows, last, unrolls, index, terms, *estimates]
         memory = kernel.shared_memory
         simt.run(kernel.text(), arrays, (blocks, 1, 1), shared_memory=memory)
-        kernel = GradientKernel(Tiling(shape, 32, 1), batch, blocks)
+        kernel = GradientKernel(Tiling(shape, 32, 1), batch, 1, blocks)
         vector = np.full((1, shape.size), np.nan, np.float32)
         arrays = [params, mean, scale, rows, unrolls, noise, index, *estimates, terms, vector]
         simt.run(kernel.text(), arrays, (1, 2, 1), shared_memory=kernel.shared_memory)
@@ -297,7 +298,7 @@ def modelled_actions(shape, *arrays):
 
     def run(*arrays):
         drawn = [np.full(x.shape, np.nan, np.float32) for x in results]
-        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), count)
+        kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), Minibatch(environments=count), 1)
         given = [*(np.array(x) for x in arrays), *drawn]
         simt.run(kernel.text(), given, shared_memory=kernel.shared_memory)
         return drawn
@@ -305,14 +306,23 @@ def modelled_actions(shape, *arrays):
     return launch.Actions(*jax.pure_callback(run, results, *arrays))
 
 
+def on_the_device(monkeypatch, **functions):
+    """Lets the check launch these functions on its device, and the kernels on the CPU after it."""
+    for name, function in functions.items():
+        calls = iter([function, getattr(launch, name)])
+        monkeypatch.setattr(launch, name, lambda *arrays, calls=calls: next(calls)(*arrays))
+
+
 @pytest.mark.cpu
-def test_the_probe_agrees_with_the_model(monkeypatch):
-    monkeypatch.setattr(launch, "gradient", modelled)
-    monkeypatch.setattr(launch, "actions", modelled_actions)
-    monkeypatch.setattr(launch, "adam", modelled_adam)
-    assert probe.runs_correctly.__wrapped__()
-    monkeypatch.setattr(launch, "gradient", lambda *arrays: 1.1 * modelled(*arrays))
-    assert not probe.runs_correctly.__wrapped__()
+@pytest.mark.parametrize("factor", [1.0, 1.1])
+def test_the_probe_agrees_with_the_model(monkeypatch, factor):
+    on_the_device(
+        monkeypatch,
+        gradient=lambda *arrays: factor * modelled(*arrays),
+        actions=modelled_actions,
+        adam=modelled_adam,
+    )
+    assert probe.runs_correctly.__wrapped__() == (factor == 1.0)
 
 
 @pytest.mark.cpu
@@ -326,7 +336,7 @@ def test_the_probe_sees_wrong_actions(monkeypatch, name, error):
         return drawn._replace(**{name: getattr(drawn, name) + error})
 
     assert probe.runs_correctly.__wrapped__()
-    monkeypatch.setattr(launch, "actions", wrong)
+    on_the_device(monkeypatch, actions=wrong)
     assert not probe.runs_correctly.__wrapped__()
 
 
@@ -341,7 +351,7 @@ def test_the_probe_sees_a_wrong_step(monkeypatch, place, error):
         made[place] = made[place].at[(0,) * made[place].ndim].add(error)
         return tuple(made)
 
-    monkeypatch.setattr(launch, "adam", wrong)
+    on_the_device(monkeypatch, adam=wrong)
     assert not probe.runs_correctly.__wrapped__()
 
 
@@ -498,8 +508,8 @@ def modelled_adam(rule, *arrays):
     """`launch.adam` on the model of a GPU, for one policy."""
 
     def run(*arrays):
-        given = {name: np.array(x) for name, x in zip(adam.ARRAYS, arrays, strict=True)}
-        results = [given[name] for name in adam.UPDATED]
+        given = {name: np.array(x) for name, x in zip(ADAM.arguments, arrays, strict=True)}
+        results = [given[name] for name in ADAM.returns]
         kernel = AdamKernel(rule, 2)
         memory = kernel.shared_memory
         simt.run(kernel.text(), [*given.values(), *results], (2, 1, 1), shared_memory=memory)

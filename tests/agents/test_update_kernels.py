@@ -45,8 +45,8 @@ def test_the_advantages_are_those_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
     tiling = Tiling(case.shape, case.rows, -(-case.rows // 128), "advantages")
-    kernel = AdvantageKernel(tiling, case.batch._replace(minibatches=COUNT))
-    blocks = min(case.blocks, kernel.tiles)
+    blocks = min(case.blocks, tiling.tiles(case.batch))
+    kernel = AdvantageKernel(tiling, case.batch._replace(minibatches=COUNT), blocks)
     results = [
         np.full((case.seeds, *rest), np.nan, np.float32)
         for rest in (case.batch[1:3], case.batch[1:3], (blocks, 2))
@@ -66,8 +66,8 @@ def test_the_gradient_is_that_of_float64(name):
     case = CASES[name]
     made = [make_data(case, seed) for seed in range(case.seeds)]
     tiling = Tiling(case.shape, *case.gradient)
-    kernel = GradientKernel(tiling, case.batch._replace(minibatches=COUNT), 3)
-    blocks = min(case.blocks, kernel.tiles)
+    blocks = min(case.blocks, tiling.tiles(case.batch))
+    kernel = GradientKernel(tiling, case.batch._replace(minibatches=COUNT), blocks, 3)
     estimated = [
         np.stack([x.astype(np.float32) for x in column])
         for column in zip(*((data.advantages, data.targets) for data in made), strict=True)
@@ -151,9 +151,9 @@ def test_the_actions_are_those_of_float64(name, rows):
     tiling = Tiling(shape, rows, -(-rows // 128), "actions")
     given = [np.stack(x) for x in zip(*(arrays for arrays, _ in made), strict=True)]
     results = [np.full((2, *size), np.nan, np.float32) for size in drawn(shape, environments)]
-    kernel = ActionKernel(tiling, environments)
     # Of two blocks, the model runs the one with the second tile after that with the third.
     for blocks in (1, 2):
+        kernel = ActionKernel(tiling, Minibatch(environments=environments), blocks)
         sizes = (blocks, 1, 2), kernel.threads, kernel.shared_memory
         simt.run(kernel.text(), [*given, *results], *sizes)
     for i, (_, expected) in enumerate(made):
@@ -185,7 +185,7 @@ def test_the_actions_at_the_ends_of_their_ranges_are_those_of_float64(name, spre
     arrays, expected = make_actions(shape, 40, 0, spread)
     on_a_cpu = jax.jit(functools.partial(launch.actions, shape))
     on_a_gpu = [np.full(size, np.nan, np.float32) for size in drawn(shape, 40)]
-    kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), 40)
+    kernel = ActionKernel(Tiling(shape, 32, 1, "actions"), Minibatch(environments=40), 2)
     sizes = (2, 1, 1), kernel.threads, kernel.shared_memory
     simt.run(kernel.text(), [*arrays, *on_a_gpu], *sizes)
     for results in ([np.asarray(x) for x in on_a_cpu(*arrays)], on_a_gpu):
@@ -201,7 +201,8 @@ def test_the_actions_at_the_ends_of_their_ranges_are_those_of_float64(name, spre
 )
 def test_a_tile_of_actions_fills_the_gpu(environments, memory, rows):
     shape = UpdateShape(16, 128, 3, 2, "tanh_normal", "tanh")
-    assert gpu_tiling.action_tiling(shape, environments, 132, memory).rows == rows
+    batch = Minibatch(environments=environments)
+    assert gpu_tiling.best_tiling("actions", shape, batch, 132, memory).rows == rows
 
 
 @pytest.mark.parametrize("architecture", [80, 90])
@@ -211,9 +212,9 @@ def test_llvm_compiles_them(name, architecture):
     others = (Tiling(case.shape, 64, 1, purpose) for purpose in ("advantages", "actions"))
     tilings = Tiling(case.shape, *case.gradient), *others
     kernels = (
-        GradientKernel(tilings[0], Minibatch(4096, 512, 16), 74),
-        AdvantageKernel(tilings[1], Minibatch(4096, 512, 16)),
-        ActionKernel(tilings[2], 4096),
+        GradientKernel(tilings[0], Minibatch(4096, 512, 16), 66, 74),
+        AdvantageKernel(tilings[1], Minibatch(4096, 512, 16), 74),
+        ActionKernel(tilings[2], Minibatch(environments=4096), 132),
     )
     for tiling, kernel in zip(tilings, kernels, strict=True):
         ptx = gpu.assembled(kernel.text(), architecture, PTX_VERSION)
@@ -236,5 +237,5 @@ def test_llvm_compiles_them(name, architecture):
 )
 def test_the_tile_is_the_largest_that_fits(width, layers, activation, memory, rows):
     shape = UpdateShape(16, width, layers, 2, "tanh_normal", activation)
-    tiling = gpu_tiling.gradient_tiling(shape, memory)
+    tiling = gpu_tiling.best_tiling("gradient", shape, Minibatch(9, 9, 9), 1, memory)
     assert (tiling.rows if tiling else None) == rows

@@ -3,7 +3,6 @@
 - `shapes`: the networks, the data, and the step of an unroll
 - `sample_loss`: the action of one sample, and its loss with derivatives, as JAX functions
 - `adam`: a step of Adam along the gradient, as JAX functions
-- `reference`: what the kernels should compute, in NumPy
 - `arrays`: the arrays that the kernels take and return, with their axes
 - `launch`: the kernels as JAX functions, for every platform
 - `layout`: parameters and moments as vectors

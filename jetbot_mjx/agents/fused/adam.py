@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 
 from jetbot_mjx.agents.fused.sample_loss import vector_of
 from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, VALUE_METRICS, UpdateShape
-from onekernel.build import ScalarProgram, scalarize_part
+from onekernel.build import ScalarProgram, scalarize
 
 BETA_1, BETA_2 = 0.9, 0.999
 _EPSILON = 1e-8
@@ -99,12 +99,6 @@ class Factors(NamedTuple):
 SIZES = {"adam_terms": len(AdamTerms._fields), "progress": len(Progress._fields) - 1 + len(METRICS)}
 """Lengths of the arrays of `AdamTerms` and `Progress`."""
 
-ARRAYS = ("gradient", "params", "mu", "nu", "progress", "index", "adam_terms")
-"""The arrays that the kernels take, as `launch.adam` does."""
-
-UPDATED = ("params", "mu", "nu", "progress")
-"""Those which they change in place, and return."""
-
 
 @functools.cache
 def programs(rule: AdamRule) -> tuple[ScalarProgram, ScalarProgram]:
@@ -115,14 +109,13 @@ def programs(rule: AdamRule) -> tuple[ScalarProgram, ScalarProgram]:
     """
     scalar, metrics = vector_of(), vector_of(len(METRICS))
     arrays = vector_of(SIZES["progress"]), vector_of(SIZES["adam_terms"])
-    common = jax.make_jaxpr(functools.partial(factors, rule=rule))(scalar, metrics, *arrays)
-    of_all = Factors(*[scalar] * len(Factors._fields))
-    of_one = jax.make_jaxpr(element)(scalar, scalar, scalar, scalar, of_all)
+    common = Factors(*[scalar] * len(Factors._fields))
     # Their numbers may not be finite, so that x - x, for one, is not simplified to 0.
-    first, second = (
-        scalarize_part(x, x.jaxpr.invars, x.jaxpr.outvars, finite=False) for x in (common, of_one)
+    of_all = functools.partial(factors, rule=rule)
+    return (
+        scalarize(of_all, scalar, metrics, *arrays, finite=False),
+        scalarize(element, *[scalar] * 4, common, finite=False),
     )
-    return first, second
 
 
 def factors(
@@ -173,7 +166,7 @@ def factors(
 
 def element(
     param: Array, mu: Array, nu: Array, gradient: Array, common: Factors
-) -> tuple[Array, Array, Array]:
+) -> tuple[Array, ...]:
     """Return the next parameter and means of one element, or of many.
 
     Args:
@@ -190,8 +183,5 @@ def element(
     change = common.rate * (new_mu * common.inverse_1)
     change = change / (jnp.sqrt(new_nu * common.inverse_2) + _EPSILON)
     # Or what it was, if the step is left out.
-    new, old = (param - change, new_mu, new_nu), (param, mu, nu)
-    first, second, third = (
-        jnp.where(common.is_applied > 0.0, *x) for x in zip(new, old, strict=True)
-    )
-    return first, second, third
+    pairs = (param - change, param), (new_mu, mu), (new_nu, nu)
+    return tuple(jnp.where(common.is_applied > 0.0, *pair) for pair in pairs)

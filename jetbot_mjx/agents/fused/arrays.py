@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import ShapedArray
 from jaxtyping import Array, Float
 
-from jetbot_mjx.agents.fused.adam import ARRAYS, SIZES, UPDATED, AdamRule
+from jetbot_mjx.agents.fused.adam import SIZES, AdamRule
 from jetbot_mjx.agents.fused.shapes import LossTerms, Minibatch, Unroll, UpdateShape
 
 Arrays = Mapping[str, Array]
@@ -78,9 +78,8 @@ class Signature:
     @property
     def aliases(self) -> dict[int, int]:
         """Return the places of the arguments that the kernel changes, with those of the results."""
-        returned = list(self.returns)
-        places = enumerate(self.arguments)
-        return {i: returned.index(name) for i, name in places if name in returned}
+        given = self.arguments
+        return {given.index(x): i for i, x in enumerate(self.returns) if x in given}
 
     def batch_of(self, spec: Spec, arrays: Sequence[Array | ShapedArray]) -> Minibatch:
         """Return how much data there is, and refuse what a kernel would read beyond its end.
@@ -145,7 +144,7 @@ _DATA = ("rows", "last", "unrolls", "noise")
 _EACH = dict.fromkeys(Actions._fields, "environments action")
 _EACH |= {"log_prob": "environments", "distribution_params": "environments 2*action"}
 _STEPS = {name: f"time {axes}" for name, axes in _EACH.items()}
-_LEARNED = {name: AXES[name] for name in UPDATED}
+_UPDATED = {name: AXES[name] for name in ("params", "mu", "nu", "progress")}
 
 ACTIONS = Signature("actions", (*_NETWORK, "observations", "action_noise"), _EACH)
 UNROLL = Signature(
@@ -154,6 +153,6 @@ UNROLL = Signature(
     {"end": "environments state", "kept": "time environments kept", **_STEPS},
 )
 GRADIENT = Signature("gradient", (*_NETWORK, *_DATA, "index", "terms"), {"gradient": "size"})
-ADAM = Signature("adam", ARRAYS, _LEARNED)
+ADAM = Signature("adam", ("gradient", *_UPDATED, "index", "adam_terms"), _UPDATED)
 # The index of the minibatch is no argument: all minibatches are computed by one call.
-UPDATE = Signature("update", (*_NETWORK[1:], *_DATA, "terms", "adam_terms", *UPDATED), _LEARNED)
+UPDATE = Signature("update", (*_NETWORK[1:], *_DATA, "terms", "adam_terms", *_UPDATED), _UPDATED)

@@ -8,50 +8,35 @@ call for each step would wake all threads twice.
 from collections.abc import Mapping
 
 from jetbot_mjx.agents.fused import sample_loss
-from jetbot_mjx.agents.fused.arrays import ACTIONS, UNROLL, Actions
+from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
 from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, TILE_ROWS, NetworkStage
-from jetbot_mjx.agents.fused.cpu_stages import Stages, sample_function
+from jetbot_mjx.agents.fused.cpu_stages import sample_function
 from jetbot_mjx.agents.fused.sample_loss import vector_of
 from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel.build import LlvmWriter, Value, cpu, scalarize
-
-_PART_ROWS = 2 * TILE_ROWS
-"""Environments of a part if there are no more than `MOST_PARTS` times as many; each part copies the
-weights."""
-
-
-def action_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
-    """Return the stage of `arrays.ACTIONS`.
-
-    Args:
-      shape: the networks.
-      batch: the data, of which the number of environments is used.
-      lanes: the number of float32 values in a vector register.
-    """
-    return Stages([ActionStage(shape, batch.environments, lanes, _PART_ROWS)])
 
 
 class ActionStage(NetworkStage):
     """An `ActionStage` runs the policy network and draws an action from each distribution."""
 
     name = "actions"
-    arrays_of = (*ACTIONS.arguments, *ACTIONS.returns)
 
-    def __init__(self, shape: UpdateShape, environments: int, lanes: int, part_rows: int) -> None:
+    part_rows = 2 * TILE_ROWS
+    """Environments of a part, unless there would be too many parts; each copies the weights."""
+
+    def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         """Divide the environments.
 
         Args:
           shape: the networks.
-          environments: the number of environments.
+          batch: the data, of which the number of environments is used.
           lanes: the number of float32 values in a vector register.
-          part_rows: the environments of a part, unless there would be too many parts.
         """
-        self.environments = environments
         numbers = ACTIONS.counts(shape, Minibatch(environments=1))
         self.drawn = {name: numbers[name] for name in Actions._fields}
         """The numbers of an environment in each array of `Actions`."""
-        part_items = max(part_rows, -(-environments // MOST_PARTS))
-        super().__init__(shape, lanes, environments, part_items)
+        part_items = max(self.part_rows, -(-batch.environments // MOST_PARTS))
+        super().__init__(shape, lanes, batch.environments, part_items)
 
     def scratch_sizes(self) -> dict[str, int]:
         """Add what the samples read and write, a row of lanes for each number."""
@@ -61,8 +46,8 @@ class ActionStage(NetworkStage):
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation and the sample."""
-        activate = self.activation()
-        activated = scalarize(lambda z: activate(z)[0], vector_of())
+        name = self.shape.activation
+        activated = scalarize(lambda z: sample_loss.activation(name, z)[0], vector_of())
         drawn = sample_loss.action_program(self.shape)
         return [
             self.on_layers("activate", activated, (0,), (0,)),
@@ -89,75 +74,48 @@ class ActionStage(NetworkStage):
             self.load_observation(arrays["observations"] + place, row)
         self.forward(self.stored_rows(count))
         # and draw the actions, a lane for each environment.
+        places, actions = self.places, self.shape.actions
         for start in self.groups(count):
             there = w.minimum(count - start, w.lanes)
-            self._draw(first + start, start, there, arrays)
-
-    def _draw(self, first: Value, start: Value, there: Value, arrays: Mapping[str, Value]) -> None:
-        """Draw the actions of a group of environments.
-
-        Args:
-          first: the first environment.
-          start: its row.
-          there: the number of environments.
-          arrays: those of `act`.
-        """
-        w, shape, places = self.w, self.shape, self.places
-        lanes, actions, deviations = w.lanes, shape.actions, self.deviations
-        # Collect what the samples read, environment by environment.
-        with w.loop(lanes) as lane:
-            # Lanes beyond the last environment repeat it.
-            within = w.minimum(lane, there - 1)
-            outputs = places["outputs"] + (start + within) * HEAD
-            noise = (first + within) * actions
-            sources = [
-                (outputs, self.outputs),
-                (outputs if deviations is None else deviations, actions),
-                (arrays["action_noise"] + noise, actions),
-            ]
-            self.gather("sample", lane, sources)
-        w.call("draw", places["sample"], places["drawn"])
-        # Store what they draw, the numbers of each array behind those of the one before.
-        with w.loop(there) as lane:
-            place = 0
-            for name, size in self.drawn.items():
-                row = arrays[name] + (first + lane) * size
-                for i in range(size):
-                    row[i] = (places["drawn"] + place * lanes)[lane]
-                    place += 1
+            # Collect what the samples read; lanes beyond the last environment repeat it.
+            with w.loop(w.lanes) as lane:
+                row = start + w.minimum(lane, there - 1)
+                outputs = places["outputs"] + row * HEAD
+                noise = arrays["action_noise"] + (first + row) * actions
+                sources = (outputs, self.outputs), (self.deviations, actions), (noise, actions)
+                self.gather("sample", lane, sources)
+            w.call("draw", places["sample"], places["drawn"])
+            # Store what they draw, the numbers of each array behind those of the one before.
+            with w.loop(there) as lane:
+                drawn = places["drawn"] + lane
+                for name, size in self.drawn.items():
+                    target = arrays[name] + (first + start + lane) * size
+                    for i in range(size):
+                        target[i] = drawn[i * w.lanes]
+                    drawn += size * w.lanes
 
 
-def unroll_stages(unroll: Unroll, batch: Minibatch, lanes: int) -> Stages:
-    """Return the stage of `arrays.UNROLL`.
-
-    Args:
-      unroll: the networks and the environment.
-      batch: the data, of which the number of environments and the time are used.
-      lanes: the number of float32 values in a vector register.
-    """
-    return Stages([_UnrollStage(unroll, batch, lanes)])
-
-
-class _UnrollStage(ActionStage):
-    """Takes environments through all steps of an unroll."""
+class UnrollStage(ActionStage):
+    """An `UnrollStage` takes environments through all steps of an unroll."""
 
     name = "unroll"
-    arrays_of = (*UNROLL.arguments, *UNROLL.returns)
+    # The parts are smaller than those of one step: each arranges the weights for all steps.
+    part_rows = TILE_ROWS
 
     def __init__(self, unroll: Unroll, batch: Minibatch, lanes: int) -> None:
-        # The parts are smaller than those of one step: each arranges the weights for all steps.
-        super().__init__(unroll.shape, batch.environments, lanes, TILE_ROWS)
+        """Divide the environments.
+
+        Args:
+          unroll: the networks and the environment.
+          batch: the data, of which the number of environments and the time are used.
+          lanes: the number of float32 values in a vector register.
+        """
+        super().__init__(unroll.shape, batch, lanes)
         self._unroll, self._time = unroll, batch.time
-        numbers = {"kept": len(unroll.kept), "unroll_noise": self.shape.actions, **self.drawn}
-        self._step_sizes = {name: batch.environments * size for name, size in numbers.items()}
-        """The numbers of a step in each array that holds all steps."""
 
     def own_functions(self) -> list[LlvmWriter]:
         """Write the activation, the sample and the step of the environments."""
-        return [
-            *super().own_functions(),
-            *cpu.step_functions(self._unroll.kernel, self.lanes),
-        ]
+        return [*super().own_functions(), *cpu.step_functions(self._unroll.kernel, self.lanes)]
 
     def tile(self, first: Value, count: Value) -> None:
         """Take some environments through all steps."""
@@ -165,8 +123,10 @@ class _UnrollStage(ActionStage):
         limit = first + count
         with w.loop(self._time) as step:
             # Find the step's part of each array, and the states before it.
-            sizes = self._step_sizes.items()
-            here = {name: self.arrays[name] + step * size for name, size in sizes}
+            here = {
+                name: self.arrays[name] + step * (self.sizes[name] // self._time)
+                for name in ("kept", "unroll_noise", *self.drawn)
+            }
             before = w.select(step.equals(0), self.arrays["start"], end)
             here["observations"] = before + unroll.observation
             here["action_noise"] = here["unroll_noise"]
@@ -179,6 +139,5 @@ class _UnrollStage(ActionStage):
                 environment = first + row
                 source = end + environment * unroll.state
                 target = here["kept"] + environment * len(unroll.kept)
-                for place, begin, last in unroll.ranges:
-                    with w.loop(last + 1 - begin) as i:
-                        (target + place)[i] = (source + begin)[i]
+                for place, number in enumerate(unroll.kept):
+                    target[place] = source[number]

@@ -1,29 +1,27 @@
 """Write a step of Adam on CPUs: first the squares of the gradient, and then all elements.
 
 The call of all minibatches makes the stages of the gradient and then these for each of them. The
-first of these is joined with the sum of the gradients: it squares what that has just written.
+squares follow the sum of the gradients without a wait: a part squares what it has just written.
 """
 
 from jetbot_mjx.agents.fused import adam
-from jetbot_mjx.agents.fused.adam import METRICS, SIZES, UPDATED, AdamRule, Factors
+from jetbot_mjx.agents.fused.adam import METRICS, SIZES, AdamRule, Factors
 from jetbot_mjx.agents.fused.cpu_gradient import gradient_stages
 from jetbot_mjx.agents.fused.cpu_product import add_all
 from jetbot_mjx.agents.fused.cpu_stages import (
-    SQUARES,
     Call,
-    JoinedStage,
     SquareStage,
-    Stages,
+    Stage,
     VectorStage,
     sample_function,
 )
 from jetbot_mjx.agents.fused.shapes import Minibatch
 from onekernel.build import LlvmWriter, ScalarProgram, run_program
 
-_VECTORS = (*UPDATED[:3], "gradient")
+_VECTORS = ("params", "mu", "nu", "gradient")
 
 
-def adam_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> Stages:
+def adam_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.ADAM`.
 
     Args:
@@ -32,11 +30,10 @@ def adam_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> Stages:
       lanes: the number of float32 values in a vector register.
     """
     del batch
-    stages = [SquareStage(lanes, rule.shape.ranges), _AdamStage(rule, lanes)]
-    return Stages(stages, {"squares": SQUARES})
+    return [[SquareStage(rule.shape, lanes)], [_AdamStage(rule, lanes)]]
 
 
-def update_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> Stages:
+def update_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.UPDATE`, through which the call goes for each minibatch.
 
     Args:
@@ -44,10 +41,9 @@ def update_stages(rule: AdamRule, batch: Minibatch, lanes: int) -> Stages:
       batch: the minibatch.
       lanes: the number of float32 values in a vector register.
     """
-    (*parts, total), between = gradient_stages(rule.shape, batch, lanes)
-    (squares, step), own = adam_stages(rule, batch, lanes)
-    stages = [*parts, JoinedStage(total, squares), step]
-    return Stages(stages, {"gradient": rule.shape.size, **own, **between})
+    *parts, total = gradient_stages(rule.shape, batch, lanes)
+    squares, step = adam_stages(rule, batch, lanes)
+    return [*parts, total + squares, step]
 
 
 class _AdamStage(VectorStage):
@@ -56,7 +52,8 @@ class _AdamStage(VectorStage):
     name = "adam"
 
     def __init__(self, rule: AdamRule, lanes: int) -> None:
-        self.rule, self.lanes = rule, lanes
+        super().__init__(rule.shape, lanes)
+        self.rule = rule
         # Scratch memory: what `factors` reads, and what it returns.
         self.writes = 1 + len(METRICS) + sum(SIZES.values())
         self.scratch = self.writes + len(Factors._fields) + SIZES["progress"]
@@ -64,19 +61,16 @@ class _AdamStage(VectorStage):
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function, and those that it calls."""
         # Elements are updated a vector at a time, and those at the end one by one.
-        factors, element = adam.programs(self.rule)
-        elements = [_elements_function(element, n) for n in (self.lanes, 1)]
-        return [sample_function("factors", factors, 1), *elements, self._step(call)]
-
-    def _step(self, call: Call) -> LlvmWriter:
         rule, lanes = self.rule, self.lanes
+        factors, element = adam.programs(rule)
+        elements = [_elements_function(element, n) for n in (lanes, 1)]
         w, (job, policy, part, minibatch, scratch) = self.begin(lanes)
         names = *_VECTORS, "progress", "adam_terms", "squares"
         *vectors, rows, terms, squares = (call.array(job, policy, name) for name in names)
         # What `factors` reads: the sum of squares, the metrics, the progress, and the terms.
         reads, writes = scratch, scratch + self.writes
         reads.store(0.0)
-        add_all(squares, SQUARES, reads)
+        add_all(squares, self.parts, reads)
         before = rows + minibatch * SIZES["progress"]
         sources = [vectors[-1] + place for place in rule.places]
         sources += [before + i for i in range(SIZES["progress"])]
@@ -96,7 +90,7 @@ class _AdamStage(VectorStage):
             done = whole * lanes
             for width, begin, length in ((lanes, first, whole), (1, first + done, count - done)):
                 w.call(f"elements.{width}", *(x + begin for x in vectors), writes, length)
-        return w
+        return [sample_function("factors", factors, 1), *elements, w]
 
 
 def _elements_function(program: ScalarProgram, lanes: int) -> LlvmWriter:

@@ -7,6 +7,7 @@ adds to the gradient of weights and biases.
 """
 
 import abc
+import functools
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.cpu_network import HEAD, MOST_PARTS, NetworkStage
@@ -19,25 +20,16 @@ from jetbot_mjx.agents.fused.cpu_product import (
     transposed,
     vectors_of,
 )
-from jetbot_mjx.agents.fused.cpu_stages import Stages, SumStage, integer_at, sample_function
+from jetbot_mjx.agents.fused.cpu_stages import Stage, SumStage, integer_at, sample_function
 from jetbot_mjx.agents.fused.sample_loss import ValueStep, vector_of
-from jetbot_mjx.agents.fused.shapes import (
-    POLICY_METRICS,
-    VALUE_METRICS,
-    LossTerms,
-    Minibatch,
-    UpdateShape,
-)
+from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, LossTerms, Minibatch, UpdateShape
 from onekernel.build import LlvmWriter, ScalarProgram, Value, scalarize
-
-_READ = ("params", "mean", "scale", "rows")
-"""Arrays that both networks read first."""
 
 _PART_SAMPLES = 256
 """Samples of a part, about, if the minibatch has no more than `MOST_PARTS` times as many."""
 
 
-def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
+def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> list[list[Stage]]:
     """Return the stages of `arrays.GRADIENT`, from values to the sum of all parts.
 
     Args:
@@ -46,18 +38,8 @@ def gradient_stages(shape: UpdateShape, batch: Minibatch, lanes: int) -> Stages:
       lanes: the number of float32 values in a vector register.
     """
     values, policy = _ValueStage(shape, batch, lanes), _PolicyStage(shape, batch, lanes)
-    (begin, end), (values_begin, values_end) = shape.ranges
-    ranges = {
-        "policy_vectors": (policy.parts, (begin, end, values_begin)),
-        "values_vectors": (values.parts, (values_begin, values_end, shape.size)),
-    }
-    between = {
-        # A gradient of each part, of its network only.
-        "values_vectors": values.parts * values.size,
-        "policy_vectors": policy.parts * policy.size,
-        "advantages": batch.samples,
-    }
-    return Stages([values, policy, SumStage(lanes, ranges)], between)
+    vectors = {f"{stage.name}_vectors": stage.parts for stage in (policy, values)}
+    return [[values], [policy], [SumStage(shape, lanes, vectors)]]
 
 
 class _GradientStage(NetworkStage):
@@ -89,6 +71,8 @@ class _GradientStage(NetworkStage):
         self.batch = batch
         unrolls = max(1, round(_PART_SAMPLES / batch.time), -(-batch.unrolls // MOST_PARTS))
         super().__init__(shape, lanes, batch.unrolls, unrolls, batch.time + (not self.is_policy))
+        # A gradient of each part, of its network only.
+        self.handed_on = {f"{self.name}_vectors": self.parts * self.size}
 
     def scratch_sizes(self) -> dict[str, int]:
         shape, stride, lanes, rows = self.shape, self.stride, self.lanes, self.rows
@@ -104,7 +88,8 @@ class _GradientStage(NetworkStage):
 
     def own_functions(self) -> list[LlvmWriter]:
         scalar = vector_of()
-        activated, both = scalarize(self.activation(), scalar), (0, 1)
+        activation = functools.partial(sample_loss.activation, self.shape.activation)
+        activated, both = scalarize(activation, scalar), (0, 1)
         scaled = scalarize(lambda one, other: one * other, scalar, scalar)
         return [
             self.on_layers("activate", activated, (0,), both),
@@ -132,15 +117,12 @@ class _GradientStage(NetworkStage):
 
     def begin_part(self) -> None:
         super().begin_part()
-        w, shape, places = self.w, self.shape, self.places
+        shape, places = self.shape, self.places
         self.vector = self.arrays[f"{self.name}_vectors"] + self.part.number * self.size
         # Find the unrolls and the noise of the minibatch.
-        for name, size in (
-            ("unrolls", self.batch.unrolls),
-            ("noise", self.batch.samples * shape.actions),
-        ):
-            if name in self.arrays:
-                self.arrays[name] += self.part.minibatch * size
+        noise = self.batch.samples * shape.actions
+        for name, size in (("unrolls", self.batch.unrolls), ("noise", noise)):
+            self.arrays[name] += self.part.minibatch * size
         # Transpose the weights for the backward pass, and set all sums to zero.
         for i, inputs, start in shape.hidden_layers:
             source = self.params + start
@@ -149,12 +131,8 @@ class _GradientStage(NetworkStage):
                 self._transpose(source, places[f"turned{i}"], inputs, shape.width)
         source = self.params + shape.hidden
         self._transpose(source, places["turned_head"], shape.width, self.outputs)
-        for name, count in (
-            ("errors", self.rows * HEAD),
-            ("head_sums", (shape.width + 1) * HEAD),
-            ("sums", self.slots * w.lanes),
-        ):
-            fill(places[name], count)
+        for name in ("errors", "head_sums", "sums"):
+            fill(places[name], self.scratch_sizes()[name])
 
     def _transpose(self, source: Value, target: Value, rows: int, columns: int) -> None:
         """Copy a matrix of weights transposed."""
@@ -219,12 +197,12 @@ class _ValueStage(_GradientStage):
 
     name = "values"
     is_policy = False
-    arrays_of = (*_READ, "last", "unrolls", "terms", "values_vectors", "advantages")
 
     def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
         self.slots, self.size = len(VALUE_METRICS), shape.size - shape.policy_size
         self.loss_program, self.loss_lanes = sample_loss.value_step_program(batch.samples), 1
         super().__init__(shape, batch, lanes)
+        self.handed_on = {**self.handed_on, "advantages": batch.samples}
 
     def observation(self, unroll: Value, step: Value) -> Value:
         # The row behind the steps has the observation after them. An address beyond the array is
@@ -272,10 +250,9 @@ class _PolicyStage(_GradientStage):
     """The gradient of the policy network."""
 
     name = "policy"
-    arrays_of = (*_READ, "unrolls", "noise", "terms", "policy_vectors", "advantages")
 
     def __init__(self, shape: UpdateShape, batch: Minibatch, lanes: int) -> None:
-        self.slots, self.size = shape.deviations + len(POLICY_METRICS), shape.policy_size
+        self.slots, self.size = shape.slots - shape.outputs[0], shape.policy_size
         self.loss_program = sample_loss.policy_program(shape, batch.samples)
         self.loss_lanes = lanes
         super().__init__(shape, batch, lanes)
@@ -283,14 +260,11 @@ class _PolicyStage(_GradientStage):
     def begin_part(self) -> None:
         super().begin_part()
         if self.shape.normalizes:
-            self._load_statistics()
-
-    def _load_statistics(self) -> None:
-        """Compute the mean of all advantages and 1 / (std + 1e-8)."""
-        # Every part computes them, in one order: so none waits for another.
-        self.mean = self._mean_advantage(None)
-        variance = self._mean_advantage(self.mean)
-        self.scale = 1.0 / (self.w.intrinsic("sqrt", variance) + 1e-8)
+            # The mean of all advantages and 1 / (std + 1e-8). Every part computes them, in one
+            # order: so none waits for another.
+            self.mean = self._mean_advantage(None)
+            variance = self._mean_advantage(self.mean)
+            self.scale = 1.0 / (self.w.intrinsic("sqrt", variance) + 1e-8)
 
     def _mean_advantage(self, centre: Value | None) -> Value:
         """Return the mean of the advantages, or of their squared distances from a centre."""
@@ -298,8 +272,7 @@ class _PolicyStage(_GradientStage):
         total = self.places["statistics"]
         # A sum for each lane, and then one of all lanes.
         fill(total, lanes)
-        first, count = (w.constant(x, "u64") for x in (0, samples))
-        for place, kind in vectors_of(first, count):
+        for place, kind in vectors_of(w.constant(0, "u64"), w.constant(samples, "u64")):
             value = (self.arrays["advantages"] + place).load(kind)
             if centre is not None:
                 distance = value - (centre if kind == "float" else centre.splat(lanes))
@@ -310,21 +283,15 @@ class _PolicyStage(_GradientStage):
 
     def add_losses(self, first: Value, count: Value) -> None:
         """Compute the losses of as many samples at once as a vector has lanes."""
-        w, time, places = self.w, self.batch.time, self.places
-        lanes = w.lanes
-        rows, results = count * time, places["results"]
+        w, lanes, places = self.w, self.lanes, self.places
+        rows, results = count * self.batch.time, places["results"]
         for start in self.groups(rows):
             # Collect what the loss reads, sample by sample.
-            there = w.minimum(rows - start, lanes)
             with w.loop(lanes) as lane:
-                # Lanes beyond the last sample repeat it, with a weight of zero.
-                is_there = lane < there
-                row = w.minimum(start + lane, rows - 1)
-                within = row // time
-                step = row - within * time
-                self._load_sample(first + within, step, row, is_there, lane)
+                self._load_sample(lane, start + lane, rows, first)
             w.call("policy_loss", places["loss"], results)
             # Store the derivatives by the outputs, and add up the sums behind them.
+            there = w.minimum(rows - start, lanes)
             with w.loop(there) as lane, w.loop(self.outputs) as j:
                 source = results + j * lanes + lane
                 places["errors"][(start + lane) * HEAD + j] = source.load()
@@ -333,25 +300,33 @@ class _PolicyStage(_GradientStage):
                 value = (results + self.outputs * lanes + place).load(w.vector)
                 add_to(places["sums"] + place, value)
 
-    def _load_sample(
-        self, unroll: Value, step: Value, row: Value, is_there: Value, lane: Value
-    ) -> None:
-        """Copy what the loss of a sample reads to a lane, in the order of `PolicySample`."""
+    def _load_sample(self, lane: Value, row: Value, rows: Value, first: Value) -> None:
+        """Copy what the loss of a sample reads to a lane, in the order of `PolicySample`.
+
+        Args:
+          lane: the lane.
+          row: the row of the sample.
+          rows: the number of rows.
+          first: the first unroll.
+        """
         w, shape, batch = self.w, self.shape, self.batch
-        columns, actions, deviations = shape.columns, shape.actions, self.deviations
+        columns, actions = shape.columns, shape.actions
+        # Lanes beyond the last sample repeat it, with a weight of zero.
+        weight = w.select(row < rows, w.constant(1.0), 0.0)
+        row = w.minimum(row, rows - 1)
+        unroll, step = first + row // batch.time, row % batch.time
         outputs = self.places["outputs"] + row * HEAD
         collected = self.row_of(unroll, step)
         noise = self.arrays["noise"] + (step * batch.unrolls + unroll) * actions
         advantage = self.arrays["advantages"][unroll * batch.time + step]
         if shape.normalizes:
             advantage = (advantage - self.mean) * self.scale
-        first = columns["raw_action"]
+        start, stop = columns["raw_action"], columns["reward"]
         sources = [
             (outputs, self.outputs),
-            (outputs if deviations is None else deviations, actions),
-            (collected + first, columns["reward"] - first),
+            (self.deviations, actions),
+            (collected + start, stop - start),
             (noise, actions),
         ]
         # The fields of `PolicySample`, one behind the other, and the coefficients.
-        weight = w.select(is_there, w.constant(1.0), 0.0)
         self.gather("loss", lane, sources, advantage, weight, *self.load_terms())

@@ -7,12 +7,8 @@ A column of ones beside the activations has the biases as its weights, so that o
 a layer with its biases.
 """
 
-import functools
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 
-from jaxtyping import Array
-
-from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.cpu_product import ROWS, Matrix, fill, multiply, rounded_up
 from jetbot_mjx.agents.fused.cpu_stages import Call, Stage
 from jetbot_mjx.agents.fused.shapes import UpdateShape, places
@@ -44,8 +40,6 @@ class NetworkStage(Stage):
         outputs                  (rows, HEAD)
     """
 
-    arrays_of: tuple[str, ...]
-    """Names of the arrays that it reads or writes."""
     is_policy = True
     """Whether the network is the policy's."""
 
@@ -67,8 +61,9 @@ class NetworkStage(Stage):
         self.parts = -(-items // part_items)
         self.tile_items = min(part_items, -(-TILE_ROWS // steps))
         # The rows of a tile that are stored, and the strides of those of a layer.
-        self.rows = rounded(self.tile_items * steps, ROWS)
-        self.stride, self.first_stride = shape.width + _PAD, rounded(shape.observations + 1, _PAD)
+        self.rows = -(-self.tile_items * steps // ROWS) * ROWS
+        self.stride = shape.width + _PAD
+        self.first_stride = -(-(shape.observations + 1) // _PAD) * _PAD
         self.layout = places(self.scratch_sizes(), _PAD)
         """Where each array begins in a part's scratch memory, and its `size`, in floats."""
         self.scratch = self.layout["size"]
@@ -120,21 +115,16 @@ class NetworkStage(Stage):
                     at[x].store(result)
         return w
 
-    def activation(self) -> Callable[[Array], tuple[Array, Array]]:
-        """Return the activation with its derivative, as a function of a scalar."""
-        return functools.partial(sample_loss.activation, self.shape.activation)
-
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function that computes one part, and those that it calls."""
         functions = self.own_functions()
         self.w, self.part = w, part = self.begin(self.lanes)
         # Find the arrays of the policy, the network's parameters and the scratch memory.
-        self.arrays = {name: call.array(part.job, part.policy, name) for name in self.arrays_of}
+        self.sizes = call.sizes
+        self.arrays = {name: call.array(part.job, part.policy, name) for name in call.sizes}
         start = 0 if self.is_policy else self.shape.policy_size
         self.params = self.arrays["params"] + start
-        self.places = {
-            name: part.scratch + place for name, place in self.layout.items() if name != "size"
-        }
+        self.places = {name: part.scratch + place for name, place in self.layout.items()}
         self.begin_part()
         # Go through the items of the part in tiles.
         first = part.number * self.part_items
@@ -187,10 +177,8 @@ class NetworkStage(Stage):
             yield group * lanes
 
     @property
-    def deviations(self) -> Value | None:
-        """Return the address of the standard deviations that are parameters; None: none are."""
-        if not self.shape.deviations:
-            return None
+    def deviations(self) -> Value:
+        """Return the address of the standard deviations that are parameters, or of any numbers."""
         return self.params + (self.shape.hidden + (self.shape.width + 1) * self.outputs)
 
     def gather(
@@ -242,8 +230,3 @@ class NetworkStage(Stage):
         # The last layer has no activation.
         head, outputs = Matrix(places["head"], HEAD), Matrix(places["outputs"], HEAD)
         multiply(layers[-1], head, outputs, (stored, HEAD, shape.width + 1))
-
-
-def rounded(size: int, multiple: int) -> int:
-    """Return a size rounded up to a multiple of another."""
-    return -(-size // multiple) * multiple

@@ -14,13 +14,8 @@ import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from jetbot_mjx.agents.fused.cpu_product import (
-    add_all,
-    add_to,
-    fill,
-    product_functions,
-    vectors_of,
-)
+from jetbot_mjx.agents.fused.cpu_product import add_all, add_to, fill, product_functions, vectors_of
+from jetbot_mjx.agents.fused.shapes import UpdateShape
 from onekernel.build import LlvmWriter, ScalarProgram, Value, cpu, run_program
 
 _CHUNKS = 8
@@ -47,48 +42,45 @@ _PARAMETERS = ("ptr job", "u64 policy", "u64 part", "u64 minibatch", "ptr scratc
 class Call:
     """A `Call` holds the arrays of a call and its stages."""
 
-    arguments: tuple[str, ...]
-    """Names of the arrays that it reads; all have the policies as their first axis."""
-    results: tuple[str, ...]
+    arrays: tuple[str, ...]
+    """Names of the arrays that XLA passes: the arguments, the results, and those between the
+    stages. Each has the policies as its first axis."""
     sizes: Mapping[str, int]
     """Numbers of one policy in each array."""
-    stages: Sequence["Stage"]
+    stages: Sequence[Sequence["Stage"]]
+    """The stages in their order. In place of one there may be several of as many parts: a part of
+    the second follows that of the first, whose numbers are still in the cache."""
     minibatches: int
     """How often to go through the stages. With an array `index`, that is the only minibatch."""
 
-    def text(self, *, lanes: int, registers: int, machine: str) -> str:
-        """Return the LLVM module.
-
-        Args:
-          lanes: the number of float32 values in a vector register.
-          registers: the number of vector registers.
-          machine: the processor, one of `MACHINES`.
-        """
+    def text(self, host: cpu.Host) -> str:
+        """Return the LLVM module for a processor."""
         # Stages share some functions, which are in the module once.
-        functions = [function for stage in self.stages for function in stage.functions(self)]
-        functions += [*product_functions(lanes, registers), self._needed(), self._block()]
+        stages = [stage for together in self.stages for stage in together]
+        functions = [function for stage in stages for function in stage.functions(self)]
+        functions += [*product_functions(host.lanes, host.registers), self._needed(), self._block()]
         return cpu.call_text(
             functions,
             blocks_per_instance=self._parts * self.minibatches,
             blocks_per_thread=1,
-            scratch=max(64 * -(-stage.scratch // 16) for stage in self.stages),
-            machine=machine,
+            scratch=max(64 * -(-stage.scratch // 16) for stage in stages),
+            machine=host.machine,
         )
 
     def array(self, job: Value, policy: Value, name: str) -> Value:
         """Return the address of the array of a policy."""
-        # XLA passes the arguments and then the results, each with the policies as its first axis.
-        place = (*self.arguments, *self.results).index(name)
+        place = self.arrays.index(name)
         return cpu.array_of(job, place) + policy * self.sizes[name]
 
     @property
     def _parts(self) -> int:
-        return sum(stage.parts for stage in self.stages)
+        return sum(stage.parts for stage, *_ in self.stages)
 
     @property
     def _starts(self) -> list[int]:
         """Return the number of parts before each stage."""
-        return [sum(x.parts for x in self.stages[:i]) for i in range(len(self.stages))]
+        parts = (stage.parts for stage, *_ in self.stages)
+        return list(itertools.accumulate(parts, initial=0))[:-1]
 
     def _decoded(self, job: Value, index: Value) -> tuple[Value, Value, Value]:
         """Return the policies, and of a block its minibatch and its place in that."""
@@ -114,23 +106,17 @@ class Call:
         job, index, scratch = w.parameters
         policies, minibatch, place = self._decoded(job, index)
         # Find the stage, and then the policy and the part of the stage.
-        for stage, start in zip(self.stages, self._starts, strict=True):
-            with w.when(place < policies * (start + stage.parts)):
+        for stages, start in zip(self.stages, self._starts, strict=True):
+            parts = stages[0].parts
+            with w.when(place < policies * (start + parts)):
                 within = place - policies * start
-                policy, part = within // stage.parts, within % stage.parts
-                if "index" in self.arguments:
+                policy, part = within // parts, within % parts
+                if "index" in self.arrays:
                     minibatch = integer_at(self.array(job, policy, "index"))
-                w.call(stage.name, *Part(job, policy, part, minibatch, scratch))
+                for stage in stages:
+                    w.call(stage.name, *Part(job, policy, part, minibatch, scratch))
                 w.ret()
         return w
-
-
-class Stages(NamedTuple):
-    """A `Stages` holds the stages of a call, in their order."""
-
-    stages: Sequence["Stage"]
-    between: Mapping[str, int] = {}
-    """Numbers of one policy in each array that the stages hand on to each other."""
 
 
 def integer_at(address: Value) -> Value:
@@ -147,6 +133,8 @@ class Stage(abc.ABC):
     """Number of parts of a policy."""
     scratch: int = 0
     """Numbers in the scratch memory of a thread, which is aligned to 64 bytes."""
+    handed_on: Mapping[str, int] = {}
+    """Numbers of one policy in each array that it hands on to the stages behind it."""
 
     @abc.abstractmethod
     def functions(self, call: Call) -> list[LlvmWriter]:
@@ -181,6 +169,15 @@ class VectorStage(Stage):
 
     parts = _CHUNKS
 
+    def __init__(self, shape: UpdateShape, lanes: int) -> None:
+        """Prepare.
+
+        Args:
+          shape: the networks, whose parameters the vector holds.
+          lanes: the number of float32 values in a vector register.
+        """
+        self.shape, self.lanes = shape, lanes
+
     def chunk(self, part: Value, start: int, stop: int) -> tuple[Value, Value]:
         """Return the first element of a part's share of a range, and the number of elements."""
         w, size = part.writer, stop - start
@@ -195,25 +192,29 @@ class SumStage(VectorStage):
 
     name = "total"
 
-    def __init__(self, lanes: int, ranges: Mapping[str, tuple[int, Sequence[int]]]) -> None:
+    def __init__(self, shape: UpdateShape, lanes: int, vectors: Mapping[str, int]) -> None:
         """Prepare.
 
         Args:
+          shape: the networks.
           lanes: the number of float32 values in a vector register.
-          ranges: of each array of vectors their number, and where in the gradient they begin, where
-            their parameters end, and where they end.
+          vectors: how many vectors each array has, first that of the policy, then of the values.
         """
-        self._lanes, self._ranges = lanes, ranges
+        super().__init__(shape, lanes)
+        self._vectors, self.handed_on = vectors, {"gradient": shape.size}
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function."""
-        w, (job, policy, part, *_) = self.begin(self._lanes)
+        w, (job, policy, part, *_) = self.begin(self.lanes)
         # The array of each network has a vector for each part of its stage.
-        gradient = call.array(job, policy, "gradient")
-        for name, (count, places) in self._ranges.items():
-            vectors, begin, size = call.array(job, policy, name), places[0], places[-1] - places[0]
-            for start, stop in itertools.pairwise(places):
-                for place, kind in vectors_of(*self.chunk(part, start - begin, stop - begin)):
+        gradient, shape = call.array(job, policy, "gradient"), self.shape
+        ends = shape.policy_size, shape.size
+        networks = zip(self._vectors.items(), shape.ranges, ends, strict=True)
+        for (name, count), (begin, stop), end in networks:
+            vectors, size = call.array(job, policy, name), end - begin
+            # The parameters, and the metrics behind them.
+            for bounds in ((0, stop - begin), (stop - begin, size)):
+                for place, kind in vectors_of(*self.chunk(part, *bounds)):
                     # An element's sum over the vectors of all parts, in their order.
                     source = vectors + place
                     total = source.load(kind)
@@ -226,54 +227,21 @@ class SumStage(VectorStage):
 class SquareStage(VectorStage):
     """A `SquareStage` adds up the squares of the gradient, for each chunk."""
 
-    name = "squares"
-
-    def __init__(self, lanes: int, ranges: Sequence[tuple[int, int]]) -> None:
-        """Prepare.
-
-        Args:
-          lanes: the number of float32 values in a vector register.
-          ranges: where the gradient holds parameters.
-        """
-        self._lanes, self._ranges, self.scratch = lanes, ranges, lanes
+    name, handed_on = "squares", {"squares": _CHUNKS}
+    scratch = 16
+    """A sum for each lane of the longest vectors."""
 
     def functions(self, call: Call) -> list[LlvmWriter]:
         """Write the function."""
-        w, (job, policy, part, _, scratch) = self.begin(self._lanes)
+        w, (job, policy, part, _, scratch) = self.begin(self.lanes)
         gradient, squares = (call.array(job, policy, name) for name in ("gradient", "squares"))
         # A sum for each lane, and then one of all lanes.
-        fill(scratch, self._lanes)
-        for start, stop in self._ranges:
+        fill(scratch, self.lanes)
+        for start, stop in self.shape.ranges:
             for place, kind in vectors_of(*self.chunk(part, start, stop)):
                 value = (gradient + place).load(kind)
                 add_to(scratch, value * value)
         target = squares + part
         target.store(0.0)
-        add_all(scratch, self._lanes, target)
+        add_all(scratch, self.lanes, target)
         return [w]
-
-
-class JoinedStage(Stage):
-    """A `JoinedStage` is two stages: a part of the second reads what that of the first wrote.
-
-    No thread waits between them, and a part's numbers are still in its cache.
-    """
-
-    def __init__(self, first: Stage, second: Stage) -> None:
-        """Prepare, for two stages of the same number of parts."""
-        assert first.parts == second.parts
-        self._stages = first, second
-        self.name, self.parts = f"{first.name}_and_{second.name}", first.parts
-        self.scratch = max(first.scratch, second.scratch)
-
-    def functions(self, call: Call) -> list[LlvmWriter]:
-        """Write both functions, and one that calls them."""
-        w, part = self.begin(1)
-        # Both functions get the same part.
-        for stage in self._stages:
-            w.call(stage.name, *part)
-        return [*(function for stage in self._stages for function in stage.functions(call)), w]
-
-
-SQUARES = _CHUNKS
-"""Length of the array `squares` of a policy."""

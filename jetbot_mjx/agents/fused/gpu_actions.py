@@ -4,6 +4,8 @@ A block loops over tiles of environments: it runs the policy network as the kern
 do, and then each thread draws the action of one environment.
 """
 
+import math
+
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import ACTIONS, Actions
 from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
@@ -15,38 +17,29 @@ from jetbot_mjx.agents.fused.tensor_core import Value
 class ActionKernel(NetworkKernel):
     """An `ActionKernel` takes and returns the arrays of `arrays.ACTIONS`."""
 
-    name = "ppo_actions"
+    name, arguments, returns = "ppo_actions", ACTIONS.arguments, Actions._fields
 
-    def __init__(self, tiling: Tiling, environments: int) -> None:
+    def __init__(self, tiling: Tiling, batch: Minibatch, blocks: int) -> None:
         """Prepare to write.
 
         Args:
           tiling: the division of the work.
-          environments: the number of environments of a policy.
+          batch: the data, of which the number of environments is used.
+          blocks: the number of blocks of a policy.
         """
-        batch = Minibatch(environments=environments)
-        sizes = ACTIONS.counts(tiling.shape, batch)
-        super().__init__(sizes, 0, tiling, batch, -(-environments // tiling.rows))
+        super().__init__(ACTIONS.shapes(tiling.shape, batch), tiling, batch, blocks)
 
-    def text(self) -> str:
-        """Return the module."""
-        ir, shape = self.ir, self.shape
-        self.prepare()
-        self.find_arrays(ir.register("ctaid.z"))
-        # Load the network once, and then take the tiles through it.
-        self.load_network(self.arrays["params"], ir.constant(shape.outputs[0], "u32"))
-        ir.synchronize()
-        with ir.repeat(self.block) as loop:
-            (tile,) = loop.carried
-            self._tile(tile)
-            self.next_tile(loop, tile)
-        return ir.module(self.threads)
+    def begin(self) -> list[Value]:
+        """Load the policy network."""
+        self.load_network(self.arrays["params"], self.ir.constant(self.shape.outputs[0], "u32"))
+        return []
 
     def _environment(self, tile: Value, row: Value) -> Value:
         """Return the environment of a row of a tile, or the last one if there is none."""
         return self.ir.minimum(tile * self.tiling.rows + row, self.batch.environments - 1)
 
-    def _tile(self, tile: Value) -> None:
+    def tile(self, tile: Value, carried: list[Value]) -> list[Value]:
+        """Draw the actions of a tile of environments."""
         ir, shape, rows = self.ir, self.shape, self.tiling.rows
         # Fetch the noise before the threads wait for each other.
         own = ir.minimum(self.thread, rows - 1)
@@ -64,6 +57,7 @@ class ActionKernel(NetworkKernel):
         environment = tile * rows + self.thread
         with ir.when(ir.select(self.thread < rows, environment, beyond) < beyond):
             self._draw(environment, noise)
+        return carried
 
     def _draw(self, environment: Value, noise: list[Value]) -> None:
         """Draw the action of the thread's environment, and store it."""
@@ -74,7 +68,7 @@ class ActionKernel(NetworkKernel):
         results = iter(ir.run(sample_loss.action_program(shape, for_gpu=True), sample))
         # Store its results, which follow each other in the order of the arrays.
         for name in Actions._fields:
-            size = self.sizes[name] // self.batch.environments
+            size = math.prod(self.shapes[name][1:])
             row = ir.row(self.arrays[name], environment, size)
             for i in range(size):
                 row[i] = next(results)

@@ -5,7 +5,7 @@ then updates its own elements: so no block waits for another one.
 """
 
 from jetbot_mjx.agents.fused import adam
-from jetbot_mjx.agents.fused.adam import SIZES, UPDATED, AdamRule, Factors
+from jetbot_mjx.agents.fused.adam import SIZES, AdamRule, Factors
 from jetbot_mjx.agents.fused.arrays import ADAM
 from jetbot_mjx.agents.fused.shapes import Minibatch
 from jetbot_mjx.agents.fused.tensor_core import LANES, GpuKernel, Value
@@ -24,9 +24,9 @@ _SUMS = 4
 
 
 class AdamKernel(GpuKernel):
-    """An `AdamKernel` takes `adam.ARRAYS` of each policy, and changes `adam.UPDATED`."""
+    """An `AdamKernel` takes the arrays of `arrays.ADAM`, and changes those that it returns."""
 
-    name = "ppo_adam"
+    name, arguments, returns = "ppo_adam", ADAM.arguments, tuple(ADAM.returns)
 
     def __init__(self, rule: AdamRule, blocks: int) -> None:
         """Prepare to write.
@@ -37,8 +37,8 @@ class AdamKernel(GpuKernel):
         """
         # In shared memory, floats: a sum of squares of each thread, and then one of each lane.
         shared_memory = 4 * (_THREADS + LANES)
-        super().__init__(ADAM.counts(rule, Minibatch()), len(UPDATED), _THREADS, shared_memory)
-        self.rule, self.blocks = rule, blocks
+        super().__init__(ADAM.shapes(rule, Minibatch()), blocks, _THREADS, shared_memory)
+        self.rule = rule
 
     def text(self) -> str:
         """Return the module."""
@@ -63,7 +63,7 @@ class AdamKernel(GpuKernel):
             values = early[i] if i < _EARLY else self._fetch(place)
             updated = ir.run(element, [*values, *common])
             with ir.when(self._is_parameter(place)):
-                for name, value in zip(UPDATED, updated, strict=False):
+                for name, value in zip(self.returns, updated, strict=False):
                     self.arrays[name][place] = value
         # One thread of all writes the row behind that which the other blocks may still read.
         after = before + SIZES["progress"]
@@ -80,12 +80,11 @@ class AdamKernel(GpuKernel):
     def _fetch(self, place: Value) -> list[Value]:
         """Fetch what `element` takes of the vectors."""
         kept = self.ir.minimum(place, self.rule.shape.size - 1)
-        return [self.arrays[name][kept] for name in (*UPDATED[:3], "gradient")]
+        return [self.arrays[name][kept] for name in ("params", "mu", "nu", "gradient")]
 
     def _is_parameter(self, place: Value) -> Value:
         """Return whether an element is a parameter: metrics are behind those of each network."""
-        ir, ((start, stop), (first, end)) = self.ir, self.rule.shape.ranges
-        assert start == 0
+        ir, ((_, stop), (first, end)) = self.ir, self.rule.shape.ranges
         # Move those between the networks to the second one's start, and its metrics to the end.
         middle = ir.select(place < stop, first, place)
         return ir.select(middle < first, end, middle) < end

@@ -11,58 +11,40 @@ from jetbot_mjx.agents.fused.arrays import GRADIENT
 from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import Tiling
 from jetbot_mjx.agents.fused.shapes import Minibatch
-from jetbot_mjx.agents.fused.tensor_core import LANES, Value
-
-ARGUMENTS = ("params", "mean", "scale", "rows", "last", "unrolls", "index", "terms")
-RESULTS = ("advantages", "targets", "statistics")
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, Value
 
 
 class AdvantageKernel(NetworkKernel):
-    """An `AdvantageKernel` takes `ARGUMENTS`, as `arrays.AXES` lists them.
+    """An `AdvantageKernel` takes arguments of `arrays.GRADIENT`.
 
-    It returns the advantages and the value targets, each of shape (unrolls, time), and the sums of
-    the advantages and of their squares, of shape (blocks, 2).
+    It returns the advantages and the value targets of all samples, unroll by unroll, and of each
+    block the sums of its advantages and of their squares.
     """
 
     name = "ppo_advantages"
+    arguments = ("params", "mean", "scale", "rows", "last", "unrolls", "index", "terms")
+    returns = ("advantages", "targets", "statistics")
 
-    def __init__(self, tiling: Tiling, batch: Minibatch) -> None:
+    def __init__(self, tiling: Tiling, batch: Minibatch, blocks: int) -> None:
         """Prepare to write.
 
         Args:
           tiling: the division of the work.
           batch: the minibatch.
+          blocks: the number of blocks of a policy.
         """
-        sizes = GRADIENT.counts(tiling.shape, batch)
-        sizes = {name: sizes[name] for name in ARGUMENTS}
-        sizes |= {"advantages": batch.samples, "targets": batch.samples}
-        self.per_tile = tiling.rows // (batch.time + 1)
-        super().__init__(sizes, 1, tiling, batch, -(-batch.unrolls // self.per_tile))
+        shapes = GRADIENT.shapes(tiling.shape, batch) | estimate_shapes(batch, blocks)
+        super().__init__(shapes, tiling, batch, blocks)
+        self.per_tile = tiling.items(batch)
 
-    def text(self) -> str:
-        """Return the module."""
-        ir, shape = self.ir, self.shape
-        self.prepare()
-        policy = ir.register("ctaid.z")
-        self.find_arrays(policy)
-        # Each block has sums of its own.
-        place = policy * self.blocks + self.block
-        self.statistics = ir.row(ir.parameters[-1], place, 2)
+    def begin(self) -> list[Value]:
+        """Load the value network, and begin with sums of zero."""
+        ir = self.ir
         index = self.arrays["index"].load("u32")
         self.unrolls = ir.row(self.arrays["unrolls"], index, self.batch.unrolls)
         self.load_terms()
-        # Load the value network once, and then take the tiles through it.
-        self.load_network(self.arrays["params"] + shape.policy_size, ir.constant(1, "u32"))
-        ir.synchronize()
-        zero = ir.constant(0.0)
-        with ir.repeat(self.block, zero, zero) as loop:
-            tile, total, squares = loop.carried
-            # The next tile overwrites nothing that is read after this one's last barrier.
-            advantage = self._tile(tile)
-            total, squares = total + advantage, squares + advantage * advantage
-            self.next_tile(loop, tile, total, squares)
-        self._store_statistics(total, squares)
-        return ir.module(self.threads)
+        self.load_network(self.arrays["params"] + self.shape.policy_size, ir.constant(1, "u32"))
+        return [ir.constant(0.0)] * 2
 
     def _unroll(self, tile: Value, row: Value) -> tuple[Value, Value]:
         """Return the unroll of a row of a tile, which may not exist, and the step in it."""
@@ -77,8 +59,8 @@ class AdvantageKernel(NetworkKernel):
         sample = collected * time + ir.minimum(step, time - 1)
         return collected, ir.row(self.arrays["rows"], sample, self.shape.columns["size"])
 
-    def _tile(self, tile: Value) -> Value:
-        """Compute a tile; return the thread's advantage, or 0 if it has none."""
+    def tile(self, tile: Value, carried: list[Value]) -> list[Value]:
+        """Compute a tile, and add the thread's advantage and its square to the sums."""
         ir, shape, time = self.ir, self.shape, self.batch.time
         rows = self.tiling.rows
         # Fetch what the step of the thread depends on before the threads wait for each other.
@@ -121,7 +103,8 @@ class AdvantageKernel(NetworkKernel):
             place = unroll * time + step
             self.arrays["advantages"][place] = advantage
             self.arrays["targets"][place] = self.read("targets", own)
-        return ir.select(there, advantage, 0.0)
+        advantage = ir.select(there, advantage, 0.0)
+        return [carried[0] + advantage, carried[1] + advantage * advantage]
 
     def _error(self, step: list[Value]) -> list[Value]:
         """Return the results of `sample_loss.value_error` for a `ValueStep`."""
@@ -129,13 +112,11 @@ class AdvantageKernel(NetworkKernel):
 
     def _store_values(self) -> None:
         """Write the forward pass, and store the first output of each row."""
-        ir = self.ir
-        pointer = ir.shared((self.row + self.sum_row) * 4, self.bytes_of("values"))
-        sums = self.forward()
-        with ir.when(self.sum_column.equals(0)):
+        row, sums = self.row + self.sum_row, self.forward()
+        with self.ir.when(self.sum_column.equals(0)):
             for m, (four,) in enumerate(sums):
-                ir.moved(pointer, 64 * m).store(four[0])
-                ir.moved(pointer, 64 * m + 32).store(four[2])
+                self.write("values", row, four[0], TILE * m)
+                self.write("values", row, four[2], TILE * m + 8)
 
     def _accumulate(self) -> None:
         """Run backwards through an unroll, and store its value targets."""
@@ -148,10 +129,10 @@ class AdvantageKernel(NetworkKernel):
             (total,) = ir.run(gae_step, [delta, factor, total])
             self.write("targets", first, total + self.read("values", first, step), step)
 
-    def _store_statistics(self, *sums: Value) -> None:
+    def end(self, carried: list[Value]) -> None:
         """Add up the threads' sums in a fixed order, and store those of the block."""
         ir, threads = self.ir, self.tiling.threads
-        for i, value in enumerate(sums):
+        for i, value in enumerate(carried):
             self.write("statistics", self.thread, value, threads * i)
         # The first warp adds up the sums of all threads, those of each lane.
         ir.synchronize()
@@ -165,6 +146,11 @@ class AdvantageKernel(NetworkKernel):
         ir.synchronize()
         with ir.when(self.thread < 2):
             places = range(lanes, lanes + LANES)
-            self.statistics[self.thread] = ir.total(
+            ir.row(self.arrays["statistics"], self.block, 2)[self.thread] = ir.total(
                 self.read("statistics", self.thread * LANES, place) for place in places
             )
+
+
+def estimate_shapes(batch: Minibatch, blocks: int) -> dict[str, tuple[int, ...]]:
+    """Return the shapes of the arrays that an `AdvantageKernel` of some blocks returns."""
+    return {"advantages": (batch.samples,), "targets": (batch.samples,), "statistics": (blocks, 2)}

@@ -5,20 +5,15 @@ tiles of samples. Weights and activations are in shared memory as float16, all s
 and the sums of the gradient stay in registers until the last tile.
 """
 
-import itertools
-from collections.abc import Iterator
+import jax
 
 from jetbot_mjx.agents.fused import sample_loss
 from jetbot_mjx.agents.fused.arrays import GRADIENT
+from jetbot_mjx.agents.fused.gpu_advantages import AdvantageKernel, estimate_shapes
 from jetbot_mjx.agents.fused.gpu_network import NetworkKernel
 from jetbot_mjx.agents.fused.gpu_tiling import PAD, Tiling, padded, shares_of
 from jetbot_mjx.agents.fused.shapes import VALUE_METRICS, Minibatch
-from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Sums, Value
-
-ARGUMENTS = (
-    *("params", "mean", "scale", "rows", "unrolls", "noise", "index"),
-    *("advantages", "targets", "statistics", "terms"),
-)
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuWriter, Value
 
 _ONES = 0x3C003C00
 """Two ones in float16."""
@@ -29,10 +24,10 @@ over many, they would be too small for float16."""
 
 
 class GradientKernel(NetworkKernel):
-    """A `GradientKernel` takes `ARGUMENTS`, and returns a vector for each block.
+    """A `GradientKernel` takes arguments of `arrays.GRADIENT` and the results of the advantages.
 
-    The arguments are those of `arrays.AXES` and the results of the kernel of the advantages. The
-    sum of the vectors is the gradient, with the sums of the metrics at their places.
+    It returns a vector for each block. The sum of the vectors is the gradient, with the sums of the
+    metrics at their places.
 
     In shared memory it also has, with a row for each sample of a tile where nothing else is said:
 
@@ -45,73 +40,84 @@ class GradientKernel(NetworkKernel):
     """
 
     name = "ppo_gradient"
+    arguments = (
+        *("params", "mean", "scale", "rows", "unrolls", "noise", "index"),
+        *(*AdvantageKernel.returns, "terms"),
+    )
+    returns = ("gradients",)
+    networks = 2
 
-    def __init__(self, tiling: Tiling, batch: Minibatch, advantage_blocks: int) -> None:
+    def __init__(
+        self, tiling: Tiling, batch: Minibatch, blocks: int, advantage_blocks: int
+    ) -> None:
         """Prepare to write.
 
         Args:
           tiling: the division of the work.
           batch: the minibatch.
+          blocks: the number of blocks of each network of a policy.
           advantage_blocks: the number of blocks of the kernel of the advantages.
         """
-        sizes = GRADIENT.counts(tiling.shape, batch) | {"statistics": 2 * advantage_blocks}
-        sizes |= {"advantages": batch.samples, "targets": batch.samples}
-        sizes = {name: sizes[name] for name in ARGUMENTS}
-        super().__init__(sizes, 1, tiling, batch, -(-batch.samples // tiling.rows))
+        shapes = GRADIENT.shapes(tiling.shape, batch) | estimate_shapes(batch, advantage_blocks)
+        shapes["gradients"] = blocks, tiling.shape.size
+        super().__init__(shapes, tiling, batch, blocks)
         self.advantage_blocks = advantage_blocks
         self.width, self.shares = self.shape.width, shares_of(self.shape)
         self.error_scale = batch.samples * _MEAN_SCALE
 
-    def text(self) -> str:
-        """Return the module."""
-        ir, shape = self.ir, self.shape
-        self.prepare()
-        # Load what all tiles need into shared memory.
-        self.load_network(self._find_data(), self.outputs)
-        self._clear()
-        if shape.normalizes:
-            self._load_statistics()
-        ir.synchronize()
-        # Go through the tiles; the sums of the gradient are carried from one to the next.
-        self._take_sums(itertools.repeat(ir.constant(0.0)))
-        with ir.repeat(self.block, *self._all_sums()) as loop:
-            tile, *sums = loop.carried
-            self._take_sums(iter(sums))
-            self._load_tile(tile)
-            # Warps read rows that others have loaded,
-            ir.synchronize()
-            self.store_outputs(self.forward())
-            # the loss all outputs of a row,
-            ir.synchronize()
-            with ir.when(self.thread < self.tiling.rows):
-                self._loss(tile)
-            # and the backward pass the errors of all rows.
-            ir.synchronize()
-            self._backward()
-            # The next tile overwrites what the backward pass reads.
-            ir.synchronize()
-            self.next_tile(loop, tile, *self._all_sums())
-        self._store_gradient()
-        return ir.module(self.threads)
-
-    def _find_data(self) -> Value:
-        """Find the data of the minibatch, and return the parameters of the block's network."""
+    def begin(self) -> list[Value]:
+        """Load the block's network, and begin with sums of zero."""
         ir, shape, batch = self.ir, self.shape, self.batch
-        # The second axis of the grid is the network, the third one the policy.
-        self.network, policy = ir.register("ctaid.y"), ir.register("ctaid.z")
+        # The second axis of the grid is the network.
+        self.network = ir.register("ctaid.y")
         self.is_policy = self.network.equals(0)
-        self.find_arrays(policy)
+        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
+        # The first of the 16 units behind which the warp computes the gradient of biases and head.
+        self.own_tile = ir.minimum(self.warp, self.width // TILE - 1) * TILE
+        # Find the data of the minibatch, and the block's own gradient, of one of the networks.
         index, noise = self.arrays["index"].load("u32"), batch.samples * shape.actions
         self.unrolls = ir.row(self.arrays["unrolls"], index, batch.unrolls)
         self.noise = ir.row(self.arrays["noise"], index, noise)
-        # Each block writes a gradient of its own, of one of the networks.
-        place = policy * self.blocks + self.block
         start = self.network * shape.policy_size
-        self.vector = ir.row(ir.parameters[-1], place, shape.size) + start
-        params = self.arrays["params"] + start
+        self.vector = ir.row(self.arrays["gradients"], self.block, shape.size) + start
+        # Load what all tiles need into shared memory.
         self.load_terms()
-        self.outputs = ir.select(self.is_policy, ir.constant(shape.outputs[0], "u32"), 1)
-        return params
+        self.load_network(self.arrays["params"] + start, self.outputs)
+        self._clear()
+        if shape.normalizes:
+            self._load_statistics()
+        # The sums of the gradient are carried from tile to tile.
+        sums = (
+            [ir.zeros(share.row_tiles, 2 * share.pairs) for share in self.shares],
+            [ir.zeros(1, 1) for _ in range(shape.layers)],
+            ir.zeros(1, 1),
+        )
+        zeros, self.sums_tree = jax.tree.flatten(sums)
+        return zeros
+
+    def tile(self, tile: Value, carried: list[Value]) -> list[Value]:
+        """Add the gradient of a tile of samples to the sums."""
+        ir = self.ir
+        self._take_sums(carried)
+        self._load_tile(tile)
+        # Warps read rows that others have loaded,
+        ir.synchronize()
+        self.store_outputs(self.forward())
+        # the loss all outputs of a row,
+        ir.synchronize()
+        with ir.when(self.thread < self.tiling.rows):
+            self._loss(tile)
+        # and the backward pass the errors of all rows.
+        ir.synchronize()
+        self._backward()
+        # The next tile overwrites what the backward pass reads.
+        ir.synchronize()
+        return jax.tree.leaves((self.weight_sums, self.bias_sums, self.head_sums))
+
+    def _take_sums(self, values: list[Value]) -> None:
+        """Set the sums of the weights and biases of the layers, and those of the head."""
+        sums = jax.tree.unflatten(self.sums_tree, values)
+        self.weight_sums, self.bias_sums, self.head_sums = sums
 
     def _clear(self) -> None:
         ir = self.ir
@@ -119,11 +125,11 @@ class GradientKernel(NetworkKernel):
         # Errors beyond the outputs stay zero, and the slots begin so.
         for name, following in (("errors", "extras"), ("slots", "size")):
             for i in self.each((self.bytes_of(following) - self.bytes_of(name)) // 4):
-                ir.shared(i * 4, self.bytes_of(name)).store(zero)
+                self.write(name, i, zero)
 
     def _load_statistics(self) -> None:
         """Compute the mean of the advantages and 1 / std from the sums of all blocks."""
-        ir, place = self.ir, self.bytes_of("statistics")
+        ir = self.ir
         # A warp adds up the sums of the blocks, and a thread those of the lanes.
         with ir.when(self.thread < LANES):
             for i in range(2):
@@ -136,17 +142,15 @@ class GradientKernel(NetworkKernel):
                 self.write("statistics", self.thread, total, LANES * i)
         ir.synchronize()
         with ir.when(self.thread < 1):
-            totals = []
-            for i in range(2):
-                lanes = range(LANES * i, LANES * (i + 1))
-                total = ir.total(ir.shared(place + 4 * lane).load() for lane in lanes)
-                totals.append(total * (1 / self.batch.samples))
-            mean, square = totals
+            mean, square = (
+                ir.total(self.read("statistics", LANES * i, lane) for lane in range(LANES))
+                * (1 / self.batch.samples)
+                for i in range(2)
+            )
             variance = square - mean * mean
             variance = ir.select(variance < 0.0, ir.constant(0.0), variance)
-            ir.shared(place + 4 * 2 * LANES).store(mean)
-            scale = ir.reciprocal(ir.sqrt(variance) + 1e-8)
-            ir.shared(place + 4 * (2 * LANES + 1)).store(scale)
+            self.write("statistics", 2 * LANES, mean)
+            self.write("statistics", 2 * LANES + 1, ir.reciprocal(ir.sqrt(variance) + 1e-8))
 
     def _load_tile(self, tile: Value) -> None:
         """Copy a tile's observations and what else the loss reads to shared memory."""
@@ -169,63 +173,40 @@ class GradientKernel(NetworkKernel):
         extras += [self.arrays[name][sample] for name in ("advantages", "targets")]
         self.load_observations(lambda row: place(row)[3])
         # Store it in a row for each sample.
-        pointer = ir.shared(own * (4 * self.tiling.extras), self.bytes_of("extras"))
+        first = own * self.tiling.extras
         for i, value in enumerate(extras):
-            ir.moved(pointer, 4 * i).store(value)
+            self.write("extras", first, value, i)
 
-    # The sums of the gradient are carried from tile to tile.
-
-    def _take_sums(self, values: Iterator[Value]) -> None:
-        """Set the sums, in the order of `_all_sums`."""
-
-        def take(rows: int, columns: int) -> Sums:
-            return [[[next(values) for _ in range(4)] for _ in range(columns)] for _ in range(rows)]
-
-        self.weight_sums = [take(share.row_tiles, 2 * share.pairs) for share in self.shares]
-        self.bias_sums = [take(1, 1) for _ in range(self.shape.layers)]
-        self.head_sums = take(1, 1)
-
-    def _all_sums(self) -> list[Value]:
-        groups = [*self.weight_sums, *self.bias_sums, self.head_sums]
-        return [x for group in groups for row in group for four in row for x in four]
-
-    def _extra(self, index: int) -> Value:
-        """Return a number that the loss of the thread's sample reads."""
-        return self.ir.moved(self.extras, 4 * index).load()
+    def _extras(self, start: int, stop: int) -> list[Value]:
+        """Return numbers that `_load_tile` has stored for the loss of the thread's sample."""
+        first = self.thread * self.tiling.extras
+        return [self.read("extras", first, i) for i in range(start, stop)]
 
     def _loss(self, tile: Value) -> None:
         """Write the derivative of the loss by the outputs of one sample, a thread for each."""
-        ir = self.ir
+        ir, end = self.ir, self.tiling.extras
         self.is_there = tile * self.tiling.rows + self.thread < self.batch.samples
-        self.extras = ir.shared(self.thread * (4 * self.tiling.extras), self.bytes_of("extras"))
         # All threads of a block have the same network, so none of them waits here.
         with ir.when(self.is_policy):
             self._policy_loss()
         with ir.when(self.network.equals(1)):
             program = sample_loss.value_program(self.batch.samples)
-            (value,), target = self.outputs_of(self.thread, 1), self._extra(self.tiling.extras - 1)
-            slope, square = ir.run(program, [value, target, self.terms.vf_loss_coefficient])
+            given = [*self.outputs_of(self.thread, 1), *self._extras(end - 1, end)]
+            slope, square = ir.run(program, [*given, self.terms.vf_loss_coefficient])
             self._store_errors([slope], [square])
 
     def _policy_loss(self) -> None:
         ir, shape = self.ir, self.shape
+        *extras, advantage = self._extras(0, self.tiling.extras - 1)
+        if shape.normalizes:
+            mean, scale = (self.read("statistics", 2 * LANES + i) for i in (0, 1))
+            advantage = (advantage - mean) * scale
         # A `PolicySample` and the coefficients.
-        extras = [self._extra(i) for i in range(self.tiling.extras - 2)]
         outputs = self.outputs_of(self.thread, shape.outputs[0])
-        sample = [*outputs, *self.deviations(), *extras]
-        sample += [self._advantage(), ir.constant(1.0), *self.terms]
+        sample = [*outputs, *self.deviations(), *extras, advantage, ir.constant(1.0), *self.terms]
         program = sample_loss.policy_program(shape, self.batch.samples, for_gpu=True)
         results = ir.run(program, sample)
         self._store_errors(results[: shape.outputs[0]], results[shape.outputs[0] :])
-
-    def _advantage(self) -> Value:
-        """Return the advantage of the thread's sample, normalised if configured."""
-        advantage = self._extra(self.tiling.extras - 2)
-        if not self.shape.normalizes:
-            return advantage
-        place = self.bytes_of("statistics") + 4 * 2 * LANES
-        mean, scale = (self.ir.shared(place + 4 * i).load() for i in (0, 1))
-        return (advantage - mean) * scale
 
     def _store_errors(self, slopes: list[Value], sums: list[Value]) -> None:
         """Store a sample's derivatives by the outputs, and add them and the sums to their slots."""
@@ -237,21 +218,19 @@ class GradientKernel(NetworkKernel):
         zero = ir.constant(0.0)
         padded = [*(x * self.error_scale for x in kept[: len(slopes)]), zero]
         for i in range(0, len(slopes), 2):
-            packed = ir.pack(padded[i], padded[i + 1])
-            ir.moved(errors, 2 * i).store(packed)
+            ir.moved(errors, 2 * i).store(ir.pack(padded[i], padded[i + 1]))
         # Sums of a row of a tile, of which one thread changes each.
-        slots = ir.shared(self.thread * 4, self.bytes_of("slots"))
         for i, value in enumerate(kept):
-            place = ir.moved(slots, 4 * i * (self.tiling.rows + 1))
-            place.store(place.load() + value)
+            offset = i * (self.tiling.rows + 1)
+            total = self.read("slots", self.thread, offset) + value
+            self.write("slots", self.thread, total, offset)
 
     def _backward(self) -> None:
         """Add a tile's gradient of all weights to the sums, from the last layer to the first."""
         ir, shape, tiling = self.ir, self.shape, self.tiling
         samples, tiles = tiling.rows // TILE, self.width // TILE
         # The head's weights: the activations, transposed, times the errors.
-        column = ir.minimum(self.warp, tiles - 1) * TILE
-        left = self.operand("left", f"layer{shape.layers}", "rows", 0, column)
+        left = self.operand("left", f"layer{shape.layers}", "rows", 0, self.own_tile)
         right = self.operand("right", "errors", "rows")
         self.head_sums = ir.product(self.head_sums, samples, left, right)
         # Back through the layers; the weights of one need the errors behind it.
@@ -267,7 +246,7 @@ class GradientKernel(NetworkKernel):
         # The errors times the weights, transposed.
         left = self.operand("left", errors, "columns", self.row)
         right = self.operand("right", weights, "columns", self.column)
-        zeros = [[[ir.constant(0.0)] * 4] * (2 * self.pairs)] * self.tiling.row_tiles
+        zeros = ir.zeros(self.tiling.row_tiles, 2 * self.pairs)
         sums = ir.product(zeros, steps, left, right)
         # Times the slopes of the activations, which stand where the results go.
         kind = self.shape.activation
@@ -295,18 +274,15 @@ class GradientKernel(NetworkKernel):
         right = self.operand("right", self.layer(layer), "rows", 0, column)
         self.weight_sums[layer] = ir.product(self.weight_sums[layer], samples, left, right)
         # The biases: the same with ones in place of the layer's inputs.
-        place = ir.minimum(self.warp, self.width // TILE - 1) * TILE
-        left = self.operand("left", errors, "rows", 0, place)
+        left = self.operand("left", errors, "rows", 0, self.own_tile)
         ones = [ir.constant(_ONES, "u32")] * 4
         self.bias_sums[layer] = ir.product(self.bias_sums[layer], samples, left, lambda *_: ones)
 
     def _share_of_warp(self, layer: int) -> tuple[Value, Value]:
         """Return the first row (output) and column (input) of the warp's share of a gradient."""
-        share = self.shares[layer]
+        share, rows = self.shares[layer], self.width // TILE
         columns = padded(self.shape.inputs[layer]) // TILE
-        row = self.ir.minimum(
-            self.warp % share.groups * share.row_tiles, self.width // TILE - share.row_tiles
-        )
+        row = self.ir.minimum(self.warp % share.groups * share.row_tiles, rows - share.row_tiles)
         column = self.ir.minimum(self.warp // share.groups * share.pairs, columns - share.pairs)
         return row * TILE, column * TILE
 
@@ -314,9 +290,10 @@ class GradientKernel(NetworkKernel):
         """Store a sum of products with errors."""
         self.vector[place] = value * (1 / self.error_scale)
 
-    def _store_gradient(self) -> None:
+    def end(self, carried: list[Value]) -> None:
         """Store the block's sums."""
         ir, shape = self.ir, self.shape
+        self._take_sums(carried)
         # A lane has four sums of each product; `tensor_core` says which.
         for layer, inputs, start in shape.hidden_layers:
             row, column = self._share_of_warp(layer)
@@ -333,8 +310,7 @@ class GradientKernel(NetworkKernel):
                             self._put_sum(value, place)
             # The bias of an output is in all columns of its sums.
             ((four,),) = self.bias_sums[layer]
-            place = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
-            place += start + inputs * self.width
+            place = self.own_tile + self.sum_row + (start + inputs * self.width)
             with ir.when(self.sum_column.equals(0)):
                 self._put_sum(four[0], place)
                 self._put_sum(four[2], place + 8)
@@ -344,7 +320,7 @@ class GradientKernel(NetworkKernel):
         """Store the sums of the last layer, and of what the slots hold."""
         ir, shape = self.ir, self.shape
         ((four,),) = self.head_sums
-        row = ir.minimum(self.warp, self.width // TILE - 1) * TILE + self.sum_row
+        row = self.own_tile + self.sum_row
         for i, value in enumerate(four):
             column = self.sum_column + i % 2
             place = (row + 8 * (i // 2)) * self.outputs + column + offset
@@ -354,8 +330,8 @@ class GradientKernel(NetworkKernel):
         slots = ir.constant(shape.slots, "u32")
         count = ir.select(self.is_policy, slots, 1 + len(VALUE_METRICS))
         with ir.when(self.thread < count):
-            first = ir.shared(self.thread * (4 * (self.tiling.rows + 1)), self.bytes_of("slots"))
-            total = ir.total(ir.moved(first, 4 * i).load() for i in range(self.tiling.rows))
+            first = self.thread * (self.tiling.rows + 1)
+            total = ir.total(self.read("slots", first, i) for i in range(self.tiling.rows))
             self.vector[self.outputs * self.width + self.thread + offset] = total
 
 

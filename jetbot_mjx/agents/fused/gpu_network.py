@@ -1,20 +1,14 @@
 """Load a network into shared memory, and write its forward pass."""
 
-from collections.abc import Callable, Mapping
+import abc
+import itertools
+from collections.abc import Callable, Iterator, Mapping
 from typing import Literal
 
-from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_BYTES, PAD, Tiling, padded
+from jetbot_mjx.agents.fused.gpu_tiling import MOST_OUTPUTS, OUTPUT_STRIDE, PAD, Tiling, padded
 from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, LossTerms, Minibatch
-from jetbot_mjx.agents.fused.tensor_core import (
-    LANES,
-    TILE,
-    GpuKernel,
-    GpuWriter,
-    Operand,
-    Sums,
-    Value,
-)
-from onekernel.build import Repeat
+from jetbot_mjx.agents.fused.tensor_core import LANES, TILE, GpuKernel, GpuWriter, Operand, Sums
+from onekernel.build import Value
 
 
 class NetworkKernel(GpuKernel):
@@ -32,19 +26,18 @@ class NetworkKernel(GpuKernel):
     """
 
     def __init__(
-        self, sizes: Mapping[str, int], others: int, tiling: Tiling, batch: Minibatch, tiles: int
+        self, shapes: Mapping[str, tuple[int, ...]], tiling: Tiling, batch: Minibatch, blocks: int
     ) -> None:
         """Prepare to write.
 
         Args:
-          sizes: the numbers of a policy's row of each array.
-          others: the number of arrays behind these.
+          shapes: the shapes of all arrays for one policy.
           tiling: the division of the work.
-          batch: the minibatch.
-          tiles: the number of tiles of all data.
+          batch: the data of a policy.
+          blocks: the number of blocks along the first axis of the grid.
         """
-        super().__init__(sizes, others, tiling.threads, tiling.layout["size"])
-        self.tiling, self.shape, self.batch, self.tiles = tiling, tiling.shape, batch, tiles
+        super().__init__(shapes, blocks, tiling.threads, tiling.layout["size"])
+        self.tiling, self.shape, self.batch = tiling, tiling.shape, batch
         self.stride = self.shape.width + PAD
         self.first = padded(self.shape.observations)
 
@@ -52,11 +45,11 @@ class NetworkKernel(GpuKernel):
         """Return the byte of shared memory where an array begins."""
         return self.tiling.layout[name]
 
-    def read(self, name: str, place: Value, offset: int = 0) -> Value:
+    def read(self, name: str, place: Value | int, offset: int = 0) -> Value:
         """Return a number of an array of float32 in shared memory."""
         return self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).load()
 
-    def write(self, name: str, place: Value, value: Value, offset: int = 0) -> None:
+    def write(self, name: str, place: Value | int, value: Value, offset: int = 0) -> None:
         """Write a number of an array of float32 in shared memory."""
         self.ir.shared(place * 4, self.bytes_of(name) + 4 * offset).store(value)
 
@@ -73,16 +66,48 @@ class NetworkKernel(GpuKernel):
         """Load the coefficients of the loss."""
         self.terms = LossTerms(*(self.arrays["terms"][i] for i in range(len(LossTerms._fields))))
 
-    def share(self, total: int, groups: int, group: Value) -> Value:
-        """Return the first of a group's tiles; the last group's may overlap the one before."""
-        per = -(-total // groups)
-        return self.ir.minimum(group * per, total - per)
+    @abc.abstractmethod
+    def begin(self) -> list[Value]:
+        """Load what all tiles need, and return the values that the first tile begins with."""
 
-    def prepare(self) -> None:
+    @abc.abstractmethod
+    def tile(self, tile: Value, carried: list[Value]) -> list[Value]:
+        """Compute a tile.
+
+        Args:
+          tile: its number.
+          carried: the values that it begins with.
+
+        Returns:
+          Those that the block's next tile begins with.
+        """
+
+    def end(self, carried: list[Value]) -> None:
+        """Store what the last tile returned."""
+
+    def text(self) -> str:
+        """Return the module."""
+        ir, tiles = self.ir, self.tiling.tiles(self.batch)
+        self._find_thread()
+        self.find_arrays(ir.register("ctaid.z"))
+        initial = self.begin()
+        ir.synchronize()
+        # The blocks take the tiles in turns. A tile overwrites nothing that is read after the last
+        # barrier of the one before.
+        with ir.repeat(self.block, *initial) as loop:
+            tile, *carried = loop.carried
+            carried = self.tile(tile, carried)
+            # By no constant: where the assembler sees that a loop ends at once, it makes code with
+            # more registers.
+            following = tile + ir.register("nctaid.x")
+            loop.again(following < tiles, following, *carried)
+        self.end(carried)
+        return ir.module(self.threads)
+
+    def _find_thread(self) -> None:
         """Read the thread's place in the grid, and derive its places in the matrices."""
         ir, tiling = self.ir, self.tiling
-        self.thread = ir.register("tid.x")
-        self.block, self.blocks = ir.register("ctaid.x"), ir.register("nctaid.x")
+        self.thread, self.block = ir.register("tid.x"), ir.register("ctaid.x")
         lane, self.warp = self.thread % LANES, self.thread // LANES
         # Rows and columns of the matrices that a lane points `ldmatrix` at: see `tensor_core`.
         self.row_first = (lane % 16, lane // 16 * 8)
@@ -93,8 +118,9 @@ class NetworkKernel(GpuKernel):
         self.row = self.row_group * (TILE * tiling.row_tiles)
         pairs = self.shape.width // TILE
         self.pairs = -(-pairs // tiling.column_groups)
-        column_group = self.warp % tiling.column_groups
-        self.column = self.share(pairs, tiling.column_groups, column_group) * TILE
+        # The columns of the last warp may overlap those of the one before.
+        column = self.warp % tiling.column_groups * self.pairs
+        self.column = ir.minimum(column, pairs - self.pairs) * TILE
         # Where the lane's sums are in a layer's activations.
         self.place = (self.row + self.sum_row) * (2 * self.stride) + (
             self.column + self.sum_column
@@ -141,6 +167,12 @@ class NetworkKernel(GpuKernel):
             numbers.append(self.ir.minimum(self.thread + threads * full, count - 1))
         return numbers
 
+    def pair_places(self, rows: int, columns: int) -> Iterator[tuple[Value, Value]]:
+        """Yield the thread's share of a matrix: the row and first column of pairs of numbers."""
+        half = columns // 2
+        for i in self.each(rows * half):
+            yield i // half, i % half * 2
+
     def load_network(self, params: Value, outputs: Value) -> None:
         """Copy a network and the observations' statistics to shared memory.
 
@@ -152,14 +184,13 @@ class NetworkKernel(GpuKernel):
         self.params = params
         # The hidden layers, eight pairs of weights of a thread at a time.
         for layer, inputs, start in shape.hidden_layers:
-            pairs = self.each(padded(inputs) * width // 2)
-            for first in range(0, len(pairs), 8):
-                self._load_weights(params, start, layer, pairs[first : first + 8])
+            pairs = self.pair_places(padded(inputs), width)
+            while some := list(itertools.islice(pairs, 8)):
+                self._load_weights(start, layer, some)
             for i in self.each(width):
                 self.write(f"biases{layer}", i, params[i + (start + inputs * width)])
         # The last layer; its columns beyond the outputs are zero.
-        for i in self.each(width * TILE // 2):
-            row, column = i // (TILE // 2), i % (TILE // 2) * 2
+        for row, column in self.pair_places(width, TILE):
             pair = [
                 self._within(params, row * outputs + shape.hidden, column + j, outputs)
                 for j in (0, 1)
@@ -172,21 +203,19 @@ class NetworkKernel(GpuKernel):
             for i in self.each(self.first):
                 self.write(name, i, self._within(self.arrays[name], None, i, shape.observations))
 
-    def _load_weights(self, params: Value, offset: int, layer: int, places: list[Value]) -> None:
-        """Copy the thread's pairs of a hidden layer's weights, with zeros beyond its inputs."""
+    def _load_weights(self, offset: int, layer: int, places: list[tuple[Value, Value]]) -> None:
+        """Copy pairs of a hidden layer's weights, with zeros beyond its inputs."""
         ir, width, inputs = self.ir, self.shape.width, self.shape.inputs[layer]
         # Fetch all pairs before the first one is stored, so that the thread waits only once.
-        pairs = []
-        for i in places:
-            row, column = i // (width // 2), i % (width // 2) * 2
+        fetched = []
+        for row, column in places:
             kept = ir.minimum(row, inputs - 1)
-            pair = [params[kept * width + column + (offset + j)] for j in (0, 1)]
+            pair = [self.params[kept * width + column + (offset + j)] for j in (0, 1)]
             if inputs % TILE:
                 pair = [ir.select(row < inputs, x, 0.0) for x in pair]
-            pairs.append((row * (2 * self.stride) + column * 2, pair))
-        for place, pair in pairs:
-            packed = ir.pack(*pair)
-            ir.shared(place, self.bytes_of(f"weights{layer}")).store(packed)
+            fetched.append((row, column, pair))
+        for place in fetched:
+            self._store_pair(f"weights{layer}", *place)
 
     def _within(self, array: Value, start: Value | None, index: Value, count: Value | int) -> Value:
         """Return an element of a row that starts somewhere; zero beyond the row's end."""
@@ -203,8 +232,7 @@ class NetworkKernel(GpuKernel):
         ir, count = self.ir, self.shape.observations
         # Fetch all pairs of the thread before the first one is stored.
         fetched = []
-        for i in self.each(self.tiling.rows * self.first // 2):
-            row, column = i // (self.first // 2), i % (self.first // 2) * 2
+        for row, column in self.pair_places(self.tiling.rows, self.first):
             start = starts(row)
             pair = [start[ir.minimum(column + j, count - 1)] for j in (0, 1)]
             fetched.append((row, column, pair))
@@ -217,8 +245,7 @@ class NetworkKernel(GpuKernel):
     def _store_pair(self, name: str, row: Value, column: Value, pair: list[Value]) -> None:
         """Store two neighbouring numbers of a matrix of float16."""
         place = row * (2 * self.stride_of(name)) + column * 2
-        packed = self.ir.pack(*pair)
-        self.ir.shared(place, self.bytes_of(name)).store(packed)
+        self.ir.shared(place, self.bytes_of(name)).store(self.ir.pack(*pair))
 
     def synchronize_rows(self) -> None:
         """Wait for the warps that compute the same rows."""
@@ -234,7 +261,7 @@ class NetworkKernel(GpuKernel):
             # The activations before the layer times its weights, added to its biases.
             left = self.operand("left", self.layer(layer), "columns", self.row)
             right = self.operand("right", f"weights{layer}", "rows", 0, self.column)
-            column = (self.column + self.sum_column) * 4
+            column = self.column + self.sum_column
             biases = self._biases(column, f"biases{layer}", 2 * self.pairs)
             sums = ir.product(biases, steps, left, right)
             if layer and not tiling.is_gradient:
@@ -247,36 +274,30 @@ class NetworkKernel(GpuKernel):
             steps = shape.width // TILE
         left = self.operand("left", self.layer(shape.layers), "columns", self.row)
         right = self.operand("right", "head", "rows")
-        biases = self._biases(self.sum_column * 4, "head_biases", 1)
+        biases = self._biases(self.sum_column, "head_biases", 1)
         return ir.product(biases, steps, left, right)
 
     def store_outputs(self, sums: Sums) -> None:
         """Store the outputs of the network in shared memory, a row for each sample."""
-        ir, stride = self.ir, OUTPUT_BYTES
-        pointer = ir.shared(
-            (self.row + self.sum_row) * stride + self.sum_column * 4, self.bytes_of("outputs")
-        )
+        first = (self.row + self.sum_row) * OUTPUT_STRIDE + self.sum_column
         for m, (four,) in enumerate(sums):
             for i, value in enumerate(four):
-                ir.moved(pointer, stride * (TILE * m + 8 * (i // 2)) + 4 * (i % 2)).store(value)
+                offset = OUTPUT_STRIDE * (TILE * m + 8 * (i // 2)) + i % 2
+                self.write("outputs", first, value, offset)
 
     def outputs_of(self, row: Value, count: int) -> list[Value]:
         """Return the outputs of the network for a row of the tile."""
-        place = self.ir.shared(row * OUTPUT_BYTES, self.bytes_of("outputs"))
-        return [self.ir.moved(place, 4 * i).load() for i in range(count)]
+        place = row * OUTPUT_STRIDE
+        return [self.read("outputs", place, i) for i in range(count)]
 
     def deviations(self) -> list[Value]:
         """Return the standard deviations that are parameters of the policy, or any numbers."""
-        count = self.shape.actions
-        if not self.shape.deviations:
-            return [self.ir.constant(0.0)] * count
-        place = self.shape.policy_size - len(POLICY_METRICS) - count
-        return [self.params[place + i] for i in range(count)]
+        end = self.shape.policy_size - len(POLICY_METRICS)
+        return [self.params[i] for i in range(end - self.shape.actions, end)]
 
     def _biases(self, place: Value, name: str, columns: int) -> Sums:
         """Return the sums with which a layer's product begins: a bias for each column."""
-        ir, pointer = self.ir, self.ir.shared(place, self.bytes_of(name))
-        pairs = [[ir.moved(pointer, 32 * n + 4 * j).load() for j in (0, 1)] for n in range(columns)]
+        pairs = [[self.read(name, place, 8 * n + j) for j in (0, 1)] for n in range(columns)]
         # A lane's four sums are in two rows of the same two columns.
         return [[[*pair, *pair] for pair in pairs] for _ in range(self.tiling.row_tiles)]
 
@@ -286,12 +307,10 @@ class NetworkKernel(GpuKernel):
         pointer = ir.shared(self.place, self.bytes_of(self.layer(layer)))
         for offset, low, high in self.halves(sums):
             pair = [_activated(ir, self.shape.activation, z) for z in (low, high)]
-            values = ir.pack(pair[0][0], pair[1][0])
-            ir.moved(pointer, offset).store(values)
+            ir.moved(pointer, offset).store(ir.pack(pair[0][0], pair[1][0]))
             if self.shape.activation == "swish" and self.tiling.is_gradient:
                 slopes = ir.shared(self.place, self.bytes_of(f"slopes{layer}"))
-                derivatives = ir.pack(pair[0][1], pair[1][1])
-                ir.moved(slopes, offset).store(derivatives)
+                ir.moved(slopes, offset).store(ir.pack(pair[0][1], pair[1][1]))
 
     def halves(self, sums: Sums) -> list[tuple[int, Value, Value]]:
         """Return the bytes from the lane's place, and the two neighbouring sums that are there."""
@@ -301,11 +320,6 @@ class NetworkKernel(GpuKernel):
             for n, four in enumerate(row)
             for half in (0, 1)
         ]
-
-    def next_tile(self, loop: Repeat, tile: Value, *carried: Value) -> None:
-        """End an iteration of the loop over a block's tiles, which carries some values."""
-        following = tile + self.blocks
-        loop.again(following < self.tiles, following, *carried)
 
 
 def _activated(ir: GpuWriter, name: str, z: Value) -> tuple[Value, Value]:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import functools
-from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 from jetbot_mjx.agents.fused.shapes import Minibatch, UpdateShape, places
@@ -10,8 +9,8 @@ from jetbot_mjx.agents.fused.tensor_core import LANES, TILE
 
 MOST_OUTPUTS = 8
 """Columns of the last layer that are computed."""
-OUTPUT_BYTES = 4 * (MOST_OUTPUTS + 1)
-"""Bytes from one sample's outputs to those of the next in shared memory."""
+OUTPUT_STRIDE = MOST_OUTPUTS + 1
+"""Numbers from one sample's outputs to those of the next in shared memory."""
 MOST_OBSERVATIONS = 64
 MOST_WIDTH = 128
 MOST_SUMS = 176
@@ -20,9 +19,11 @@ MOST_SUMS = 176
 PAD = 8
 """Numbers between the rows of a matrix in shared memory, so that eight rows meet all banks."""
 
-_GRADIENT_WARPS = 8
-_WARPS = {"gradient": _GRADIENT_WARPS, "advantages": 16, "actions": 16}
+_WARPS = {"gradient": 8, "advantages": 16, "actions": 16}
 """Warps of a block, by the purpose of the kernel."""
+
+_ROWS = {"gradient": (128, 64, 32), "advantages": (256, 128, 64), "actions": (256, 128, 64, 32)}
+"""Rows that a tile may have, likewise."""
 
 
 class Shares(NamedTuple):
@@ -42,12 +43,11 @@ class Shares(NamedTuple):
     def of(cls, rows: int, pairs: int) -> "Shares":
         """Return the shares with the fewest sums and, of these, with the fewest loads."""
         # Groups of warps share the rows, and the warps of a group the columns.
-        options = []
+        options, warps = [], _WARPS["gradient"]
         for row_tiles in range(1, rows + 1):
             groups = -(-rows // row_tiles)
-            if groups <= _GRADIENT_WARPS:
-                per_warp = -(-pairs // (_GRADIENT_WARPS // groups))
-                options.append(cls(row_tiles, per_warp, groups))
+            if groups <= warps:
+                options.append(cls(row_tiles, -(-pairs // (warps // groups)), groups))
         return min(options, key=lambda x: (x.row_tiles * x.pairs, x.row_tiles + x.pairs))
 
 
@@ -99,6 +99,16 @@ class Tiling:
         """Return whether all layers are kept, for a backward pass."""
         return self.purpose == "gradient"
 
+    def items(self, batch: Minibatch) -> int:
+        """Return how many samples, environments, or whole unrolls a tile holds."""
+        # Each unroll is followed by its last observation.
+        return self.rows // (batch.time + 1) if self.purpose == "advantages" else self.rows
+
+    def tiles(self, batch: Minibatch) -> int:
+        """Return the number of tiles of all data."""
+        every = {"advantages": batch.unrolls, "actions": batch.environments}
+        return -(-every.get(self.purpose, batch.samples) // self.items(batch))
+
     @property
     def extras(self) -> int:
         """Return how many numbers of a sample beside the observation a row holds; it is odd."""
@@ -110,101 +120,61 @@ class Tiling:
         # Every kernel: the network, float16 but for biases and statistics, and the observations.
         shape, rows = self.shape, self.rows
         stride = shape.width + PAD
-        first, outputs = padded(shape.observations), 4 * rows * (MOST_OUTPUTS + 1)
+        first, outputs = padded(shape.observations), 4 * rows * OUTPUT_STRIDE
         sizes = {f"weights{i}": 2 * padded(n) * stride for i, n in enumerate(shape.inputs[:-1])}
         sizes["head"] = 2 * shape.width * (TILE + PAD)
         sizes |= {f"biases{i}": 4 * shape.width for i in range(shape.layers)}
         sizes |= {"head_biases": 4 * MOST_OUTPUTS, "mean": 4 * first, "scale": 4 * first}
         sizes["layer0"] = 2 * rows * (first + PAD)
+        # All layers for a backward pass, or one, in which each replaces the one before.
+        layers = range(1, 1 + (shape.layers if self.is_gradient else 1))
+        sizes |= {f"layer{i}": 2 * rows * stride for i in layers}
         if self.is_gradient:
-            # All layers for the backward pass, the loss's operands and results for each row, the
-            # statistics of the advantages, and a sum for each row and slot.
-            sizes |= {f"layer{i + 1}": 2 * rows * stride for i in range(shape.layers)}
+            # The loss's operands and results for each row, the statistics of the advantages, and a
+            # sum for each row and slot.
             if shape.activation == "swish":
-                sizes |= {f"slopes{i + 1}": 2 * rows * stride for i in range(shape.layers)}
+                sizes |= {f"slopes{i}": 2 * rows * stride for i in layers}
             sizes["outputs"] = outputs
             sizes["errors"] = 2 * rows * (TILE + PAD)
             sizes["extras"] = 4 * rows * self.extras
             sizes["statistics"] = 4 * (2 * LANES + 2)
             sizes["slots"] = 4 * shape.slots * (rows + 1)
         elif self.purpose == "actions":
-            # One layer, in which each replaces the one before.
-            sizes |= {"layer1": 2 * rows * stride, "outputs": outputs}
+            sizes["outputs"] = outputs
         else:
-            # Likewise, a number of each kind for each row and one behind it, and a pair of sums for
-            # each thread and each lane.
-            sizes["layer1"] = 2 * rows * stride
+            # A number of each kind for each row and one behind it, and a pair of sums for each
+            # thread and each lane.
             sizes |= dict.fromkeys(("values", "deltas", "factors", "targets"), 4 * (rows + 1))
             sizes["statistics"] = 4 * 2 * (self.threads + LANES)
         return places(sizes, 16)
 
 
-def gradient_tiling(shape: UpdateShape, shared_memory: int) -> Tiling | None:
-    """Return the tiling of the gradient with the largest tile that fits.
-
-    Args:
-      shape: the networks.
-      shared_memory: bytes of shared memory that a block may have.
-
-    Returns:
-      The tiling; None: not even the smallest tile fits.
-    """
-    # The larger the tile, the fewer barriers for each sample.
-    tilings = [Tiling(shape, 128, 2), Tiling(shape, 64, 1), Tiling(shape, 32, 1)]
-    return next((x for x in tilings if x.layout["size"] <= shared_memory), None)
-
-
-def advantage_tiling(
-    shape: UpdateShape, batch: Minibatch, blocks: int, shared_memory: int
+def best_tiling(
+    purpose: str, shape: UpdateShape, batch: Minibatch, blocks: int, shared_memory: int
 ) -> Tiling | None:
-    """Return the tiling of the advantages that is likely fastest.
+    """Return the tiling that fits and is likely fastest.
 
     Args:
+      purpose: what the kernel computes, as in `Tiling`.
       shape: the networks.
-      batch: the minibatch.
+      batch: the data of a policy.
       blocks: the number of blocks that run at the same time.
       shared_memory: bytes of shared memory that a block may have.
 
     Returns:
-      The tiling; None: no tile that holds an unroll fits.
+      The tiling; None: no tile fits, or none holds an unroll.
     """
-    tilings = [Tiling(shape, n, -(-n // 128), "advantages") for n in (256, 128, 64)]
-    return _fastest(
-        (x for x in tilings if x.rows > batch.time),
-        lambda rows: -(-batch.unrolls // (rows // (batch.time + 1))),
-        blocks,
-        shared_memory,
-    )
-
-
-def action_tiling(
-    shape: UpdateShape, environments: int, blocks: int, shared_memory: int
-) -> Tiling | None:
-    """Return the tiling of the actions that is likely fastest.
-
-    Args:
-      shape: the networks.
-      environments: the number of environments.
-      blocks: the number of blocks that run at the same time.
-      shared_memory: bytes of shared memory that a block may have.
-
-    Returns:
-      The tiling; None: not even the smallest tile fits.
-    """
-    tilings = [Tiling(shape, n, -(-n // 128), "actions") for n in (256, 128, 64, 32)]
-    return _fastest(tilings, lambda rows: -(-environments // rows), blocks, shared_memory)
-
-
-def _fastest(
-    tilings: Iterable[Tiling], tiles: Callable[[int], int], blocks: int, shared_memory: int
-) -> Tiling | None:
-    """Return the tiling that fits and is likely fastest, from the number of tiles by their rows."""
-    # Larger tiles need fewer barriers, and smaller ones leave no multiprocessor without work.
-    fitting = [x for x in tilings if x.layout["size"] <= shared_memory]
+    warps = _WARPS[purpose]
+    tilings = (Tiling(shape, n, -(-n // (8 * warps)), purpose) for n in _ROWS[purpose])
+    fitting = [x for x in tilings if x.layout["size"] <= shared_memory and x.items(batch)]
 
     def cost(tiling: Tiling) -> int:
-        # A tile takes some time for its barriers, whatever its size.
-        return -(-tiles(tiling.rows) // blocks) * (tiling.rows + 64)
+        # Larger tiles need fewer barriers for each sample,
+        if tiling.is_gradient:
+            return -tiling.rows
+        # and smaller ones leave no multiprocessor without work. A tile takes some time for its
+        # barriers, whatever its size.
+        return -(-tiling.tiles(batch) // blocks) * (tiling.rows + 64)
 
     return min(fitting, key=cost, default=None)
 

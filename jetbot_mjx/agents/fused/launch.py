@@ -3,7 +3,7 @@
 Their arguments are arrays of `arrays`, in the order of each kernel's signature there.
 """
 
-import math
+import functools
 from collections.abc import Collection, Sequence
 from typing import Protocol
 
@@ -135,7 +135,7 @@ def gradient(shape: UpdateShape, *given: Array) -> Float[Array, " size"]:
     return _PRIMITIVES["gradient"].bind(*given, spec=shape)[0]
 
 
-def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
+def adam(rule: AdamRule, *given: Array) -> tuple[Array, ...]:
     """Make a step of Adam, whose equations are in `jetbot_mjx.agents.fused.adam`.
 
     Args:
@@ -145,11 +145,10 @@ def adam(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The next parameters, means and progress.
     """
-    params, mu, nu, progress = _PRIMITIVES["adam"].bind(*given, spec=rule)
-    return params, mu, nu, progress
+    return tuple(_PRIMITIVES["adam"].bind(*given, spec=rule))
 
 
-def update(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
+def update(rule: AdamRule, *given: Array) -> tuple[Array, ...]:
     """Make a step of Adam along the gradient of each minibatch, as `gradient` and `adam` do.
 
     Args:
@@ -159,8 +158,7 @@ def update(rule: AdamRule, *given: Array) -> tuple[Array, Array, Array, Array]:
     Returns:
       The parameters, means and progress after the last minibatch.
     """
-    params, mu, nu, progress = _PRIMITIVES["update"].bind(*given, spec=rule)
-    return params, mu, nu, progress
+    return tuple(_PRIMITIVES["update"].bind(*given, spec=rule))
 
 
 def _primitive(kernel: Signature) -> Primitive:
@@ -176,28 +174,23 @@ def _primitive(kernel: Signature) -> Primitive:
     def abstract(*given: ShapedArray, spec: Spec) -> list[ShapedArray]:
         return [ShapedArray(shape, np.float32) for shape in result_shapes(given, spec)]
 
-    def lower_by(launcher: Launcher) -> None:
-        def lowered(*given: Array, spec: Spec) -> list[Array]:
-            # One axis of policies. XLA would copy what is changed in place if it had another shape.
-            batch = given[0].shape[:-1]
-            flat = {
-                name: x
-                if name in kernel.returns
-                else x.reshape(math.prod(batch), *x.shape[len(batch) :])
-                for name, x in zip(kernel.arguments, given, strict=True)
-            }
-            made = launcher.launch(kernel, spec, kernel.batch_of(spec, given), flat)
-            # Behind the results there may be scratch memory.
-            shapes = result_shapes(given, spec)
-            return [x.reshape(shape) for x, shape in zip(made, shapes, strict=False)]
-
-        lowering = mlir.lower_fun(lowered)
-        mlir.register_lowering(primitive, lowering, platform=launcher.BACKEND.PLATFORM)
+    def lowered(launcher: Launcher, *given: Array, spec: Spec) -> list[Array]:
+        # One axis of policies. XLA would copy what is changed in place if it had another shape.
+        batch = given[0].shape[:-1]
+        flat = {
+            name: x if name in kernel.returns else x.reshape(-1, *x.shape[len(batch) :])
+            for name, x in zip(kernel.arguments, given, strict=True)
+        }
+        made = launcher.launch(kernel, spec, kernel.batch_of(spec, given), flat)
+        # Behind the results there may be scratch memory.
+        shapes = result_shapes(given, spec)
+        return [x.reshape(shape) for x, shape in zip(made, shapes, strict=False)]
 
     # For every platform that has the kernel, whatever the default device is.
     for launcher in _LAUNCHERS.values():
         if kernel.name in launcher.NAMES:
-            lower_by(launcher)
+            rule = mlir.lower_fun(functools.partial(lowered, launcher))
+            mlir.register_lowering(primitive, rule, platform=launcher.BACKEND.PLATFORM)
     return primitive
 
 

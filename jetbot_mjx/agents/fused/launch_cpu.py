@@ -1,18 +1,19 @@
 """Launch the kernels of PPO on CPUs, of which one computes a whole update."""
 
 import functools
-from collections.abc import Callable, Collection, Mapping
+import itertools
+from collections.abc import Callable, Collection, Mapping, Sequence
 
 import jax
 import numpy as np
 from jaxtyping import Array
 
 from jetbot_mjx.agents.fused.arrays import UPDATE, Arrays, Signature, Spec
-from jetbot_mjx.agents.fused.cpu_actions import action_stages, unroll_stages
+from jetbot_mjx.agents.fused.cpu_actions import ActionStage, UnrollStage
 from jetbot_mjx.agents.fused.cpu_adam import adam_stages, update_stages
 from jetbot_mjx.agents.fused.cpu_gradient import gradient_stages
 from jetbot_mjx.agents.fused.cpu_network import HEAD
-from jetbot_mjx.agents.fused.cpu_stages import Call, Stages
+from jetbot_mjx.agents.fused.cpu_stages import Call, Stage
 from jetbot_mjx.agents.fused.shapes import Minibatch, Unroll, UpdateShape
 from onekernel.build import Backend, cpu, in_background
 
@@ -40,14 +41,14 @@ def refusal(shape: UpdateShape, batch: Minibatch) -> str | None:
     if shape.width % _WIDTH_STEP:
         return f"it takes layers of 16, 32, 48, ... units, not {shape.width}"
     lanes = cpu.host_processor().lanes
-    if max(4 * x.scratch for x in gradient_stages(shape, batch, lanes).stages) > _MOST_MEMORY:
+    if max(4 * x.scratch for x, *_ in gradient_stages(shape, batch, lanes)) > _MOST_MEMORY:
         return f"unrolls of {batch.time} steps do not fit in {_MOST_MEMORY >> 20} MiB"
     return None
 
 
-_STAGES: Mapping[str, Callable[..., Stages]] = {
-    "actions": action_stages,
-    "unroll": unroll_stages,
+_STAGES: Mapping[str, Callable[..., Sequence[Sequence[Stage]]]] = {
+    "actions": lambda *given: [[ActionStage(*given)]],
+    "unroll": lambda *given: [[UnrollStage(*given)]],
     "gradient": gradient_stages,
     "adam": adam_stages,
     "update": update_stages,
@@ -61,21 +62,22 @@ NAMES: Collection[str] = frozenset(_STAGES)
 
 def _call(kernel: Signature, spec: Spec, batch: Minibatch, lanes: int) -> Call:
     """Return the call of a kernel."""
-    # Behind the results come the arrays between the stages, for which XLA finds memory.
     stages = _STAGES[kernel.name](spec, batch, lanes)
+    sizes = kernel.counts(spec, batch)
+    # Behind the results come the arrays between the stages, for which XLA finds memory.
+    between = {name: n for x in itertools.chain(*stages) for name, n in x.handed_on.items()}
+    others = [name for name in between if name not in sizes]
     return Call(
-        kernel.arguments,
-        (*kernel.returns, *(name for name in stages.between if name not in kernel.returns)),
-        {**kernel.counts(spec, batch), **stages.between},
-        stages.stages,
+        (*kernel.arguments, *kernel.returns, *others),
+        sizes | between,
+        stages,
         minibatches=batch.minibatches if kernel is UPDATE else 1,
     )
 
 
 def _written(host: cpu.Host, kernel: Signature, spec: Spec, batch: Minibatch) -> str:
     """Write the LLVM module of a kernel."""
-    call = _call(kernel, spec, batch, host.lanes)
-    return call.text(lanes=host.lanes, registers=host.registers, machine=host.machine)
+    return _call(kernel, spec, batch, host.lanes).text(host)
 
 
 _written_once = functools.cache(_written)
@@ -102,8 +104,8 @@ def launch(kernel: Signature, spec: Spec, batch: Minibatch, arrays: Arrays) -> l
     host, policies = cpu.host_processor(), len(next(iter(arrays.values())))
     # Results are as long as the call says, but for those that take the place of arguments.
     call = _call(kernel, spec, batch, host.lanes)
-    shapes = {name: (policies, call.sizes[name]) for name in call.results}
-    shapes |= {name: arrays[name].shape for name in kernel.returns if name in arrays}
-    like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes.values()]
+    names = call.arrays[len(arrays) :]
+    shapes = [arrays[x].shape if x in arrays else (policies, call.sizes[x]) for x in names]
+    like = [jax.ShapeDtypeStruct(shape, np.float32) for shape in shapes]
     text = _text(host, kernel, spec, batch)
     return cpu.launch_text(text, list(arrays.values()), like, kernel.aliases)

@@ -1,29 +1,20 @@
 """Lay the parameters of both networks out as one vector, in which Adam's moments lie likewise."""
 
 import math
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 from jaxtyping import Array, Float, PyTree
 
 from jetbot_mjx.agents.fused.shapes import POLICY_METRICS, VALUE_METRICS, UpdateShape
 from jetbot_mjx.agents.learner import Layout
 from jetbot_mjx.agents.networks import NetworkParams
 
-
-class _Place(NamedTuple):
-    """A `_Place` is where a parameter lies in the vector."""
-
-    network: str
-    path: tuple[str, ...]
-    shape: tuple[int, ...]
-    start: int
-
-    @property
-    def stop(self) -> int:
-        return self.start + math.prod(self.shape)
+_Places = dict[tuple[str, ...], tuple[slice, tuple[int, ...]]]
+"""Where a vector holds each parameter, and its shape, by the keys of the network and of the
+dictionaries in it."""
 
 
 class VectorLayout(Layout):
@@ -55,55 +46,50 @@ class VectorLayout(Layout):
 
     def _vector(self, params: NetworkParams) -> Float[Array | np.ndarray, " size"]:
         """Return the vector that holds the parameters."""
-        is_on_host = isinstance(jax.tree.leaves(params)[0], np.ndarray)
+        leaves: PyTree = flatten_dict({"policy": params.policy, "value": params.value})
+        is_on_host = isinstance(next(iter(leaves.values())), np.ndarray)
         concatenate = np.concatenate if is_on_host else jnp.concatenate
         parts, end = [], 0
-        for place in self._places:
-            leaf = getattr(params, place.network)
-            for key in place.path:
-                leaf = leaf[key]
+        for path, (place, _) in self._places.items():
             # The room for metrics before it, if any, and the parameter.
-            parts += [np.zeros(place.start - end, np.float32), leaf.reshape(-1)]
+            parts += [np.zeros(place.start - end, np.float32), leaves[path].reshape(-1)]
             end = place.stop
         return concatenate([*parts, np.zeros(self._size - end, np.float32)])
 
     def _params(self, vector: Float[Array, " size"]) -> NetworkParams:
         """Return the parameters that a vector holds."""
-        # Make the dictionaries on the way to each parameter, and put it there.
-        networks: dict[str, PyTree] = {"policy": {}, "value": {}}
-        for place in self._places:
-            inner = networks[place.network]
-            for key in place.path[:-1]:
-                inner = inner.setdefault(key, {})
-            inner[place.path[-1]] = vector[place.start : place.stop].reshape(place.shape)
-        return NetworkParams(**networks)
+        places = self._places.items()
+        leaves = {path: vector[place].reshape(shape) for path, (place, shape) in places}
+        return NetworkParams(**unflatten_dict(leaves))
 
 
-def _places(shape: UpdateShape) -> list[_Place]:
+def _places(shape: UpdateShape) -> _Places:
     """Return where each parameter lies, in the order of the vector."""
-    normal, places, start = shape.distribution == "normal", [], 0
+    places: _Places = {}
+    start = 0
 
-    def add(network: str, path: tuple[str, ...], *sizes: int) -> None:
+    def add(path: tuple[str, ...], *sizes: int) -> None:
         nonlocal start
-        places.append(_Place(network, ("params", *path), sizes, start))
-        start = places[-1].stop
+        end = start + math.prod(sizes)
+        places[network, "params", *path] = slice(start, end), sizes
+        start = end
 
     for network, outputs, metrics in zip(
         ("policy", "value"), shape.outputs, (POLICY_METRICS, VALUE_METRICS), strict=True
     ):
         # Brax's policy with a `normal` distribution has other names.
-        by_mean = normal and network == "policy"
+        by_mean = shape.distribution == "normal" and network == "policy"
         for layer, inputs in enumerate(shape.inputs):
             # The hidden layers, and then the head, whose size is that of the outputs.
             path = (*(["MLP_0"] if by_mean else []), f"hidden_{layer}")
             size = shape.width
             if layer == shape.layers:
                 path, size = (("Dense_0",) if by_mean else path), outputs
-            add(network, (*path, "kernel"), inputs, size)
-            add(network, (*path, "bias"), size)
+            add((*path, "kernel"), inputs, size)
+            add((*path, "bias"), size)
         # Standard deviations that are parameters themselves.
         if by_mean:
-            add(network, ("std_param", "value"), shape.actions)
+            add(("std_param", "value"), shape.actions)
         # Room for the sums of the network's metrics.
         start += len(metrics)
     return places

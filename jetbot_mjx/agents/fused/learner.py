@@ -9,7 +9,6 @@ On GPUs, products round their operands to float16; everything else is float32.
 """
 
 from collections.abc import Callable, Iterable, Mapping
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,19 +30,6 @@ from jetbot_mjx.packed import Packed, PackedStep, pack
 
 Extras = dict[str, Array | tuple[Array, ...]]
 """What Brax keeps of actions, by name."""
-
-
-class Collected(NamedTuple):
-    """A `Collected` holds the data of a training step, in the order of the kernels' arguments."""
-
-    mean: Float[Array, " obs"]
-    """Mean of the observations."""
-    scale: Float[Array, " obs"]
-    """The inverse of their standard deviations."""
-    rows: Float[Array, "unrolls time columns"]
-    """A row for each step, with the columns of `UpdateShape.columns`."""
-    last: Float[Array, "unrolls obs"]
-    """The observations after the last steps."""
 
 
 def shape_of(
@@ -138,7 +124,7 @@ class FusedLearner(Learner):
         return launch.backend().obstacle()
 
     def failure(self) -> str | None:
-        """Return that the kernels of this GPU failed their comparison with NumPy, or None."""
+        """Return that the kernels of this GPU failed their comparison with the CPU's, or None."""
         # On a CPU, `obstacle` has tried the same compiler with a small kernel.
         if jax.default_backend() != "gpu" or probe.runs_correctly():
             return None
@@ -280,29 +266,24 @@ class FusedLearner(Learner):
         ended = jax.lax.while_loop(lambda state: state[0] < self.batch.minibatches, step, begun)
         return self.results(ended[1:], optimizer_state)
 
-    def collected(self, data: Transition, normalizer: Normalizer) -> Collected:
+    def collected(self, data: Transition, normalizer: Normalizer) -> tuple[Array, ...]:
         """Return the collected data as the kernels read it.
 
         Args:
           data: the unrolls, of shape (unrolls, time, ...).
           normalizer: the statistics of the observations.
+
+        Returns:
+          The arrays `mean`, `scale`, `rows` and `last` of `arrays.AXES`.
         """
         # A row for each step: what the policy saw and did, and what came of it.
-        extras: PyTree = data.extras
-        distribution = extras["policy_extras"]["distribution_params"]
-        if self.shape.distribution == "normal":
-            distribution = jnp.concatenate(distribution, axis=-1)
-        rows = [
-            data.observation,
-            extras["policy_extras"]["raw_action"],
-            extras["policy_extras"]["log_prob"][..., None],
-            distribution,
-            data.reward[..., None],
-            data.discount[..., None],
-            extras["state_extras"]["truncation"][..., None],
-        ]
-        last = data.next_observation[:, -1]
-        return Collected(*self._statistics(normalizer), jnp.concatenate(rows, axis=-1), last)
+        kept: PyTree = data.extras["policy_extras"]
+        parts = data.observation, kept["raw_action"], kept["log_prob"], kept["distribution_params"]
+        results = data.reward, data.discount, data.extras["state_extras"]["truncation"]
+        # Each is a number of a step or several; a `normal` distribution has two arrays.
+        leaves = (x.reshape(*data.reward.shape, -1) for x in jax.tree.leaves((parts, results)))
+        rows, last = jnp.concatenate([*leaves], axis=-1), data.next_observation[:, -1]
+        return *self._statistics(normalizer), rows, last
 
     def noise(self, keys: Keys) -> Float[Array, "minibatches time unrolls actions"]:
         """Draw the noise that estimates the entropy, from the key of each minibatch."""
@@ -313,7 +294,7 @@ class FusedLearner(Learner):
     def gradient(
         self,
         params: Float[Array, " size"],
-        collected: Collected,
+        collected: tuple[Array, ...],
         unrolls: Int[Array, "minibatches unrolls"],
         noise: Float[Array, "minibatches time unrolls actions"],
         index: Int[Array, ""],

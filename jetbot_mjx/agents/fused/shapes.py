@@ -124,20 +124,6 @@ class Unroll(NamedTuple):
         """Return how many numbers a state has."""
         return self.kernel.argument_shapes[0][0]
 
-    @property
-    def ranges(self) -> list[tuple[int, int, int]]:
-        """Return the ranges of adjacent numbers that are kept of a state.
-
-        Of each range: its place among the kept numbers, and its first and last number.
-        """
-        ranges: list[tuple[int, int, int]] = []
-        for place, number in enumerate(self.kept):
-            if ranges and ranges[-1][2] == number - 1:
-                ranges[-1] = (*ranges[-1][:2], number)
-            else:
-                ranges.append((place, number, number))
-        return ranges
-
 
 class LossTerms(NamedTuple, Generic[Number]):
     """A `LossTerms` holds the coefficients of the loss, under the names of the configuration.

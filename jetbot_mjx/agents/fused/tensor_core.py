@@ -11,6 +11,7 @@ row at an address that one lane gives. With `.trans` each matrix is transposed o
 """
 
 import abc
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from onekernel.build import LlvmWriter, ScalarProgram, Value, gpu, run_program
@@ -43,19 +44,27 @@ class GpuKernel(abc.ABC):
     name: str
     """Name of the kernel."""
 
+    arguments: tuple[str, ...]
+    """Names of the arrays that it reads or changes."""
+    returns: tuple[str, ...]
+    """Names of those that it returns, in memory of their own if they are no arguments."""
+    networks = 1
+    """Number of blocks along the second axis of the grid."""
+
     def __init__(
-        self, sizes: Mapping[str, int], others: int, threads: int, shared_memory: int
+        self, shapes: Mapping[str, tuple[int, ...]], blocks: int, threads: int, shared_memory: int
     ) -> None:
         """Prepare to write.
 
         Args:
-          sizes: the numbers of a policy's row of each array, by name, in the kernel's order.
-          others: the number of arrays behind these.
+          shapes: the shapes of all arrays for one policy.
+          blocks: the number of blocks along the first axis of the grid.
           threads: the threads of a block.
           shared_memory: the shared memory that a launch gives to each block [bytes].
         """
-        self.sizes, self.threads, self.shared_memory = sizes, threads, shared_memory
-        self.ir = GpuWriter(self.name, len(sizes) + others)
+        self.shapes, self.blocks = shapes, blocks
+        self.threads, self.shared_memory = threads, shared_memory
+        self.ir = GpuWriter(self.name, len(self.arguments) + len(self.returns))
 
     @abc.abstractmethod
     def text(self) -> str:
@@ -63,8 +72,12 @@ class GpuKernel(abc.ABC):
 
     def find_arrays(self, policy: Value) -> None:
         """Set `arrays` to the addresses of a policy's rows."""
-        rows = zip(self.sizes.items(), self.ir.parameters, strict=False)
-        self.arrays = {name: self.ir.row(array, policy, size) for (name, size), array in rows}
+        # Arguments that it changes are among the results, too, at the same addresses.
+        names = dict.fromkeys((*self.arguments, *self.returns))
+        self.arrays = {
+            name: self.ir.row(array, policy, math.prod(self.shapes[name]))
+            for name, array in zip(names, self.ir.parameters, strict=False)
+        }
 
 
 class GpuWriter(LlvmWriter):
@@ -180,6 +193,10 @@ class GpuWriter(LlvmWriter):
         kind = ".trans.b16.p3" if transposed else ".b16.p3"
         name = f"llvm.nvvm.ldmatrix.sync.aligned.m8n8.x4{kind}"
         return self._parts(self.call(name, place, result=_QUAD, suffix=_TOGETHER), "u32")
+
+    def zeros(self, rows: int, columns: int) -> Sums:
+        """Return zeros as the sums of a warp's row and column tiles."""
+        return [[[self.constant(0.0)] * 4 for _ in range(columns)] for _ in range(rows)]
 
     def product(self, sums: Sums, steps: int, left: Operand, right: Operand) -> Sums:
         """Return sums + left @ right.
