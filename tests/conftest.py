@@ -84,6 +84,11 @@ def pytest_collection_modifyitems(items):
     items.sort(key=lambda item: rank.get(item.path.stem, len(_LONGEST)))
 
 
+def pytest_collection_finish():
+    """Leaves what was imported out of all garbage collections, as `freeze_what_stays` does."""
+    gc.freeze()
+
+
 @pytest.fixture(autouse=True)
 def fallbacks_printed_anew(monkeypatch):
     """Each test is a process of its own in this: what an earlier one printed is printed again."""
@@ -109,6 +114,17 @@ def forget_modules(tmp_path_factory):
     for name, folder in [*task_modules.TASK_FOLDERS.items()]:
         if str(folder).startswith(temporary):
             del task_modules.TASK_FOLDERS[name]
+
+
+@pytest.fixture(scope="module", autouse=True)
+def freeze_what_stays():
+    """Leaves what a file's tests have made to the caches, and out of all later garbage collections.
+
+    Looking through the gigabytes that a worker has in the end takes seconds, again and again.
+    """
+    yield
+    gc.collect()
+    gc.freeze()
 
 
 @pytest.fixture(scope="session")

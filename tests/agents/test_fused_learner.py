@@ -448,7 +448,7 @@ def assert_gradient_is_xlas(settings):
     xla = XlaLearner(settings.ppo, rounding(settings, ppo.networks), ONE_DEVICE)
     key = jax.random.PRNGKey(2)
     with jax.default_matmul_precision("highest"):
-        metrics, expected = xla.gradient(params, statistics, batch, key)
+        metrics, expected = jax.jit(xla.gradient)(params, statistics, batch, key)
     shape = shape_of(settings.ppo, OBSERVATIONS, ACTIONS)
     fused = FusedLearner(settings.ppo, shape)
     order = jnp.asarray(np.random.default_rng(1).permutation(settings.ppo.batch_size))
@@ -535,6 +535,12 @@ def test_adam_is_that_of_optax(schedule, distribution, compute):
     state = params, make_optimizer(settings.ppo).init(params)
     ours, totals = fused.layout.pack(state), jnp.zeros(8)
     adam_step = jax.jit(compute, static_argnums=0)
+
+    @jax.jit
+    def optax_step(state, *given):
+        xla.gradient = lambda *_: given
+        return xla.minibatch_step(*state, statistics, batch, jax.random.PRNGKey(0))
+
     sizes = np.asarray(fused.rule.places)
     for call, count in enumerate((2, 6)):
         totals, vectors = jnp.zeros_like(totals), fused.first_vectors(*ours)
@@ -542,19 +548,18 @@ def test_adam_is_that_of_optax(schedule, distribution, compute):
         rule = fused.rule._replace(steps=count)
         terms = fused.adam_terms(ours[1])
         for i in range(count):
-            sums = jnp.asarray(rng.normal(size=5) * 64, jnp.float32)
+            sums = np.float32(rng.normal(size=5) * 64)
             # The divergence lowers the step size, raises it, or leaves it.
-            sums = sums.at[2].set([4.0, 0.1, 1.2, -1.0][i % 4])
-            gradient = jax.tree.map(lambda x: jnp.asarray(rng.normal(size=x.shape) * 0.1), params)
+            sums[2] = [4.0, 0.1, 1.2, -1.0][i % 4]
+            gradient = jax.tree.map(lambda x: np.float32(rng.normal(size=x.shape) * 0.1), params)
             if (call, i) == (1, 2):
-                gradient = jax.tree.map(lambda x: x.at[(0,) * x.ndim].set(jnp.nan), gradient)
-                sums = sums * jnp.nan
-            gradient = jax.tree.map(lambda x: x.astype(jnp.float32), gradient)
-            given = fused.metrics(sums), gradient
-            xla.gradient = lambda *_, given=given: given
-            *state, row = xla.minibatch_step(*state, statistics, batch, jax.random.PRNGKey(0))
+                for leaf in jax.tree.leaves(gradient):
+                    leaf[(0,) * leaf.ndim] = np.nan
+                sums *= np.nan
+            *state, row = optax_step(state, fused.metrics(sums), gradient)
             totals += jnp.where(row[-1] > 0, row, 0.0)
-            vector = fused.layout.pack(gradient).at[sizes].set(sums)
+            vector = fused.layout.pack(gradient)
+            vector[sizes] = sums
             vectors = adam_step(rule, vector, *vectors, jnp.int32(i), terms)
         *ours, found_totals = fused.results(vectors, ours[1])
     found = fused.layout.unpack(tuple(ours))

@@ -1,6 +1,7 @@
 """MJX's line search in float32: steps that it cannot resolve, and costs relative to the start."""
 
 import dataclasses
+import functools
 import threading
 
 import jax
@@ -69,14 +70,27 @@ STATES = {
 }
 
 
+@functools.cache
+def physics_step(impl):
+    """An environment, and its physics step with another model; XLA compiles one for all models."""
+    env = make_env(parse_config({"physics": {"ctrl_dt": 1 / 120, "impl": impl}}))
+
+    def step(model, *given):
+        return env.with_model(model).physics.step(*given)
+
+    if impl == "xla":
+        return env, jax.jit(step)
+    return env, lambda model, *given: jax.jit(functools.partial(step, model))(*given)
+
+
 @pytest.mark.parametrize("impl", ["auto", "xla"])
 @pytest.mark.parametrize("name", STATES)
 def test_a_physics_step_ends_where_c_mujoco_converges(name, impl):
     friction, state, ctrl = STATES[name]
-    env = make_env(parse_config({"physics": {"ctrl_dt": 1 / 120, "impl": impl}}))
+    env, step = physics_step(impl)
     robot = dataclasses.replace(env.robot, friction=friction)
     model = make_mj_model(robot, env.config.physics, visual=False)
-    after = jax.jit(env.with_model(mjx.put_model(model)).physics.step)(state, ctrl)
+    after = step(mjx.put_model(model), state, ctrl)
 
     model.opt.iterations, model.opt.ls_iterations, model.opt.tolerance = 100, 50, 1e-12
     data = mujoco.MjData(model)
@@ -147,9 +161,10 @@ def test_relative_costs_are_differences_of_mjx_costs(xml):
         creates = line_search._relative_point, library[1]
         return jnp.stack([create(*args).cost for create in creates])
 
-    # The last row, of a contact or a limit, becomes active or inactive half-way.
+    # The last row, of a contact or a limit, becomes active or inactive half-way, between two of
+    # these lengths: at it, rounding would decide which.
     furthest = -2 * context.Jaref[-1] / change[-1]
-    ours, theirs = np.asarray(costs(jnp.linspace(0, furthest, 21)), np.float64).T
+    ours, theirs = np.asarray(costs(jnp.linspace(0, furthest, 22)), np.float64).T
     assert ours[0] == 0
     rounding = 2e-6 * np.abs(theirs).max()
     np.testing.assert_allclose(ours, theirs - theirs[0], rtol=1e-5, atol=rounding)

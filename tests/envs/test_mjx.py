@@ -36,10 +36,11 @@ def test_trimesh_is_loaded_when_a_mesh_needs_it_and_prints_nothing():
     [
         "from jetbot_mjx import JetBotEnv, load_config",
         "import jetbot_mjx.agents.ppo",
-        "import jetbot_mjx.agents.vision",
-        "import jetbot_mjx.evaluation.rollout",
-        "import jetbot_mjx.runs.warm_start",
-        "import jetbot_mjx.training.brax_trainer",
+        # A process each, and the next test finds whoever imports Brax or MJX before our own.
+        pytest.param("import jetbot_mjx.agents.vision", marks=pytest.mark.slow),
+        pytest.param("import jetbot_mjx.evaluation.rollout", marks=pytest.mark.slow),
+        pytest.param("import jetbot_mjx.runs.warm_start", marks=pytest.mark.slow),
+        pytest.param("import jetbot_mjx.training.brax_trainer", marks=pytest.mark.slow),
     ],
 )
 def test_importing_prints_nothing(statement):

@@ -43,7 +43,8 @@ def minibatch(rng, settings, networks):
 
     keys = jax.random.split(jax.random.PRNGKey(1))
     params = NetworkParams(
-        policy=networks.policy_network.init(keys[0]), value=networks.value_network.init(keys[1])
+        policy=jax.jit(networks.policy_network.init)(keys[0]),
+        value=jax.jit(networks.value_network.init)(keys[1]),
     )
     statistics = running_statistics.init_state(jax.ShapeDtypeStruct((OBSERVATIONS,), jnp.float32))
     statistics = statistics.replace(mean=normal(OBSERVATIONS), std=jnp.full(OBSERVATIONS, 1.5))

@@ -22,9 +22,18 @@ def made(**options):
     return kernel.Kernel(program, carried=2, steps=2, fallback=fallback, **options).as_step()
 
 
-def launches(function, *arguments, platforms=None):
-    """How many kernels a program calls on the platform that it is lowered for."""
+def lowered_text(function, *arguments, platforms=None):
+    """A program as StableHLO, for the platform that it is lowered for."""
     # A function of its own: what was lowered before would be taken again.
     traced = jax.jit(lambda *x: function(*x)).trace(*arguments)
-    text = traced.lower(lowering_platforms=platforms).as_text()
+    return traced.lower(lowering_platforms=platforms).as_text()
+
+
+def launches_in(text):
+    """How many kernels a lowered program calls."""
     return text.count("custom_call @onekernel_") + text.count(f"custom_call @{gpu._TARGET}")
+
+
+def launches(function, *arguments, platforms=None):
+    """How many kernels a program calls on the platform that it is lowered for."""
+    return launches_in(lowered_text(function, *arguments, platforms=platforms))

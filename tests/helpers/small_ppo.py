@@ -41,13 +41,16 @@ OBS, ACTIONS = 7, 2
 
 
 def beginning(ppo):
-    policy_key, value_key = jax.random.split(jax.random.PRNGKey(0))
-    params = losses.PPONetworkParams(
-        policy=ppo.networks.policy_network.init(policy_key),
-        value=ppo.networks.value_network.init(value_key),
-    )
-    normalizer = running_statistics.init_state(specs.Array((OBS,), jnp.dtype("float32")))
-    return params, make_optimizer(ppo.config).init(params), normalizer
+    def begin(key):
+        policy_key, value_key = jax.random.split(key)
+        params = losses.PPONetworkParams(
+            policy=ppo.networks.policy_network.init(policy_key),
+            value=ppo.networks.value_network.init(value_key),
+        )
+        normalizer = running_statistics.init_state(specs.Array((OBS,), jnp.dtype("float32")))
+        return params, make_optimizer(ppo.config).init(params), normalizer
+
+    return jax.jit(begin)(jax.random.PRNGKey(0))
 
 
 def made_up(ppo, spoiled=()):

@@ -177,6 +177,23 @@ def random_data(rng, case):
     return data, rng.permutation(collected)[:unrolls].astype(np.int32)
 
 
+@functools.partial(jax.jit, static_argnums=3)
+def reference(leaves, data, log_ratios, case):
+    """The data with all that the loss takes, its gradient, and the sums of the metrics.
+
+    Args:
+      leaves: the networks.
+      data: what `random_data` makes.
+      log_ratios: how likely the actions were, beside the current policy's logarithms.
+      case: a case.
+    """
+    brax, parameters = policy(leaves, data, case.shape)
+    log_prob = brax.log_prob(parameters, data["raw_action"]) - log_ratios
+    advantage, target = estimates(leaves, data, case)
+    data = {**data, "log_prob": log_prob, "advantage": advantage, "target": target}
+    return data, *jax.grad(loss, has_aux=True)(leaves, data, case)
+
+
 @functools.cache
 def make_data(case, seed):
     """What the kernels are given for one seed, and what float64 makes of it; not to be changed."""
@@ -187,14 +204,10 @@ def make_data(case, seed):
         network(rng, shape, 1),
     )
     data, unrolls = random_data(rng, case)
+    # Ratios far from the ends of the clip range, where rounding would decide.
+    ratios = rng.choice([0.4, 1.0, 2.5], size=data["reward"].shape)
     with jax.enable_x64(True):
-        leaves, data = jax.tree.map(jnp.asarray, (leaves, data))
-        brax, parameters = policy(leaves, data, shape)
-        # Ratios far from the ends of the clip range, where rounding would decide.
-        ratios = rng.choice([0.4, 1.0, 2.5], size=data["reward"].shape)
-        data["log_prob"] = brax.log_prob(parameters, data["raw_action"]) - np.log(ratios)
-        data["advantage"], data["target"] = estimates(leaves, data, case)
-        gradient, sums = jax.jit(jax.grad(loss, has_aux=True), static_argnums=2)(leaves, data, case)
+        data, gradient, sums = jax.device_get(reference(leaves, data, np.log(ratios), case))
     parts = [*gradient[0], *gradient[1], *sums[:4], *gradient[2], sums[4]]
     flat = [*leaves[0], *leaves[1], np.zeros(4), *leaves[2], np.zeros(1)]
     # Rows at their places among the collected ones; the others are not numbers.
@@ -250,6 +263,21 @@ def assert_is_gradient(vector, data, bound):
     assert start == vector.size
 
 
+@functools.partial(jax.jit, static_argnums=2)
+def actions(leaves, data, shape):
+    """Actions before and after `tanh`, their log-probabilities, and the networks' outputs."""
+    brax, parameters = policy(leaves, data, shape)
+    distribution = brax.create_dist(parameters)
+    raw = distribution.loc + distribution.scale * data["noise"]
+    return brax.postprocess(raw), raw, brax.log_prob(parameters, raw), parameters
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def log_prob(distribution, size, parameters, raw_action):
+    """The log-probabilities of actions before `tanh`, by one of Brax's distributions."""
+    return distribution(size).log_prob(parameters, raw_action)
+
+
 def make_actions(shape, environments, seed, spread=None):
     """What the kernel of the actions is given for one policy, and what it should give.
 
@@ -272,14 +300,11 @@ def make_actions(shape, environments, seed, spread=None):
         "noise": rng.normal(size=(environments, shape.actions)),
     }
     with jax.enable_x64(True):
-        brax, parameters = policy(leaves, data, shape)
-        distribution = brax.create_dist(parameters)
-        raw = distribution.loc + distribution.scale * data["noise"]
-        expected = brax.postprocess(raw), raw, brax.log_prob(parameters, raw)
+        *expected, parameters = jax.device_get(actions(leaves, data, shape))
     if shape.deviations:
         parameters = np.concatenate(parameters, axis=-1)
     arrays = [np.concatenate(flat), *data.values()]
-    return [x.astype(np.float32) for x in arrays], [*map(np.asarray, expected), parameters]
+    return [x.astype(np.float32) for x in arrays], [*expected, parameters]
 
 
 def assert_are_actions(results, shape, expected, bound):
@@ -287,9 +312,10 @@ def assert_are_actions(results, shape, expected, bound):
         assert ours.shape == wanted.shape
         np.testing.assert_allclose(ours, wanted, atol=bound, rtol=bound)
     # The probability is that of the action which was drawn, not of the exact one.
-    _, raw, log_prob, parameters = (np.asarray(x, np.float64) for x in results)
-    brax = NormalTanhDistribution(shape.actions)
+    _, raw, found, parameters = (np.asarray(x, np.float64) for x in results)
+    distribution = NormalTanhDistribution
     if shape.deviations:
-        brax, parameters = NormalDistribution(shape.actions), np.split(parameters, 2, axis=-1)
+        distribution, parameters = NormalDistribution, np.split(parameters, 2, axis=-1)
     with jax.enable_x64(True):
-        np.testing.assert_allclose(log_prob, brax.log_prob(parameters, raw), atol=3e-5)
+        expected = log_prob(distribution, shape.actions, parameters, raw)
+    np.testing.assert_allclose(found, expected, atol=3e-5)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from helpers.small_kernels import launches
+from helpers.small_kernels import launches, launches_in, lowered_text
 from jetbot_mjx.config import load_config
 from jetbot_mjx.envs.domain_randomization import maybe_randomize
 from jetbot_mjx.envs.jetbot_env import make_env
@@ -43,10 +43,9 @@ MOVES = {
 
 def is_one_kernel(function, *arguments, platforms=None):
     """Whether a program calls one kernel, and computes nothing beside it."""
-    traced = jax.jit(lambda *x: function(*x)).trace(*arguments)
-    text = traced.lower(lowering_platforms=platforms).as_text()
+    text = lowered_text(function, *arguments, platforms=platforms)
     others = set(re.findall(r"stablehlo\.(\w+)", text)) - MOVES
-    return launches(function, *arguments, platforms=platforms) == 1 and not others
+    return launches_in(text) == 1 and not others
 
 
 def robots(count, *shape, seed=0):
@@ -680,11 +679,12 @@ def driven(request, root):
     batch, one = environment(request.param, root)
     keys = jax.random.split(jax.random.PRNGKey(3), ENVS)
     ours = drive_all(
-        pack(batch.reset(keys), batch_axes=1),
+        jax.jit(lambda keys: pack(batch.reset(keys), batch_axes=1))(keys),
         jax.jit(batch.step_packed),
-        lambda packed: pack(spoilt(packed.unpack()), batch_axes=1),
+        jax.jit(lambda packed: pack(spoilt(packed.unpack()), batch_axes=1)),
     )
-    theirs = drive_all(jax.vmap(one.reset)(keys), jax.jit(jax.vmap(one.step)), spoilt)
+    reset, step = (jax.jit(jax.vmap(function)) for function in (one.reset, one.step))
+    theirs = drive_all(reset(keys), step, jax.jit(spoilt))
     return request.param, *(
         jax.tree.map(lambda *x: np.stack(x), *states)
         for states in ([packed.unpack() for packed in ours], theirs)

@@ -93,7 +93,7 @@ def drive(env, targets):
         return jax.lax.scan(hold, states, targets)[0]
 
     keys = jax.random.split(jax.random.PRNGKey(0), targets.shape[1])
-    return run(jax.vmap(env.reset)(keys).pipeline_state, targets)
+    return run(jax.jit(jax.vmap(env.reset))(keys).pipeline_state, targets)
 
 
 def drawn(robots, holds=16):
