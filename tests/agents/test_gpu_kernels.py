@@ -104,9 +104,9 @@ def test_a_step_of_adam_is_that_of_a_cpu(name, schedule, model):
     terms = [[limit, 2e-3, 0.25, 0.01, 0.1, 1e-5, 1e-2] for limit in (1.0, 9.0, np.inf)]
     arrays = [*(x.astype(np.float32) for x in (*vectors, progress)), index, np.float32(terms)]
     ours = launched_by(launch_gpu, signatures.ADAM, rule, arrays)
-    theirs = jax.jit(lambda *given: launched_by(launch_cpu, signatures.ADAM, rule, given)[:4])(
-        *arrays
-    )
+    with jax.default_device(jax.devices("cpu")[0]):
+        run = jax.jit(lambda *given: launched_by(launch_cpu, signatures.ADAM, rule, given)[:4])
+        theirs = run(*arrays)
     for i, (one, other) in enumerate(zip(ours, theirs, strict=True)):
         np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-7)
         # The policy in the middle keeps what it has.
