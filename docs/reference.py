@@ -2,8 +2,8 @@
 
 - `configuration.md`: The types, bounds, defaults and explanations come from the schema of `Config`,
   the refusals from its checks, and the values of the shipped files from the files.
-- The tables of quantities that may differ, in pages that hold `<!-- table: NAME -->`, come from
-  `QUANTITIES` and the shipped files.
+- Tables in pages that hold `<!-- table: NAME -->`: those of quantities that may differ come from
+  `QUANTITIES` and the shipped files, that of JAX's primitives from `onekernel`.
 - `api/ROOM.md`: The public names and the modules of each room come from its folder.
 
 Nothing of this is written by hand.
@@ -37,6 +37,7 @@ from jetbot_mjx.config import (
     load_config,
     parse_config,
 )
+from onekernel.lower.jaxpr import primitives
 
 ROOT = Path(__file__).parents[1]
 PAGE = "configuration.md"
@@ -170,15 +171,24 @@ def _robustness_values() -> Iterator[str]:
         yield f"| {' | '.join(cells)} |"
 
 
+def _primitives() -> Iterator[str]:
+    """Yield the lines of a table of JAX's primitives that a kernel can do."""
+    yield "| becomes | JAX's primitives |"
+    yield "|---|---|"
+    for kind, names in primitives().items():
+        yield f"| {kind} | {' '.join(f'`{name}`' for name in names)} |"
+
+
 _TABLES = {
     "robot_ranges": lambda: _ranges_in("real_jetbot", RobotParams),
     "look_ranges": lambda: _ranges_in("camera_real", LookParams),
     "robustness_values": _robustness_values,
+    "primitives": _primitives,
 }
 
 
 def with_tables(text: str) -> str:
-    """Return the Markdown of a page with its tables of quantities in place of their names."""
+    """Return the Markdown of a page with its tables in place of their names."""
     return re.sub(r"<!-- table: (\w+) -->", lambda found: "\n".join(_TABLES[found[1]]()), text)
 
 

@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.extend import core as jex
 from jax.extend import source_info_util
 from jax.extend.core import ClosedJaxpr, JaxprEqn, Literal, Var
 from jaxtyping import Array, PyTree
@@ -174,6 +175,26 @@ def scalarize_part(
         raise UnsupportedError(f"{program.size:,} operations, more than {MAX_PROGRAM_OPERATIONS:,}")
     check_bytes(program.array_bytes)
     return program
+
+
+def primitives() -> dict[str, list[str]]:
+    """Return the names of the JAX primitives that have a rule, by what the rule does."""
+    own = (name[1:] for name in dir(_JaxprLowering(ExprGraph())) if name[:2] != "__")
+    kinds = {
+        "an operation for each element": EVALUATE,
+        "scalars rearranged, nothing computed": RULES,
+        "several operations": ARITHMETIC_RULES,
+        "indices known only at run time, sorting": DYNAMIC_RULES,
+        "random numbers": RANDOM_RULES,
+        "a formula of other operations": EXPANSIONS,
+        "loops, branches, calls, linear algebra": own,
+    }
+    public = {x.name for x in vars(jex.primitives).values() if isinstance(x, jex.Primitive)}
+    found: dict[str, list[str]] = {}
+    for kind, names in kinds.items():
+        found[kind] = sorted(public.intersection(names))
+        public -= set(found[kind])
+    return found
 
 
 class _JaxprLowering:

@@ -675,3 +675,10 @@ def test_of_the_arithmetic_of_mjx_most_is_multiplication_by_zero(env):
     )
     # The traced step has some 15,000 operations on arrays of up to 64 numbers.
     assert size < step.size < 15_000
+
+
+def test_the_primitives_with_a_rule_are_listed_once():
+    names = [name for kind in jaxpr.primitives().values() for name in kind]
+    assert len(names) == len(set(names)) > 100
+    assert {"scan", "while", "cond", "sin", "dot_general", "gather", "erf", "qr"} <= {*names}
+    assert not {"fft", "eigh", "lgamma"} & {*names}
