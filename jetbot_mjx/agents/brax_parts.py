@@ -11,6 +11,9 @@ from brax.training.acme import specs as specs
 from brax.training.agents.ppo import optimizer as optimizer
 from brax.training.types import Transition as Transition
 from brax.training.types import UInt64 as UInt64
+from brax.training.types import (
+    identity_observation_preprocessor as identity_observation_preprocessor,
+)
 
 Normalizer = running_statistics.RunningStatisticsState
 """The statistics that normalise observations, of a vector or of its parts by name."""

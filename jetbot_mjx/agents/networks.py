@@ -15,7 +15,12 @@ import numpy as np
 from flax import struct
 from jaxtyping import Array, Float, PyTree, UInt32
 
-from jetbot_mjx.agents.brax_parts import Normalizer, running_statistics, specs
+from jetbot_mjx.agents.brax_parts import (
+    Normalizer,
+    identity_observation_preprocessor,
+    running_statistics,
+    specs,
+)
 from jetbot_mjx.agents.cnn_sizes import check_size, is_image
 from jetbot_mjx.config import NetworkConfig, PPOConfig
 from jetbot_mjx.devices import default_device_cpu
@@ -174,7 +179,11 @@ def make_networks(
     if not isinstance(observation_size, int):
         shapes = {name: tuple(shape) for name, shape in observation_size.items()}
         check_size(network.cnn, shapes)
-    preprocess = running_statistics.normalize if config.normalize_observations else _unchanged
+    preprocess = (
+        running_statistics.normalize
+        if config.normalize_observations
+        else identity_observation_preprocessor
+    )
 
     def build() -> Any:
         # Brax's networks hold an observation of zeros, which need not be on the GPU.
@@ -189,10 +198,6 @@ def make_networks(
             )
 
     return Networks(build)
-
-
-def _unchanged(obs: PyTree, normalizer: Normalizer) -> PyTree:
-    return obs
 
 
 def init_normalizer(observation_size: int | Mapping[str, Sequence[int]]) -> Normalizer:

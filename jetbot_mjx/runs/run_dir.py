@@ -59,10 +59,10 @@ class DamagedRunError(UserError):
         self.run_dir, self.reason = run_dir, reason
 
 
-def default_run_dir(config_path: Path) -> Path:
+def default_run_dir(config_path: Path, root: Path = Path("runs")) -> Path:
     """Return `runs/<config>-<date>-<time>`, in local time."""
     now = datetime.datetime.now().astimezone()
-    return Path("runs") / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
+    return root / f"{config_path.stem}-{now:%Y%m%d-%H%M%S}"
 
 
 def seed_dirs(run_dir: Path, config: Config) -> list[Path]:
