@@ -23,6 +23,7 @@ from benchmarks.throughput import (
     adapters,
     baselines,
     compare,
+    ensembles,
     fuse,
     kernels,
     one_robot,
@@ -496,3 +497,19 @@ def test_a_program_is_the_same_as_one_kernel_and_by_xla(name, capsys, monkeypatc
     assert row.kernel_seconds > 0
     with pytest.raises(UserError, match="there is no program nothing: choose of"):
         programs.main(["nothing"])
+
+
+def test_an_ensemble_is_solved_alike_as_one_kernel_and_by_xla(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(timing, "REPEAT_SECONDS", 0.01)
+    monkeypatch.setattr(ensembles, "END", 0.5)
+    output = tmp_path / "rates.json"
+    given = ["--num-instances", "64", "--rounds", "1", "--output", str(output)]
+    assert ensembles.main(given) == 0
+    kernel, xla = json.loads(output.read_text())["rows"][:2]
+    assert (kernel["contender"], xla["contender"]) == ("kernel", "xla")
+    # Round-off decides here and there whether a step is repeated.
+    assert kernel["mean_steps"] == pytest.approx(xla["mean_steps"], rel=0.02)
+    assert kernel["mean_steps"] > 10
+    assert max(kernel["median_error"], xla["median_error"]) < 1e-3
+    with pytest.raises(UserError, match=r"--tolerance 0\.0: name a number from 1e-7 to 1"):
+        ensembles.main(["--tolerance", "0"])
