@@ -270,10 +270,10 @@ class PPO:
         """
         make_steps = self.learner.unroll(self._env, state)
 
-        # An unroll: the policy acts for `unroll_length` steps in every environment.
         def unroll(
             carry: tuple[Packed, PRNGKeyArray], _: None
         ) -> tuple[tuple[Packed, PRNGKeyArray], tuple[Transition, NanDump]]:
+            """Let the policy act for `unroll_length` steps in every environment."""
             start, key = carry
             key, next_key = jax.random.split(key)
             after, data = make_steps(start, key)
