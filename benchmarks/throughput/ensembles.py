@@ -20,6 +20,7 @@ import statistics
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -171,6 +172,54 @@ def exact(starts: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     return y.T
 
 
+class Row(NamedTuple):
+    """A `Row` holds the rate of one contender."""
+
+    contender: str
+    instances_per_second: float
+    """Median of the rounds."""
+    repeats: list[float]
+    """`instances_per_second` of each round."""
+    compile_seconds: float
+    mean_steps: float
+    """Steps of an instance, with those that were repeated."""
+    median_error: float
+    """Largest difference of a coordinate to the exact end."""
+
+
+def measure(count: int, tolerance: float, rounds: int) -> list[Row]:
+    """Time all contenders.
+
+    Args:
+      count: number of instances.
+      tolerance: relative and absolute tolerance of a step.
+      rounds: number of rounds, in each of which every contender is timed once.
+    """
+    starts = np.random.default_rng(0).normal((0.0, 0.0, 25.0), 5.0, (count, 3)).astype(np.float32)
+
+    def one(start: Array) -> tuple[Array, Array]:
+        return solve(start, tolerance)
+
+    functions = {"kernel": fuse(one, on_unsupported="raise"), "xla": one}
+    if importlib.util.find_spec("diffrax"):
+        functions["diffrax"] = by_diffrax(tolerance)
+    else:
+        print("diffrax is not installed: pip install diffrax")
+    argument = jnp.asarray(starts)
+    contenders = {name: Compiled(jax.vmap(f), argument) for name, f in functions.items()}
+    rates: dict[str, list[float]] = {name: [] for name in contenders}
+    for _ in range(rounds):
+        for name, contender in contenders.items():
+            rates[name].append(count / contender.repeat())
+    ends, rows = exact(starts[:256]), []
+    for name, contender in contenders.items():
+        end, steps = contender.results()
+        error = float(np.median(np.abs(end[:256] - ends).max(axis=1)))
+        rate, seconds = statistics.median(rates[name]), contender.compile_seconds
+        rows.append(Row(name, rate, rates[name], seconds, float(steps.mean()), error))
+    return rows
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Parse the command line, measure, print a table and write a file.
 
@@ -194,51 +243,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
         check_output(options.output)
     device = jax.devices()[0]
     count = options.num_instances or (1_000_000 if device.platform == "gpu" else 4096)
-    starts = np.random.default_rng(0).normal((0.0, 0.0, 25.0), 5.0, (count, 3)).astype(np.float32)
-
-    def one(start: Array) -> tuple[Array, Array]:
-        return solve(start, options.tolerance)
-
-    functions = {"kernel": fuse(one, on_unsupported="raise"), "xla": one}
-    if importlib.util.find_spec("diffrax"):
-        functions["diffrax"] = by_diffrax(options.tolerance)
-    else:
-        print("diffrax is not installed: pip install diffrax")
-    argument = jnp.asarray(starts)
-    contenders = {name: Compiled(jax.vmap(f), argument) for name, f in functions.items()}
-    seconds: dict[str, list[float]] = {name: [] for name in contenders}
-    for _ in range(options.rounds):
-        for name, contender in contenders.items():
-            seconds[name].append(contender.repeat())
+    rows = measure(count, options.tolerance, options.rounds)
     print(f"{device.device_kind}, {available_cores()} cores, {count:,} instances")
     print(
         f"{'contender':10}{'instances/s':>13}{'min .. max':>19}"
         f"{'compile':>10}{'steps':>8}{'error':>9}"
     )
-    ends, rows = exact(starts[:256]), []
-    for name, contender in contenders.items():
-        end, steps = contender.results()
-        rates = [count / x for x in seconds[name]]
-        rate = statistics.median(rates)
-        error = float(np.median(np.abs(end[:256] - ends).max(axis=1)))
-        rows.append(
-            {
-                "contender": name,
-                "instances_per_second": rate,
-                "repeats": rates,
-                "compile_seconds": contender.compile_seconds,
-                "mean_steps": float(steps.mean()),
-                "median_error": error,
-            }
-        )
+    for row in rows:
+        rate = row.instances_per_second
         print(
-            f"{name:10}{format_count(rate, 4):>13}{format_spread(rate, rates):>19}"
-            f"{contender.compile_seconds:>8.1f} s{steps.mean():>8.1f}{error:>9.0e}"
+            f"{row.contender:10}{format_count(rate, 4):>13}{format_spread(rate, row.repeats):>19}"
+            f"{row.compile_seconds:>8.1f} s{row.mean_steps:>8.1f}{row.median_error:>9.0e}"
         )
     if options.output:
         about = {"device": device.device_kind, "cpu_cores": available_cores()}
-        about |= {"num_instances": count, "tolerance": options.tolerance}
-        write(options.output, {**about, "versions": versions(), "rows": rows})
+        about |= {"num_instances": count, "tolerance": options.tolerance, "versions": versions()}
+        write(options.output, {**about, "rows": [row._asdict() for row in rows]})
         print(f"wrote {options.output}")
     return 0
 
