@@ -39,6 +39,7 @@ from onekernel.lower import (
     is_constant,
     is_table,
     length_of,
+    recomputable,
 )
 
 STEP = "step"
@@ -229,6 +230,10 @@ class ProgramWriter:
         # The addresses of arrays, and the counters of loops, one number for all lanes.
         self._addresses: dict[int, Value] = {}
         self._counters: dict[int, Value] = {}
+        # The values that the current loops compute again instead of keeping them in registers, and
+        # what has been computed again so far, by the index of the value and the basic block.
+        self._recomputed: frozenset[int] = frozenset()
+        self._again: dict[tuple[int, str], Value] = {}
         # A vector of truth values: the lanes that execute the current block; None: all lanes.
         self._mask: Value | None = None
 
@@ -277,6 +282,8 @@ class ProgramWriter:
         if not is_constant(x):
             if self._is_deferred(x):
                 return self._load(x) if x.op == "load" else self._computed(x)
+            if x.index in self._recomputed:
+                return self._computed_again(x)
             if x.op == "counter":
                 return self._counters[x.index].splat(self.writer.lanes)
             value = self._values[x.index]
@@ -299,10 +306,13 @@ class ProgramWriter:
 
     def _block(self, block: Block) -> None:
         for item in block.items:
-            if isinstance(item, PlacedLoop) and item.loop.counter is not None:
-                self._counted_loop(item)
-            elif isinstance(item, PlacedLoop):
-                self._loop(item)
+            if isinstance(item, PlacedLoop):
+                enclosing = self._recomputed
+                # A CPU reads a value from memory as cheaply as it computes it again.
+                self._recomputed |= recomputable(item) if self.for_gpu else frozenset()
+                write = self._loop if item.loop.counter is None else self._counted_loop
+                write(item)
+                self._recomputed = enclosing
             elif isinstance(item, PlacedBranch):
                 self._branch(item)
             else:
@@ -536,6 +546,21 @@ class ProgramWriter:
         if source.op == "load":
             return is_constant(source.operands[1])
         return source is not x and callable(self._values.get(source.index))
+
+    def _computed_again(self, value: Expr) -> Value:
+        """Append an operation from before a loop once more, in the present basic block."""
+        key = value.index, self.writer.label
+        if key not in self._again:
+            operands = [self._operand(x) for x in value.operands]
+            place = [is_constant(x) for x in value.operands].index(False)
+            # LLVM would find the equal operation before the loop, and take its value: pass an
+            # operand through an instruction that LLVM does not know.
+            operand = operands[place]
+            operands[place] = self.writer.let(
+                f'call float asm sideeffect "mov.f32 $0, $1;", "=f,f"({operand.typed})', "float"
+            )
+            self._again[key] = _write_of(value, for_gpu=True)(self, value, operands)
+        return self._again[key]
 
     def _computed(self, value: Expr) -> Value:
         write = _write_of(value, for_gpu=self.for_gpu)

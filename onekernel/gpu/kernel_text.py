@@ -134,10 +134,15 @@ def map_kernel_text(kernel: Kernel) -> str:
 
 def module_text(kernel: LlvmWriter, threads: int) -> str:
     """Return the module of a kernel, whose blocks have at most so many threads."""
-    # Metadata with which LLVM tells the driver the largest block, for its allocation of registers.
-    annotations = "!nvvm.annotations = !{!0}"
-    most = f'!0 = !{{ptr @{kernel.name}, !"maxntidx", i32 {threads}}}\n'
-    return codegen.module_text([kernel], annotations, most)
+    # Metadata with which LLVM tells the driver the largest block, and that a multiprocessor need not
+    # hold more than one of it. Otherwise the driver gives the threads of a large program as few as
+    # 32 registers each, so that more blocks fit: half_cheetah then makes a third of its steps.
+    limits = {"maxntidx": threads, "minctasm": 1}
+    annotations = [
+        f'!{i} = !{{ptr @{kernel.name}, !"{name}", i32 {limit}}}'
+        for i, (name, limit) in enumerate(limits.items())
+    ]
+    return codegen.module_text([kernel], "!nvvm.annotations = !{!0, !1}", *annotations)
 
 
 def _writer(arrays: int) -> LlvmWriter:

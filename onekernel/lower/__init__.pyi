@@ -13,3 +13,4 @@ from .schedule import Block as Block
 from .schedule import Item as Item
 from .schedule import PlacedBranch as PlacedBranch
 from .schedule import PlacedLoop as PlacedLoop
+from .schedule import recomputable as recomputable

@@ -23,6 +23,9 @@ _OF_ITERATION = ("carry", "counter")
 _AFTERWARDS = ("result", "stack")
 """Operations whose value is there after a loop or branch."""
 
+_CHEAP = ("abs", "add", "max", "min", "mul", "neg", "sub")
+"""Operations on floats that cost less than a register."""
+
 
 @dataclasses.dataclass(eq=False, repr=False)
 class Block:
@@ -110,6 +113,62 @@ def schedule(outputs: Iterable[Scalar]) -> Block:
       one.
     """
     return _Scheduler().schedule([x for x in outputs if not is_constant(x)])
+
+
+def recomputable(loop: PlacedLoop) -> frozenset[int]:
+    """Return which values from before a loop follow from others that the loop uses, too.
+
+    A value that a loop uses occupies a register during all iterations. One that takes a single
+    operation on values which are there anyway can be computed inside instead.
+
+    Args:
+      loop: the loop.
+
+    Returns:
+      The indices of these values.
+    """
+    read: dict[int, Expr] = {}
+    made: set[int] = set()
+    pending: list[Item] = [loop]
+    while pending:
+        item = pending.pop()
+        if isinstance(item, Expr):
+            scalars, values = item.operands, [item]
+        elif isinstance(item, PlacedBranch):
+            branch, values = item.branch, item.results
+            sides = [side[x.place] for x in values for side in (branch.if_false, branch.if_true)]
+            scalars = [branch.condition, *sides]
+        else:
+            scalars, values = _read_by_loop(item, is_outermost=item is loop), _made_by_loop(item)
+        read |= {x.index: x for x in _expressions(scalars)}
+        made |= {x.index for x in values}
+        if not isinstance(item, Expr):
+            pending += [inner for block in item.blocks for inner in block.items]
+    outside = {index: x for index, x in read.items() if index not in made}
+    return frozenset(
+        index
+        for index, x in outside.items()
+        if x.op in _CHEAP
+        and x.dtype.kind == "f"
+        and all(operand.index in outside for operand in _expressions(x.operands))
+    )
+
+
+def _read_by_loop(item: PlacedLoop, *, is_outermost: bool) -> list[Scalar]:
+    """Return the scalars that a loop itself reads; the outermost one reads initial ones before."""
+    loop = item.loop
+    return [
+        loop.condition,
+        *(loop.initial[place] for place in item.places if not is_outermost),
+        *(loop.updated[place] for place in item.places),
+        *(loop.results[result.place] for result in item.results),
+        *(loop.stacked[stack.place] for stack in item.stacks),
+    ]
+
+
+def _made_by_loop(item: PlacedLoop) -> list[Expr]:
+    counter = [item.loop.counter] if item.loop.counter is not None else []
+    return [*item.loop.carries, *counter, *item.results, *item.stacks]
 
 
 class _Scheduler:

@@ -117,3 +117,23 @@ def test_the_bytes_of_a_map_are_those_of_the_function(items, model):
     # Where a number is whole, rounding decides between two bytes.
     assert np.abs(ours.astype(int) - theirs).max() <= 1
     assert (ours == theirs).mean() > 0.99
+
+
+def damped(x):
+    """A loop of its own length for each robot, which reads a vector and its multiples."""
+    twice, half = x + x, x * 0.5
+
+    def again(s):
+        y, count = s
+        return (y * half - x) * twice, count + 1
+
+    return jax.lax.while_loop(lambda s: s[1] < x[0], again, (x * x, 0.0))[0]
+
+
+def test_a_loop_computes_again_what_follows_from_its_other_values(model):
+    kernel = Kernel(scalarize(damped, VECTOR), carried=1, steps=1, fallback=None)
+    # Twice and half of each number, in the loop; LLVM does not move them out again.
+    assert kernel_text(kernel).count('"mov.f32 $0, $1;"') == 2 * VECTOR.shape[0]
+    x = robots(70)
+    (ours,) = gpu.launch(kernel, [x])
+    np.testing.assert_allclose(ours, expected(damped, x), rtol=2e-5, atol=2e-6)

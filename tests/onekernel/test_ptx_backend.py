@@ -30,6 +30,8 @@ def test_it_is_compiled_for_every_architecture(name, architecture):
     assert f".target sm_{architecture}" in text
     assert text.count(gpu.INSTANCES) == 1
     assert f".maxntid {gpu.MAX_THREADS}" in text
+    # A thread may have as many registers as one block leaves it.
+    assert ".minnctapersm 1\n" in text
     # All threads of a block begin a step together.
     assert len(re.findall(r"bar(rier)?\.(cta\.)?sync", text)) == 1
     # Values in between stay in registers.

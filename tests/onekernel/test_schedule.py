@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from onekernel.lower.scalar_ir import Expr, ExprGraph
-from onekernel.lower.schedule import PlacedBranch, PlacedLoop, schedule
+from onekernel.lower.schedule import PlacedBranch, PlacedLoop, recomputable, schedule
 
 ONE = np.float32(1)
 
@@ -242,3 +242,70 @@ def test_what_a_loop_in_a_loop_stores_is_read_there(graph, x):
     placed = inside(schedule(graph.end_loop(outer)), PlacedLoop)
     assert ops(placed.body) == ["PlacedLoop", "load"]
     assert ops(inside(placed.body, PlacedLoop).body) == ["convert", "mul"]
+
+
+def loop_with(graph, first, body):
+    """The loop of numbers below 9 whose iteration adds what `body` computes."""
+    ends = loop_of(graph, [first], lambda carry: [graph.apply("add", carry, body(carry))])
+    return inside(schedule(ends), PlacedLoop)
+
+
+def test_what_follows_from_other_values_of_a_loop_is_recomputable(graph, x):
+    y, first = graph.input(np.float32), graph.input(np.float32)
+    product = graph.apply("mul", x, y)
+
+    def reads(*values):
+        def body(carry):
+            total = carry
+            for value in values:
+                total = graph.apply("mul", total, value)
+            return total
+
+        return recomputable(loop_with(graph, first, body))
+
+    assert reads(product, x, y) == {product.index}
+    # Instead of the product, another value would have to be kept.
+    assert reads(product, x) == frozenset()
+    assert reads(product) == frozenset()
+
+
+def test_the_initial_value_of_a_loop_is_not_there_in_its_iterations(graph, x):
+    product = graph.apply("mul", x, np.float32(3))
+    loop = loop_with(graph, x, lambda carry: graph.apply("mul", carry, product))
+    assert recomputable(loop) == frozenset()
+
+
+def test_the_initial_value_of_a_loop_inside_is_there(graph, x):
+    first = graph.input(np.float32)
+    product = graph.apply("mul", x, np.float32(3))
+
+    def body(carry):
+        def inner(number):
+            return [graph.apply("add", graph.apply("add", number, product), carry)]
+
+        return loop_of(graph, [x], inner)[0]
+
+    loop = loop_with(graph, first, body)
+    assert recomputable(loop) == {product.index}
+    assert recomputable(inside(loop.body, PlacedLoop)) == frozenset()
+
+
+def test_what_a_branch_in_a_loop_needs_is_there(graph, x, flag):
+    first = graph.input(np.float32)
+    double = graph.apply("add", x, x)
+
+    def body(carry):
+        sides = [graph.apply("mul", carry, x)], [graph.apply("mul", carry, double)]
+        return graph.branch(graph.apply("gt", carry, ONE), *sides)[0]
+
+    assert recomputable(loop_with(graph, first, body)) == {double.index}
+
+
+@pytest.mark.parametrize("op", ["sqrt", "floor"])
+def test_what_costs_more_than_a_register_is_not_recomputable(graph, x, op):
+    first, root = graph.input(np.float32), graph.apply(op, x)
+
+    def body(carry):
+        return graph.apply("mul", graph.apply("mul", carry, root), x)
+
+    assert recomputable(loop_with(graph, first, body)) == frozenset()

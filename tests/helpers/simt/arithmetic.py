@@ -130,6 +130,7 @@ _APPROXIMATE = {
 ASSEMBLY = {
     "add.u32": np.add,
     "cvt.rn.satfinite.f16x2.f32": _packed,
+    "mov.f32": np.copy,
     **{
         name: lambda x, function=function: function(x.astype(np.float64)).astype(np.float32)
         for name, function in _APPROXIMATE.items()

@@ -226,7 +226,7 @@ class Block:
         result = INTRINSICS[name](*self._given(operands))
         return result.view(TYPES[kind]) if "sat" in name else result.astype(TYPES[kind])
 
-    @_runs(rf'call \w+ asm "({_any(ASSEMBLY)}) [$0-9, ]*;", "[^"]*"\((.*)\)')
+    @_runs(rf'call \w+ asm(?: sideeffect)? "({_any(ASSEMBLY)}) [$0-9, ]*;", "[^"]*"\((.*)\)')
     def assembly(self, name, operands):
         return ASSEMBLY[name](*self._given(operands))
 
