@@ -134,9 +134,9 @@ def map_kernel_text(kernel: Kernel) -> str:
 
 def module_text(kernel: LlvmWriter, threads: int) -> str:
     """Return the module of a kernel, whose blocks have at most so many threads."""
-    # Metadata with which LLVM tells the driver the largest block, and that a multiprocessor need not
-    # hold more than one of it. Otherwise the driver gives the threads of a large program as few as
-    # 32 registers each, so that more blocks fit: half_cheetah then makes a third of its steps.
+    # Metadata with which LLVM tells the driver the largest block, and that a multiprocessor need
+    # not hold more than one. Otherwise the driver gives the threads of a large program as few as 32
+    # registers each, so that more blocks fit, and half_cheetah makes half as many steps.
     limits = {"maxntidx": threads, "minctasm": 1}
     annotations = [
         f'!{i} = !{{ptr @{kernel.name}, !"{name}", i32 {limit}}}'
