@@ -4,6 +4,8 @@
 
   kernel   `onekernel.mujoco.fuse_mjx`
   mjx      `mjx.step`, compiled by XLA in a process of its own; left out if that takes too long
+  warp     MJX-Warp (`pip install warp-lang`, at the version that MJX requires), likewise; it needs
+           an NVIDIA GPU
   rollout  C MuJoCo's threaded `mujoco.rollout`, one thread per core
   batch    C MuJoCo's threaded `mujoco.batch`, one thread per core
 
@@ -19,6 +21,7 @@ float32 can show, so that MJX iterates on where nothing changes any more: `--tol
 """
 
 import argparse
+import contextlib
 import copy
 import importlib.util
 import math
@@ -30,7 +33,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +41,7 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float
+from mujoco import mjx
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
 
@@ -74,6 +78,9 @@ _MOST_STEPS = 100
 """Most physics steps by which a state is older than the model's first one."""
 _ROBOTS_PER_CORE = 256
 """Most instances per core of C MuJoCo."""
+_MOST_IN_MEMORY = {"mjx": 8192, "warp": 32_768}
+"""Most instances of those that keep all of MJX's data of an instance in memory; from about there
+on, more of them are not faster."""
 
 Moved = tuple[Float[np.ndarray, "n nq"], Float[np.ndarray, "n nv"]]
 """Positions and velocities of the instances after one environment step."""
@@ -181,24 +188,23 @@ class Contender(Protocol):
 class Compiled:
     """A step of one instance that JAX compiles, for all instances of a problem."""
 
-    def __init__(self, problem: Problem, step: FusedMjx, *, by_xla: bool) -> None:
+    def __init__(self, problem: Problem, states: Any, step: Callable[[Any, Array], Any]) -> None:
         """Compile a call and warm it up.
 
         Args:
           problem: the model, states and controls.
-          step: the model's step.
-          by_xla: whether XLA compiles `mjx.step`; otherwise the step is called as it is.
+          states: a pytree with `qpos` and `qvel`, with a leading axis of instances.
+          step: a function of (state, ctrl) of one instance that makes an environment step.
         """
         settings = problem.settings
         self.num_envs, self._unroll = settings.num_envs, settings.unroll
         self._distinct = len(problem.states)
-        one = _mjx_step(step, settings.n_substeps) if by_xla else step
 
-        def call(states: MjxState, controls: Float[Array, "t n nu"]) -> MjxState:
-            return jax.lax.scan(lambda x, u: (jax.vmap(one)(x, u), None), states, controls)[0]
+        def call(states: Any, controls: Float[Array, "t n nu"]) -> Any:
+            return jax.lax.scan(lambda x, u: (jax.vmap(step)(x, u), None), states, controls)[0]
 
         start = time.perf_counter()
-        self._states, self._call = problem.first(step), jax.jit(call)
+        self._states, self._call = states, jax.jit(call)
         self._controls = jnp.asarray(problem.controls.swapaxes(0, 1))
         self._program = self._call.lower(self._states, self._controls).compile()
         self.compile_seconds: float | None = time.perf_counter() - start
@@ -220,26 +226,63 @@ class Compiled:
         return time.perf_counter() - start
 
 
-def _mjx_step(step: FusedMjx, n_substeps: int) -> Callable[[MjxState, Array], MjxState]:
-    """Return a step of one instance that calls `mjx.step`."""
-    from mujoco import mjx
+def _by_kernel(problem: Problem, step: FusedMjx) -> Compiled:
+    return Compiled(problem, problem.first(step), step)
+
+
+def _by_xla(problem: Problem) -> Compiled:
+    """Return `mjx.step`, which XLA compiles."""
+    step = fuse_mjx(problem.model, problem.settings.n_substeps)
 
     def substep(state: MjxState, ctrl: Array) -> MjxState:
         with jax.default_matmul_precision("highest"):
             return step.from_data(mjx.step(step.model, step.to_data(state, ctrl)))
 
+    return Compiled(problem, problem.first(step), _repeated(problem, substep))
+
+
+def _by_warp(problem: Problem) -> Compiled:
+    """Return `mjx.step` with the kernels of MuJoCo Warp."""
+    first = problem.first(fuse_mjx(problem.model))
+    model = mjx.put_model(problem.model, impl="warp")
+    # As many contacts and constraints as MJX makes of this model.
+    rows = mjx.make_data(problem.model, impl="jax")._impl
+    contacts, constraints = rows.contact.dist.shape[0], rows.efc_J.shape[0]
+
+    def begin(state: MjxState) -> mjx.Data:
+        data = mjx.make_data(
+            problem.model,
+            impl="warp",
+            naconmax=max(1, contacts) * problem.settings.num_envs,
+            njmax=max(1, constraints),
+        )
+        names = "qpos", "qvel", "act", "time", "qacc_warmstart"
+        return data.replace(**{name: getattr(state, name) for name in names})
+
+    def substep(data: mjx.Data, ctrl: Array) -> mjx.Data:
+        return mjx.step(model, data.replace(ctrl=ctrl))
+
+    return Compiled(problem, jax.jit(jax.vmap(begin))(first), _repeated(problem, substep))
+
+
+def _repeated(
+    problem: Problem, substep: Callable[[Any, Array], Any]
+) -> Callable[[Any, Array], Any]:
+    """Return an environment step of physics steps."""
+    count = problem.settings.n_substeps
     return lambda state, ctrl: jax.lax.fori_loop(
-        0, n_substeps, lambda _, state: substep(state, ctrl), state
+        0, count, lambda _, state: substep(state, ctrl), state
     )
 
 
 class InOtherProcess:
-    """MJX through XLA, in a process that can be ended while XLA compiles."""
+    """MJX, in a process that can be ended while it compiles."""
 
-    def __init__(self, settings: Settings, limit: float) -> None:
+    def __init__(self, name: str, settings: Settings, limit: float) -> None:
         """Start the process and wait until it has compiled.
 
         Args:
+          name: `mjx` or `warp`.
           settings: the problem.
           limit: the longest time to compile [s].
 
@@ -247,17 +290,18 @@ class InOtherProcess:
           TimeoutError: it takes longer.
           UserError: the process failed.
         """
-        self.num_envs = settings.num_envs
+        self.num_envs = min(settings.num_envs, _MOST_IN_MEMORY[name])
+        settings = settings._replace(num_envs=self.num_envs)
         context = multiprocessing.get_context("spawn")
         self._connection, other = context.Pipe()
-        self._process = context.Process(target=_serve, args=(other, settings), daemon=True)
+        self._process = context.Process(target=_serve, args=(other, name, settings), daemon=True)
         self._process.start()
         other.close()
         try:
             # Loading the model and moving the instances take a while too: count from their end.
             self._receive()
             if not self._connection.poll(limit):
-                raise TimeoutError(f"XLA compiles for more than {limit:g} s")
+                raise TimeoutError(f"it compiles for more than {limit:g} s")
             self.compile_seconds = self._receive()
         except BaseException:
             self.close()
@@ -284,15 +328,14 @@ class InOtherProcess:
         try:
             return self._connection.recv()
         except EOFError:
-            raise UserError("the process that steps MJX through XLA failed") from None
+            raise UserError("the process that steps MJX failed") from None
 
 
-def _serve(connection: Connection, settings: Settings) -> None:
-    """Compile MJX through XLA, and answer for it until the other side closes the connection."""
+def _serve(connection: Connection, name: str, settings: Settings) -> None:
+    """Compile MJX, and answer for it until the other side closes the connection."""
     problem = Problem(settings)
-    step = fuse_mjx(problem.model, settings.n_substeps)
     connection.send("ready")
-    contender = Compiled(problem, step, by_xla=True)
+    contender = {"mjx": _by_xla, "warp": _by_warp}[name](problem)
     connection.send(contender.compile_seconds)
     while True:
         try:
@@ -428,41 +471,44 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
     Args:
       settings: the problem.
       rounds: number of rounds, in each of which every contender is timed once.
-      xla_limit: the longest time that XLA may take to compile MJX [s]; 0: leave it out.
+      xla_limit: the longest time to compile MJX [s]; 0: leave it out, and MJX-Warp too.
 
     Yields:
       One row for each contender.
     """
     problem = Problem(settings)
-    notes = {"kernel": "", "mjx": "", "rollout": "", "batch": ""}
     step = fuse_mjx(problem.model, settings.n_substeps, on_unsupported="xla")
-    compiled: dict[str, Compiled | InOtherProcess] = {}
+    notes = {
+        "kernel": step.obstacle or "",
+        "mjx": "",
+        "warp": _no_warp(),
+        "rollout": "",
+        "batch": "",
+    }
     contenders: dict[str, Contender] = {
         "rollout": Mujoco(problem, is_batch=False),
         "batch": Mujoco(problem, is_batch=True),
     }
-    if step.obstacle is None:
-        compiled["kernel"] = Compiled(problem, step, by_xla=False)
-    else:
-        notes["kernel"] = step.obstacle
-    xla = None
-    try:
-        if xla_limit:
-            xla = compiled["mjx"] = InOtherProcess(settings, xla_limit)
-        else:
-            notes["mjx"] = "left out"
-    except TimeoutError as error:
-        notes["mjx"] = str(error)
-    try:
+    compiled: dict[str, Compiled | InOtherProcess] = {}
+    if not notes["kernel"]:
+        compiled["kernel"] = _by_kernel(problem, step)
+    with contextlib.ExitStack() as stack:
+        for name in ("mjx", "warp"):
+            if not xla_limit:
+                notes[name] = "left out"
+            if notes[name]:
+                continue
+            try:
+                compiled[name] = other = InOtherProcess(name, settings, xla_limit)
+                stack.callback(other.close)
+            except TimeoutError as error:
+                notes[name] = str(error)
         contenders |= compiled
         repeats: dict[str, list[float]] = {name: [] for name in contenders}
         for _ in range(rounds):
             for name, contender in contenders.items():
                 repeats[name].append(contender.repeat())
         moved = {name: contender.moved() for name, contender in compiled.items()}
-    finally:
-        if xla is not None:
-            xla.close()
     reference = converged(problem)
     for name in notes:
         contender = contenders.get(name)
@@ -481,6 +527,13 @@ def measure(settings: Settings, rounds: int, xla_limit: float) -> Iterator[Row]:
             from_mjx,
             notes[name],
         )
+
+
+def _no_warp() -> str:
+    """Return why MJX-Warp cannot run here; empty if it can."""
+    if jax.default_backend() != "gpu":
+        return "it needs an NVIDIA GPU"
+    return "" if importlib.util.find_spec("warp") else "warp-lang is not installed"
 
 
 _HEAD = (
@@ -531,7 +584,7 @@ def _parser() -> cli.Parser:
         type=float,
         default=60.0,
         metavar="SECONDS",
-        help="the longest time that XLA may take to compile MJX; 0: leave MJX out (default: 60)",
+        help="the longest time to compile MJX, by XLA or for Warp; 0: leave both out (default: 60)",
     )
     parser.add_argument("--output", type=Path, help="a JSON file for the results")
     return parser

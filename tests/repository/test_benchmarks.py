@@ -470,7 +470,7 @@ def test_a_model_is_stepped_alike_by_all_contenders(tmp_path, monkeypatch):
     stored = json.loads(output.read_text())
     rows = {row["contender"]: row for row in stored["rows"]}
     assert stored["solver"] == {"tolerance": 1e-6}
-    assert list(rows) == ["kernel", "mjx", "rollout", "batch"]
+    assert list(rows) == ["kernel", "mjx", "warp", "rollout", "batch"]
     assert rows["kernel"]["from_mujoco"] < 1e-5
     assert rows["mjx"]["note"] == "left out"
     assert all(rows[name]["env_steps_per_second"] > 0 for name in ("kernel", "rollout", "batch"))
