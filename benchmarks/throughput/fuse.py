@@ -30,7 +30,7 @@ import os
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -41,6 +41,8 @@ import mujoco
 import mujoco.rollout
 import numpy as np
 from jaxtyping import Array, Float
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter
 from mujoco import mjx
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[2]))
@@ -50,7 +52,8 @@ from benchmarks.harness.results import check_output, write
 from benchmarks.harness.timing import available_cores, warm_up
 from jetbot_mjx import cli
 from jetbot_mjx.errors import UserError
-from jetbot_mjx.runs.run_dir import versions
+from jetbot_mjx.evaluation.plots import theme, to_png
+from jetbot_mjx.runs.run_dir import versions, write_bytes
 from onekernel.mujoco import FusedMjx, MjxState, fuse_mjx
 
 GYMNASIUM = (
@@ -560,6 +563,39 @@ def table_line(row: Row) -> str:
     )
 
 
+def plot_rates(rows: Sequence[Mapping[str, Any]], title: str) -> Figure:
+    """Plot the rates of all contenders, a line for each model.
+
+    Args:
+      rows: rows as `Row._asdict` returns them.
+      title: the device and the settings.
+
+    Returns:
+      The figure, in the colours of the active theme.
+    """
+    models = list(dict.fromkeys(row["model"] for row in rows))
+    figure = Figure(figsize=(7.2, 1.3 + 0.36 * len(models)), layout="constrained")
+    axes = figure.subplots()
+    for index, contender in enumerate(dict.fromkeys(row["contender"] for row in rows)):
+        points = [
+            (row["env_steps_per_second"], models.index(row["model"]))
+            for row in rows
+            if row["contender"] == contender and row["env_steps_per_second"]
+        ]
+        if points:
+            style: Any = {"color": f"C{index}", "marker": "osD^v"[index % 5], "ls": ""}
+            axes.plot(*zip(*points, strict=True), label=contender, markersize=6, **style)
+    axes.set(xscale="log", xlabel="environment steps per second", title=title)
+    axes.title.set_fontsize(9)
+    axes.set_yticks(range(len(models)), models)
+    axes.set_ylim(len(models) - 0.5, -0.5)
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: format_count(value)))
+    axes.grid()
+    axes.set_axisbelow(True)
+    figure.legend(loc="outside lower center", ncols=5, fontsize="small")
+    return figure
+
+
 def _parser() -> cli.Parser:
     """Return the parser of the command line."""
     parser = cli.Parser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -586,7 +622,9 @@ def _parser() -> cli.Parser:
         metavar="SECONDS",
         help="the longest time to compile MJX, by XLA or for Warp; 0: leave both out (default: 60)",
     )
-    parser.add_argument("--output", type=Path, help="a JSON file for the results")
+    parser.add_argument(
+        "--output", type=Path, help="a JSON file for the results; a plot is written beside it"
+    )
     return parser
 
 
@@ -632,7 +670,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "unroll": options.unroll,
         }
         write(options.output, {**about, "rows": rows})
-        print(f"wrote {options.output}")
+        title = f"{device.device_kind}, {available_cores()} cores, {num_envs:,} instances"
+        image = options.output.with_suffix(".png")
+        with theme("light"):
+            write_bytes(image, to_png(plot_rates(rows, title)))
+        print(f"wrote {options.output} and {image}")
     return 0
 
 

@@ -472,7 +472,8 @@ def test_a_model_is_stepped_alike_by_all_contenders(tmp_path, monkeypatch):
     assert stored["solver"] == {"tolerance": 1e-6}
     assert list(rows) == ["kernel", "mjx", "warp", "rollout", "batch"]
     assert rows["kernel"]["from_mujoco"] < 1e-5
-    assert rows["mjx"]["note"] == "left out"
+    assert rows["mjx"]["note"] == rows["warp"]["note"] == "left out"
+    assert output.with_suffix(".png").read_bytes().startswith(b"\x89PNG")
     assert all(rows[name]["env_steps_per_second"] > 0 for name in ("kernel", "rollout", "batch"))
 
 
