@@ -5,6 +5,7 @@ import warnings
 from typing import NamedTuple
 
 import jax
+import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -268,3 +269,25 @@ def test_explain_tells_what_stands_in_the_way(capsys):
     out = capsys.readouterr().out
     line = r"spectrum is no kernel: one kernel cannot do the operation fft \(.*test_fuse.py:\d+"
     assert re.match(line, out)
+
+
+def test_jax_exports_the_function_itself_and_says_that_it_cannot_export_a_kernel():
+    @fuse
+    def wave(x):
+        return jnp.sin(x) * 2.0
+
+    def exported(function, **options):
+        return jax.export.export(jax.jit(jax.vmap(function)), **options)(like)
+
+    x = jnp.linspace(-1.0, 1.0, 5)
+    like = jax.ShapeDtypeStruct(x.shape, x.dtype)
+    # A kernel of a CPU is machine code in this process: what JAX stores would not contain it.
+    with pytest.raises(ValueError, match="custom calls whose targets have no compatibility") as no:
+        exported(wave)
+    stored = exported(wave.__wrapped__).serialize()
+    np.testing.assert_allclose(jax.export.deserialize(stored).call(x), jax.vmap(wave)(x), rtol=1e-6)
+    # Who insists gets a program for this process.
+    name = re.search(r"@(\w+)", str(no.value))[1]
+    check = jax.export.DisabledSafetyCheck.custom_call(name)
+    again = jax.export.deserialize(exported(wave, disabled_checks=[check]).serialize())
+    np.testing.assert_array_equal(again.call(x), jax.jit(jax.vmap(wave))(x))
